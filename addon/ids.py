@@ -61,9 +61,14 @@ BACKPROJECT = "mphdrr.backproject"
 SHOW_IN_PERSPECTIVE = "mphdrr.show_in_perspective"
 CLEAR_PERSPECTIVE = "mphdrr.clear_perspective"
 RESAMPLE_IN_PERSPECTIVE = "mphdrr.resample_in_perspective"
+NEW_EVENT_RECIPE = "mphdrr.new_event_recipe"
+TRY_EVENT = "mphdrr.try_event"
+MAKE_EVENT_SET = "mphdrr.make_event_set"
+OPEN_EVENT = "mphdrr.open_event"
 
 # --- Panels, drawn in the order of the work: bl_order -----------------------------------------------------------------
-ORDER_GEOMETRY, ORDER_PHANTOM, ORDER_PROJECTIONS, ORDER_RUNS, ORDER_RECONSTRUCTION, ORDER_EXPORT = 0, 10, 20, 25, 27, 30
+ORDER_GEOMETRY, ORDER_PHANTOM, ORDER_PROJECTIONS, ORDER_RUNS, ORDER_RECONSTRUCTION = 0, 10, 20, 25, 27
+ORDER_EVENTS, ORDER_EXPORT = 28, 30
 
 # --- Datablocks ---------------------------------------------------------------------------------------------
 SCANNER = "Scanner"  # default name of a scanner's collection

@@ -49,7 +49,8 @@ class Job:
     wants to stop, `stages_of` gives its stages. ``finish(result)`` runs in the main thread and returns the line to report;
     if that takes long, it is a generator (`Finishing`). Where the user cancels, its last yield raises `Cancelled`: by then
     it has changed nothing that it does not take back. ``discard()`` removes what the work has left on disk and what
-    ``look()`` has shown, where the job ends before it has finished.
+    ``look()`` has shown, where the job ends before it has finished. ``left()`` says what a job that the user has cancelled
+    leaves behind.
 
     ``look()`` is called in the main thread while the work runs in another, ten times a second: it may show what there is so
     far. A work that sees that `enough` is set ends early, as if it were done: the user has pressed Finish Now.
@@ -61,6 +62,7 @@ class Job:
     discard: Callable[[], None] = lambda: None
     look: Callable[[], None] = lambda: None
     enough: threading.Event | None = None
+    left: Callable[[], str] = lambda: "nothing was changed"
 
 
 def run(job: Job, progress: Progress = lambda done, total: None) -> str:
@@ -357,7 +359,8 @@ class JobOperator:
 
     def _failed(self, error: BaseException) -> set[str]:
         if isinstance(error, Cancelled):
-            self.report({"WARNING"}, f"{self.bl_label}: cancelled, nothing was changed")
+            left = "nothing was changed" if self._job is None else self._job.left()
+            self.report({"WARNING"}, f"{self.bl_label}: cancelled, {left}")
         elif isinstance(error, InputError):
             self.report({"ERROR"}, str(error))
         elif isinstance(error, ReferenceError):  # a datablock that the job had made or found

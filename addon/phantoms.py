@@ -5,7 +5,7 @@ phantom may have children that go with it: a volume of its other quantity, and a
 """
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -134,10 +134,7 @@ def adding(
             values["text"].from_string(recipe.settings["text"])
         collection = bpy.context.collection
         item = volumes.add_stored(stored[0], name, collection)
-        properties = item.mphdrr_volume
-        for key, value in values.items():
-            setattr(getattr(properties, kind), key, value)
-        properties.kind = kind.upper()  # last: until then no change of a setting makes the voxels again
+        take_settings(item, kind, values)
         for other in stored[1:]:
             child = volumes.add_stored(other, f"{item.name} {other.volume.quantity}", collection)
             child.mphdrr_volume.with_parent = True
@@ -148,6 +145,16 @@ def adding(
         return f"Added {item.name!r}: {grid.shape[0]}^3 voxels of {grid.spacing[0]:.3g} mm"
 
     return jobs.Job("Making a phantom", work, finish)
+
+
+def take_settings(item: bpy.types.Object, kind: str, values: Mapping[str, Any]) -> None:
+    """Say that a volume is the phantom of a kind (`PhantomSettings.identifier`) with these settings; its voxels stay."""
+    properties = item.mphdrr_volume
+    properties.kind = "VOLUME"  # until the kind is said, no change of a setting makes the voxels again
+    for key, value in values.items():
+        setattr(getattr(properties, kind), key, value)
+    properties.kind = kind.upper()
+    properties.outdated, properties.message = False, ""
 
 
 def updating(item: bpy.types.Object, bake: bool = False) -> jobs.Job:

@@ -27,6 +27,7 @@ from . import (
     column_maps,
     display_properties,
     epipolar_properties,
+    event_properties,
     ids,
     perspective_properties,
     phantom_properties,
@@ -235,6 +236,7 @@ CLASSES = (
     *display_properties.CLASSES,
     *epipolar_properties.CLASSES,
     *perspective_properties.CLASSES,
+    *event_properties.CLASSES,
     *column_maps.CLASSES,
 )
 
@@ -249,5 +251,6 @@ POINTERS = (
     (bpy.types.Scene, "mphdrr_display", display_properties.DisplayProperties),
     (bpy.types.Scene, "mphdrr_epipolar", epipolar_properties.EpipolarProperties),
     (bpy.types.Scene, "mphdrr_perspective", perspective_properties.PerspectiveProperties),
+    (bpy.types.Scene, "mphdrr_events", event_properties.EventProperties),
     (bpy.types.WindowManager, "mphdrr_columns", column_maps.ColumnMapProperties),
 )

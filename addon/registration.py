@@ -15,6 +15,7 @@ from ..operators import add_phantom
 from . import (
     color_bar,
     epipolar_drawing,
+    event_notes,
     following,
     framing,
     frustums,
@@ -237,6 +238,7 @@ def unregister() -> None:
     runs.stop()
     plots.stop()
     recoloring.stop()
+    event_notes.stop()
     _registered.close()
 
 

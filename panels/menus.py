@@ -65,6 +65,7 @@ class MPHDRR_MT_volumes(bpy.types.Menu):
         layout.menu("MPHDRR_MT_add", text="Add Phantom or Volume", icon="ADD")
         layout.separator()
         layout.operator(ids.UPDATE_PHANTOM, icon="FILE_REFRESH")
+        layout.operator(ids.TRY_EVENT)
         layout.operator(ids.APPLY_PHANTOM_POSE, icon="OBJECT_ORIGIN")
         layout.operator(ids.SHOW_PHANTOM_OUTLINE, text="Show or Hide Outline", icon="SHADING_WIRE")
         layout.separator()
@@ -100,6 +101,10 @@ class MPHDRR_MT_projections(bpy.types.Menu):
         layout.operator(ids.RECONSTRUCT, icon="OUTLINER_OB_VOLUME")
         layout.operator(ids.SHOW_RECONSTRUCTION, icon="IMAGE_DATA")
         layout.operator_menu_enum(ids.BACKPROJECT, "how", icon="OUTLINER_DATA_VOLUME")
+        layout.separator()
+        layout.operator_menu_enum(ids.NEW_EVENT_RECIPE, "like", icon="FILE_NEW")
+        layout.operator(ids.MAKE_EVENT_SET, icon="FILE_CACHE")
+        layout.operator(ids.OPEN_EVENT, icon="OUTLINER_OB_VOLUME")
         layout.separator()
         settings = context.scene.mphdrr_projections
         layout.operator_menu_enum(ids.COMPARE_RUNS, "other", icon="SELECT_DIFFERENCE")

@@ -1,0 +1,85 @@
+"""Event sets: a recipe written and tried on the phantom in the scene, a set made as a job, an event opened in the scene."""
+
+from typing import Any
+
+import bpy
+from bpy.props import EnumProperty, StringProperty
+from bpy_extras.io_utils import ExportHelper
+
+from ..addon import choices, event_sets, ids, jobs
+from ..addon.event_properties import COUNT, FOLDER, MODEL, NEXT, OPENED, RECIPE
+from ..addon.reports import run_reported
+from ..core.events.templates import TEMPLATES
+
+
+def _setting(operator: Any, context: bpy.types.Context, name: str) -> Any:
+    """A setting given to the operator, else the panel's."""
+    return getattr(operator if operator.properties.is_property_set(name) else context.scene.mphdrr_events, name)
+
+
+class MPHDRR_OT_new_event_recipe(ExportHelper, bpy.types.Operator):
+    """Write a recipe for events with comments in it, to be edited and tried. Its scanner is the scene's workbook, or the
+    example's where there is none
+    """
+
+    bl_idname = ids.NEW_EVENT_RECIPE
+    bl_label = "New Event Recipe"
+    bl_options = {"REGISTER", "UNDO"}
+
+    filename_ext = ".toml"
+    filter_glob: StringProperty(default="*.toml", options={"HIDDEN"})
+    like: EnumProperty(
+        name="Like", description="What the recipe begins with",
+        items=choices.items({}, ((name, name.capitalize(), text) for name, text in TEMPLATES.items())),
+    )  # fmt: skip
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        return run_reported(self, lambda: event_sets.write_recipe(context.scene, self.filepath, self.like))
+
+
+class MPHDRR_OT_try_event(jobs.JobOperator, bpy.types.Operator):
+    """Put the recipe's next event on the phantom in the scene: its kind, settings and pose. Makes a phantom where there is
+    none. The number goes up by one; the same number always is the same phantom
+    """
+
+    bl_idname = ids.TRY_EVENT
+    bl_label = "Another Phantom of the Recipe"
+
+    recipe: RECIPE  # type: ignore[valid-type]
+    number: NEXT  # type: ignore[valid-type]
+    folder: FOLDER  # type: ignore[valid-type]
+
+    def job(self, context: bpy.types.Context) -> jobs.Job:
+        return event_sets.trying(context, *(_setting(self, context, name) for name in ("recipe", "number", "folder")))
+
+
+class MPHDRR_OT_make_event_set(jobs.JobOperator, bpy.types.Operator):
+    """Make the events of the recipe in a folder, those that it does not have yet. Cancelled, it keeps what is made, and goes
+    on from there the next time
+    """
+
+    bl_idname = ids.MAKE_EVENT_SET
+    bl_label = "Make Event Set"
+
+    recipe: RECIPE  # type: ignore[valid-type]
+    folder: FOLDER  # type: ignore[valid-type]
+    count: COUNT  # type: ignore[valid-type]
+
+    def job(self, context: bpy.types.Context) -> jobs.Job:
+        return event_sets.making(*(_setting(self, context, name) for name in ("recipe", "folder", "count")))
+
+
+class MPHDRR_OT_open_event(jobs.JobOperator, bpy.types.Operator):
+    """Open an event of a set in the scene, in place of the one opened before: its truth as a volume, its phantom at its pose
+    with its settings, hidden, and its projections as a run
+    """
+
+    bl_idname = ids.OPEN_EVENT
+    bl_label = "Open Event"
+
+    folder: FOLDER  # type: ignore[valid-type]
+    opened: OPENED  # type: ignore[valid-type]
+    model: MODEL  # type: ignore[valid-type]
+
+    def job(self, context: bpy.types.Context) -> jobs.Job:
+        return event_sets.opening(context, *(_setting(self, context, name) for name in ("folder", "opened", "model")))

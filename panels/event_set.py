@@ -1,0 +1,50 @@
+"""Sidebar, after the reconstruction: events of a recipe, tried on the phantom, made as a set, opened in the scene."""
+
+import bpy
+
+from ..addon import event_notes, ids, jobs
+from .geometry import Sidebar, draw_hint, draw_text
+
+
+class MPHDRR_PT_event_set(Sidebar, bpy.types.Panel):
+    bl_label = "Event Set"
+    bl_order = ids.ORDER_EVENTS
+    bl_options = {"DEFAULT_CLOSED"}
+
+    def draw(self, context: bpy.types.Context) -> None:
+        layout = self.layout
+        layout.operator_context = "INVOKE_DEFAULT"
+        layout.use_property_split = True
+        layout.use_property_decorate = False
+        settings = context.scene.mphdrr_events
+        jobs.draw_job(layout)
+        column = layout.column(align=True)
+        column.prop(settings, "recipe")
+        column.operator_menu_enum(ids.NEW_EVENT_RECIPE, "like", text="New Recipe", icon="FILE_NEW")
+        recipe, made = event_notes.of_recipe(settings.recipe), event_notes.of_set(settings.folder)
+        if recipe is not None:
+            _draw_note(layout, recipe)
+        elif made is None:
+            draw_hint(layout, "Choose a recipe, or write one.")
+        if not (recipe or made or event_notes.NOTHING).is_wrong:
+            column = layout.column(align=True)
+            column.prop(settings, "number")
+            column.operator(ids.TRY_EVENT, text="Another One", icon="FILE_REFRESH")
+        if settings.tried:
+            draw_text(layout, settings.tried[:1].upper() + settings.tried[1:], "OUTLINER_DATA_VOLUME")
+        column = layout.column(align=True)
+        column.prop(settings, "folder")
+        column.prop(settings, "count")
+        column.operator(ids.MAKE_EVENT_SET, icon="FILE_CACHE")
+        if made is not None:
+            _draw_note(layout, made)
+            column = layout.column(align=True)
+            column.prop(settings, "opened")
+            column.prop(settings, "model", placeholder="First")
+            column.operator(ids.OPEN_EVENT, icon="OUTLINER_OB_VOLUME")
+
+
+def _draw_note(layout: bpy.types.UILayout, note: event_notes.Note) -> None:
+    column = layout.column()
+    column.alert = note.is_wrong
+    draw_text(column, note.text, "ERROR" if note.is_wrong else "INFO")

@@ -1,5 +1,5 @@
-"""Pictures of every phantom, a CT, the scanner's sensitivity, back-projections, events and the demo: `make gallery` writes them
-to docs/images.
+"""Pictures of every phantom, a CT, the scanner's sensitivity, back-projections, events and the demo: `make gallery` writes
+them to docs/images.
 
     python examples/gallery.py FOLDER [CT]
 

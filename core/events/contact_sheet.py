@@ -275,7 +275,8 @@ def _bright(values: NDArray[np.float32]) -> float:
 
 def _range(window: tuple[float, float], unit: str) -> str:
     largest = f"{window[1]:.0f}" if window[1] >= 1000 else number(window[1], 3)
-    return f"0 to {largest} {unit}".replace(" mm", " · mm")
+    said = unit.replace("1/mm mm", "").replace(" mm", " · mm")  # line integrals of mu are numbers
+    return f"0 to {largest} {said}".rstrip()
 
 
 def _listed(values: NDArray[np.float64]) -> str:

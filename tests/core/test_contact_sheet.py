@@ -113,3 +113,9 @@ def test_wrong_calls_of_the_command_are_refused(events, tmp_path, capsys):
         assert main(["events", "show", folder, *options]) == 1
         assert said in capsys.readouterr().err
     assert not list(tmp_path.glob("s.*"))
+
+
+def test_line_integrals_of_attenuation_have_no_unit(tmp_path):
+    mu = mph.Volume(np.full((4, 4, 4), 0.02, np.float32), mph.Grid.centered(4, 5.0), "mu")
+    said = texts(drawn([ShownEvent("Event 0", "", mu, np.zeros(3), radon=np.full((2, 4, 4), 0.4))]), tmp_path)
+    assert "Truth, 0 to 0.02 1/mm" in said and "Radon, 2 angles, 0 to 0.4" in said

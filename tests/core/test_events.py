@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import math
 import pickle
+import tomllib
 import warnings
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -366,3 +369,42 @@ def test_a_set_grows_and_keeps_what_it_has(tmp_path):
     (tmp_path / "set" / "events" / "000000.h5").unlink()
     assert [made.number for made in events.making(events.EventSet(tmp_path / "set").recipe, tmp_path / "set")] == [0]
     assert json.loads((tmp_path / "set" / "inputs" / "inputs.json").read_text())[str(WORKBOOK)]["what"] == "copy"
+
+
+WRONG: list[Any] = [
+    *(-1, 0, 1e300, math.nan, math.inf, 10**30, "x", "", [], {}, True, [1], ["a"], [[1, 2], [3]], {"from": 1}),
+    *({"from": "a", "to": "b"}, {"from": 1, "to": math.inf}, {"one_of": []}, {"one_of": [1, "a"]}),
+    {"one_of": [{"from": 1, "to": 2}, [1]]},
+]
+
+
+def places(value: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
+    """Where values are in a recipe."""
+    items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    for key, inner in items:
+        yield (*path, key)
+        yield from places(inner, (*path, key))
+
+
+@pytest.mark.long
+@pytest.mark.filterwarnings("ignore")
+def test_a_wrong_value_anywhere_is_refused_in_one_line(monkeypatch):
+    more = '[augmentation]\nmirror = 0.5\nsize = 1.1\nmodule_gain = 0.1\n[[phantoms]]\nkind = "torso"\ngates = 2\n'
+    right = tomllib.loads(TEXT + more)
+    refused = 0
+    for path in places(right):
+        for wrong in WRONG:
+            values = copy.deepcopy(right)
+            table = values
+            for key in path[:-1]:
+                table = table[key]
+            table[path[-1]] = wrong
+            monkeypatch.setattr("mphdrr.core.events.recipe.parse_toml", lambda text, name, values=values: values)
+            try:
+                recipe = events.EventRecipe("")
+                for number in range(3):
+                    _ = events.plan(recipe, number).phantom
+            except mph.InputError as error:
+                assert "\n" not in str(error)
+                refused += 1
+    assert refused > 1000

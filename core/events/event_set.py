@@ -7,7 +7,7 @@ import os
 from collections.abc import Callable, Iterator, Mapping
 from functools import cached_property
 from pathlib import Path
-from typing import Any, overload
+from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -313,13 +313,19 @@ class EventSet:
     def __len__(self) -> int:
         return len(self._events)
 
-    @overload
-    def __getitem__(self, index: int) -> Event: ...
-    @overload
-    def __getitem__(self, index: slice) -> EventSet: ...
-    def __getitem__(self, index: Any) -> Any:
-        found = self._events[index]
-        return self._of(found) if isinstance(index, slice) else found
+    if TYPE_CHECKING:  # typing keeps overloads for ever, and with them all that can be reached from here, such as bpy
+
+        @overload
+        def __getitem__(self, index: int) -> Event: ...
+        @overload
+        def __getitem__(self, index: slice) -> EventSet: ...
+        def __getitem__(self, index: Any) -> Any: ...
+
+    else:
+
+        def __getitem__(self, index: Any) -> Any:
+            found = self._events[index]
+            return self._of(found) if isinstance(index, slice) else found
 
     def __iter__(self) -> Iterator[Event]:
         return iter(self._events)

@@ -2,6 +2,7 @@
 
 import argparse
 import ast
+import operator
 import os
 import re
 from pathlib import Path
@@ -47,12 +48,19 @@ _PUBLIC = Path(mph.__file__)
 
 
 def public_names() -> dict[str, list[str]]:
-    """The names of `mphdrr.core`, by the room (or file) of core that they come from, in the order of its imports."""
+    """The names of `mphdrr.core`, by the room (or file) of core that they come from, in the order of its imports.
+
+    Those of a room with names of its own, ``mph.events``, begin with its name.
+    """
     rooms: dict[str, list[str]] = {}
     for line in ast.parse(_PUBLIC.read_text(encoding="utf-8")).body:
         if isinstance(line, ast.ImportFrom) and line.module:
             names = [alias.name for alias in line.names if alias.name in mph.__all__]
             rooms.setdefault(line.module.split(".")[0], []).extend(names)
+        elif isinstance(line, ast.ImportFrom):
+            for alias in line.names:
+                own = getattr(getattr(mph, alias.name), "__all__", ())
+                rooms |= {alias.name: [f"{alias.name}.{name}" for name in own]} if own else {}
     return rooms
 
 
@@ -68,7 +76,7 @@ class PublicNames(SphinxDirective):
         for room in self.arguments[0].split():
             seen.add(room)
             for name in public_names()[room]:
-                value = getattr(mph, name)
+                value = operator.attrgetter(name)(mph)
                 if isinstance(value, dict):  # a table of what has names
                     lines += [f".. py:data:: mphdrr.core.{name}", "", f"   By name: {', '.join(value)}.", ""]
                 elif isinstance(value, type) or callable(value):

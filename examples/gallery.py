@@ -1,5 +1,5 @@
-"""Pictures of every phantom, a CT, the scanner's sensitivity, back-projections and the demo: `make gallery` writes them to
-docs/images.
+"""Pictures of every phantom, a CT, the scanner's sensitivity, back-projections, events and the demo: `make gallery` writes
+them to docs/images.
 
     python examples/gallery.py FOLDER [CT]
 
@@ -17,6 +17,8 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 import mphdrr.core as mph
+from mphdrr.core.events.contact_sheet import contact_sheet
+from mphdrr.core.events.templates import template_text
 from mphdrr.core.runs.display import Display
 
 HERE = Path(__file__).parent
@@ -47,6 +49,7 @@ def main(folder: Path, ct: Path | None) -> None:
         volumes["chest CT"] = mph.hu_to_mu(hounsfield)
     keep(sheet(system, volumes), folder / "gallery.webp")
     keep(back_projections(system), folder / "back-projections.webp")
+    keep(events(), folder / "event-sets.webp")
     in_the_scanner(system, folder, hounsfield)
 
 
@@ -109,6 +112,14 @@ def back_projections(system: mph.PinholeSystem) -> Image.Image:
             write.text((left, top + 4), f"{label}; {name}" if column else label, fill=(220, 222, 226))
             page.paste(picture.resize((size, size), Image.Resampling.BICUBIC), (left, top + TEXT))
     return page
+
+
+def events() -> Image.Image:
+    """Three events of the recipe that `mphdrr events new --like derenzo` writes."""
+    with tempfile.TemporaryDirectory() as folder:
+        made = mph.events.make(mph.events.EventRecipe(template_text("derenzo")), Path(folder, "derenzo"), 3)
+        title = "An event set: phantoms turned at random, and what 80 pinholes see of them"
+        return Image.fromarray(contact_sheet(list(made), "emission", title).picture)
 
 
 def telling(array: np.ndarray) -> list[int]:

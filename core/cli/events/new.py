@@ -1,0 +1,53 @@
+"""``mphdrr events new --like derenzo``."""
+
+import argparse
+import os
+import sys
+from pathlib import Path
+
+from ...errors import InputError
+from ...events.templates import EXAMPLE, TEMPLATES, template_text
+from ...files import replacing
+from ..options import add_command, output_path
+
+
+def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
+    """Add the action."""
+    parser = add_command(
+        actions,
+        "new",
+        "write a commented recipe to begin with",
+        "mphdrr events new --like derenzo --system scanner.xlsx -o derenzo.toml",
+    )
+    add = parser.add_argument
+    add("--like", choices=tuple(TEMPLATES), default="derenzo", metavar="NAME", help="see the list below")
+    add("--system", metavar="FILE", help="the scanner's geometry workbook; default: that of the examples")
+    add("-o", "--output", metavar="FILE", help="a new file (.toml); default: standard output")
+    names = "\n".join(f"  {name:<13}{text}" for name, text in TEMPLATES.items())
+    parser.epilog = f"recipes:\n{names}\n{parser.epilog}"
+    parser.set_defaults(run=_run)
+
+
+def _run(arguments: argparse.Namespace) -> None:
+    workbook = Path(EXAMPLE if arguments.system is None else arguments.system)
+    if not workbook.is_file():
+        raise InputError(f"--system {workbook}: no such file; expected a geometry workbook (.xlsx, .xlsm)")
+    if arguments.output is None:
+        sys.stdout.write(template_text(arguments.like, workbook.absolute()))
+        return
+    path = output_path(arguments.output, (".toml",))
+    if path.exists():  # recipes are edited by hand
+        raise InputError(f"{path}: it exists; choose another name, or remove it first")
+    with replacing(path) as temporary:
+        temporary.write_text(template_text(arguments.like, _seen_from(path.parent, workbook)), encoding="utf-8")
+    print(f"{path}: edit it, then: mphdrr events make SET --recipe {path} -n 1000")
+
+
+def _seen_from(folder: Path, workbook: Path) -> str:
+    """A workbook's path relative to a folder, with / on every system; absolute for the example, or on another drive."""
+    if workbook == EXAMPLE:
+        return workbook.as_posix()
+    try:
+        return Path(os.path.relpath(workbook, folder)).as_posix()
+    except ValueError:
+        return workbook.absolute().as_posix()

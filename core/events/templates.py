@@ -1,0 +1,32 @@
+"""Recipes to begin with: commented files that users copy and change."""
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from types import MappingProxyType
+
+from ..toml import toml_value
+from ..validation import one_of
+
+_FOLDER = Path(__file__).with_name("templates")
+EXAMPLE = Path(__file__).parents[2] / "examples" / "dc-spect-80.xlsx"
+"""The workbook that comes with the program."""
+
+TEMPLATES: Mapping[str, str] = MappingProxyType({
+    "derenzo": "Derenzo phantoms turned at random: line integrals, counts, Radon images; explains draws",
+    "cardiac": "a beating torso with and without perfusion defects: counts with attenuation",
+    "mixed": "phantoms of several kinds in any position, one for the test alone; small images",
+    "files": "your own volumes, each placed and turned a little differently, with their attenuation",
+})  # fmt: skip
+"""What each template is, by name."""
+
+
+def template_text(name: str, workbook: str | os.PathLike[str] = EXAMPLE) -> str:
+    """The text of a template (TOML), with a workbook's path as the recipe's folder sees it; `InputError` for another name.
+
+    >>> Path("derenzo.toml").write_text(template_text("derenzo", "scanner.xlsx"))
+    """
+    one_of(name, TEMPLATES, "recipe to begin with")
+    text = (_FOLDER / f"{name}.toml").read_text(encoding="utf-8")
+    path = str(workbook) if isinstance(workbook, str) else Path(workbook).as_posix()
+    return text.replace(toml_value(EXAMPLE.name), toml_value(path), 1)

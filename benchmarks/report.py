@@ -15,6 +15,8 @@ from case import SIDE, Case, Row
 from mphdrr.core.runs.run import versions
 from mphdrr.core.version import VERSION
 
+EVENTS = "## Event sets"
+"""The heading of the page's last section, which `events.py` writes."""
 TITLES = {"forward": "forward", "adjoint": "adjoint", "emission": "emission", "pose_gradient": "pose gradient"}
 
 RECORDED_WORK = (8, 256, 256)  # views, pixels, voxels
@@ -55,7 +57,9 @@ def write(results: Results, folder: Path) -> None:
     picture = folder / "images" / "benchmarks.svg"
     drawn = draw(results, picture)
     path = folder / "benchmarks.md"
-    path.write_text(page(results, picture.relative_to(folder) if drawn else None), encoding="utf-8")
+    _, heading, events = path.read_text(encoding="utf-8").partition(EVENTS) if path.is_file() else ("", "", "")
+    text = page(results, picture.relative_to(folder) if drawn else None)
+    path.write_text(text + (f"\n{heading}{events}" if heading else ""), encoding="utf-8")
     print(f"{path}" + (f" and {picture}" if drawn else "; for a plot: pip install matplotlib"))
 
 

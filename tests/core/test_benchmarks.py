@@ -24,3 +24,19 @@ def test_plain_c_integrates_the_same(tmp_path):
     row = dict(zip(head, rows[0], strict=True))
     assert row["projector"] == "plain C, OpenMP" and float(row["forward ms"]) > 0 and float(row["emission ms"]) > 0
     assert float(row["error"]) < 1e-5 and float(row["offset px"]) < 1e-3 and float(row["mismatch"]) < 1e-5
+
+
+@pytest.mark.long
+def test_event_sets_are_measured_and_the_page_keeps_the_rest(tmp_path):
+    page = tmp_path / "benchmarks.md"
+    page.write_text("# Benchmarks\n\nkept\n\n## Event sets\n\nold\n")
+    size = ["--voxels", "64", "--pixels", "8", "--events", "2", "--no-pipeline"]
+    command = [sys.executable, str(SCRIPT.with_name("events.py")), *size, "--output", str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    text = page.read_text()
+    assert text.startswith("# Benchmarks\n\nkept\n\n## Event sets\n") and "old" not in text
+    head, _, *rows = (line.strip("| ").split(" | ") for line in text.splitlines() if line.startswith("|"))
+    found = [dict(zip(head, row, strict=True)) for row in rows]
+    assert {row["images"] for row in found} == {"line integrals", "emission"}
+    assert all(float(row["s an event"]) > 0 and float(row["MB an event"]) > 0 for row in found)

@@ -79,11 +79,14 @@ def check(folder: str | os.PathLike[str], progress: Progress | None = None) -> l
     if faults:  # what events should be is not known without them
         return faults
     faults += _index(target)
-    planned, there = _planned(target), target.numbers()
+    planned, there = set(_planned(target)), target.numbers()
     fingerprint = target.recipe.fingerprint
 
     def faults_of(number: int) -> Fault | None:
-        return _event_fault(target, number, fingerprint)
+        fault = _event_fault(target, number, fingerprint)
+        if fault is None or number in planned:
+            return fault
+        return Fault("foreign", fault.path, f"{fault.text}, and not in the index")  # nobody asked for it
 
     numbers = sorted({*planned, *there})
     with ThreadPoolExecutor(os.cpu_count()) as pool:
@@ -116,7 +119,7 @@ def repair(folder: str | os.PathLike[str], faults: list[Fault]) -> list[int]:
         if fault.kind == "foreign":
             _move(fault.path, target)
         elif fault.kind in ("damaged", "another recipe", "leftover"):
-            fault.path.unlink(missing_ok=True)
+            _remove(fault.path, target)
     if rewrite:
         target.write_index(planned)
     return sorted({fault.event for fault in faults if fault.event is not None})
@@ -142,11 +145,16 @@ def _inputs(target: SetFolder) -> Iterator[Fault]:
 
 
 def _planned(target: SetFolder) -> list[int]:
-    """The events that the set should have: those of the index, and without one that can be read, those that are there."""
+    """The events that the set should have: of the index, and those there of its recipe; without an index, all there."""
+    there = target.numbers()
     try:
-        return target.planned() or target.numbers()
+        planned = target.planned()
     except InputError:
-        return target.numbers()
+        planned = []
+    if not planned:
+        return there
+    beside = set(there) - set(planned)  # of an index that was cut
+    return sorted({*planned, *(n for n in beside if target.is_made(n, target.recipe.fingerprint))})
 
 
 def _index(target: SetFolder) -> list[Fault]:
@@ -193,6 +201,17 @@ def _foreign(target: SetFolder) -> Iterator[Fault]:
                 yield Fault("leftover", path, f"{path}: left by a work that was interrupted, or is under way")
             else:
                 yield Fault("foreign", path, f"{path}: not of this set")
+
+
+def _remove(path: Path, target: SetFolder) -> None:
+    """Remove a file of the set; a folder in its place is not the set's, and moves."""
+    if path.is_dir() and not path.is_symlink():
+        _move(path, target)
+        return
+    try:
+        path.unlink(missing_ok=True)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be removed ({error.strerror or error})") from error
 
 
 def _move(path: Path, target: SetFolder) -> None:

@@ -95,7 +95,8 @@ class SetFolder:
             _write_text(self.recipe_path, recipe.text)
         there = read_recipe(self.recipe_path)
         if there.values != recipe.values:
-            raise InputError(f"{self.recipe_path}: another recipe: choose another folder for {recipe.name}")
+            no_events = "" if self.numbers() else f", or remove {self.path}, which holds no events yet"
+            raise InputError(f"{self.recipe_path}: another recipe: choose another folder for {recipe.name}{no_events}")
         ensure_folder(self.events)
         copies = self.copies()
         if set(copies) != set(recipe.files) or not self.numbers():
@@ -148,7 +149,9 @@ class SetFolder:
         except FileNotFoundError:
             return []
         except (OSError, ValueError, csv.Error) as error:
-            raise InputError(f"{self.index_path}: cannot be read ({error})") from None
+            raise InputError(
+                f"{self.index_path}: cannot be read ({error}): mphdrr events check {self.path} --repair writes it anew"
+            ) from None
         if not all(isinstance(row.get("event"), int) for row in rows):
             raise InputError(
                 f"{self.index_path}: cannot be read: mphdrr events check {self.path} --repair writes it anew"
@@ -169,7 +172,7 @@ class SetFolder:
     def write_index(self, numbers: Iterable[int]) -> None:
         """Write the index of these events unless it is there."""
         text = self.index_text(numbers)
-        if not self.index_path.is_file() or self.index_path.read_text(encoding="utf-8") != text:
+        if not self.index_path.is_file() or self.index_path.read_bytes() != text.encode():
             _write_text(self.index_path, text)
 
     def remove_leftovers(self, number: int) -> None:

@@ -91,7 +91,7 @@ class EventRecipe:
             values = self.values
             if "version" not in values:
                 raise InputError(f"version: missing; this mphDRR reads version = {VERSION}")
-            if values["version"] != VERSION:
+            if values["version"] != VERSION or isinstance(values["version"], bool):
                 raise InputError(f"version: expected {VERSION}, got {values['version']!r}; a newer mphDRR may read it")
             unknown(values, _KNOWN, "")
             _ = self.seed, self.system, self.grid, self.quantity, self.phantoms, self.models, self.radon
@@ -130,6 +130,8 @@ class EventRecipe:
         if "spacing" not in self._truth:
             raise InputError("truth.spacing: missing; give the voxel size in mm")
         voxels = self._truth.get("voxels", 256)
+        if isinstance(voxels, bool):
+            raise InputError(f"truth.voxels: expected 3 whole numbers of at least 1, got {voxels}")
         shape = whole_shape([voxels] * 3 if isinstance(voxels, int) else voxels, "truth.voxels", 3)
         spacing = lengths(self._truth["spacing"], "truth.spacing", 3)
         return Grid.centered(shape, spacing, real_array(self._truth.get("center", [0.0] * 3), "truth.center", (3,)))

@@ -77,10 +77,40 @@ def index(folder: Path, others: Path) -> Path:
     return path
 
 
+def index_saved_elsewhere(folder: Path, others: Path) -> Path:
+    path = folder / "index.csv"
+    path.write_bytes(path.read_bytes().replace(b"\n", b"\r\n"))
+    return path
+
+
+def index_cut_between_rows(folder: Path, others: Path) -> Path:
+    path = folder / "index.csv"
+    path.write_bytes(b"".join(path.read_bytes().splitlines(keepends=True)[:4]))
+    return path
+
+
+def index_of_no_text(folder: Path, others: Path) -> Path:
+    path = folder / "index.csv"
+    path.write_bytes(path.read_bytes() + b"\xff\xfe")
+    return path
+
+
+def foreign_event(folder: Path, others: Path) -> Path:
+    return Path(shutil.copy(others / "foreign" / "events" / "000002.h5", folder / "events" / "000077.h5"))
+
+
+def folder_for_event(folder: Path, others: Path) -> Path:
+    path = missing(folder, others)
+    path.mkdir()
+    return path
+
+
 DAMAGE = {
     cut: "cut: ", other_recipe: "of another recipe", changed_byte: "changed: its bytes", missing: "missing",
     renamed: "it is event 0", header_byte: "not an event of mphDRR", foreign: "not of this set",
     leftover: "interrupted", index: "changed: it is not what recipe.toml says",
+    index_saved_elsewhere: "changed: ", index_cut_between_rows: "changed: ", index_of_no_text: "changed: ",
+    foreign_event: "not in the index", folder_for_event: "",
 }  # fmt: skip
 
 
@@ -101,7 +131,8 @@ def test_damage_is_found_and_mended_and_nothing_else_is_touched(tmp_path, made, 
     assert main(["events", "check", str(folder), "--repair"]) == 0
     assert tree(folder) == before
     assert {file: file.stat().st_mtime_ns for file in times} == times
-    assert (tmp_path / "set-foreign" / "notes.txt").exists() == (damage is foreign)
+    moved = [file.name for file in (tmp_path / "set-foreign").glob("*")]
+    assert moved == ([path.name] if damage in (foreign, foreign_event, folder_for_event) else [])
     assert main(["events", "check", str(folder)]) == 0
 
 

@@ -35,8 +35,9 @@ def _run(arguments: argparse.Namespace) -> None:
     lines = [fault.text for fault in faults]
     record = [{**asdict(fault), "path": str(fault.path)} for fault in faults]
     if not arguments.repair or not faults:
-        count = len(SetFolder(folder).planned())
-        print_answer(arguments, record, lines or [f"{folder}: {count} events, every byte as it was written"])
+        if not faults:
+            lines = [f"{folder}: {len(SetFolder(folder).planned())} events, every byte as it was written"]
+        print_answer(arguments, record, lines)
         if faults:
             raise InputError(
                 f"{folder}: {len(faults)} fault{'s' * (len(faults) > 1)}; --repair mends what can be mended"
@@ -48,7 +49,7 @@ def _run(arguments: argparse.Namespace) -> None:
     done = watched(making_again(folder, again, arguments.workers), SetFolder(folder), quiet=True)
     left = check(folder, progress_bar("checking again"))
     record = [{**asdict(fault), "path": str(fault.path)} for fault in left]
-    said = f"{folder}: {len(faults)} faults mended, {done} events made anew"
+    said = f"{folder}: {len(faults)} fault{'s' * (len(faults) > 1)} mended, {done} events made anew"
     print_answer(arguments, record, [fault.text for fault in left] or [said])
     if left:
-        raise InputError(f"{folder}: {len(left)} faults are left")
+        raise InputError(f"{folder}: {len(left)} of its faults are left")

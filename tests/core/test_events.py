@@ -334,6 +334,8 @@ def test_a_beating_torso_is_the_mean_of_its_gates(tmp_path):
         ("angles = [6, 8]", "angles = [6, 6]", "radon.angles: expected different numbers of angles"),
         ("levels = [1.0, 0.25]", "levels = [0]", "noise.levels: expected shares of the acquisition time above 0"),
         ("train = 0.8", "train = -1", "splits: expected 2 odds of 0 or more"),
+        ("voxels = 16", "voxels = true", "truth.voxels: expected 3 whole numbers"),
+        ("version = 1", "version = true", "version: expected 1, got True"),
         ("voxels = 16", 'voxels = 16\nstore = "float8"', "truth.store 'float8': expected one of float32, float16, sparse"),
         ("modules =", "modles =", "system.modles: no such setting"),
         (f"file = {str(WORKBOOK)!r}", "", "system.file: missing"),

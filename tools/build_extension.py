@@ -39,8 +39,8 @@ PURE = (
 )
 STABLE_ABI = ("psutil==7.2.2",)
 # For Python 3.11 and for the others: from 2.4 on pylibjpeg-openjpeg asks for numpy 2, and 2.3 for macOS 14.
-COMPILED_311 = ("h5py==3.16.0", "pylibjpeg-openjpeg==2.2.1")
-COMPILED = ("h5py==3.16.0", "pylibjpeg-openjpeg==2.6.0")
+COMPILED_311 = ("h5py==3.15.1", "pylibjpeg-openjpeg==2.2.1")
+COMPILED = ("h5py==3.15.1", "pylibjpeg-openjpeg==2.6.0")
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ from typing import Any
 
 from ..errors import InputError
 from .folders import SetFolder
+from .pool import threads_each
 from .writing import EventWriter, Written
 
 _RETRIES = 3
@@ -31,7 +32,9 @@ def in_cluster(target: SetFolder, numbers: Sequence[int], address: str, workers:
         raise InputError('--dask needs Dask, which is missing: pip install "mphdrr[dask]"') from None
     with contextlib.ExitStack() as stack:
         where: Any = address
+        threads = None  # those of a worker of the cluster
         if address == "local":
+            threads = threads_each(workers)
             cluster = LocalCluster(
                 n_workers=workers, threads_per_worker=1, dashboard_address=None, silence_logs=logging.CRITICAL
             )
@@ -41,7 +44,9 @@ def in_cluster(target: SetFolder, numbers: Sequence[int], address: str, workers:
         except (OSError, ValueError) as error:
             raise InputError(f"--dask {address}: no scheduler answers there ({error})") from None
         path = target.path
-        futures = [client.submit(_write, path, n, key=f"{path}-{n}", retries=_RETRIES, pure=False) for n in numbers]
+        futures = [
+            client.submit(_write, path, n, threads, key=f"{path}-{n}", retries=_RETRIES, pure=False) for n in numbers
+        ]
         of = dict(zip((future.key for future in futures), numbers, strict=True))
         try:
             for future in as_completed(futures, loop=client.loop):
@@ -56,12 +61,12 @@ def in_cluster(target: SetFolder, numbers: Sequence[int], address: str, workers:
             client.cancel(futures)
 
 
-def _write(folder: Path, number: int) -> tuple[Any, ...]:
+def _write(folder: Path, number: int, threads: int | None) -> tuple[Any, ...]:
     """What a Dask worker does; the scanner and its rays are kept for the next event."""
     from distributed import get_worker
 
     with _one_event:
         if folder not in _writers:
             _writers.clear()
-            _writers[folder] = EventWriter(folder, get_worker().state.nthreads)
+            _writers[folder] = EventWriter(folder, threads or get_worker().state.nthreads)
         return tuple(_writers[folder].write(number))

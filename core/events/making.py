@@ -13,7 +13,7 @@ from ..geometry.grid import Grid
 from ..geometry.parallel_views import parallel_views
 from ..geometry.system import PinholeSystem, chosen_modules
 from ..geometry.views import Views
-from ..memory import require
+from ..memory import readable_size, require
 from ..progress import Progress
 from ..projector import Emission, Projector, intensity
 from ..recording import recorded_warnings
@@ -72,6 +72,11 @@ class EventMaker:
             n += sum(recipe.radon.counts) * math.prod(recipe.radon.shape)
         return 4 * n
 
+    def require_memory(self, workers: int = 1) -> None:
+        """Raise `InputError` where so many events at once do not fit into memory, or the scanner cannot be read."""
+        what = f"an event of {readable_size(self.raw_bytes)}" if workers == 1 else f"{workers} workers"
+        require(workers * 2.5 * self.raw_bytes, what)
+
     def plan(self, number: int) -> PlannedEvent:
         """What an event is."""
         return plan(self.recipe, number)
@@ -79,7 +84,7 @@ class EventMaker:
     def make(self, number: int, progress: Progress | None = None) -> EventArrays:
         """Compute an event; `progress` is called as ``progress(steps done, steps)`` and may raise `Cancelled`."""
         planned, recipe = self.plan(number), self.recipe
-        require(2.5 * self.raw_bytes, f"an event of {self.raw_bytes / 1e6:.0f} MB")
+        self.require_memory()
         done, steps = 0, 1 + len(recipe.models) + (0 if recipe.radon is None else len(recipe.radon.counts))
 
         def step() -> None:

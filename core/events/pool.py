@@ -11,7 +11,6 @@ from multiprocessing import get_context, parent_process
 from pathlib import Path
 
 from ..errors import InputError
-from ..memory import require
 from .folders import SetFolder
 from .making import EventMaker
 from .writing import EventWriter, Written
@@ -32,11 +31,11 @@ def in_processes(target: SetFolder, numbers: Sequence[int], workers: int) -> Ite
     """
     if not numbers:
         return
-    require(workers * 2.5 * EventMaker(target.recipe).raw_bytes, f"{workers} workers")
+    EventMaker(target.recipe).require_memory(workers)
     waiting, breaks = deque(numbers), 0
     while waiting:
         under_way: dict[Future[Written], int] = {}
-        pool = ProcessPoolExecutor(workers, get_context("spawn"), _begin, (target.path, _threads(workers)))
+        pool = ProcessPoolExecutor(workers, get_context("spawn"), _begin, (target.path, threads_each(workers)))
         try:
             while waiting or under_way:
                 while waiting and len(under_way) < workers + 1:  # one more, so that no worker waits for the next
@@ -62,7 +61,7 @@ def in_processes(target: SetFolder, numbers: Sequence[int], workers: int) -> Ite
             pool.shutdown(wait=True, cancel_futures=True)  # what is under way is finished: it counts
 
 
-def _threads(workers: int) -> int:
+def threads_each(workers: int) -> int:
     """Of each worker: together they use all cores."""
     return max(1, (os.cpu_count() or 1) // workers)
 

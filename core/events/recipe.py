@@ -26,7 +26,21 @@ VERSION = 1
 TRUTH_STORES = ("float32", "float16", "sparse")
 IMAGE_STORES = ("float32", "float16")
 QUANTITIES = ("activity", "mu")
-_TAKEN = ("truth", "truth_affine", "affine", "pose", "position", "euler_degrees", "number", "level", "record", "json")
+_TAKEN = (
+    *(
+        "truth",
+        "truth_affine",
+        "affine",
+        "pose",
+        "placement",
+        "position",
+        "euler_degrees",
+        "module_gain",
+        "number",
+        "level",
+    ),
+    *("record", "json"),
+)
 """What else exports and batches of an event hold, besides the images of models."""
 
 _TABLES = (

@@ -13,6 +13,7 @@ from ..validation import whole_number
 from .dask_work import in_cluster
 from .event_set import EventSet
 from .folders import SetFolder
+from .making import EventMaker
 from .planning import plan
 from .pool import in_processes
 from .recipe import EventRecipe
@@ -117,6 +118,7 @@ def prepare(
     for number in mine:  # what does not fit together shows before the first is computed; a torso's check takes 20 ms
         if not target.event_path(number).exists():
             _ = plan(recipe, number).phantom
+    EventMaker(recipe).require_memory()
     recipe = target.prepare(recipe)
     target.write_index([*target.planned(), *numbers])
     return target, [number for number in mine if not target.is_made(number, recipe.fingerprint)]

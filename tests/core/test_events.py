@@ -337,6 +337,8 @@ def test_a_beating_torso_is_the_mean_of_its_gates(tmp_path):
         ("voxels = 16", "voxels = true", "truth.voxels: expected 3 whole numbers"),
         ("version = 1", "version = true", "version: expected 1, got True"),
         ("voxels = 16", 'voxels = 16\nstore = "float8"', "truth.store 'float8': expected one of float32, float16, sparse"),
+        ("voxels = 16", "voxels = 100000", "an event of .* needs .* of memory"),
+        ("[models.lines]", "[models.placement]", "models.placement: other arrays are called so"),
         ("modules =", "modles =", "system.modles: no such setting"),
         (f"file = {str(WORKBOOK)!r}", "", "system.file: missing"),
         ("{ from = 30, to = 36 }", "-3", "event 1: derenzo.*radius: expected .* above 0|radius"),

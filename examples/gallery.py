@@ -115,9 +115,10 @@ def back_projections(system: mph.PinholeSystem) -> Image.Image:
 
 
 def events() -> Image.Image:
-    """Three events of the recipe that `mphdrr events new --like derenzo` writes."""
+    """Three events of the recipe that `mphdrr events new --like derenzo` writes, in voxels of half the size."""
+    recipe = mph.events.EventRecipe(template_text("derenzo").replace("spacing = 1.0", "spacing = 0.5"))
     with tempfile.TemporaryDirectory() as folder:
-        made = mph.events.make(mph.events.EventRecipe(template_text("derenzo")), Path(folder, "derenzo"), 3)
+        made = mph.events.make(recipe, Path(folder, "derenzo"), 3)
         title = "An event set: phantoms turned at random, and what 80 pinholes see of them"
         return Image.fromarray(contact_sheet(list(made), "emission", title).picture)
 

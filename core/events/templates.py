@@ -13,7 +13,7 @@ EXAMPLE = Path(__file__).parents[2] / "examples" / "dc-spect-80.xlsx"
 """The workbook that comes with the program."""
 
 TEMPLATES: Mapping[str, str] = MappingProxyType({
-    "derenzo": "Derenzo phantoms turned at random: line integrals, counts, Radon images; explains draws",
+    "derenzo": "Derenzo phantoms turned at random: counts or line integrals, Radon images; explains draws",
     "cardiac": "a beating torso with and without perfusion defects: counts with attenuation",
     "mixed": "phantoms of several kinds in any position, one for the test alone; small images",
     "files": "your own volumes, each placed and turned a little differently, with their attenuation",

@@ -36,9 +36,9 @@ def test_every_template_reads_and_plans(name, tmp_path):
 def test_the_derenzo_template_is_the_users_event():
     recipe = mph.events.EventRecipe(template_text("derenzo"))
     assert recipe.grid.shape == (256, 256, 256)
-    np.testing.assert_allclose(recipe.grid.spacing, 0.5)
+    np.testing.assert_allclose(recipe.grid.spacing, 1.0)
     assert recipe.radon is not None and recipe.radon.counts == (96, 256)
-    assert list(recipe.models) == ["lines", "emission"]
+    assert list(recipe.models) == ["emission"] and recipe.models["emission"]["model.aperture_points"] == 7
     maker = mph.events.EventMaker(recipe)
     assert (len(maker.system), maker.views.shape) == (80, (256, 256))
 

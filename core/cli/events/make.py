@@ -5,6 +5,7 @@ import shutil
 import sys
 import time
 from collections.abc import Iterator
+from pathlib import Path
 
 from ...errors import InputError
 from ...events.folders import SetFolder
@@ -46,6 +47,10 @@ def chosen_recipe(folder: str, recipe: str | None) -> EventRecipe:
     """The recipe in a file, or that of a set's folder."""
     if recipe is not None:
         return read_recipe(recipe)
+    if Path(folder).is_file():
+        raise InputError(
+            f"{folder}: is a file; name the set's folder, and a recipe by --recipe: make set --recipe {folder}"
+        )
     if not SetFolder(folder).recipe_path.is_file():
         raise InputError(f"{folder}: it holds no recipe.toml: give --recipe FILE (mphdrr events new writes one)")
     return SetFolder(folder).recipe
@@ -62,15 +67,15 @@ def _run(arguments: argparse.Namespace) -> None:
         arguments.shard,
         dask=arguments.dask,
     )
-    done = watched(work, SetFolder(arguments.folder), arguments.quiet)
+    done = watched(work, SetFolder(arguments.folder), arguments.quiet, arguments.shard)
     folder = SetFolder(arguments.folder)
     there = len(folder.numbers())
     print(f"{arguments.folder}: {there} of {len(folder.planned())} events, {done} made now")
 
 
-def watched(work: Iterator[Made], folder: SetFolder, quiet: bool) -> int:
+def watched(work: Iterator[Made], folder: SetFolder, quiet: bool, shard: tuple[int, int] = (1, 1)) -> int:
     """Do the work and say how far it is; the number of events that it made."""
-    report, done = _Report(folder, quiet), 0
+    report, done = _Report(folder, quiet, shard), 0
     try:
         for made in work:
             done = made.done
@@ -83,19 +88,21 @@ def watched(work: Iterator[Made], folder: SetFolder, quiet: bool) -> int:
 class _Report:
     """Says how large the set becomes, and what is left, on standard error."""
 
-    def __init__(self, folder: SetFolder, quiet: bool) -> None:
+    def __init__(self, folder: SetFolder, quiet: bool, shard: tuple[int, int]) -> None:
         self.folder, self.quiet, self.shows = folder, quiet, sys.stderr.isatty() and not quiet
         self.started, self.bytes, self.open_line = time.monotonic(), 0, False
         if quiet:
             return
-        missing = [n for n in folder.planned() if not folder.event_path(n).exists()]
+        part, parts = shard
+        mine = [number for number in folder.planned() if number % parts == part - 1]
+        missing = [number for number in mine if not folder.event_path(number).exists()]
         sizes = [folder.event_path(n).stat().st_size for n in folder.numbers()[:100]]
         raw = EventMaker(folder.recipe).raw_bytes
         if sizes:
             each = sum(sizes) / len(sizes)
             size = f"about {readable_size(each)} each, {readable_size(each * len(missing))} in all"
         else:
-            size = f"up to {readable_size(raw)} each before they are compressed"
+            size = f"up to {readable_size(raw)} each, {readable_size(raw * len(missing))} in all, before they are compressed"
         self._say(f"{len(missing)} events are missing, {size}; {readable_size(self._free())} are free")
 
     def __call__(self, made: Made) -> None:

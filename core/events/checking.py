@@ -188,6 +188,9 @@ def _foreign(target: SetFolder) -> Iterator[Fault]:
     """Files and folders that do not belong to the set."""
     events = {target.event_path(number).name for number in target.numbers()}
     inputs = {INPUT_LIST, *(copy.path.name for copy in target.copies().values())}
+    originals = [
+        Path(os.path.normpath(target.path / name)) for name in target.recipe.files
+    ]  # may lie beside the recipe
     for folder, known in (
         (target.path, {RECIPE, INDEX, INPUTS, EVENTS}),
         (target.inputs, inputs),
@@ -195,7 +198,7 @@ def _foreign(target: SetFolder) -> Iterator[Fault]:
     ):
         for name in sorted(os.listdir(folder)) if folder.is_dir() else ():
             path = folder / name
-            if name in known:
+            if name in known or any(original.is_relative_to(path) for original in originals):
                 continue
             if is_leftover(name):
                 yield Fault("leftover", path, f"{path}: left by a work that was interrupted, or is under way")

@@ -132,9 +132,10 @@ class SetFolder:
             name: {"file": copy.path.name, "what": copy.what, "sha256": copy.sha256} for name, copy in copies.items()
         }
         _write_text(self.inputs / INPUT_LIST, json.dumps(listed, indent=1, sort_keys=True) + "\n")
-        for name in os.listdir(self.inputs):
-            if name != INPUT_LIST and name not in [copy.path.name for copy in copies.values()]:
-                (self.inputs / name).unlink(missing_ok=True)  # of a recipe that was changed before its first event
+        kept = {copy.path for copy in copies.values()}
+        for copy in known.values():  # of a recipe that was changed before its first event
+            if copy.path not in kept:
+                copy.path.unlink(missing_ok=True)
         return copies
 
     def planned(self) -> list[int]:

@@ -12,7 +12,7 @@ import mphdrr.core as mph
 from mphdrr.addon.cli import main
 from mphdrr.core import events
 
-from .small_events import TEXT, small_recipe
+from .small_events import TEXT, WORKBOOK, small_recipe
 from .test_event_work import tree
 
 
@@ -170,6 +170,20 @@ def test_a_changed_recipe_is_found_and_its_events_made_anew(tmp_path, made, caps
     for number in range(3):
         name = f"events/{number:06d}.h5"
         assert (folder / name).read_bytes() == (made / "foreign" / name).read_bytes()
+
+
+def test_what_the_recipe_names_may_lie_in_the_folder(tmp_path):
+    """A recipe that was written there, with its workbook beside it and in the folder of copies."""
+    folder = tmp_path / "set"
+    (folder / "inputs").mkdir(parents=True)
+    for name in ("scanner.xlsx", "inputs/scanner.xlsx", "inputs/mine.txt"):
+        shutil.copy(WORKBOOK, folder / name)
+    recipe = small_recipe(folder, TEXT.replace(repr(str(WORKBOOK)), '"scanner.xlsx"'))
+    (folder / "small.toml").rename(folder / "recipe.toml")
+    events.make(events.read_recipe(folder / "recipe.toml"), folder, 1)
+    assert (folder / "inputs" / "mine.txt").exists() and recipe.seed == 5
+    assert [fault.path.name for fault in events.check(folder)] == ["mine.txt"]
+    assert main(["events", "make", str(folder), "-n", "2"]) == 0
 
 
 def test_status(tmp_path, made, capsys):

@@ -103,7 +103,7 @@ class _Report:
             size = f"about {readable_size(each)} each, {readable_size(each * len(missing))} in all"
         else:
             size = f"up to {readable_size(raw)} each, {readable_size(raw * len(missing))} in all, before they are compressed"
-        self._say(f"{len(missing)} events are missing, {size}; {readable_size(self._free())} are free")
+        self._say(f"events missing: {len(missing)}, {size}; {readable_size(self._free())} are free")
 
     def __call__(self, made: Made) -> None:
         self.bytes += made.size

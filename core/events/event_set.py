@@ -19,12 +19,12 @@ from ..geometry.views import Views
 from ..physics.noise import sample_counts
 from ..runs.recipe import Recipe, recorded_recipe
 from ..runs.run import ProjectionRun
-from ..runs.run_recipe import recipe_model, recipe_views, with_phantom
+from ..runs.run_recipe import recipe_model, with_phantom
 from ..validation import freeze, positive
 from ..volumes.volume import Volume
 from .event_files import header, names_of, read_array, read_truth
 from .folders import SetFolder
-from .making import radon_views, recipe_system
+from .making import EventMaker, radon_views
 from .planning import PlannedEvent, plan
 from .recipe import EventRecipe
 
@@ -46,12 +46,9 @@ class _Source:
         return self.folder.recipe
 
     @cached_property
-    def system(self) -> PinholeSystem:
-        return recipe_system(self.recipe)
-
-    @cached_property
-    def views(self) -> Views:
-        return recipe_views(self.recipe.system, self.system)
+    def maker(self) -> EventMaker:
+        """It has scanner and views."""
+        return EventMaker(self.recipe)
 
     @cached_property
     def rows(self) -> dict[int, dict[str, Any]]:
@@ -149,12 +146,12 @@ class Event:
     @property
     def views(self) -> Views:
         """Of the images."""
-        return self._source.views
+        return self._source.maker.views
 
     @property
     def system(self) -> PinholeSystem:
         """The scanner."""
-        return self._source.system
+        return self._source.maker.system
 
     @property
     def models(self) -> list[str]:
@@ -351,7 +348,7 @@ class EventSet:
     @property
     def system(self) -> PinholeSystem:
         """The scanner of the first event's set."""
-        return self._first.system
+        return self._first.maker.system
 
     def where(self, holds: Callable[[Mapping[str, Any]], bool]) -> EventSet:
         """The events whose row of the index a function takes."""

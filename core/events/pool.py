@@ -27,10 +27,15 @@ def in_processes(target: SetFolder, numbers: Sequence[int], workers: int) -> Ite
     Raises
     ------
     InputError
-        That of a worker, such as a full disk; there is not enough memory; or workers die again and again.
+        That of a worker, such as a full disk; there is not enough memory; workers die again and again; or this is Blender.
     """
     if not numbers:
         return
+    if __name__.startswith("bl_ext."):  # an extension's name, which no other process knows
+        raise InputError(
+            f"workers: expected 1 within Blender, which takes all cores, got {workers}; mphdrr as a Python package takes "
+            "more, and several commands share a set by --shard"
+        )
     EventMaker(target.recipe).require_memory(workers)
     waiting, breaks = deque(numbers), 0
     while waiting:

@@ -6,6 +6,14 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
 WORKBOOK = ROOT / "examples" / "dc-spect-80.xlsx"
+RECIPE = f"""
+version = 1
+system = {{ file = {str(WORKBOOK)!r}, modules = "1-4" }}
+detector = {{ rows = 16, columns = 16 }}
+truth = {{ voxels = 16, spacing = 6.0 }}
+models = {{ lines = {{ kind = "transmission" }} }}
+phantoms = [{{ kind = "points", diameter = {{ from = 6, to = 12 }} }}]
+"""
 SMALL = ("--voxels", "32", "--spacing", "3", "--size", "24", "32")
 
 
@@ -55,3 +63,15 @@ print("PROJECTED")
         blend,
     )
     assert "PROJECTED" in said.stdout
+
+
+def test_event_sets_are_made_by_command(blender, work_folder):
+    recipe, made = work_folder / "small.toml", work_folder / "set"
+    recipe.write_text(RECIPE, encoding="utf-8")
+    command = ("--command", "mphdrr", "events", "make", made, "--recipe", recipe, "-n", "3")
+    said = blender(*command, "--workers", "2", check=False)
+    assert said.returncode == 1 and "Traceback" not in said.stderr
+    assert "mphdrr: workers: expected 1 within Blender" in said.stderr
+    blender(*command)
+    said = blender("--command", "mphdrr", "events", "check", made)
+    assert "3 events, every byte as it was written" in said.stdout

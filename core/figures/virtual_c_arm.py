@@ -1,7 +1,8 @@
 """One module's geometry to scale: as the true pinhole, and as a virtual C-arm whose source is 5 l from the isocentre.
 
 The second is how projections are often made with a renderer of radiographs: from source to detector 10 l, from source to the
-isocentre 5 l ("sdr"), whatever the pinhole's distance b is.
+isocentre 5 l ("sdr"), whatever the pinhole's distance b is. It is drawn on the module's side. DiffDRR, given the
+workbook's azimuth and elevation, has it at the module's mirror image in z, at the same distances (`c_arm_views`).
 """
 
 from collections.abc import Sequence
@@ -121,7 +122,8 @@ def draw(page: Page, subject: Subject) -> None:
     pinhole, c_arm = _fan(module.views(), module), _fan(c_arm_views(module), module)
     em = page.em
     title = f"Module {int(module.numbers[0])}: the true pinhole, and a virtual C-arm in its place"
-    top = heading(page, title, ["To scale, in a plane through the principal ray"])
+    mirrored = "DiffDRR, given the workbook's azimuth and elevation, has the C-arm at the module's mirror image in z"
+    top = heading(page, title, ["To scale, in a plane through the principal ray", mirrored])
     ranges = [
         (-m.l - m.thick, max(pinhole.detector, m.b + m.radius)),
         (min(c_arm.source, 0.0), max(c_arm.detector, m.b + m.radius)),

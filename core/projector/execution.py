@@ -27,6 +27,9 @@ _RAYS_OF_A_ROUND = 2**19
 # Threads of a backprojection, each with a volume of its own: more would gain little and take much memory.
 _MOST_VOLUMES = 8
 
+# Finding the filled part of a volume, and copying it, takes the time of so many steps along rays for each voxel.
+_STEPS_OF_A_VOXEL = 4
+
 # Adds values to a volume along rays: ``add(volume, values, rays, attenuation)``.
 Add = Callable[[ArrayOrTensor, ArrayOrTensor, Rays, Attenuation | None], None]
 Report = Callable[[int], None]
@@ -51,10 +54,12 @@ class Execution:
     mu_grid: Grid | None = None  # the voxels of mu, where that has its own
     float64: bool = False  # whether arrays are float64, not float32
     threads: int = 1  # on which a backend without threads of its own is called
+    # whether few rays are traced through the whole volume; if not, a view's rounding is the same beside whatever others
+    whole_for_few: bool = False
 
     def images(self, volume: ArrayOrTensor, bundles: Bundles, mu: ArrayOrTensor = None) -> Iterator[ArrayOrTensor]:
         """The images one by one, as the backend computes them: integrals, value x mm, weighted and summed."""
-        lattices = self._lattices(volume, mu)
+        lattices = self._lattices(volume, mu, bundles)
         forward = self.backend.functions.forward
 
         def run(task: _Task) -> _Task:
@@ -81,7 +86,7 @@ class Execution:
         self, volume: ArrayOrTensor, bundles: Bundles, mu: ArrayOrTensor = None
     ) -> list[tuple[Part, Array]]:
         """The backend's derivatives, part by part, (7 or 14, rays)."""
-        lattices = self._lattices(volume, mu)
+        lattices = self._lattices(volume, mu, bundles)
         derivatives = self.backend.functions.derivatives
 
         def run(task: _Task) -> list[tuple[Part, Array]]:
@@ -109,7 +114,7 @@ class Execution:
         self, images: ArrayOrTensor, bundles: Bundles, volume: ArrayOrTensor, mu: ArrayOrTensor
     ) -> ArrayOrTensor:
         """The gradient by mu of the sum of `images` times the projections of `volume`, as the backend computes it."""
-        images, lattices = self.to_backend(images), self._lattices(volume, mu, whole_mu=True)
+        images, lattices = self.to_backend(images), self._lattices(volume, mu, bundles, whole_mu=True)
         gradient_of = self.backend.functions.mu_gradient
 
         def add(gradient: ArrayOrTensor, *values_and_rays: Any) -> None:
@@ -195,9 +200,13 @@ class Execution:
             return bundles.parts(task.images, most)
         return bundles.parts_of(task.images.start, *task.block, most)
 
-    def _lattices(self, volume: ArrayOrTensor, mu: ArrayOrTensor, whole_mu: bool = False) -> Lattices:
-        """The filled parts of volume and mu, as the backend computes with them."""
+    def _lattices(self, volume: ArrayOrTensor, mu: ArrayOrTensor, bundles: Bundles, whole_mu: bool = False) -> Lattices:
+        """The filled parts of volume and mu, as the backend computes with them, or the whole volume."""
         volume = self.to_backend(volume)
+        if self.whole_for_few and mu is None and len(bundles):
+            steps = sum(self.grid.shape) * len(bundles) * bundles[0].n_rays()
+            if steps < _STEPS_OF_A_VOXEL * self.grid.n_voxels:
+                return Lattices(self.grid, volume)
         mu = None if mu is None else cast_like(mu, volume)
         return filled_lattices(self.grid, volume, mu, self.mu_grid, whole_mu)
 

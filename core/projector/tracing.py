@@ -163,7 +163,7 @@ def _execution(
     if is_tensor(array) and array.device.type != "cpu" and backend == "auto":
         chosen = backends.for_tensor(array)
     float64 = chosen.always_float64 or any(is_double(value) for value in (array, mu, *geometry))
-    return array, mu, Execution(chosen, grid, mu_grid, float64, thread_count(None))
+    return array, mu, Execution(chosen, grid, mu_grid, float64, thread_count(None), whole_for_few=True)
 
 
 def _field(value: Volume | ArrayOrTensor, name: str, grid: Grid | None, float64: bool) -> tuple[ArrayOrTensor, Grid]:

@@ -257,16 +257,143 @@ def test_generation_before_04(rng):
                        drr.density)  # fmt: skip
 
 
+ONE, WHERE = [0.3, -0.2, 0.1], [4.0, 120.0, -7.0]  # one pose
+EULER = {"parameterization": "euler_angles", "convention": "ZXY"}
+
+
+@pytest.mark.parametrize(("old", "where"), [(True, [17.0, 21.0, 10.0]), (False, WHERE)])
+def test_every_form_of_the_arguments_means_the_same_pose(old, where, subject, rng):
+    """One-dimensional, arrays, lists, whole numbers, names by position: as tensors (1, 3) and keywords."""
+    drr = DRR(ct(rng), [1.5, 2.0, 1.0], 90.0, 6, 8.0) if old else DRR(subject, 240.0, 6, 8.0)
+    expected = drr(torch.tensor([ONE]).double(), torch.tensor([where]).double(), **EULER)
+    assert expected.shape == (1, 1, 6, 6) and expected.max() > 0
+    for image in (
+        drr(torch.tensor(ONE), torch.tensor(where), **EULER),
+        drr(torch.tensor([ONE]), torch.tensor(where), **EULER),
+        drr([ONE], where, **EULER),
+        drr(np.array(ONE), np.array([where]), **EULER),
+        drr(torch.tensor(ONE), torch.tensor([int(x) for x in where]), **EULER),
+        drr(torch.tensor([ONE]), torch.tensor([where]), "euler_angles", "ZXY"),
+        drr(torch.tensor([ONE]), torch.tensor([where]), "euler_angles", convention="ZXY"),
+        drr(torch.tensor(ONE), torch.tensor(where), "ZXY", parameterization="euler_angles"),
+    ):
+        np.testing.assert_allclose(image, expected, rtol=1e-4, atol=1e-4)
+    if not old:
+        positional = convert(torch.tensor([ONE]), torch.tensor(where), "euler_angles", "ZXY")
+        assert torch.equal(positional.matrix, convert(torch.tensor([ONE]), torch.tensor([where]), **EULER).matrix)
+        np.testing.assert_allclose(drr(positional), expected, rtol=1e-4, atol=1e-4)
+    several = drr(ROTATION, torch.tensor(where), **EULER)  # one translation for both
+    np.testing.assert_allclose(several, drr(ROTATION, torch.tensor([where, where]), **EULER))
+    with_convention = drr(torch.tensor(ONE), torch.tensor(where), parameterization="euler_angles", convention="XYZ")
+    if old:  # the only parameterization is that of Euler angles, whatever the convention
+        np.testing.assert_allclose(drr(torch.tensor(ONE), torch.tensor(where), convention="XYZ"), with_convention)
+
+
+def test_gradients_reach_poses_of_one_dimension(subject):
+    rotation, translation = (torch.tensor(x, dtype=torch.float64, requires_grad=True) for x in (ONE, WHERE))
+    DRR(subject, 240.0, 6, 8.0)(rotation, translation, "axis_angle").sum().backward()
+    batched = [torch.tensor([x], dtype=torch.float64, requires_grad=True) for x in (ONE, WHERE)]
+    DRR(subject, 240.0, 6, 8.0)(*batched, parameterization="axis_angle").sum().backward()
+    for one, many in zip((rotation, translation), batched, strict=True):
+        np.testing.assert_allclose(one.grad, many.grad[0])
+        assert one.grad.abs().min() > 0
+
+
+def test_rays_from_within_the_volume_and_away_from_it_are_followed_both_ways(subject):
+    """The whole line: a source in the volume, one beyond it that looks away, and both in one batch."""
+    drr = DRR(subject, 60.0, 7, 9.0, 8, 7.0, x0=3.0)
+    turn = convert(ROTATION[:1].double(), torch.zeros(1, 3).double(), parameterization="axis_angle").rotation
+    center = torch.tensor(drr.grid.center)
+    poses = torch.eye(4, dtype=torch.float64).repeat(3, 1, 1)
+    poses[:, :3, :3] = turn
+    axis = (turn @ subject.reorient[:3, 2].double())[0]  # where the camera looks
+    poses[:, :3, 3] = center + torch.tensor([[3.0], [200.0], [-200.0]]) * axis
+    images = drr(poses)[:, 0]
+    assert (images.amax(dim=(1, 2)) > 0).all()
+    camera = RigidTransform(poses @ subject.reorient.double())
+    source, corner, row_step, column_step = drr.detector.lattice()
+    row, column = (torch.arange(n)[..., None] for n in (7, 8))
+    targets = camera((corner + row[:, None] * row_step + column * column_step).reshape(1, -1, 3))
+    for b in range(3):
+        start = camera(source[None, None])[b]
+        along = (targets[b] - start) * 50
+        expected = trace_rays(subject.density.double(), start - along, start + along, grid=drr.grid)
+        np.testing.assert_allclose(images[b].reshape(-1), expected, rtol=1e-4, atol=1e-4)
+    for b in range(3):  # alone, too
+        np.testing.assert_allclose(drr(poses[b])[0, 0], images[b], rtol=1e-5, atol=1e-5)
+
+
+def test_a_call_copies_no_volume_and_sees_every_change_of_it(rng):
+    """A call takes no memory of the volume's size, and edits of the density, however made, count in the next call."""
+    import tracemalloc
+
+    hu = np.full((160, 140, 90), 40.0, np.float32)
+    hu[:40] = -1000  # whose margins are not cropped, either
+    hu[60:70, 50:60, 20:30] = 700
+    drr = DRR(hu, [1.0, 1.1, 1.2], sdr=400.0, height=40, delx=5.0)
+    pose = torch.tensor([[0.2, -0.3, np.pi / 2]]), torch.tensor([[80.0, 77.0, 54.0]])
+    first = drr(*pose)
+    tracemalloc.start()
+    again = drr(*pose)
+    _, most = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert most < 0.1 * drr.density.nbytes
+    assert torch.equal(again, first) and first.max() > 0
+    for change in (
+        lambda: drr.density.mul_(2.0),
+        lambda: drr.density.data.mul_(2.0),
+        lambda: np.multiply(drr.density.numpy(), 2.0, out=drr.density.numpy()),
+        lambda: setattr(drr, "density", drr.density * 2.0),
+    ):
+        change()
+        changed = drr(*pose)
+        np.testing.assert_allclose(changed, 2 * again, rtol=1e-6)
+        again = changed
+
+
+def test_one_prepared_volume_serves_every_module(scanner, rng):
+    """`set_intrinsics` of sdr is another C-arm of the same volume, as of a new `DRR`."""
+    hu, spacing = ct(rng), [3.0, 2.5, 2.0]
+    middle = torch.tensor(np.array(hu.shape)[None] * spacing / 2)
+    drr = DRR(hu, spacing, sdr=300.0, height=9, delx=6.0)
+    for m in (3, 44):
+        sdr = 5 * float(scanner.collimator_length[m])
+        drr.set_intrinsics(sdr=sdr)
+        image = drr(torch.tensor([[*angles_of(scanner, m), 0.0]]), middle, "euler_angles", "ZYX")
+        own = DRR(hu, spacing, sdr=sdr, height=9, delx=6.0)
+        assert torch.equal(image, own(torch.tensor([[*angles_of(scanner, m), 0.0]]), middle, "euler_angles", "ZYX"))
+
+
+@pytest.mark.long
+def test_eighty_calls_on_a_chest_ct_take_four_seconds_of_two_cores():
+    """512 x 512 x 133 voxels, 250 x 250 pixels, one call a module; by processor time, which other work disturbs less."""
+    import time
+
+    x, y, z = np.ogrid[-1:1:512j, -1:1:512j, -1:1:133j]
+    hu = np.where(1.6 * x**2 + 2.9 * y**2 < 1, 100 * np.sin(9 * x + 7 * y + 5 * z), -1000).astype(np.float32)
+    spacing = [0.703125, 0.703125, 2.5]
+    drr = DRR(hu, spacing, sdr=450.0, height=250, delx=2.0)
+    middle = torch.tensor(np.array(hu.shape)[None] * spacing / 2)
+    seconds = []
+    for azimuth in np.linspace(0.0, 4.5, 21):
+        start = time.process_time()
+        drr(torch.tensor([[azimuth, -0.24, 0.0]]), middle, parameterization="euler_angles", convention="ZYX")
+        seconds.append(time.process_time() - start)
+    assert 80 * float(np.median(seconds[1:])) / 2 < 4.0
+
+
 def test_points_before_04(rng):
     """Where its formula fits its images, a pixel's point is where its ray ends; back and forth always."""
     pose = convert(torch.tensor([[0.4, -0.3, 0.2]]), TRANSLATION[:1], parameterization="euler_angles", convention="ZYX")
     pixels = torch.tensor(np.stack(np.mgrid[:11, :8][::-1], -1).reshape(1, -1, 2) + 0.5, dtype=torch.float64)
     drr = DRR(ct(rng), [1.5, 2.0, 1.0], 90.0, 11, 5.0, 8, x0=6.0, reverse_x_axis=True)
-    ends = pose.to(torch.float64)(drr.detector.targets()[None])
+    _, corner, row_step, column_step = drr.detector.lattice()
+    column, row = torch.floor(pixels[0]).T[..., None]
+    ends = pose.to(torch.float64)((corner + row * row_step + column * column_step)[None])
     np.testing.assert_allclose(drr.inverse_projection(pose, pixels), ends, atol=1e-4)
     drr = DRR(ct(rng), [1.5, 2.0, 1.0], 90.0, 11, 5.0, 8, 4.0, x0=6.0, y0=-3.0)
     points = drr.inverse_projection(pose, pixels)
-    nearer = torch.lerp(pose.to(torch.float64)(drr.detector.source[None]), points, 0.6)
+    nearer = torch.lerp(pose.to(torch.float64)(drr.detector.lattice()[None, :1]), points, 0.6)
     np.testing.assert_allclose(drr.perspective_projection(pose, nearer), pixels, atol=1e-4)
 
 
@@ -425,6 +552,21 @@ def test_bad_input_is_one_clear_line(subject):
         (lambda: drr(ROTATION), "RigidTransform"),
         (lambda: drr(ROTATION, TRANSLATION, parameterization="euler"), "axis_angle"),
         (lambda: drr.set_intrinsics_(colour=1), "colour"),
+        (lambda: drr.set_intrinsics_(sdd=300.0, sdr=100.0), "sdr"),
+        (lambda: drr(ROTATION, TRANSLATION, "euler_angles"), "convention"),
+        (lambda: drr(ROTATION, TRANSLATION, "euler_angles", "ZXY", "ZYX"), "got 5 arguments"),
+        (lambda: drr(ROTATION, parameterization="euler_angles"), "rotation and a translation"),
+        (lambda: drr(ROTATION, TRANSLATION[:, :2], "axis_angle"), "B x 3"),
+        (lambda: drr(ROTATION, TRANSLATION.repeat(2, 1)[:3], "axis_angle"), "2 x 3 and 3 x 3"),
+        (lambda: drr(ROTATION[0, :2], TRANSLATION[0], "axis_angle"), "x 3 for axis_angle"),
+        (lambda: drr(0.3, TRANSLATION, "axis_angle"), "rotation"),
+        (lambda: drr(None, TRANSLATION, "axis_angle"), "rotation"),
+        (lambda: drr([0.1, 0.2, "a"], TRANSLATION, "axis_angle"), "rotation"),
+        (lambda: drr([0.1, np.nan, 0.2], TRANSLATION, "axis_angle"), "rotation"),
+        (lambda: drr(ROTATION * np.nan, TRANSLATION, "axis_angle"), "finite"),
+        (lambda: drr(), "pose"),
+        (lambda: DRR(np.full((3, 3, 3), np.nan), [1.0, 1.0, 1.0], 90.0, 6, 4.0), "volume"),
+        (lambda: DRR(np.zeros((3, 3)), [1.0, 1.0, 1.0], 90.0, 6, 4.0), "volume"),
     ):
         with pytest.raises(InputError) as error:
             call()

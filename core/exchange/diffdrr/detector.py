@@ -34,26 +34,23 @@ class Detector:
         for name in ("sdd", "delx", "dely"):
             positive(getattr(self, name), name, "mm")
 
-    @property
-    def source(self) -> Tensor:
-        """The source (1, 3), mm."""
-        return torch.tensor([[self.sdd / 2 if self.old else 0.0, 0.0, 0.0]], dtype=torch.float64)
+    def lattice(self, calibration: Tensor | None = None) -> Tensor:
+        """Source, centre of the first pixel, and the steps to the next row and column (4, 3), mm.
 
-    def targets(self, calibration: Tensor | None = None) -> Tensor:
-        """The pixels' centres (height * width, 3), mm; `calibration` (4, 4) maps (column, row, 1) to them."""
-        row = torch.arange(self.height, dtype=torch.float64) - (self.height - 1) / 2
-        column = torch.arange(self.width, dtype=torch.float64) - (self.width - 1) / 2
-        if self.reverse_x_axis:
-            column = -column
-        row, column = (x.reshape(-1) for x in torch.meshgrid(row, column, indexing="ij"))
-        if self.old:
-            behind = torch.full_like(row, -self.sdd / 2)
-            return torch.stack([behind, row * self.delx - self.y0, column * self.dely - self.x0], dim=-1)
-        unit = torch.stack([column, -row, torch.ones_like(row)], dim=-1)
-        if calibration is None:
-            return unit * torch.tensor([self.delx, self.dely, self.sdd]) + torch.tensor([self.x0, self.y0, 0.0])
-        calibration = calibration.to("cpu", torch.float64).reshape(4, 4)
-        return unit @ calibration[:3, :3].mT + calibration[:3, 3]
+        `calibration` (4, 4) maps (column, row upwards, 1), counted from the middle, to the pixels' centres.
+        """
+        if calibration is not None:
+            matrix = calibration.to("cpu", torch.float64).reshape(4, 4)
+            column, up, middle = matrix[:3, 0], matrix[:3, 1], matrix[:3, 2] + matrix[:3, 3]
+        else:
+            axes = [[self.delx, 0, 0], [0, self.dely, 0], [self.x0, self.y0, self.sdd]]
+            if self.old:
+                axes = [[0, 0, self.dely], [0, -self.delx, 0], [-self.sdd / 2, -self.y0, -self.x0]]
+            column, up, middle = torch.tensor(axes, dtype=torch.float64)
+        column = -column if self.reverse_x_axis else column
+        corner = middle + ((self.height - 1) * up - (self.width - 1) * column) / 2
+        source = torch.tensor([self.sdd / 2 if self.old else 0.0, 0.0, 0.0]).to(corner)
+        return torch.stack([source, corner, -up, column])
 
     def project(self, points: Tensor) -> Tensor:
         """Pixels (..., 2), x right and y down from the image's corner, of `points` (..., 3) in the camera's frame."""

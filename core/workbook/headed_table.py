@@ -96,15 +96,12 @@ class HeadedTable:
         return {plain(text).casefold(): at for at, text in self.head.items() if is_label_heading(text)}
 
     def unknown(self) -> list[tuple[At, str]]:
-        """The headings over numbers that are not understood."""
-        return [
-            (at, text)
-            for column, places in self.other_heads.items()
-            if column in self.numeric and column != self.label_column
-            for at in places
-            if not (is_number_heading(text := self.head[at]) or is_label_heading(text))
-            and plain(text).casefold() not in IGNORED_HEADINGS
-        ]
+        """The headings over numbers that are not understood: of each column the first, and the texts of all."""
+        found = []
+        for column in self.other_heads.keys() & self.numeric - {self.label_column}:
+            texts = {at: text for at in self.other_heads[column] if not _says_nothing(text := self.head[at])}
+            found += [(min(texts), " ".join(texts.values()))] if texts else []
+        return sorted(found)
 
     @cached_property
     def _key_columns(self) -> list[int]:
@@ -179,6 +176,11 @@ class HeadedTable:
         column = self.columns[quantity][0]
         filled = [row for row in self.rows if self.sheet.value(row, column) is not None]
         return quantity in DIMENSIONS and filled == [*self.rows[:1]]
+
+
+def _says_nothing(heading: str) -> bool:
+    """Whether a heading is known to say nothing of the quantities."""
+    return is_number_heading(heading) or is_label_heading(heading) or plain(heading).casefold() in IGNORED_HEADINGS
 
 
 def headed_tables(book: Book) -> tuple[dict[str, Sheet], list[HeadedTable]]:

@@ -9,7 +9,7 @@ import unicodedata
 from collections.abc import Iterable
 from typing import NamedTuple
 
-from .quantities import ANGLE_UNITS, QUANTITIES
+from .quantities import ANGLE_UNITS, QUANTITIES, TYPED
 
 _NUMBER_HEADINGS = (
     "definitions, number, no, no., nr, nr., #, module, modules, module number, module no, module no., module #, "
@@ -41,6 +41,10 @@ _OTHER_UNIT_WORDS = (
     "centimetri millimetri см мм дюйм дюймы сантиметры миллиметры 厘米 公分 毫米 英寸 センチ ミリ インチ"
 )
 """Words that speak of a unit or a scale which is not supported."""
+_VERSIONS = (
+    "actual cad cmm corrected effective final half inner max mean measured new nominal old outer real surveyed true"
+)
+"""Words that say which one of several values of a quantity a column holds."""
 
 _QUANTITY_OF = {
     text if len(text) == 1 else text.casefold(): quantity.name
@@ -60,6 +64,8 @@ _WITH_UNIT = re.compile(
 )
 _BRACKETED_UNIT = re.compile(r"\((?:in )?([^()]+)\)|\[(?:in )?([^\[\]]+)\]|(.+)")
 _WORD = re.compile(r"[^\W\d_]+")
+_VAGUE = frozenset(_WORD.findall(" ".join([_VERSIONS, *_QUANTITY_OF, *_UNIT_OF, *map(" ".join, _HINTS.values())])))
+"""Words that tell no quantity from those of the table."""
 _FILLERS = frozenset(["in", "all", "are", "is", "lengths", "length", "values", "value", "the"])
 # "in" is also a word and "m" a letter: they are units in brackets, or after a number or "in", or at the end.
 _IN_BRACKETS = re.compile(r"[(\[]\s*(in|m|\"|''|″)\.?\s*[)\]]")
@@ -132,6 +138,17 @@ def may_mean(text: str) -> list[str]:
     """The quantities that a heading may be about, by its words."""
     words = set(re.findall(r"[^\W_]+", plain(text).casefold()))
     return [name for name, hints in _HINTS.items() if words & hints]
+
+
+def rivals(text: str) -> list[str]:
+    """The typed quantities for whose own heading one that is not understood may be taken.
+
+    It contains their heading, or says nothing else in its words: "x1 (old)", "measured x", but not "z axis of the ray".
+    """
+    words = re.findall(r"[^\W_]+", plain(text))
+    within = {_quantity_of(" ".join(words[i : i + n])) for i in range(len(words)) for n in range(1, 12)}
+    vague = _VAGUE.issuperset(_WORD.findall(plain(text).casefold()))
+    return [name for name in may_mean(text) if name in TYPED and (vague or name in within)]
 
 
 def units_mentioned(text: str, alone: bool = False) -> list[str]:

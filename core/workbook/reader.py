@@ -30,12 +30,12 @@ def read_system(
 ) -> PinholeSystem:
     """The scanner in a geometry workbook; `source` names the workbook and the cell of every number.
 
-    Tables are found by their headings, listed in `core.workbook.quantities`, with their units. Anything that is not
-    understood for certain is refused; `columns` then says what is meant. The pinhole centres, d, R, Ld and Td are needed,
-    a number for each module or one for all. l comes from its column, and where that is blank from `collimator_length`. A
-    stored value that is not what its formula gives is refused. Numbers that follow from the others are only checked: one
-    that differs by more than 1e-6 (relative, mm or radians) and by more than rounding in its last decimal is an
-    `InputWarning`.
+    Tables are found by their headings, listed in `core.workbook.quantities`, with their units. What could be mistaken is
+    refused; `columns` then says what is meant. The pinhole centres, d, R, Ld and Td are needed, a number for each module or
+    one for all. l comes from its column, and where that is blank from `collimator_length`. A stored value that is not what
+    its formula gives is refused, unless all formulas store 0 or nothing. Numbers that follow from the others are only
+    checked: one that differs by more than 1e-6 (relative, mm or radians) and by more than rounding in its last decimal is an
+    `InputWarning`. So are columns that may be about the scanner and are not understood.
 
     Parameters
     ----------

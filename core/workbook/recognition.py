@@ -14,7 +14,7 @@ from typing import NamedTuple
 from ..errors import InputError, InputWarning
 from .book import HEADING_ROWS, Book, Sheet
 from .headed_table import HeadedTable, headed_table, headed_tables, is_number
-from .headings import UNIT_WORDS, heading_of, may_mean, quoted, shows_as_stored, unit_of, units_mentioned
+from .headings import UNIT_WORDS, heading_of, may_mean, quoted, rivals, shows_as_stored, unit_of, units_mentioned
 from .layout import Column, Layout, Table, by_label, in_order
 from .quantities import DERIVED, LENGTH_UNITS, NEEDED, OPTIONAL, POSITION, QUANTITIES, TYPED
 from .sheet_xml import At
@@ -142,12 +142,12 @@ def _matched_rows(modules: Table, table: Table, coordinates: HeadedTable, headed
 def _notes(layout: Layout, recognized: Recognized) -> Iterator[str]:
     """What a person should know of a workbook without doubts, as texts of warnings."""
     table, modules = recognized.tables["x1"], layout.modules
-    for quantity in [QUANTITIES[name] for name in OPTIONAL if name not in recognized.tables]:
-        for at, text in table.unknown()[:1] if quantity.formula else ():
-            yield (
-                f"no column is headed {quantity.name}, so the {quantity.title} is {quantity.blank_is}; "
-                f"{table.sheet.place(*at)} {quoted(text)} is not understood"
-            )
+    unknown = {(its, at): text for its in dict.fromkeys(recognized.tables.values()) for at, text in its.unknown()}
+    absent = [QUANTITIES[name] for name in OPTIONAL if name not in recognized.tables and table.unknown()]
+    without = [f"no column is headed {q.name}, so the {q.title} is {q.blank_is}; " for q in absent if q.formula]
+    if without or any(map(may_mean, unknown.values())):
+        places = ", ".join(f"{its.sheet.place(*at)} {quoted(text)}" for (its, at), text in unknown.items())
+        yield f"{''.join(without)}{places}: not understood and not read"
     used = {column.table.sheet.name for column in layout.columns.values()}
     units = {column.unit for column in layout.columns.values() if column.unit in LENGTH_UNITS}
     said = " and ".join(sorted(units))
@@ -173,7 +173,7 @@ def _doubts_about(table: HeadedTable, quantities: set[str]) -> Iterator[str]:
     lengths = {unit for _, unit in used if unit in LENGTH_UNITS}
     yield from _headings(table)
     for at, text in table.unknown():
-        for name in [name for name in may_mean(text) if name in quantities][:1]:
+        for name in rivals(text)[:1]:
             yield f"{table.sheet.place(*at)} is headed {quoted(text)}, which is not understood and may mean {name}"
     numbers = [table.sheet.place(*at) for at in table.number_columns.values()]
     if len(numbers) > 1:

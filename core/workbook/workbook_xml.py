@@ -163,6 +163,11 @@ class WorkbookXml:
             if cell.formula is not None or cell.array is not None
         }
 
+    @cached_property
+    def never_calculated(self) -> bool:
+        """Whether every formula stores 0 or nothing, as programs that cannot calculate, such as XlsxWriter, leave it."""
+        return not any(cell.value or cell.value is False for cell in self.formulas.values())
+
     def meaning(self, sheet: str, name: str) -> str | None:
         """The formula that a defined name stands for on `sheet`; None if it is unknown or depends on the cell."""
         own, _, plain = name.rpartition("!")

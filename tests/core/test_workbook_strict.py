@@ -307,6 +307,78 @@ READ: dict[str, Edit] = {
 }
 
 
+BESIDE = [
+    "principal ray z axis",
+    "x tilt of the plate",
+    "position of the cable (mm)",
+    "coordinate system",
+    "diameter of the screw",
+    "bore of the flange",
+    "r of the bearing",
+    "width of the gap, cm",
+    "thickness of shielding",
+    "height above the floor",
+    "depth of the groove",
+    "azimuth of the cable",
+    "azimuth, measured",
+    "elevation (deg)",
+    "b value",
+]
+
+
+@pytest.mark.parametrize("with_length", [True, False])
+@pytest.mark.parametrize(
+    "titles", [*([title] for title in BESIDE), BESIDE, ["sensitivity", "y axis", "z axis"]], ids=str
+)
+def test_exact_headings_are_read_whatever_stands_beside_them(titles, with_length, tmp_path):
+    """One warning names all columns that are not understood, also those that say nothing of the scanner's."""
+
+    def edit(main: Worksheet, coordinates: Worksheet) -> None:
+        typed(main, coordinates)
+        if not with_length:
+            coordinates["G1"] = coordinates["G2"] = None
+        for sheet in (main, coordinates):
+            for i, title in enumerate(titles):
+                sheet.cell(2, 20 + i).value = title
+                for row in range(3, 7):
+                    sheet.cell(row, 20 + i).value = 0.25 * row + i
+
+    with pytest.warns(InputWarning) as caught:
+        assert_plain(read_edited(tmp_path, edit))
+    (said,) = (str(warning.message) for warning in caught)
+    assert said.startswith("scanner.xlsx: ") and "\n" not in said
+    assert ("no column is headed l, so the collimator length is the design formula's" in said) == (not with_length)
+    for i, title in enumerate(titles):
+        for sheet in ("Main", "Coordinates"):
+            assert f"{sheet}!{get_column_letter(20 + i)}2 {title!r}" in said
+
+
+@pytest.mark.parametrize(
+    ("cell", "title"),
+    [
+        *(("Coordinates!T2", title) for title in ("x1 nominal", "x1_new", "x1.2", "y1 (CMM)", "z", "x (cm)", "measured y")),
+        *(("Coordinates!T2", title) for title in ("pinhole x", "z coordinate of crystal", "l as built", "effective length")),
+        *(("Main!T2", title) for title in ("d (new)", "outer diameter", "half diameter of pinhole", "R old", "roi radius*")),
+        *(("Main!T2", title) for title in ("Ld 2", "inner side of crystal", "crystal side, used", "Td (2022)", "thickness")),
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("with_length", [True, False])
+def test_a_heading_that_may_be_mistaken_for_an_exact_one_is_refused(cell, title, with_length, tmp_path):
+    sheet, at = cell.split("!")
+
+    def edit(main: Worksheet, coordinates: Worksheet) -> None:
+        typed(main, coordinates)
+        if not with_length:
+            coordinates["G1"] = coordinates["G2"] = None
+        table = {"Main": main, "Coordinates": coordinates}[sheet]
+        table[at] = title
+        for row in range(3, 7):
+            table[f"T{row}"] = 51.0 + row
+
+    with pytest.raises(InputError, match=f"{cell} is headed .*, which is not understood and may mean"):
+        read_edited(tmp_path, edit)
+
+
 @pytest.mark.parametrize("kind", READ)
 def test_what_is_understood_is_read(kind, tmp_path):
     assert_plain(read_edited(tmp_path, READ[kind]))
@@ -470,9 +542,108 @@ def test_stored_values_that_are_right_are_read(settings, tmp_path):
 
 
 @pytest.mark.parametrize("settings", ["", 'fullCalcOnLoad="1"'])
-def test_a_zero_stored_for_every_formula_is_refused_with_both_numbers(settings, tmp_path):
-    with pytest.raises(InputError, match=r"Coordinates!E3 stores 0, but its formula =SQRT.* gives 294\.229655"):
-        mph.read_system(with_values(tmp_path, lambda *at: 0, settings))
+def test_zeros_stored_for_all_formulas_count_as_not_stored(settings, tmp_path):
+    assert_plain(mph.read_system(with_values(tmp_path, lambda *at: 0, settings)))
+    columns = mph.draft_column_map(tmp_path / "scanner.xlsx").columns
+    assert_plain(mph.read_system(tmp_path / "scanner.xlsx", columns))
+
+
+@pytest.mark.parametrize("settings", ["", 'fullCalcOnLoad="1"'])
+@pytest.mark.parametrize("calculated", ["E4", "W5", "N3"])
+def test_zeros_beside_a_calculated_formula_are_refused_with_both_numbers(calculated, settings, tmp_path):
+    """One formula that stores its result says that the file was calculated: the zeros are then out of date."""
+    right = right_values(tmp_path)
+    value = right.get(("Coordinates", calculated), 1.5)
+    values = {("Coordinates", calculated): value} if calculated != "W5" else {}
+    book = plain()
+    if calculated == "W5":  # a formula of a sheet that nobody reads
+        book.create_sheet("Theta")["A1"] = "=Coordinates!B3*2"
+        values["Theta", "A1"] = 554
+    with pytest.raises(InputError, match=r"Coordinates!\w+ stores 0, but its formula =.* gives -?\d+\.\d+"):
+        mph.read_system(with_values(tmp_path, lambda *at: values.get(at, 0), settings, book))
+
+
+def test_zeros_of_formulas_that_are_zero_are_read_in_either_case(tmp_path):
+    """The ring of a scanner at z = 0, by formula: stored by a program that calculates, and by one that does not."""
+    expected = None
+    for store in (lambda right, at: right, lambda right, at: 0):
+        book = plain(np.array([[277.0, 70.3, 0.0], [155.0, 158.4, 0.0], [-63.1, -245.8, 0.0]]))
+        for row in (3, 4, 5):
+            book["Coordinates"][f"D{row}"] = f"=B{row}-B{row}"
+        system = mph.read_system(saved(book, tmp_path, "right.xlsx"))
+        cells = openpyxl.load_workbook(mph.write_system(system, tmp_path / "new.xlsx").path, data_only=True)[
+            "Coordinates"
+        ]
+        own = {
+            "E": "E",
+            "F": "F",
+            "G": "G",
+            "H": "H",
+            "I": "I",
+            "J": "J",
+            "K": "K",
+            "L": "U",
+            "M": "V",
+            "N": "W",
+            "D": "D",
+        }
+        stored = {("Coordinates", f"{at}{r}"): cells[f"{own[at]}{r}"].value for at in own for r in (3, 4, 5)}
+        path = with_values(tmp_path, lambda *at, store=store, stored=stored: store(stored[at], at), "", book)
+        read = mph.read_system(path)
+        expected = read if expected is None else expected
+        np.testing.assert_array_equal(read.centers, expected.centers)
+        np.testing.assert_array_equal(read.centers[:, 2], 0)
+
+
+def test_zeros_of_formulas_beyond_us_are_refused_where_nothing_was_calculated(tmp_path):
+    book = plain()
+    book["Coordinates"]["D6"] = "=XLOOKUP(A6,Z1:Z4,Y1:Y4)"
+    with pytest.raises(InputError, match=r"Coordinates!D6 holds the formula =XLOOKUP.*stores 0.*") as refusal:
+        mph.read_system(with_values(tmp_path, lambda *at: 0, "", book))
+    assert "\n" not in str(refusal.value)
+    book = plain()
+    for row in range(3, 7):  # a number that is only compared
+        book["Coordinates"][f"M{row}"] = f"=XLOOKUP(A{row},Z1:Z4,Y1:Y4)"
+    assert_plain(mph.read_system(with_values(tmp_path, lambda *at: 0, "", book)))
+
+
+def test_what_is_written_into_a_workbook_of_zeros_stores_all_values(tmp_path):
+    """In every sheet: no zero stays beside calculated numbers, where it would count."""
+    book = plain()
+    for row in range(3, 7):
+        book["Main"][f"D{row}"] = "=2*25"
+    book.create_sheet("Theta")["A1"] = "=SUM(Main!D3:D6)+Coordinates!G3"
+    template = with_values(tmp_path, lambda *at: 0, "", book)
+    system = mph.read_system(template)
+    assert mph.write_system(system, tmp_path / "same.xlsx", template).path.read_bytes() == template.read_bytes()
+    moved = by_design(replace(system, centers=system.centers * 1.1))
+    written = mph.write_system(moved, tmp_path / "moved.xlsx", template)
+    back = mph.read_system(written.path)
+    np.testing.assert_allclose(back.centers, moved.centers, rtol=1e-12)
+    np.testing.assert_allclose(back.collimator_length, moved.collimator_length, rtol=1e-12)
+    values = openpyxl.load_workbook(written.path, data_only=True)
+    assert [values["Main"][f"D{row}"].value for row in range(3, 7)] == [50] * 4
+    assert values["Theta"]["A1"].value == pytest.approx(200 + moved.collimator_length[0], rel=1e-12)
+    np.testing.assert_allclose([values["Coordinates"][f"E{r}"].value for r in range(3, 7)], moved.pinhole_distance)
+
+
+@pytest.mark.parametrize("constant_memory", [False, True])
+def test_the_example_written_again_by_xlsxwriter_is_read(constant_memory, workbook, tmp_path):
+    """Its formulas, of which XlsxWriter stores 0."""
+    xlsxwriter = pytest.importorskip("xlsxwriter")
+    path = tmp_path / "scanner.xlsx"
+    with xlsxwriter.Workbook(path, {"constant_memory": constant_memory}) as book:
+        for sheet in openpyxl.load_workbook(workbook).worksheets:
+            worksheet = book.add_worksheet(sheet.title)
+            for row in sheet.iter_rows():
+                for cell in row:
+                    worksheet.write(cell.row - 1, cell.column - 1, cell.value)
+    zeros = openpyxl.load_workbook(path, data_only=True)["Coordinates"]
+    assert [zeros[at].value for at in ("E3", "G82", "W40")] == [0, 0, 0]
+    read, expected = mph.read_system(path), mph.read_system(workbook)
+    np.testing.assert_array_equal(read.centers, expected.centers)
+    for name in ("collimator_length", *DIMENSIONS.values()):
+        np.testing.assert_allclose(getattr(read, name), getattr(expected, name), rtol=1e-12)
 
 
 def test_a_length_stored_before_its_diameter_changed_is_refused_with_both_numbers(tmp_path):

@@ -158,8 +158,8 @@ class DRR(torch.nn.Module):
         """
         if bone_attenuation_multiplier is not None:
             self.set_bone_attenuation_multiplier(bone_attenuation_multiplier)
-        old, kind = self.detector.old, torch.float64
-        camera = self._camera(pose_matrices(args, parameterization, convention, degrees, kind, old))
+        old = self.detector.old
+        camera = self._camera(pose_matrices(args, parameterization, convention, degrees, torch.float64, old))
         lattice = self.detector.lattice(None if calibration is None else RigidTransform(calibration).matrix)
         steps = lattice[None, 2:].to(camera.matrix) @ camera.rotation.mT
         image = self._integrals(torch.cat([camera(lattice[None, :2]), steps], dim=1), mask_to_channels)
@@ -205,15 +205,11 @@ class DRR(torch.nn.Module):
         self.density = hu_to_density(self._hu, factor).to(self.density)
 
     def set_intrinsics_(self, **changes: Any) -> None:
-        """Change the detector: any of sdd or sdr, height, width, delx, dely, x0, y0, reverse_x_axis."""
-        if "sdd" not in changes and changes.get("sdr") is not None:
-            changes["sdd"] = 2 * changes.pop("sdr")
+        """Change the detector: any of sdd, height, width, delx, dely, x0, y0, reverse_x_axis."""
         known = set(Detector.__dataclass_fields__) - {"old"}
         for name in changes.keys() - known:
             raise InputError(f"set_intrinsics_: no {name!r}; expected some of {', '.join(sorted(known))}")
         self._use(replace(self.detector, **{name: value for name, value in changes.items() if value is not None}))
-
-    set_intrinsics = set_intrinsics_  # its name before 0.4
 
     def rescale_detector_(self, scale: float) -> None:
         """Multiply the number of pixels per side by `scale`, on a detector of the same size."""
@@ -297,10 +293,8 @@ def _since_04(
     volume: Any, spacing: Any, sdr: float, *args: Any, bone_attenuation_multiplier: float = 1.0, **kwargs: Any
 ) -> tuple[tuple[Any, ...], dict[str, Any]]:
     """The arguments before 0.4 as those of `DRR._set_up`: the subject stands for CT numbers and their voxel size."""
-    if isinstance(volume, Tensor):
-        hu = volume.flip([0])
-    else:
-        hu = torch.from_numpy(real_array(np.atleast_1d(volume)[::-1], "volume", (None, None, None), np.float32))
+    ct = volume if isinstance(volume, Tensor) else torch.from_numpy(real_array(volume, "volume", None, np.float32))
+    hu = ct.flip([0])
     size = np.array([positive(s, "voxel spacing", "mm") for s in np.asarray(spacing).tolist()])
     affine = affine_matrix(np.diag(size), size / 2)
     subject = Subject(hu_to_density(hu, bone_attenuation_multiplier), affine, torch.eye(4), hu)

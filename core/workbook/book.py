@@ -52,10 +52,9 @@ class Book:
         stored = self._cell(place).value
         if not isinstance(computed, Uncomputed) or stored is None:
             return computed
-        asked = self.workbook.asks_for_calculation
-        if stored in (0, "") and (asked or self.workbook.never_calculated):
+        if stored in (0, "") and (self.workbook.asks_for_calculation or self.workbook.never_calculated):
             return Uncomputed(f"it stores {stored!r}, as programs do that calculate nothing, and {computed}")
-        if asked:
+        if self.workbook.asks_for_calculation:
             self.unverified[place] = str(computed)
         return stored
 

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from mphdrr.core.errors import InputError
+from mphdrr.addon.cli import main
+from mphdrr.core.errors import InputError, InputWarning
 from mphdrr.core.geometry.presets import c_arm_views, pinhole_views
+from mphdrr.core.runs.recipe import Recipe
+from mphdrr.core.runs.run_recipe import recipe_views
 
 
 def test_pinhole_views_start_at_the_pinholes(system):
@@ -56,6 +60,82 @@ def test_the_two_agree_on_the_isocentre_and_on_which_side_is_which(system):
     l, b = system.collimator_length, system.pinhole_distance
     np.testing.assert_allclose(places[0, 1], np.repeat((10 * l / b)[:, None], 2, 1))
     np.testing.assert_allclose(places[1, 1], 2)
+
+
+CONTRADICTIONS = [
+    # of crystals of 50 mm: plane, magnification, pixels (n_v, n_u), their size, what is said
+    ("virtual", 10.0, (500, 500), 2.5, "500 pixels of 2.5 mm are 1250 mm, but the virtual detector's side is 500 mm"),
+    ("virtual", 8.0, (120, 150), 3.0, "150 pixels of 3 mm are 450 mm, but the virtual detector's side is 400 mm"),
+    (
+        "virtual",
+        10.0,
+        (200, 400),
+        (1.2, 5.0),
+        "200 pixels of 5 mm are 1000 mm, but the virtual detector's side is 500 mm",
+    ),
+    ("virtual", 10.0, (256, 256), 0.2, "256 pixels of 0.2 mm are 51.2 mm, but the virtual detector's side is 500 mm"),
+    ("real", 10.0, (64, 64), 1.0, "64 pixels of 1 mm are 64 mm, but the real detector's side is 50 mm"),
+    ("real", 4.0, (250, 250), 2.0, "250 pixels of 2 mm are 500 mm, but the real detector's side is 50 mm"),
+]
+
+
+@pytest.mark.parametrize(("plane", "magnification", "shape", "pitch", "said"), CONTRADICTIONS)
+def test_pixels_that_contradict_the_detectors_side_are_warned_of_by_both_numbers(
+    plane, magnification, shape, pitch, said, scanner
+):
+    """In Python, in recipes, on the command line; the views are those that were asked for."""
+    with pytest.warns(InputWarning) as caught:
+        views = scanner.views(shape, plane, magnification, pitch)
+    assert [str(warning.message) for warning in caught] == [said]
+    pitch_u, pitch_v = np.broadcast_to(pitch, 2) * (magnification if plane == "real" else 1)
+    np.testing.assert_allclose(np.linalg.norm(views.u_steps, axis=1), pitch_u)
+    np.testing.assert_allclose(np.linalg.norm(views.v_steps, axis=1), pitch_v)
+    if np.ndim(pitch) == 0:
+        entries = {
+            "plane": plane,
+            "magnification": magnification,
+            "rows": shape[0],
+            "columns": shape[1],
+            "pitch": pitch,
+        }
+        with pytest.warns(InputWarning, match=re.escape(said)):
+            recipe_views(Recipe({f"detector.{name}": value for name, value in entries.items()}), scanner)
+
+
+@pytest.mark.parametrize("elevation", ["module", "diffdrr"])
+def test_c_arms_warn_of_pixels_that_contradict_their_detectors_side(elevation, scanner):
+    with pytest.warns(InputWarning, match=r"500 pixels of 2.5 mm are 1250 mm, but the side, 10 Ld, is 500 mm"):
+        c_arm_views(scanner, (500, 500), 2.5, elevation=elevation)
+    with pytest.warns(InputWarning, match=r"300 pixels of 1.5 mm are 450 mm, but the side, 6 Ld, is 300 mm"):
+        c_arm_views(scanner, (200, 300), (1.5, 1.4), 6.0, elevation=elevation)
+
+
+def test_each_modules_own_side_counts(scanner):
+    sides = np.where(scanner.numbers == 7, 20.0, 50.0)
+    one = replace(scanner, detector_side=sides)
+    with pytest.warns(InputWarning, match=r"100 pixels of 0.5 mm are 50 mm, but the real detector's side is 20 mm"):
+        one.views((100, 100), "real", pitch=0.5)
+
+
+@pytest.mark.filterwarnings("error")
+def test_the_users_own_pixels_are_not_warned_of(scanner, system):
+    """250 or 256 pixels of 1 or 2 mm: the middle half, "FOV", or all of it, "Wide FOV"; and what has no pixel size."""
+    for n in (250, 256):
+        for pitch in (1.0, 2.0, (2.0, 1.0)):
+            scanner.views((n, n), pitch=pitch)
+            c_arm_views(scanner, (n, n), pitch)
+    scanner.views((64, 64), "real", pitch=0.8)
+    for one in (scanner, system):
+        one.views((7, 9), "real", 3.0)
+        pinhole_views(one, (30, 20))
+        c_arm_views(one)
+
+
+def test_the_command_line_warns_of_contradicting_pixels(workbook, tmp_path, capsys):
+    words = ["--size", "40", "30", "--pitch", "25", "--modules", "3-4", "--voxels", "12", "--spacing", "8"]
+    assert main(["project", str(workbook), *words, "-o", str(tmp_path / "run.npz")]) == 0
+    said = "30 pixels of 25 mm are 750 mm, but the virtual detector's side is 500 mm"
+    assert said in " ".join(capsys.readouterr().err.split())
 
 
 def test_bad_input_is_one_clear_line(system):

@@ -158,13 +158,13 @@ class DRR(torch.nn.Module):
         """
         if bone_attenuation_multiplier is not None:
             self.set_bone_attenuation_multiplier(bone_attenuation_multiplier)
-        old = self.detector.old
-        camera = self._camera(pose_matrices(args, parameterization, convention, degrees, torch.float64, old))
+        given = args, parameterization, convention, degrees
+        camera = self._camera(pose_matrices(*given, torch.float64, self.detector.old))
         lattice = self.detector.lattice(None if calibration is None else RigidTransform(calibration).matrix)
         steps = lattice[None, 2:].to(camera.matrix) @ camera.rotation.mT
         image = self._integrals(torch.cat([camera(lattice[None, :2]), steps], dim=1), mask_to_channels)
         if not self.reshape:
-            return image[:, 0] if old else image
+            return image[:, 0] if self.detector.old else image
         if self.subsample is not None:
             full = image.new_zeros(*image.shape[:2], self.detector.height * self.detector.width)
             image = full.index_copy(2, self.subsample.to(image.device), image)
@@ -312,8 +312,7 @@ def _whole_lines(grid: Grid, vectors: Tensor) -> list[Tensor]:
         source, normal = vectors[:, :1], torch.linalg.cross(vectors[:, 2], vectors[:, 3])[..., None]
         corners = torch.tensor(grid.corners()).to(vectors) - source
         depth = (corners @ normal / ((vectors[:, 1:2] - source) @ normal))[..., 0]  # (B, 8), 1 on the detector
-    kept = torch.zeros(4, 4).to(vectors)
-    kept[:2, 0] = 1.0  # the source stays, and the rest is stretched away from it
+    kept = torch.tensor([[1.0, 0, 0, 0]] * 2 + [[0.0] * 4] * 2).to(vectors)  # the source; the rest is stretched
     stretched = torch.eye(4).to(vectors) - kept
     factors = [] if (depth <= 0).all() else [depth.amax(dim=1).clamp_min(1e-3)]
     factors += [depth.amin(dim=1).clamp_max(-1e-3)] if (depth < 0).any() else []

@@ -85,9 +85,8 @@ def diffdrr_density(hu: Volume | NDArray[Any], bone_attenuation_multiplier: floa
     hu = hu.array if isinstance(hu, Volume) else real_array(hu, "CT numbers", None, np.float32)
     if not hu.size:
         raise InputError("CT numbers: expected at least one")
-    tissue = hu[(hu > DIFFDRR_AIR) & (hu <= DIFFDRR_BONE)]
-    density = np.where(hu > DIFFDRR_BONE, hu * factor, hu)
-    if tissue.size:
-        density = np.where(hu <= DIFFDRR_AIR, tissue.min(), density)
+    thinnest = hu.min(where=hu > DIFFDRR_AIR, initial=np.float32(np.inf))
+    density = np.maximum(hu, thinnest if thinnest <= DIFFDRR_BONE else hu.min())  # without tissue, air stays as it is
+    np.multiply(hu, factor, out=density, where=hu > DIFFDRR_BONE)
     density -= density.min()
     return density / max(density.max(), np.finfo(np.float32).tiny)

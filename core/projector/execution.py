@@ -203,10 +203,9 @@ class Execution:
     def _lattices(self, volume: ArrayOrTensor, mu: ArrayOrTensor, bundles: Bundles, whole_mu: bool = False) -> Lattices:
         """The filled parts of volume and mu, as the backend computes with them, or the whole volume."""
         volume = self.to_backend(volume)
-        if self.whole_for_few and mu is None and len(bundles):
-            steps = sum(self.grid.shape) * len(bundles) * bundles[0].n_rays()
-            if steps < _STEPS_OF_A_VOXEL * self.grid.n_voxels:
-                return Lattices(self.grid, volume)
+        maybe_few, longest = self.whole_for_few and mu is None and len(bundles) > 0, sum(self.grid.shape)
+        if maybe_few and longest * bundles[0].n_rays() * len(bundles) < _STEPS_OF_A_VOXEL * self.grid.n_voxels:
+            return Lattices(self.grid, volume)
         mu = None if mu is None else cast_like(mu, volume)
         return filled_lattices(self.grid, volume, mu, self.mu_grid, whole_mu)
 

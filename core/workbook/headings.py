@@ -41,9 +41,7 @@ _OTHER_UNIT_WORDS = (
     "centimetri millimetri см мм дюйм дюймы сантиметры миллиметры 厘米 公分 毫米 英寸 センチ ミリ インチ"
 )
 """Words that speak of a unit or a scale which is not supported."""
-_VERSIONS = (
-    "actual cad cmm corrected effective final half inner max mean measured new nominal old outer real surveyed true"
-)
+_VERSIONS = "actual cad cmm corrected effective final half inner max mean measured new nominal old outer surveyed true"
 """Words that say which one of several values of a quantity a column holds."""
 
 _QUANTITY_OF = {

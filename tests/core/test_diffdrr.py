@@ -554,7 +554,7 @@ def test_bad_input_is_one_clear_line(subject):
         (lambda: drr.set_intrinsics_(colour=1), "colour"),
         (lambda: drr(ROTATION, TRANSLATION, "euler_angles"), "convention"),
         (lambda: drr(ROTATION, TRANSLATION, "euler_angles", "ZXY", "ZYX"), "got 5 arguments"),
-        (lambda: drr(ROTATION, parameterization="euler_angles"), "rotation and a translation"),
+        (lambda: drr(ROTATION, parameterization="euler_angles"), "rotation, translation"),
         (lambda: drr(ROTATION, TRANSLATION[:, :2], "axis_angle"), "B x 3"),
         (lambda: drr(ROTATION, TRANSLATION.repeat(2, 1)[:3], "axis_angle"), "2 x 3 and 3 x 3"),
         (lambda: drr(ROTATION[0, :2], TRANSLATION[0], "axis_angle"), "x 3 for axis_angle"),

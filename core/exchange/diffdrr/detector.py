@@ -39,14 +39,13 @@ class Detector:
 
         `calibration` (4, 4) maps (column, row upwards, 1), counted from the middle, to the pixels' centres.
         """
+        axes = [[self.delx, 0, 0], [0, self.dely, 0], [self.x0, self.y0, self.sdd]]
+        if self.old:
+            axes = [[0, 0, self.dely], [0, -self.delx, 0], [-self.sdd / 2, -self.y0, -self.x0]]
+        column, up, middle = torch.tensor(axes, dtype=torch.float64)
         if calibration is not None:
             matrix = calibration.to("cpu", torch.float64).reshape(4, 4)
             column, up, middle = matrix[:3, 0], matrix[:3, 1], matrix[:3, 2] + matrix[:3, 3]
-        else:
-            axes = [[self.delx, 0, 0], [0, self.dely, 0], [self.x0, self.y0, self.sdd]]
-            if self.old:
-                axes = [[0, 0, self.dely], [0, -self.delx, 0], [-self.sdd / 2, -self.y0, -self.x0]]
-            column, up, middle = torch.tensor(axes, dtype=torch.float64)
         column = -column if self.reverse_x_axis else column
         corner = middle + ((self.height - 1) * up - (self.width - 1) * column) / 2
         source = torch.tensor([self.sdd / 2 if self.old else 0.0, 0.0, 0.0]).to(corner)

@@ -158,8 +158,8 @@ class DRR(torch.nn.Module):
         """
         if bone_attenuation_multiplier is not None:
             self.set_bone_attenuation_multiplier(bone_attenuation_multiplier)
-        given = args, parameterization, convention, degrees
-        camera = self._camera(pose_matrices(*given, torch.float64, self.detector.old))
+        pose = pose_matrices(args, parameterization, convention, degrees, torch.float64, self.detector.old)
+        camera = self._camera(pose)
         lattice = self.detector.lattice(None if calibration is None else RigidTransform(calibration).matrix)
         steps = lattice[None, 2:].to(camera.matrix) @ camera.rotation.mT
         image = self._integrals(torch.cat([camera(lattice[None, :2]), steps], dim=1), mask_to_channels)

@@ -98,8 +98,7 @@ def pose_matrices(
         parameterization, convention = "euler_angles", convention or "ZYX"
     single = parameterization in (None, "matrix")
     if [*names] or len(numbers) != (1 if single else 2):
-        wanted = "a pose, or a rotation and a translation with parameterization and convention"
-        raise InputError(f"pose: expected {wanted}, got {len(args)} arguments")
+        raise InputError(f"expected a pose, or rotation, translation and parameterization; got {len(args)} arguments")
     if single:
         return RigidTransform(numbers[0]).matrix.to(dtype)
     both = []

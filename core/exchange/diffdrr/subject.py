@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ...errors import InputError
 from ...geometry.rotations import pose_matrix
-from ...physics.ct_numbers import DIFFDRR_AIR, DIFFDRR_BONE
+from ...physics.ct_numbers import DIFFDRR_AIR, DIFFDRR_BONE, diffdrr_density
 from ...volumes.volume import LINE_INTEGRALS, Volume, require_quantity
 from ...volumes.volume_files import read_volume, read_volume_of
 
@@ -87,14 +87,13 @@ def read(
 def hu_to_density(hu: Tensor, bone_attenuation_multiplier: float = 1.0) -> Tensor:
     """`diffdrr_density` for tensors, with gradients: 0 to 1, air as thin as the thinnest tissue, bone times a factor."""
     hu = hu.to(torch.float32)
-    # Part by part, since whole masks of a large CT take longer than all the rest.
-    parts = [torch.where(part > DIFFDRR_AIR, part, torch.inf).amin() for part in hu.reshape(-1).split(2**18)]
-    thinnest = torch.stack(parts).amin()
+    if not hu.requires_grad:
+        return torch.from_numpy(diffdrr_density(hu.numpy(force=True), bone_attenuation_multiplier)).to(hu.device)
+    thinnest = torch.where(hu > DIFFDRR_AIR, hu, torch.inf).amin()
     density = torch.maximum(hu, thinnest) if thinnest <= DIFFDRR_BONE else hu
-    if bone_attenuation_multiplier != 1:
-        density = torch.where(hu > DIFFDRR_BONE, hu * bone_attenuation_multiplier, density)
-    lowest, highest = torch.aminmax(density)
-    return (density - lowest).div_((highest - lowest).clamp_min(torch.finfo(torch.float32).tiny))
+    density = torch.where(hu > DIFFDRR_BONE, hu * bone_attenuation_multiplier, density)
+    density = density - density.min()
+    return density / density.max().clamp_min(torch.finfo(torch.float32).tiny)
 
 
 def reorientation(orientation: str | None) -> Tensor:

@@ -95,13 +95,14 @@ def bsrem(
     loop = Loop("BSREM", A, iterations, start, mask, callback, progress, stop)
     data = CountData.of("BSREM", A, counts, background)
     relaxation = at_least_0(relaxation, "relaxation")
-    penalty = penalty_of(prior, A.grid)
+    penalty_inside = penalty_of(prior, A.grid)
     parts = subsets_of(A, data, usual_subsets(A) if subsets is None else subsets)
     n = len(parts)
     require(8 * n * A.grid.n_voxels, f"the gradients of {n} subsets")
     seen = sensitivities(A, parts, loop.preparing())
     total = np.sum(seen, axis=0)
-    visible = total > LEAST if loop.mask is None else (total > LEAST) & loop.mask
+    visible = loop.inside(total > LEAST)
+    penalty = penalty_inside(visible)
     # At the maximum no voxel gives more counts than there are.
     n_counts = data.counts.sum(dtype=float)
     most = np.divide(np.float32(n_counts), total, out=np.zeros_like(total), where=visible)

@@ -121,11 +121,13 @@ def usual_subsets(A: Projector) -> int:
 
 
 def _em(loop: Loop, A: Projector, data: CountData, subsets: Any, prior: Prior | None) -> Reconstruction:
-    penalty = penalty_of(prior, A.grid)
+    penalty_inside = penalty_of(prior, A.grid)
     parts = subsets_of(A, data, subsets)
     n = len(parts)
     seen = sensitivities(A, parts, loop.preparing())
-    loop.values = np.where(sum(seen) > LEAST, loop.values, np.float32(0))
+    visible = loop.inside(sum(seen) > LEAST)
+    penalty = penalty_inside(visible)
+    loop.values = np.where(visible, loop.values, np.float32(0))
     images: Array | None = None  # of the current volume, where they are known
 
     def step(number: int, x: Array, progress: Progress | None) -> tuple[Array, float]:

@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from ..arrays import is_tensor, to_numpy
 from ..errors import InputError, naming
@@ -104,6 +104,10 @@ class Loop:
     def done(self) -> int:
         """Iterations done, those before a resume included."""
         return len(self._objective)
+
+    def inside(self, seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Those of the voxels `seen` that are in the mask, too."""
+        return seen if self.mask is None else seen & self.mask
 
     def preparing(self) -> Progress | None:
         """The progress callback for what is prepared before the first iteration: it only asks whether to go on."""

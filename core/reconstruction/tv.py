@@ -29,7 +29,8 @@ def tv(
     """The volume with the least ``||A x - images||^2 / 2 + weight TV(x)``: areas of one value with sharp edges.
 
     TV, the total variation, sums the size of the gradient over the voxels: the root of the squared differences to the next
-    voxel along each axis, by the axis's spacing in units of the smallest. It makes up for views that are few or noisy.
+    voxel along each axis, by the axis's spacing in units of the smallest. Differences count between voxels that are both in
+    the mask and met by rays. It makes up for views that are few or noisy.
 
     Parameters
     ----------
@@ -58,11 +59,13 @@ def tv(
     """
     loop = least_squares_loop("TV", A, iterations, start, mask, callback, progress, stop, nonnegative=nonnegative)
     weight = positive(weight, "weight")
-    require(4 * (10 * A.grid.n_voxels + 5 * int(np.prod(A.shape_out))), "the arrays of tv")
+    require(4 * (13 * A.grid.n_voxels + 5 * int(np.prod(A.shape_out))), "the arrays of tv")
     problem = Problem.of(A, images, loop)
     closeness = A.grid.spacing.min() / A.grid.spacing
     per_pixel = inverse(problem.forward(problem.inside, loop.preparing()))
     weights = problem.adjoint(np.ones(A.shape_out, np.float32), loop.preparing())
+    seen_voxels = np.float32(weights > 0)
+    pairs = (_gradient(seen_voxels, np.ones(3)) == 0) * seen_voxels  # 1 where a voxel and the next one are seen
     # The gradient is scaled so that it has as much weight in a voxel as its rays have.
     scale = float(weights.mean()) / max(float(problem.inside.mean()), 1e-6) / float(2 * closeness.sum()) or 1.0
     factors = (scale * closeness).astype(np.float32)
@@ -77,7 +80,7 @@ def tv(
             loop.state = {"seen": seen, "ahead": seen, "beyond": x, "misfit": np.zeros_like(seen), "slopes": nothing}
         seen, ahead, beyond, misfit, slopes = (loop.state[s] for s in ("seen", "ahead", "beyond", "misfit", "slopes"))
         misfit = (misfit + per_pixel * (ahead - problem.images)) / (1 + per_pixel)
-        slopes = slopes + per_gradient * _gradient(beyond, factors)
+        slopes = pairs * (slopes + per_gradient * _gradient(beyond, factors))
         slopes /= np.maximum(1, np.sqrt(np.sum(slopes**2, axis=0)) / radius)
         back = problem.adjoint(misfit, waiting(progress, 0, 2)) + _gradient_adjoint(slopes, factors)
         new = x - per_voxel * back
@@ -90,14 +93,14 @@ def tv(
         }  # fmt: skip
         said(progress)
         squares = float(np.sum(np.square(now - problem.images, dtype=float)))
-        return new, 0.5 * squares + weight * total_variation(new, A.grid)
+        return new, 0.5 * squares + weight * total_variation(new, A.grid, pairs)
 
     return loop.run(step, {"weight": weight, "nonnegative": nonnegative})
 
 
-def total_variation(x: Array, grid: Grid) -> float:
-    """Sum of the sizes of the gradient of `x`, as `tv` defines them."""
-    slopes = _gradient(x.astype(np.float64), grid.spacing.min() / grid.spacing)
+def total_variation(x: Array, grid: Grid, pairs: Array | float = 1.0) -> float:
+    """Sum of the sizes of the gradient of `x`, as `tv` defines them; `pairs` (3, ...) is 0 for differences that do not count."""
+    slopes = pairs * _gradient(x.astype(np.float64), grid.spacing.min() / grid.spacing)
     return float(np.sum(np.sqrt(np.sum(slopes**2, axis=0))))
 
 

@@ -111,6 +111,22 @@ def test_tv_reaches_the_minimum_that_another_solver_finds(weight, nonnegative):
     assert not nonnegative or x.min() >= 0
 
 
+@pytest.mark.parametrize("weight", [2.0, 500.0])
+def test_tv_does_not_pull_at_the_edge_of_a_mask_or_of_what_is_seen(weight):
+    grid = mph.Grid.centered((16, 14, 8), (3.0, 3.0, 6.0))
+    x, y, _ = np.indices(grid.shape)
+    mask = (x - 7) ** 2 + (y - 6) ** 2 < 30
+    images = mph.parallel_views(np.arange(16) * np.pi / 16, (16, 26), 3.0)
+    B = mph.Projector(grid, images)
+    found = mph.tv(B, B(7.0 * mask), weight, 80, mask=mask).volume.array
+    assert np.abs(found[mask] / 7 - 1).max() < 2e-3
+    narrow = mph.Projector(grid, mph.parallel_views(np.arange(16) * np.pi / 16, (4, 26), 3.0))  # 12 of 48 mm along z
+    seen = narrow.T(np.ones(narrow.shape_out, np.float32)) > 0
+    assert 0.2 < seen.mean() < 0.6
+    found = mph.tv(narrow, narrow(np.full(grid.shape, 7.0, np.float32)), weight, 80).volume.array
+    assert np.abs(found[seen] / 7 - 1).max() < 2e-3 and not found[~seen].any()
+
+
 def test_tv_is_nearer_to_the_truth_than_least_squares_with_few_noisy_views():
     rng = np.random.default_rng(5)
     grid = mph.Grid.centered((24, 24, 3), 1.0)

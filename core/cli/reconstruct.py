@@ -133,7 +133,8 @@ class _Log:
     def __init__(self, recipe: Recipe, quiet: bool, start: Any) -> None:
         method = METHODS[recipe["reconstruction.method"]]
         goes_on = isinstance(start, Reconstruction) and start.settings.get("method") == method.label
-        self.total, self.quiet = (start.iterations if goes_on else 0) + recipe["reconstruction.iterations"], quiet
+        iterations = recipe["reconstruction.iterations"] or method.iterations
+        self.total, self.quiet = (start.iterations if goes_on else 0) + iterations, quiet
         self.name = method.objective
         self.begun, self.interrupted = time.monotonic(), False
 

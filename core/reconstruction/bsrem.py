@@ -109,15 +109,19 @@ def bsrem(
     mean = n_counts / max(float(total.sum(where=visible, dtype=float)), float(LEAST))
     lift, nothing = np.float32(_LIFT * mean), np.float32(_NOTHING * mean)
     loop.values = np.minimum(loop.values if start is not None else np.float32(mean), most)
-    images: list[Array] | None = None  # of the current volume in each subset, where they are known
+    images: list[Array] = []  # of the current volume in each subset, once they are known, and its objective
+    value = 0.0
 
     def gradient(s: int, its_images: Array, asked: Progress | None) -> Array:
         part, own = parts[s]
         return part.T(own.ratio(its_images), asked) - seen[s]
 
-    def objective(x: Array, its_images: list[Array]) -> float:
-        likelihood = sum(own.log_likelihood(its) for (_, own), its in zip(parts, its_images, strict=True))
-        return likelihood - (0.0 if penalty is None else penalty.value(x))
+    def objective(x: Array, asked: Progress | None) -> float:
+        nonlocal images, value
+        images = [part(x, asked) for part, _ in parts]
+        value = sum(own.log_likelihood(its) for (_, own), its in zip(parts, images, strict=True))
+        value -= 0.0 if penalty is None else penalty.value(x)
+        return value
 
     def moved(x: Array, upwards: Array, scale: Array, size: float) -> Array:
         """The volume a step further up a gradient, within its bounds."""
@@ -130,16 +134,15 @@ def bsrem(
         return found
 
     def step(number: int, x: Array, progress: Progress | None) -> tuple[Array, float]:
-        nonlocal images
-        if images is None:
-            images = [part(x, waiting(progress, 0, 2 * n)) for part, _ in parts]
+        if not images:
+            objective(x, waiting(progress, 0, 2 * n))
         halvings = int(loop.state.get("halvings", np.zeros(()))[()])
         scale = total if penalty is None else total + (x + lift) * penalty.curvature(x)
         before, least_gain = -np.inf, 0.0
         at_start: list[Array] = []
         overall = np.zeros_like(x)
         if number:  # far from the maximum the plain steps, which are those of OSEM, get on faster
-            before = objective(x, images)
+            before = value
             at_start = [gradient(s, images[s], waiting(progress, s, 2 * n)) for s in range(n)]
             overall = np.sum(at_start, axis=0)
             whole = overall if penalty is None else overall - penalty.gradient(x)
@@ -158,8 +161,7 @@ def bsrem(
                 if penalty is not None:
                     upwards = upwards - penalty.gradient(found)
                 found = moved(found, upwards, scale, size)
-            images = [part(found, waiting(progress, 2 * n - 1, 2 * n)) for part, _ in parts]
-            reached = objective(found, images)
+            reached = objective(found, waiting(progress, 2 * n - 1, 2 * n))
             rounding = _ROUNDING * abs(reached)
             if halvings < _MOST_HALVINGS and reached < before + size * least_gain - rounding:
                 halvings += 1
@@ -170,5 +172,4 @@ def bsrem(
             progress(2 * n, 2 * n)
         return found, reached
 
-    settings = {"subsets": n, "relaxation": relaxation, **data.record(), **({} if prior is None else prior.record())}
-    return loop.run(step, settings)
+    return loop.run(step, {"subsets": n, "relaxation": relaxation, **data.record(total, prior)}, objective)

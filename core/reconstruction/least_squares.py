@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InputError
 from ..progress import Progress
@@ -77,7 +77,7 @@ def sirt(
     relaxation = positive(relaxation, "relaxation")
     if relaxation >= 2:
         raise InputError(f"relaxation: expected less than 2, got {relaxation:g}")
-    problem = Problem.of(A, images, loop)
+    problem = Problem.of(A, images, loop.mask)
     per_pixel = inverse(problem.forward(problem.inside, loop.preparing()))
     per_voxel = np.float32(relaxation) * inverse(problem.adjoint(np.ones(A.shape_out, np.float32), loop.preparing()))
     residual: Array | None = None
@@ -93,13 +93,13 @@ def sirt(
         said(progress)
         return x, 0.5 * float(np.sum(per_pixel * np.square(residual, dtype=float)))
 
-    return loop.run(step, {"relaxation": relaxation, "nonnegative": nonnegative})
+    return loop.run(step, {"relaxation": relaxation, "nonnegative": nonnegative, **problem.record()})
 
 
 def cgls(
     A: Projector,
     images: ArrayLike,
-    iterations: int = 20,
+    iterations: int = 10,
     start: Start = None,
     mask: ArrayLike | None = None,
     callback: Callback | None = None,
@@ -131,18 +131,13 @@ def cgls(
     A. Bjorck, "Numerical Methods for Least Squares Problems", SIAM (1996), section 7.4.
     """
     loop = least_squares_loop("CGLS", A, iterations, start, mask, callback, progress, stop, nonnegative=False)
-    problem = Problem.of(A, images, loop)
+    problem = Problem.of(A, images, loop.mask)
 
     def step(number: int, x: Array, progress: Progress | None) -> tuple[Array, float]:
         if not loop.state:
             residual: Array = problem.images - problem.forward(x, waiting(progress, 0, 2))
             direction = problem.adjoint(residual, waiting(progress, 0, 2))
-            loop.state = {
-                **problem.known,
-                "residual": residual,
-                "direction": direction,
-                "gradient": _squares(direction),
-            }
+            loop.state = {"residual": residual, "direction": direction, "gradient": _squares(direction)}
         residual, direction, before = (loop.state[name] for name in ("residual", "direction", "gradient"))
         change = problem.forward(direction, waiting(progress, 0, 2))
         length = _squares(change)
@@ -153,11 +148,11 @@ def cgls(
             gradient = problem.adjoint(residual, waiting(progress, 1, 2))
             after = _squares(gradient)
             direction = gradient + (after / before).astype(np.float32) * direction
-            loop.state = {**problem.known, "residual": residual, "direction": direction, "gradient": after}
+            loop.state = {"residual": residual, "direction": direction, "gradient": after}
         said(progress)
         return x, 0.5 * float(_squares(residual))
 
-    return loop.run(step, {})
+    return loop.run(step, problem.record())
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,24 +164,15 @@ class Problem:
     inside: Array  # 1 where x may be other than 0
 
     @classmethod
-    def of(cls, A: Projector, images: ArrayLike, loop: Loop) -> "Problem":
-        """Checked: the images without the model's background. Raises InputError, also where a resumed one had others."""
+    def of(cls, A: Projector, images: ArrayLike, mask: NDArray[np.bool_] | None) -> "Problem":
+        """Checked: the images without the model's background. Raises InputError."""
         measured: Array = real_array(plain(images), "images", A.shape_out, np.float32) - A.background.astype(np.float32)
-        everywhere = np.ones(A.shape_in, np.float32)
-        problem = cls(A, measured, everywhere if loop.mask is None else loop.mask.astype(np.float32))
-        if loop.state and not np.allclose(
-            loop.state.get("problem", np.nan), problem.known["problem"], rtol=1e-9, atol=0
-        ):
-            raise InputError(
-                "start: this reconstruction is of other images, views or mask; give its volume to begin with that"
-            )
-        return problem
+        return cls(A, measured, np.ones(A.shape_in, np.float32) if mask is None else mask.astype(np.float32))
 
-    @property
-    def known(self) -> dict[str, Array]:
-        """For an algorithm's state: by what images and mask are known again when it is resumed."""
-        sums = (self.images.sum(dtype=float), self.inside.sum(dtype=float))
-        return {"problem": np.array([*self.images.shape, *sums])}
+    def record(self) -> dict[str, float]:
+        """For a reconstruction's settings: by what images and mask, in their order, are known again when it is resumed."""
+        arrays = {"images": self.images, "mask": self.inside}
+        return {name: float(array.ravel() @ np.linspace(1.0, 2.0, array.size)) for name, array in arrays.items()}
 
     def forward(self, x: Array, progress: Progress | None) -> Array:
         """``A x``, float32."""

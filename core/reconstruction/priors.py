@@ -94,7 +94,7 @@ class Prior(ABC):
             raise InputError(f"prior: similar: expected at most the {self.neighbors} neighbors, got {self.similar}")
 
     def on(self, grid: Grid, inside: NDArray[np.bool_] | None = None) -> "Penalty":
-        """The penalty of volumes on a grid, of pairs of voxels `inside`. Raises InputError where `anatomy` has another grid."""
+        """The penalty of a volume on a grid, of pairs of voxels `inside`. Raises InputError as `check`."""
         self.check(grid)
         return Penalty(self, grid, inside)
 

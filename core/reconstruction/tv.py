@@ -60,12 +60,12 @@ def tv(
     loop = least_squares_loop("TV", A, iterations, start, mask, callback, progress, stop, nonnegative=nonnegative)
     weight = positive(weight, "weight")
     require(4 * (13 * A.grid.n_voxels + 5 * int(np.prod(A.shape_out))), "the arrays of tv")
-    problem = Problem.of(A, images, loop)
+    problem = Problem.of(A, images, loop.mask)
     closeness = A.grid.spacing.min() / A.grid.spacing
     per_pixel = inverse(problem.forward(problem.inside, loop.preparing()))
     weights = problem.adjoint(np.ones(A.shape_out, np.float32), loop.preparing())
-    seen_voxels = np.float32(weights > 0)
-    pairs = (_gradient(seen_voxels, np.ones(3)) == 0) * seen_voxels  # 1 where a voxel and the next one are seen
+    is_seen = (weights > 0).astype(np.float32)
+    pairs = (_gradient(is_seen, np.ones(3)) == 0) * is_seen  # 1 where a voxel and the next one are seen
     # The gradient is scaled so that it has as much weight in a voxel as its rays have.
     scale = float(weights.mean()) / max(float(problem.inside.mean()), 1e-6) / float(2 * closeness.sum()) or 1.0
     factors = (scale * closeness).astype(np.float32)
@@ -88,18 +88,16 @@ def tv(
             new = np.maximum(new, np.float32(0))
         now = problem.forward(new, waiting(progress, 1, 2))
         ahead, beyond = 2 * now - seen, 2 * new - x
-        loop.state = {
-            **problem.known, "seen": now, "ahead": ahead, "beyond": beyond, "misfit": misfit, "slopes": slopes
-        }  # fmt: skip
+        loop.state = {"seen": now, "ahead": ahead, "beyond": beyond, "misfit": misfit, "slopes": slopes}
         said(progress)
         squares = float(np.sum(np.square(now - problem.images, dtype=float)))
         return new, 0.5 * squares + weight * total_variation(new, A.grid, pairs)
 
-    return loop.run(step, {"weight": weight, "nonnegative": nonnegative})
+    return loop.run(step, {"weight": weight, "nonnegative": nonnegative, **problem.record()})
 
 
 def total_variation(x: Array, grid: Grid, pairs: Array | float = 1.0) -> float:
-    """Sum of the sizes of the gradient of `x`, as `tv` defines them; `pairs` (3, ...) is 0 for differences that do not count."""
+    """Sum of the sizes of the gradient of `x`, as `tv` defines them; `pairs` (3, ...) are 0 where they do not count."""
     slopes = pairs * _gradient(x.astype(np.float64), grid.spacing.min() / grid.spacing)
     return float(np.sum(np.sqrt(np.sum(slopes**2, axis=0))))
 

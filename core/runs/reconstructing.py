@@ -104,7 +104,7 @@ def reconstruct_run(
     found = method.function(
         A,
         line_integrals(run, recipe),
-        iterations=recipe["reconstruction.iterations"],
+        iterations=recipe["reconstruction.iterations"] or method.iterations,
         start=start,
         stop=rules if watch is None else _Watched(watch, rules),
         progress=stages("reconstructing"),

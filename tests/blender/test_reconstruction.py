@@ -83,6 +83,17 @@ def test_panel_settings_count_and_scripts_override_them(render, scene):
         bpy.ops.mphdrr.reconstruct(prior="QUADRATIC")
 
 
+def test_without_a_number_each_method_does_its_own(render, scene):
+    panel = scene.mphdrr_reconstruction
+    panel.voxels, panel.spacing = 6, 16.0
+    assert panel.iterations == 0
+    for method, own in (("OSEM", 10), ("MLEM", 50), ("BSREM", 30)):
+        panel.method = method
+        assert bpy.ops.mphdrr.reconstruct() == {"FINISHED"}
+        assert panel.known["title"] == f"{method}, {own} iterations"
+    assert "OSEM 10, MLEM 50, BSREM 30, SIRT 100" in panel.bl_rna.properties["iterations"].description
+
+
 def test_every_setting_is_in_the_panel_or_left_to_files(scene):
     panel = scene.mphdrr_reconstruction
     all_names = {key.partition(".")[2] for key in SETTINGS if key.startswith("reconstruction.")}

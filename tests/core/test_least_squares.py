@@ -1,5 +1,7 @@
 """SIRT, CGLS and TV: falling objectives, known solutions, resuming, and what they are given."""
 
+import re
+
 import numpy as np
 import pytest
 
@@ -151,18 +153,36 @@ def test_a_resumed_one_gives_the_same_numbers(name, tmp_path):
         np.testing.assert_array_equal(resumed.objective, whole.objective)
 
 
-@pytest.mark.parametrize("name", ["cgls", "tv"])
+@pytest.mark.parametrize("name", ALGORITHMS)
 def test_other_images_views_or_masks_cannot_go_on_with_what_is_known_of_the_first(name):
     run = ALGORITHMS[name]
     half = run(A, NOISY, iterations=2)
     fewer = mph.Projector(GRID, A.views[1:])
     mask = np.zeros(GRID.shape, bool)
     mask[1:] = True
-    for other, images, more in ((A, NOISY + 1, {}), (fewer, NOISY[1:], {}), (A, NOISY, {"mask": mask})):
+    turned = mph.Projector(GRID, A.views[::-1])
+    for other, images, more in (
+        (A, NOISY + 1, {}), (fewer, NOISY[1:], {}), (A, NOISY, {"mask": mask}), (turned, NOISY[::-1], {})
+    ):  # fmt: skip
         with pytest.raises(mph.InputError, match="start: this reconstruction is of other images, views or mask"):
             run(other, images, iterations=1, start=half, **more)
         begun = run(other, images, iterations=1, start=half.volume, **more)
         assert begun.iterations == 1
+    assert run(A, NOISY, iterations=1, start=half).iterations == 3
+
+
+def test_other_arguments_cannot_go_on_with_what_is_known_of_the_first():
+    for half, other, said in (
+        (mph.sirt(A, NOISY, 2), lambda half: mph.sirt(A, NOISY, 1, 1.5, start=half), "relaxation 1.0, now 1.5"),
+        (
+            mph.sirt(A, NOISY, 2),
+            lambda half: mph.sirt(A, NOISY, 1, 1.0, False, start=half),
+            "nonnegative True, now False",
+        ),
+        (mph.tv(A, NOISY, 0.5, 2), lambda half: mph.tv(A, NOISY, 0.7, 1, start=half), "weight 0.5, now 0.7"),
+    ):
+        with pytest.raises(mph.InputError, match=f"start: .*{re.escape(said)}.*give its volume"):
+            other(half)
 
 
 @pytest.mark.parametrize("name", ALGORITHMS)

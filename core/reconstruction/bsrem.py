@@ -58,7 +58,9 @@ def bsrem(
     Parameters
     ----------
     A, counts, iterations, background, start, mask, callback, progress, stop
-        As of `mlem`, but zeros in `start` may grow, and without `start` it begins with the mean activity.
+        As of `mlem`, but zeros in `start` may grow, and without `start` it begins with the mean activity. With a prior,
+        ``stop=StopWhen(change=1e-8)`` left no voxel further than 1 % of the mean activity from the maximum in our tests,
+        1e-6 some as far as 10 %.
     subsets : int, optional
         By default about a fifth of the views' number.
     prior : Quadratic, RelativeDifference or TotalVariation, optional

@@ -1,18 +1,26 @@
 """Least squares by iteration: SIRT and CGLS, and what they have in common with TV."""
 
+import warnings
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..errors import InputError
+from ..errors import InputError, InputWarning
 from ..progress import Progress
 from ..projector import Projector
 from ..validation import instance, positive, real_array
 from .loop import Loop, Start, plain, waiting
 from .result import Array, Callback, Reconstruction
 from .stopping import StoppingRule
+
+_LEAN = 0.05
+"""Cosine between a gradient of CGLS and its first, 0 in exact numbers: below it volumes are within 1e-3 of theirs."""
+_LEANS = (
+    "CGLS: in iteration {} rounding has turned it off the way of exact numbers: volumes from here on are up to a few "
+    "percent beside them, though as near to the images; other backends give others"
+)
 
 
 def sirt(
@@ -111,6 +119,10 @@ def cgls(
     The fastest way to the least squares, whose values may be negative. It ends early where there is noise: about 5 to 20
     iterations are as sharp as hundreds of `sirt`.
 
+    Its gradients are at right angles to each other. Rounding makes those that come late lean to the first, and from then on,
+    often after 10 to 15 iterations, the volumes are not those of exact numbers, but a few percent beside them; they go on
+    towards the same least squares. A warning says where (Paige 1980; in double precision the same happens later).
+
     Parameters
     ----------
     A, images, iterations, start, mask, callback, progress, stop
@@ -126,9 +138,16 @@ def cgls(
     InputError
         As of `sirt`.
 
+    Warns
+    -----
+    InputWarning
+        Rounding turns it off the way of exact numbers: up to there it keeps to them within 1e-3.
+
     References
     ----------
-    A. Bjorck, "Numerical Methods for Least Squares Problems", SIAM (1996), section 7.4.
+    A. Bjorck, "Numerical Methods for Least Squares Problems", SIAM (1996), section 7.4. C. C. Paige, "Accuracy and
+    effectiveness of the Lanczos algorithm for the symmetric eigenproblem", Linear Algebra and its Applications 34 (1980)
+    235-258.
     """
     loop = least_squares_loop("CGLS", A, iterations, start, mask, callback, progress, stop, nonnegative=False)
     problem = Problem.of(A, images, loop.mask)
@@ -139,6 +158,7 @@ def cgls(
             direction = problem.adjoint(residual, waiting(progress, 0, 2))
             loop.state = {"residual": residual, "direction": direction, "gradient": _squares(direction)}
         residual, direction, before = (loop.state[name] for name in ("residual", "direction", "gradient"))
+        first = loop.state.setdefault("first", direction)
         change = problem.forward(direction, waiting(progress, 0, 2))
         length = _squares(change)
         if length > 0:  # else the least squares are reached
@@ -148,7 +168,10 @@ def cgls(
             gradient = problem.adjoint(residual, waiting(progress, 1, 2))
             after = _squares(gradient)
             direction = gradient + (after / before).astype(np.float32) * direction
-            loop.state = {"residual": residual, "direction": direction, "gradient": after}
+            loop.state |= {"residual": residual, "direction": direction, "gradient": after}
+            if float(np.vdot(first, gradient)) ** 2 > _LEAN**2 * after * _squares(first):
+                loop.state["first"] = np.zeros_like(first)  # it is said once
+                warnings.warn(_LEANS.format(number + 1), InputWarning, stacklevel=2)
         said(progress)
         return x, 0.5 * float(_squares(residual))
 

@@ -1,9 +1,11 @@
 """SIRT, CGLS and TV: falling objectives, known solutions, resuming, and what they are given."""
 
 import re
+import warnings
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 
 import mphdrr.core as mph
 from mphdrr.core.reconstruction.tv import _gradient, _gradient_adjoint, total_variation
@@ -59,6 +61,59 @@ def test_cgls_reaches_the_solution_of_numpys_lstsq():
     assert (np.diff(result.objective) <= 1e-6 * result.objective[:-1]).all()
     residual = 0.5 * np.sum((A(result.volume.array) - NOISY) ** 2)
     assert result.objective[-1] == pytest.approx(residual, rel=1e-4)
+
+
+def cgls_of_double_precision(B, images, iterations, mask):
+    """The textbook's, over the float64 reference: the volume after each iteration."""
+    B = mph.Projector(B.grid, B.views, B.model, backend="numpy")
+    x, residual = np.zeros(B.shape_in), images.astype(float)
+    direction = B.T(residual) * mask
+    size, found = np.sum(direction**2), []
+    for _ in range(iterations):
+        change = B(direction)
+        length = size / np.sum(change**2)
+        x, residual = x + length * direction, residual - length * change
+        gradient = B.T(residual) * mask
+        before, size = size, np.sum(gradient**2)
+        direction = gradient + size / before * direction
+        found.append(x)
+    return found
+
+
+@pytest.mark.parametrize("case", ["few views", "scanner", "scanner in a mask", "even"])
+def test_cgls_keeps_to_double_precision_or_says_where_it_leaves_it(case, scanner):
+    rng = np.random.default_rng(7)
+    grid = mph.Grid.centered((11, 12, 9), 9.0)
+    if case == "few views":
+        B = mph.Projector(grid, mph.parallel_views(np.arange(9) * np.pi / 9 + 0.1, (11, 16), 7.0))
+    else:
+        B = mph.Projector(grid, scanner[::6].views((14, 14)))
+    truth = gaussian_filter(rng.random(grid.shape), 1.0).astype(np.float32)
+    if case == "even":
+        truth += 100
+    mask = truth > np.median(truth) if case == "scanner in a mask" else np.ones(grid.shape, bool)
+    images = B(truth * mask)
+    images += (0.02 * images.std() * rng.standard_normal(images.shape)).astype(np.float32)
+    seen = []
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        mph.cgls(B, images, 30, mask=mask, callback=lambda i, x: seen.append(x) and None)
+    expected = cgls_of_double_precision(B, images, 30, mask)
+    errors = np.array([np.linalg.norm(a - b) / np.linalg.norm(b) for a, b in zip(seen, expected, strict=True)])
+    said = [int(re.search(r"CGLS: in iteration (\d+) rounding", str(each.message))[1]) for each in caught]
+    assert len(said) <= 1, "it is said once"
+    kept = said[0] - 1 if said else 30
+    assert kept >= 8 and (errors[:kept] < 1e-3).all()
+    assert len(said) == (errors.max() > 1e-3) or errors.max() > 1e-4, "and not of what keeps to it"
+
+
+def test_what_cgls_says_of_its_way_it_says_once_when_resumed_too():
+    with pytest.warns(mph.InputWarning, match="CGLS: in iteration"):
+        first = mph.cgls(A, NOISY, 20)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        mph.cgls(A, NOISY, 5)
+        mph.cgls(A, NOISY, 10, start=first)
 
 
 def test_cgls_is_much_faster_than_sirt():

@@ -51,8 +51,8 @@ class CountData:
     def record(self, sensitivity: Array, prior: Prior | None) -> dict[str, Any]:
         """For a reconstruction's settings: totals, counts that one unit of activity in all voxels gives, and the prior."""
         sums = {"counts": self.counts, "background": self.background, "sensitivity": sensitivity}
-        said = {"prior": None} if prior is None else prior.record()
-        return {**{name: float(numbers.sum(dtype=float)) for name, numbers in sums.items()}, **said}
+        known = {name: float(numbers.sum(dtype=float)) for name, numbers in sums.items()}
+        return known | ({"prior": None} if prior is None else prior.record())
 
     def ratio(self, images: Array) -> Array:
         """Measured by expected counts, where a volume's are `images`; 0 where neither is above 0.

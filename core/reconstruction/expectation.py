@@ -121,13 +121,12 @@ def usual_subsets(A: Projector) -> int:
 
 
 def _em(loop: Loop, A: Projector, data: CountData, subsets: Any, prior: Prior | None) -> Reconstruction:
-    penalty_inside = penalty_of(prior, A.grid)
     parts = subsets_of(A, data, subsets)
     n = len(parts)
     seen = sensitivities(A, parts, loop.preparing())
     total = sum(seen[1:], seen[0])
     visible = loop.inside(total > LEAST)
-    penalty = penalty_inside(visible)
+    penalty = penalty_of(prior, A.grid, visible)
     loop.values = np.where(visible, loop.values, np.float32(0))
     images: Array | None = None  # of the current volume, where they are known
 

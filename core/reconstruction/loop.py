@@ -128,8 +128,8 @@ class Loop:
         result = self._result(settings, "cancelled")
         try:
             if self._objective:
-                own = {} if objective is None else {"objective": objective(self.values, self.preparing())}
-                self._require_as_before({**settings, **own})
+                asked = {} if objective is None else {"objective": objective(self.values, self.preparing())}
+                self._require_as_before({**settings, **asked})
             for i in range(self._iterations):
                 values, reached = step(self.done, self.values, part_of(self._progress, i, self._iterations))
                 self.values = self._only_inside(values)
@@ -179,9 +179,7 @@ class Loop:
 
 def _same(one: Any, other: Any) -> bool:
     """Whether settings are equal, numbers but for the rounding by which backends differ."""
-    if isinstance(one, int | float) and isinstance(other, int | float):
-        return math.isclose(one, other, rel_tol=1e-7)
-    return bool(one == other)
+    return bool(one == other) or (type(one) is type(other) is float and math.isclose(one, other, rel_tol=1e-7))
 
 
 def waiting(progress: Progress | None, done: int, total: int) -> Progress | None:

@@ -94,14 +94,8 @@ class Prior(ABC):
             raise InputError(f"prior: similar: expected at most the {self.neighbors} neighbors, got {self.similar}")
 
     def on(self, grid: Grid, inside: NDArray[np.bool_] | None = None) -> "Penalty":
-        """The penalty of a volume on a grid, of pairs of voxels `inside`. Raises InputError as `check`."""
-        self.check(grid)
+        """The penalty of a volume on a grid, of pairs of voxels `inside`. Raises InputError where `anatomy` has another."""
         return Penalty(self, grid, inside)
-
-    def check(self, grid: Grid) -> None:
-        """Raise `InputError` where `anatomy` has another grid."""
-        if self.anatomy is not None and not same_lattice(self.anatomy.grid, grid):
-            raise InputError("prior: anatomy's grid is not the reconstruction's: resample it (resample(volume, grid))")
 
     def record(self) -> dict[str, Any]:
         """For a reconstruction's settings."""
@@ -351,6 +345,8 @@ class Penalty:
 
     def _similarity(self, anatomy: Volume, grid: Grid) -> list[NDArray[np.uint8]]:
         """For each step and voxel, how many of it and its neighbour have chosen the other: 0, 1 or 2."""
+        if not same_lattice(anatomy.grid, grid):
+            raise InputError("prior: anatomy's grid is not the reconstruction's: resample it (resample(volume, grid))")
         require((len(self._steps) + 8) * grid.n_voxels, "the prior's anatomy")
         known = anatomy.array if self._inside is None else np.where(self._inside, anatomy.array, np.float32(np.inf))
         padded = np.pad(known, 1, constant_values=np.inf)
@@ -371,17 +367,18 @@ class Penalty:
         return shares
 
 
-def penalty_of(prior: Prior | None, grid: Grid) -> Callable[[NDArray[np.bool_]], Penalty | None]:
-    """What makes the penalty of pairs of voxels inside, once these are known; it makes None without a prior or weight.
+def penalty_of(prior: Prior | None, grid: Grid, inside: NDArray[np.bool_]) -> Penalty | None:
+    """The penalty of pairs of voxels inside; None without a prior or weight.
 
-    Raises InputError where it is no prior, or not for the grid: before the work that finds which voxels are seen.
+    Raises InputError where it is no prior, or not for the grid.
     """
-    if prior is not None and not isinstance(prior, Prior):
+    if prior is None:
+        return None
+    if not isinstance(prior, Prior):
         known = "Quadratic, RelativeDifference or TotalVariation"
         raise InputError(f"prior: expected {known}, got {type(prior).__name__}")
-    if prior is not None:
-        prior.check(grid)
-    return lambda inside: prior.on(grid, inside) if prior is not None and prior.weight else None
+    penalty = prior.on(grid, inside)
+    return penalty if prior.weight else None
 
 
 def _half_of_neighbors(n: int) -> list[tuple[int, int, int]]:

@@ -65,7 +65,7 @@ def tv(
     per_pixel = inverse(problem.forward(problem.inside, loop.preparing()))
     weights = problem.adjoint(np.ones(A.shape_out, np.float32), loop.preparing())
     is_seen = (weights > 0).astype(np.float32)
-    pairs = (_gradient(is_seen, np.ones(3)) == 0) * is_seen  # 1 where a voxel and the next one are seen
+    pairs = (_gradient(is_seen, np.ones(3, np.float32)) == 0) * is_seen  # 1 where a voxel and the next one are seen
     # The gradient is scaled so that it has as much weight in a voxel as its rays have.
     scale = float(weights.mean()) / max(float(problem.inside.mean()), 1e-6) / float(2 * closeness.sum()) or 1.0
     factors = (scale * closeness).astype(np.float32)
@@ -104,20 +104,11 @@ def total_variation(x: Array, grid: Grid, pairs: Array | float = 1.0) -> float:
 
 def _gradient(x: Array, factors: Array) -> Array:
     """Differences to the next voxel along each axis, times the axis's factor, (3, ...); 0 at the end."""
-    slopes = np.zeros((3, *x.shape), x.dtype)
-    for axis, factor in enumerate(factors):
-        inner = tuple(slice(0, -1) if a == axis else slice(None) for a in range(3))
-        slopes[axis][inner] = factor * np.diff(x, axis=axis)
-    return slopes
+    ends = [np.take(x, [-1], axis) for axis in range(3)]
+    return np.stack([f * np.diff(x, axis=axis, append=ends[axis]) for axis, f in enumerate(factors)])
 
 
 def _gradient_adjoint(slopes: Array, factors: Array) -> Array:
     """The adjoint of `_gradient`."""
-    total = np.zeros_like(slopes[0])
-    for axis, factor in enumerate(factors):
-        lower, upper = [slice(None)] * 3, [slice(None)] * 3
-        lower[axis], upper[axis] = slice(0, -1), slice(1, None)
-        part = factor * slopes[axis][tuple(lower)]
-        total[tuple(lower)] -= part
-        total[tuple(upper)] += part
-    return total
+    inner = [np.delete(slopes[axis], -1, axis) for axis in range(3)]
+    return -sum(f * np.diff(inner[axis], axis=axis, prepend=0, append=0) for axis, f in enumerate(factors))

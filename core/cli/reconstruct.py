@@ -112,7 +112,7 @@ def _run(arguments: argparse.Namespace) -> None:
     if picture is not None:
         page = Page(*(SIZE if run.volume is None else SIZE_BESIDE_TRUTH))
         draw(page, found.volume, found.objective.tolist(), run.volume, f"{method.label} of {arguments.file}",
-             [settings_line(found)], method.objective)  # fmt: skip
+             [settings_line(found), *found.settings["flatters"]], method.objective)  # fmt: skip
         page.write(picture)
     voxels = " x ".join(map(str, found.volume.grid.shape))
     largest = f"largest {float(found.volume.array.max()):.4g} {found.volume.unit}"

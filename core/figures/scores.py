@@ -45,7 +45,7 @@ def draw(page: Page, score: VolumeScore, name: str = "") -> None:
     Slices and their axes are the phantom's where it is known, else the world's. Each goes through much of the truth.
     """
     em = page.em
-    top = heading(page, f"Score{': ' if name else ''}{name}", score.lines[:1])
+    top = heading(page, f"Score{': ' if name else ''}{name}", [*score.lines[:1], *score.notes])
     display = Display("inferno" if score.volume.quantity == "activity" else "grey")
     window = display.window(score.truth.array)
     low, high = _shown(score)
@@ -162,9 +162,7 @@ def _sector_plot(score: VolumeScore, sector: DerenzoSector) -> _Plot:
     true = score.phantom.values(line, score.pose, score.volume.quantity)
     curves.append(_Curve(fine * x[-1], true, _TRUE, 0.1))
     curves.append(_Curve(x, np.mean([profile.values for profile in sector.profiles], axis=0), _FOUND, 0.16))
-    ratio = "–" if np.isnan(sector.valley_to_peak) else f"{sector.valley_to_peak:.2f}"
-    count = len(sector.profiles)
-    return _Plot(f"{sector.rod_diameter:g} mm: {ratio}; {round(sector.resolved * count)} of {count}", curves)
+    return _Plot(f"{sector.rod_diameter:g} mm: {sector.words}", curves)
 
 
 def _draw_plots(page: Page, plots: Sequence[_Plot], room: tuple[int, int, int, int], score: VolumeScore) -> None:
@@ -180,7 +178,7 @@ def _draw_plots(page: Page, plots: Sequence[_Plot], room: tuple[int, int, int, i
     page.text("truth", x + 7.2 * em, y, 0.85 * em, _TRUE)
     page.text(score.volume.unit, left + 3.0 * em, y, 0.85 * em, FAINT, "end")
     if score.derenzo is not None:
-        page.text("mm from rod to rod; valley/peak; pairs resolved", left + width, y, 0.85 * em, FAINT, "end")
+        page.text("mm from rod to rod", left + width, y, 0.85 * em, FAINT, "end")
     for index, plot in enumerate(plots):
         row, column = divmod(index, columns)
         wide, tall = width / columns, height / rows

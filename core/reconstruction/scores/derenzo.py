@@ -66,8 +66,6 @@ class DerenzoSector:
     """mm."""
     valley_to_peak: float
     """Mean valley by mean peak of all pairs of neighbours: 0 if nothing is between the rods, 1 if no rods can be seen."""
-    resolved: float
-    """1 if `valley_to_peak` is below 0.735 and `chance` below 0.02, else 0."""
     contrast_recovery: float
     """Difference of mean peak and mean valley, by that of the phantom."""
     profiles: tuple[RodProfile, ...] = ()
@@ -76,6 +74,12 @@ class DerenzoSector:
     """Why something is NaN."""
     chance: float = np.nan
     """That noise alone makes as large a difference of mean peak and mean valley, as rods and valleys scatter."""
+
+    @property
+    def resolved(self) -> float:
+        """1 if `valley_to_peak` is below `RESOLVED_BELOW` and `chance` below `NOISE_BELOW`, else 0; see `derenzo_score`."""
+        below = self.valley_to_peak < RESOLVED_BELOW and self.chance < NOISE_BELOW
+        return float(below) if self.profiles else np.nan
 
     @property
     def pairs_resolved(self) -> float:
@@ -176,19 +180,17 @@ class _Sector:
     def score(self) -> DerenzoSector:
         diameter = float(self.rods.rod_diameters[self.sector])
         if note := self._missing(diameter):
-            return DerenzoSector(diameter, np.nan, np.nan, np.nan, note=note)
+            return DerenzoSector(diameter, np.nan, np.nan, note=note)
         rods, between = self._true_values()
         if np.isclose(rods, between, rtol=1e-9, atol=0):
             note = f"the rods hold the same {self.volume.quantity} as what is between them"
-            return DerenzoSector(diameter, np.nan, np.nan, np.nan, note=note)
+            return DerenzoSector(diameter, np.nan, np.nan, note=note)
         profiles = self._profiles(diameter, rods > between)
         peak = float(np.mean([profile.peak for profile in profiles]))
         valley = float(np.mean([profile.valley for profile in profiles]))
         ratio, note = (valley / peak, "") if peak > 0 else (np.nan, "the peaks are not above 0")
-        chance = self._chance(profiles)
-        resolved = float(ratio < RESOLVED_BELOW and chance < NOISE_BELOW)
         contrast = (peak - valley) / abs(rods - between)
-        return DerenzoSector(diameter, ratio, resolved, contrast, tuple(profiles), note, chance)
+        return DerenzoSector(diameter, ratio, contrast, tuple(profiles), note, self._chance(profiles))
 
     def _chance(self, profiles: list[RodProfile]) -> float:
         """That noise makes as large a difference of rods and valleys: of Student's t."""

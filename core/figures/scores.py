@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from ..reconstruction.scores.derenzo import DerenzoSector
 from ..reconstruction.scores.summary import VolumeScore
+from ..runs import letters
 from ..runs.display import Display
 from ..volumes.resampling import values_at
 from ..volumes.volume import Volume
@@ -190,7 +191,10 @@ def _draw_plot(page: Page, plot: _Plot, frame: tuple[float, float, float, float]
     em, (left, top, width, height), (low, high) = page.em, frame, span
     first, last = float(plot.curves[0].x[0]), float(plot.curves[0].x[-1])
     page.line([*box(left, top, width, height), (left, top)], FAINT, 0.06 * em)
-    page.text(plot.title, left, top - 0.5 * em, 0.8 * em, INK)
+    size = (
+        0.8 * em * min(1.0, width / letters.width(plot.title, 0.8 * em))
+    )  # a title that is too long is written smaller
+    page.text(plot.title, left, top - 0.5 * em, size, INK)
     for value in ticks(low, high, max(2, int(height / (2.5 * em)))):
         y = top + height * (high - value) / (high - low)
         page.line([(left - 0.3 * em, y), (left, y)], FAINT, 0.06 * em)

@@ -17,10 +17,7 @@ from .stopping import StoppingRule
 
 _LEAN = 0.05
 """Cosine between a gradient of CGLS and its first, 0 in exact numbers: below it volumes are within 1e-3 of theirs."""
-_LEANS = (
-    "CGLS: in iteration {} rounding has turned it off the way of exact numbers: volumes from here on are up to a few "
-    "percent beside them, though as near to the images; other backends give others"
-)
+_LEANS = "CGLS: from iteration {} on rounding puts its volumes up to a few percent beside those of exact numbers"
 
 
 def sirt(

@@ -78,19 +78,17 @@ class DerenzoSector:
     @property
     def resolved(self) -> float:
         """1 if `valley_to_peak` is below `RESOLVED_BELOW` and `chance` below `NOISE_BELOW`, else 0; see `derenzo_score`."""
-        below = self.valley_to_peak < RESOLVED_BELOW and self.chance < NOISE_BELOW
-        return float(below) if self.profiles else np.nan
+        return float(self.valley_to_peak < RESOLVED_BELOW and self.chance < NOISE_BELOW) if self.profiles else np.nan
 
     @property
     def pairs_resolved(self) -> float:
         """Share of the pairs of neighbours with a valley-to-peak below 0.735; by itself it says nothing, see `resolved`."""
-        pairs = [profile.valley_to_peak < RESOLVED_BELOW for profile in self.profiles] or np.nan
-        return float(np.mean(pairs))
+        return float(np.mean([profile.valley_to_peak < RESOLVED_BELOW for profile in self.profiles] or np.nan))
 
     @property
     def words(self) -> str:
         """The score in a line: whether it is resolved, and by what; or why there is none."""
-        said = f"valley/peak {self.valley_to_peak:.2f}, contrast {100 * self.contrast_recovery:.0f} %"
+        said = f"valley/peak {self.valley_to_peak:.2f}, contrast {round(100 * self.contrast_recovery)} %"
         return self.note or f"{'resolved' if self.resolved else 'not resolved'}, {said}"
 
 

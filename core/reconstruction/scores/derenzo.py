@@ -88,7 +88,7 @@ class DerenzoSector:
     @property
     def words(self) -> str:
         """The score in a line: whether it is resolved, and by what; or why there is none."""
-        said = f"valley/peak {self.valley_to_peak:.2f}, contrast {round(100 * self.contrast_recovery)} %"
+        said = f"valley/peak {self.valley_to_peak:.2f}, contrast {np.round(100 * self.contrast_recovery) + 0.0:.0f} %"
         return self.note or f"{'resolved' if self.resolved else 'not resolved'}, {said}"
 
 

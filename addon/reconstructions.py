@@ -64,12 +64,13 @@ def reconstructing(context: bpy.types.Context, recipe: Recipe) -> jobs.Job:
         reconstruction_grid(run, recipe)  # refuses what cannot be, before the work begins
         last = 0.0
 
-        def shown_of(values: NDArray[Any], objective: Sequence[float], scores: list[tuple[str, str]]) -> _Shown:
+        def shown_of(values: NDArray[Any], objective: Sequence[float], scores: Any = (), flatters: Any = ()) -> _Shown:
             grid = reconstruction_grid(run, recipe)
             volume = Volume(values, grid, "activity" if run.volume is None else run.volume.quantity)
             done = f"{len(objective)} iteration{'s' * (len(objective) > 1)}"
             record = {
-                "title": f"{method.label}, {done}", "name": method.objective, "objective": list(objective), "scores": scores,
+                "title": f"{method.label}, {done}", "name": method.objective, "objective": list(objective),
+                "scores": list(scores), "flatters": flatters,
             }  # fmt: skip
             picture = _picture(run, volume, record, name)
             stored = store_volume(volume, folder, None, {"reconstruction_of": name, **recipe.tables()})
@@ -79,12 +80,13 @@ def reconstructing(context: bpy.types.Context, recipe: Recipe) -> jobs.Job:
         def watch(iteration: int, values: NDArray[Any], objective: Sequence[float]) -> bool:
             nonlocal last
             if time.monotonic() - last > _BETWEEN and is_watched:
-                shelf.latest = shown_of(np.array(values), objective, [])
+                shelf.latest = shown_of(np.array(values), objective)
                 last = time.monotonic()
             return shelf.enough.is_set()
 
         found = reconstruct_run(run, recipe, _mu(run, recipe, readers), watch=watch, stages=stages)
-        return shown_of(found.volume.array, found.objective.tolist(), _scores(run, found.volume, stages("scoring")))
+        scores = _scores(run, found.volume, stages("scoring"))
+        return shown_of(found.volume.array, found.objective.tolist(), scores, found.settings["flatters"])
 
     def finish(result: _Shown) -> str:
         scene = jobs.found_again(bpy.data.scenes, uid)
@@ -168,11 +170,9 @@ class _Shelf:
 
 def _picture(run: ProjectionRun, volume: Volume, record: dict[str, Any], name: str) -> bytes:
     page = Page(*(SIZE if run.volume is None else SIZE_BESIDE_TRUTH))
-    lines = [
-        record["title"],
-        *([", ".join(": ".join(line) for line in record["scores"][:1])] if record["scores"] else []),
-    ]
-    draw(page, volume, record["objective"], run.volume, f"Reconstruction of {name}", [", ".join(lines)], record["name"])
+    line = ", ".join([record["title"], *map(": ".join, record["scores"][:1])])
+    lines = [line, *record["flatters"]]
+    draw(page, volume, record["objective"], run.volume, f"Reconstruction of {name}", lines, record["name"])
     return png(page.picture, _PNG_LEVEL)
 
 
@@ -182,15 +182,15 @@ def _scores(run: ProjectionRun, volume: Volume, progress: Progress | None) -> li
         return []
     truth, pose = truth_of_run(run)
     try:
-        record = score_volume(volume, truth, pose, progress).record
+        score = score_volume(volume, truth, pose, progress)
     except InputError as error:  # such as a truth that is the same everywhere: the reconstruction is worth keeping
         return [("No score", str(error))]
-    lines = [("NRMSE", f"{record['nrmse']:.3g}")]
-    for rods in record.get("derenzo", []):
-        lines.append((f"{rods['rod_diameter']:g} mm rods", rods["note"] or f"{rods['resolved']:.0%} resolved"))
-    for sphere in record.get("nema", []):
-        said = f"{sphere['contrast_recovery']:.1f} % contrast, {sphere['background_variability']:.1f} % variability"
-        lines.append((f"{sphere['diameter']:g} mm sphere", said))
+    lines = [("NRMSE", f"{score.nrmse:.3g}")]
+    for rods in score.derenzo or ():
+        lines.append((f"{rods.rod_diameter:g} mm rods", rods.words))
+    for sphere in score.nema or ():
+        said = f"{sphere.contrast_recovery:.1f} % contrast, {sphere.background_variability:.1f} % variability"
+        lines.append((f"{sphere.diameter:g} mm sphere", said))
     return lines
 
 

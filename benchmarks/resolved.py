@@ -75,9 +75,7 @@ def reconstruct(folder: Path, name: str, data: np.ndarray, n: int, iterations: i
             np.save(folder / f"{name}.npy", np.asarray(x, np.float32))
             result = {"name": name, "voxels": n, "scores": history, "seconds": time.perf_counter() - started}
             (folder / f"{name}.json").write_text(json.dumps(result, indent=1))
-            print(
-                name, iteration, [(s["diameter"], s["resolved"], s["valley"]) for s in history[iteration]], flush=True
-            )
+            print(name, iteration, [(s["diameter"], s["pairs"], s["valley"]) for s in history[iteration]], flush=True)
 
     mph.osem(A, data, iterations, SUBSETS, callback=look)
     return history
@@ -131,12 +129,13 @@ def picture(folder: Path, names: list[str], path: Path, tile: int = 260) -> None
 
 
 def scores(volume: mph.Volume) -> list[dict[str, float]]:
-    """Of each sector: rod diameter, share of pairs resolved, mean valley / peak, contrast recovery."""
+    """Of each sector: rod diameter, whether it is resolved, share of its pairs, mean valley / peak, contrast recovery."""
     score = mph.derenzo_score(volume, PHANTOM)
     return [
         {
             "diameter": float(s.rod_diameter),
-            "resolved": round(float(s.resolved), 3),
+            "resolved": bool(s.resolved),
+            "pairs": round(float(s.pairs_resolved), 3),
             "valley": round(float(s.valley_to_peak), 3),
             "contrast": round(float(s.contrast_recovery), 3),
         }

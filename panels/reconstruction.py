@@ -5,7 +5,7 @@ from bpy.app.translations import pgettext_iface as iface
 
 from ..addon import ids, jobs, plots, runs
 from ..addon.reconstruction_properties import drawn
-from .geometry import Sidebar, draw_hint
+from .geometry import Sidebar, draw_hint, draw_text
 
 _MAIN = ("method", "iterations", "subsets", "voxels", "spacing")
 """Settings that the panel itself shows; the others stand under Model and Prior."""
@@ -52,6 +52,8 @@ def _draw_result(layout: bpy.types.UILayout, settings: bpy.types.PropertyGroup, 
         row = scores.split(factor=0.3)
         row.label(text=name, translate=False)
         row.label(text=value, translate=False)
+    for text in known.get("flatters", ()):
+        draw_text(box, text)
     box.operator(ids.SHOW_RECONSTRUCTION, text="Show Slices", icon="IMAGE_DATA")
 
 

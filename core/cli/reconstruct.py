@@ -112,7 +112,7 @@ def _run(arguments: argparse.Namespace) -> None:
     if picture is not None:
         page = Page(*(SIZE if run.volume is None else SIZE_BESIDE_TRUTH))
         draw(page, found.volume, found.objective.tolist(), run.volume, f"{method.label} of {arguments.file}",
-             [settings_line(found)], method.objective)  # fmt: skip
+             [settings_line(found), *found.settings["flatters"]], method.objective)  # fmt: skip
         page.write(picture)
     voxels = " x ".join(map(str, found.volume.grid.shape))
     largest = f"largest {float(found.volume.array.max()):.4g} {found.volume.unit}"
@@ -133,7 +133,8 @@ class _Log:
     def __init__(self, recipe: Recipe, quiet: bool, start: Any) -> None:
         method = METHODS[recipe["reconstruction.method"]]
         goes_on = isinstance(start, Reconstruction) and start.settings.get("method") == method.label
-        self.total, self.quiet = (start.iterations if goes_on else 0) + recipe["reconstruction.iterations"], quiet
+        iterations = recipe["reconstruction.iterations"] or method.iterations
+        self.total, self.quiet = (start.iterations if goes_on else 0) + iterations, quiet
         self.name = method.objective
         self.begun, self.interrupted = time.monotonic(), False
 

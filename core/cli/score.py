@@ -1,6 +1,7 @@
 """``mphdrr score VOLUME --truth FILE`` and ``mphdrr score VOLUME KIND …``."""
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,8 @@ from ..phantoms.language import read_phantom
 from ..phantoms.phantom import Phantom
 from ..reconstruction.scores.summary import score_volume
 from ..runs.files import FORMATS, read_run
+from ..runs.reconstructing import flattering
+from ..runs.run import ProjectionRun
 from ..runs.run_recipe import truth_of_run
 from ..volumes.volume import UNITS, Volume
 from ..volumes.volume_files import read_volume
@@ -62,9 +65,11 @@ def _run(arguments: argparse.Namespace) -> None:
         raise InputError("score: expected --truth FILE or a kind of phantom, see mphdrr score --help")
     if arguments.make is not None and arguments.truth is not None:
         raise InputError("score: expected either --truth or a kind of phantom, got both")
-    truth, pose = _truth(arguments)
+    truth, pose, run = _truth(arguments)
     volume = read_volume(arguments.volume, arguments.quantity, progress=progress_bar("reading"))
     score = score_volume(volume, truth, pose, progress_bar("truth"))
+    if run is not None:
+        score = replace(score, notes=(*flattering(run, volume.grid), *score.notes))
     if picture is not None:
         page = Page(*SIZE)
         draw(page, score, Path(arguments.volume).name)
@@ -72,13 +77,13 @@ def _run(arguments: argparse.Namespace) -> None:
     print_answer(arguments, score.record, score.lines, score.notes)
 
 
-def _truth(arguments: argparse.Namespace) -> tuple[Volume | Phantom, NDArray[np.float64] | None]:
-    """The truth, and the pose of a phantom."""
+def _truth(arguments: argparse.Namespace) -> tuple[Volume | Phantom, NDArray[np.float64] | None, ProjectionRun | None]:
+    """The truth, the pose of a phantom, and the run that was simulated of it."""
     if arguments.make is not None:
-        return arguments.make(arguments), read_pose(arguments)
+        return arguments.make(arguments), read_pose(arguments), None
     file = Path(arguments.truth)
     if file.suffix.lower() == ".toml":
-        return read_phantom(file), read_pose(arguments)
+        return read_phantom(file), read_pose(arguments), None
     refuse(arguments, ("position", "euler"), "is for a kind of phantom or a .toml; a run or a volume knows its place")
     try:
         run = read_run(file) if file.suffix.lower() in FORMATS else None
@@ -88,5 +93,5 @@ def _truth(arguments: argparse.Namespace) -> tuple[Volume | Phantom, NDArray[np.
         run = None
     if run is not None:
         with naming(file):
-            return truth_of_run(run)
-    return read_volume(file, arguments.quantity, progress=progress_bar("reading the truth")), None
+            return *truth_of_run(run), run
+    return read_volume(file, arguments.quantity, progress=progress_bar("reading the truth")), None, None

@@ -21,6 +21,7 @@ from ..runs.recipe import Recipe, recorded_recipe
 from ..runs.run import ProjectionRun
 from ..runs.run_recipe import recipe_model, with_phantom
 from ..validation import freeze, positive
+from ..volumes.images import Images
 from ..volumes.volume import Volume
 from .event_files import header, names_of, read_array, read_truth
 from .folders import SetFolder
@@ -208,7 +209,7 @@ class Event:
         """The parallel projections (count, n_v, n_u) at so many angles, value x mm."""
         with self._open() as file:
             self._dataset(file, "radon", str(count))
-            return read_array(file, f"radon/{count}")
+            return Images.of(read_array(file, f"radon/{count}"), self._source.recipe.quantity)
 
     def radon_views(self, count: int) -> Views:
         """Of the parallel projections."""

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from ..reconstruction.scores.derenzo import DerenzoSector
 from ..reconstruction.scores.summary import VolumeScore
+from ..runs import letters
 from ..runs.display import Display
 from ..volumes.resampling import values_at
 from ..volumes.volume import Volume
@@ -45,7 +46,7 @@ def draw(page: Page, score: VolumeScore, name: str = "") -> None:
     Slices and their axes are the phantom's where it is known, else the world's. Each goes through much of the truth.
     """
     em = page.em
-    top = heading(page, f"Score{': ' if name else ''}{name}", score.lines[:1])
+    top = heading(page, f"Score{': ' if name else ''}{name}", [*score.lines[:1], *score.notes])
     display = Display("inferno" if score.volume.quantity == "activity" else "grey")
     window = display.window(score.truth.array)
     low, high = _shown(score)
@@ -162,9 +163,7 @@ def _sector_plot(score: VolumeScore, sector: DerenzoSector) -> _Plot:
     true = score.phantom.values(line, score.pose, score.volume.quantity)
     curves.append(_Curve(fine * x[-1], true, _TRUE, 0.1))
     curves.append(_Curve(x, np.mean([profile.values for profile in sector.profiles], axis=0), _FOUND, 0.16))
-    ratio = "–" if np.isnan(sector.valley_to_peak) else f"{sector.valley_to_peak:.2f}"
-    count = len(sector.profiles)
-    return _Plot(f"{sector.rod_diameter:g} mm: {ratio}; {round(sector.resolved * count)} of {count}", curves)
+    return _Plot(f"{sector.rod_diameter:g} mm: {sector.words}", curves)
 
 
 def _draw_plots(page: Page, plots: Sequence[_Plot], room: tuple[int, int, int, int], score: VolumeScore) -> None:
@@ -180,7 +179,7 @@ def _draw_plots(page: Page, plots: Sequence[_Plot], room: tuple[int, int, int, i
     page.text("truth", x + 7.2 * em, y, 0.85 * em, _TRUE)
     page.text(score.volume.unit, left + 3.0 * em, y, 0.85 * em, FAINT, "end")
     if score.derenzo is not None:
-        page.text("mm from rod to rod; valley/peak; pairs resolved", left + width, y, 0.85 * em, FAINT, "end")
+        page.text("mm from rod to rod", left + width, y, 0.85 * em, FAINT, "end")
     for index, plot in enumerate(plots):
         row, column = divmod(index, columns)
         wide, tall = width / columns, height / rows
@@ -192,7 +191,10 @@ def _draw_plot(page: Page, plot: _Plot, frame: tuple[float, float, float, float]
     em, (left, top, width, height), (low, high) = page.em, frame, span
     first, last = float(plot.curves[0].x[0]), float(plot.curves[0].x[-1])
     page.line([*box(left, top, width, height), (left, top)], FAINT, 0.06 * em)
-    page.text(plot.title, left, top - 0.5 * em, 0.8 * em, INK)
+    size = (
+        0.8 * em * min(1.0, width / letters.width(plot.title, 0.8 * em))
+    )  # a title that is too long is written smaller
+    page.text(plot.title, left, top - 0.5 * em, size, INK)
     for value in ticks(low, high, max(2, int(height / (2.5 * em)))):
         y = top + height * (high - value) / (high - low)
         page.line([(left - 0.3 * em, y), (left, y)], FAINT, 0.06 * em)

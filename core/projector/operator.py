@@ -18,6 +18,7 @@ from ..geometry.views import Views
 from ..memory import require
 from ..progress import Progress, part_of
 from ..recording import recorded_warnings
+from ..volumes.images import Images
 from ..volumes.volume import Volume
 from . import backends
 from .bundles import Bundle, Bundles
@@ -197,7 +198,9 @@ class Projector(LinearOperator):
             As of `LinearOperator`; and the model has no mu, or `mu` has another shape, or is negative.
         """
         if mu is None:
-            return super().__call__(x, progress)
+            images = super().__call__(x, progress)
+            is_labelled = isinstance(x, Volume) and self.model.takes != ("activity",)
+            return Images.of(images, x.quantity) if is_labelled else images
         x = self._check(x)
         if self.model.mu is None:
             raise InputError("mu: the projector's model has none; give it one to say on which grid mu is")

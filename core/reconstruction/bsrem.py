@@ -58,7 +58,9 @@ def bsrem(
     Parameters
     ----------
     A, counts, iterations, background, start, mask, callback, progress, stop
-        As of `mlem`, but zeros in `start` may grow, and without `start` it begins with the mean activity.
+        As of `mlem`, but zeros in `start` may grow, and without `start` it begins with the mean activity. With a prior,
+        ``stop=StopWhen(change=1e-8)`` left no voxel further than 1 % of the mean activity from the maximum in our tests,
+        1e-6 some as far as 10 %.
     subsets : int, optional
         By default about a fifth of the views' number.
     prior : Quadratic, RelativeDifference or TotalVariation, optional
@@ -95,28 +97,32 @@ def bsrem(
     loop = Loop("BSREM", A, iterations, start, mask, callback, progress, stop)
     data = CountData.of("BSREM", A, counts, background)
     relaxation = at_least_0(relaxation, "relaxation")
-    penalty = penalty_of(prior, A.grid)
     parts = subsets_of(A, data, usual_subsets(A) if subsets is None else subsets)
     n = len(parts)
     require(8 * n * A.grid.n_voxels, f"the gradients of {n} subsets")
     seen = sensitivities(A, parts, loop.preparing())
     total = np.sum(seen, axis=0)
-    visible = total > LEAST if loop.mask is None else (total > LEAST) & loop.mask
+    visible = loop.inside(total > LEAST)
+    penalty = penalty_of(prior, A.grid, visible)
     # At the maximum no voxel gives more counts than there are.
     n_counts = data.counts.sum(dtype=float)
     most = np.divide(np.float32(n_counts), total, out=np.zeros_like(total), where=visible)
     mean = n_counts / max(float(total.sum(where=visible, dtype=float)), float(LEAST))
     lift, nothing = np.float32(_LIFT * mean), np.float32(_NOTHING * mean)
     loop.values = np.minimum(loop.values if start is not None else np.float32(mean), most)
-    images: list[Array] | None = None  # of the current volume in each subset, where they are known
+    images: list[Array] = []  # of the current volume in each subset, once they are known, and its objective
+    value = 0.0
 
     def gradient(s: int, its_images: Array, asked: Progress | None) -> Array:
         part, own = parts[s]
         return part.T(own.ratio(its_images), asked) - seen[s]
 
-    def objective(x: Array, its_images: list[Array]) -> float:
-        likelihood = sum(own.log_likelihood(its) for (_, own), its in zip(parts, its_images, strict=True))
-        return likelihood - (0.0 if penalty is None else penalty.value(x))
+    def objective(x: Array, asked: Progress | None) -> float:
+        nonlocal images, value
+        images = [part(x, asked) for part, _ in parts]
+        value = sum(own.log_likelihood(its) for (_, own), its in zip(parts, images, strict=True))
+        value -= 0.0 if penalty is None else penalty.value(x)
+        return value
 
     def moved(x: Array, upwards: Array, scale: Array, size: float) -> Array:
         """The volume a step further up a gradient, within its bounds."""
@@ -129,16 +135,15 @@ def bsrem(
         return found
 
     def step(number: int, x: Array, progress: Progress | None) -> tuple[Array, float]:
-        nonlocal images
-        if images is None:
-            images = [part(x, waiting(progress, 0, 2 * n)) for part, _ in parts]
+        if not images:
+            objective(x, waiting(progress, 0, 2 * n))
         halvings = int(loop.state.get("halvings", np.zeros(()))[()])
         scale = total if penalty is None else total + (x + lift) * penalty.curvature(x)
         before, least_gain = -np.inf, 0.0
         at_start: list[Array] = []
         overall = np.zeros_like(x)
         if number:  # far from the maximum the plain steps, which are those of OSEM, get on faster
-            before = objective(x, images)
+            before = value
             at_start = [gradient(s, images[s], waiting(progress, s, 2 * n)) for s in range(n)]
             overall = np.sum(at_start, axis=0)
             whole = overall if penalty is None else overall - penalty.gradient(x)
@@ -157,8 +162,7 @@ def bsrem(
                 if penalty is not None:
                     upwards = upwards - penalty.gradient(found)
                 found = moved(found, upwards, scale, size)
-            images = [part(found, waiting(progress, 2 * n - 1, 2 * n)) for part, _ in parts]
-            reached = objective(found, images)
+            reached = objective(found, waiting(progress, 2 * n - 1, 2 * n))
             rounding = _ROUNDING * abs(reached)
             if halvings < _MOST_HALVINGS and reached < before + size * least_gain - rounding:
                 halvings += 1
@@ -169,5 +173,4 @@ def bsrem(
             progress(2 * n, 2 * n)
         return found, reached
 
-    settings = {"subsets": n, "relaxation": relaxation, **data.record(), **({} if prior is None else prior.record())}
-    return loop.run(step, settings)
+    return loop.run(step, {"subsets": n, "relaxation": relaxation, **data.record(total, prior)}, objective)

@@ -1,6 +1,7 @@
 """Counts with an additive background: their log-likelihood, and checks of what a reconstruction is given."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -9,6 +10,7 @@ from ..errors import InputError
 from ..projector import Projector
 from ..validation import instance, real_array, shape_text
 from .loop import plain
+from .priors import Prior
 from .result import Array
 
 # Less is nothing: float32 could not hold what it would be divided into.
@@ -46,9 +48,11 @@ class CountData:
     def __getitem__(self, which: NDArray[np.int64]) -> "CountData":
         return CountData(self.counts[which], self.background[which])
 
-    def record(self) -> dict[str, float]:
-        """For a reconstruction's settings."""
-        return {"counts": float(self.counts.sum(dtype=float)), "background": float(self.background.sum(dtype=float))}
+    def record(self, sensitivity: Array, prior: Prior | None) -> dict[str, Any]:
+        """For a reconstruction's settings: totals, counts that one unit of activity in all voxels gives, and the prior."""
+        sums = {"counts": self.counts, "background": self.background, "sensitivity": sensitivity}
+        known = {name: float(numbers.sum(dtype=float)) for name, numbers in sums.items()}
+        return known | ({"prior": None} if prior is None else prior.record())
 
     def ratio(self, images: Array) -> Array:
         """Measured by expected counts, where a volume's are `images`; 0 where neither is above 0.

@@ -44,8 +44,8 @@ def mlem(
     background : number, array (M,) or (M, n_v, n_u)
         Counts expected besides those of the volume, such as scatter.
     start : Volume, array, tensor or Reconstruction, optional
-        Begin with this; by default with 1 everywhere. What is 0 stays 0. A reconstruction by the same method, with the same
-        other arguments, goes on with the same numbers as without a break; its log goes on too.
+        Begin with this; by default with 1 everywhere. What is 0 stays 0. A reconstruction by the same method goes on with
+        the same numbers as without a break, its log too; the other arguments must be what they were.
     mask : array of bool, optional
         Of the grid's shape; outside it the volume is 0.
     callback
@@ -72,7 +72,7 @@ def mlem(
     ------
     InputError
         Counts, background, start or mask have another shape or grid, or are negative or not finite; `prior` is none, or its
-        anatomy has another grid.
+        anatomy has another grid; `start` is to be resumed with other data, another model or other arguments.
 
     References
     ----------
@@ -121,11 +121,13 @@ def usual_subsets(A: Projector) -> int:
 
 
 def _em(loop: Loop, A: Projector, data: CountData, subsets: Any, prior: Prior | None) -> Reconstruction:
-    penalty = penalty_of(prior, A.grid)
     parts = subsets_of(A, data, subsets)
     n = len(parts)
     seen = sensitivities(A, parts, loop.preparing())
-    loop.values = np.where(sum(seen) > LEAST, loop.values, np.float32(0))
+    total = sum(seen[1:], seen[0])
+    visible = loop.inside(total > LEAST)
+    penalty = penalty_of(prior, A.grid, visible)
+    loop.values = np.where(visible, loop.values, np.float32(0))
     images: Array | None = None  # of the current volume, where they are known
 
     def step(number: int, x: Array, progress: Progress | None) -> tuple[Array, float]:
@@ -141,11 +143,15 @@ def _em(loop: Loop, A: Projector, data: CountData, subsets: Any, prior: Prior | 
             x = np.multiply(x, factor, out=factor)
             if progress is not None:
                 progress(k + 1, n)
-        images = A(x, waiting(progress, n, n))
-        objective = data.log_likelihood(images)
-        return x, objective if penalty is None else objective - penalty.value(x)
+        return x, objective(x, waiting(progress, n, n))
 
-    return loop.run(step, {"subsets": n, **data.record(), **({} if prior is None else prior.record())})
+    def objective(x: Array, asked: Progress | None) -> float:
+        nonlocal images
+        images = A(x, asked)
+        likelihood = data.log_likelihood(images)
+        return likelihood if penalty is None else likelihood - penalty.value(x)
+
+    return loop.run(step, {"subsets": n, **data.record(total, prior)}, objective)
 
 
 def subsets_of(A: Projector, data: CountData, n: Any) -> list[tuple[Projector, CountData]]:

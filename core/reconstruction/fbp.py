@@ -10,7 +10,7 @@ from ..geometry.grid import Grid
 from ..geometry.views import Views
 from ..progress import Progress
 from ..volumes.volume import Volume
-from .filtered import checked_images, filtered_backprojection, rows_across, shares_of_turn
+from .filtered import checked_images, filtered_backprojection, rows_across, shares_of_turn, warn_of_cut
 
 _IN_PLANE = np.sin(np.radians(1.0))
 
@@ -22,7 +22,7 @@ def fbp(
     window: str = "ramp",
     progress: Progress | None = None,
     *,
-    quantity: str = "mu",
+    quantity: str | None = None,
 ) -> Volume:
     """The volume whose line integrals are `images`, by filtered backprojection of parallel views.
 
@@ -32,7 +32,7 @@ def fbp(
         Line integrals, value x mm, as of ``Projector(grid, views)``.
     views : Views
         Parallel ones, whose directions lie in a plane: half a circle or more, at any angles. Each view counts for the angle
-        halfway to its neighbours, so that they may be unevenly spaced.
+        halfway to its neighbours, so that they may be unevenly spaced; those at equal angles share what one counts for.
     grid : Grid
         Where the volume is computed; any part of the object.
     window : str
@@ -40,8 +40,8 @@ def fbp(
         (least noise).
     progress
         Called as ``progress(views done, views)``; what it raises stops the work.
-    quantity : str
-        Of the volume, as of `Volume`.
+    quantity : str, optional
+        Of the volume, as of `Volume`; by default that of the volume whose images a projector made, else "mu".
 
     Returns
     -------
@@ -56,12 +56,14 @@ def fbp(
     Warns
     -----
     InputWarning
-        Directions are missing: edges along them are lost.
+        Directions are missing: edges along them are lost. Or the images do not fall to about 0 at their edge columns, as of
+        an object that is wider, or of a displaced detector: values are wrong.
 
     References
     ----------
     A. C. Kak, M. Slaney, "Principles of Computerized Tomographic Imaging", IEEE Press (1988), chapter 3.
     """
+    quantity = str(quantity or getattr(images, "quantity", "mu"))
     images = checked_images(images, views, grid, "fbp")
     if not views.parallel:
         raise InputError("fbp: expected parallel views (see parallel_views); views from sources are for fdk")
@@ -74,13 +76,11 @@ def fbp(
             f"fbp: view {int(out_of_plane.argmax())}: its rays do not lie in the plane in which the others turn; use sirt"
         )
     images, views = rows_across(images, views, axis, "fbp")
+    warn_of_cut(images, "fbp")
     shares, _, gap = shares_of_turn(np.arctan2(along @ second, along @ first), np.pi)
     if gap:
-        warnings.warn(
-            f"fbp: {np.degrees(gap):.0f} degrees of the half circle have no view: edges along their directions are lost",
-            InputWarning,
-            stacklevel=2,
-        )
+        empty = f"{np.degrees(gap):.0f} degrees of the half circle have no view"
+        warnings.warn(f"fbp: {empty}: edges along their directions are lost", InputWarning, stacklevel=2)
     # The pixels' distance as the rays see it, across their direction.
     pitch = np.abs(np.einsum("mi,mi->m", views.u_steps, np.cross(axis, along)))
     weights = shares / pitch

@@ -12,7 +12,7 @@ from ..geometry.grid import Grid
 from ..geometry.views import Views
 from ..progress import Progress
 from ..volumes.volume import Volume
-from .filtered import checked_images, filtered_backprojection, rows_across, shares_of_turn
+from .filtered import checked_images, filtered_backprojection, rows_across, shares_of_turn, warn_of_cut
 
 Array = NDArray[np.floating[Any]]
 
@@ -30,7 +30,7 @@ def fdk(
     window: str = "ramp",
     progress: Progress | None = None,
     *,
-    quantity: str = "mu",
+    quantity: str | None = None,
 ) -> Volume:
     """The volume whose line integrals are `images`, by Feldkamp's algorithm for any flat detectors and sources on a circle.
 
@@ -63,7 +63,8 @@ def fdk(
     Warns
     -----
     InputWarning
-        The arc is shorter than half a circle and the fan's angle: some rays are missing, and edges along them are lost.
+        The arc is shorter than half a circle and the fan's angle: some rays are missing, and edges along them are lost. Or
+        the images do not fall to about 0 at their edge columns (see `fbp`).
 
     References
     ----------
@@ -72,11 +73,13 @@ def fdk(
     orbit with embedded misalignment correction using homogeneous coordinates", Medical Physics 28 (2001) 2050-2069.
     D. L. Parker, "Optimal short scan convolution reconstruction for fanbeam CT", Medical Physics 9 (1982) 254-257.
     """
+    quantity = str(quantity or getattr(images, "quantity", "mu"))
     images = checked_images(images, views, grid, "fdk")
     if views.parallel:
         raise InputError("fdk: expected views from sources; parallel views are for fbp")
     orbit = _Orbit.of(views)
     images, views = rows_across(images, views, orbit.axis, "fdk")
+    warn_of_cut(images, "fdk")
     to_detector = views.detector_centers - views.sources
     normals = np.cross(views.u_steps, views.v_steps)
     normals /= np.linalg.norm(normals, axis=1)[:, None]
@@ -84,12 +87,8 @@ def fdk(
     pitch = np.linalg.norm(views.u_steps, axis=1)
     reach, missing = orbit.reach(views)
     if missing > 0:
-        warnings.warn(
-            f"fdk: the arc is {np.degrees(missing):.0f} degrees too short for half a circle and the fan's angle: "
-            "edges along the missing rays are lost",
-            InputWarning,
-            stacklevel=2,
-        )
+        arc = f"the arc is {np.degrees(missing):.0f} degrees too short for half a circle and the fan's angle"
+        warnings.warn(f"fdk: {arc}: edges along the missing rays are lost", InputWarning, stacklevel=2)
 
     def weights(m: int) -> Array:
         # With s the source and theta a ray's direction, a ray counts for |ds x theta|, which is the measure of lines in the
@@ -180,10 +179,8 @@ def _parker(angle: float, fan: Array, arc: float, half_fan: float) -> Array:
     the arc. An arc longer than necessary is shared as if the fan were as much wider.
     """
     fan = np.clip(fan, -half_fan, half_fan)
-    rising, falling = (
-        2 * (half_fan + fan),
-        2 * (half_fan - fan),
-    )  # measured again at the arc's end, and at its beginning
+    # Measured again at the arc's end, and at its beginning.
+    rising, falling = 2 * (half_fan + fan), 2 * (half_fan - fan)
     weight = np.ones_like(fan)
     early, late = angle < rising, angle > arc - falling
     weight[early] = np.sin(np.pi / 2 * angle / rising[early]) ** 2

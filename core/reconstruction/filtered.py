@@ -1,12 +1,14 @@
 """What FBP and FDK have in common: images weighted, filtered row by row, and backprojected."""
 
+import warnings
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..errors import InputError
+from ..errors import InputError, InputWarning
 from ..geometry.grid import Grid
 from ..geometry.views import Views
 from ..memory import require
@@ -24,7 +26,13 @@ _BYTES_AT_ONCE = 2**26  # of filtered images
 _BEHIND = 1e-3  # of the distance from source to detector: nearer to the source, nothing is taken
 
 _SMALL_GAP, _OUTSTANDING = np.radians(20), 3
-"""A gap between neighbouring views belongs to their spacing if it is at most so large, or so many times the median one."""
+"""A gap between neighbouring views belongs to their spacing if it is at most so large, or so many times the usual one."""
+
+_EQUAL = 1e-6
+"""Angles that differ by less, as a share of the turn, are equal."""
+
+_FALLEN, _BY_NOISE = 0.05, 6
+"""Images have fallen to 0 where they are less than this share of the largest value, or so many deviations of the noise."""
 
 _MOST_TILT = np.radians(15)
 """Between an image's rows and the plane in which the views turn."""
@@ -45,9 +53,7 @@ def rows_across(images: Array, views: Views, axis: Array, name: str) -> tuple[Ar
         np.abs(steps @ axis) / np.linalg.norm(steps, axis=1) for steps in (views.u_steps, views.v_steps)
     )
     if along_columns.max() < along_rows.min():
-        turned = Views(
-            views.sources, views.detector_centers, views.v_steps, views.u_steps, views.shape[::-1], views.parallel
-        )
+        turned = replace(views, u_steps=views.v_steps, v_steps=views.u_steps, shape=views.shape[::-1])
         images, views, along_rows = images.swapaxes(1, 2), turned, along_columns
     worst = int(along_rows.argmax())
     if along_rows[worst] > np.sin(_MOST_TILT):
@@ -56,6 +62,18 @@ def rows_across(images: Array, views: Views, axis: Array, name: str) -> tuple[Ar
             f"the plane in which the views turn, more than {np.degrees(_MOST_TILT):.0f}: turn the images, or use sirt"
         )
     return images, views
+
+
+def warn_of_cut(images: Array, name: str) -> None:
+    """Warn where the images do not fall to about 0 at their edge columns: the filter takes what is beyond them for 0."""
+    edges = np.stack([images[:, :, :4], images[:, :, :-5:-1]], axis=-2, dtype=float)  # (M, n_v, 2, 4), outermost first
+    noise = np.sqrt(np.mean(np.diff(edges, 3) ** 2) / 20)  # neither values nor slopes count in third differences
+    largest, outermost = float(np.abs(images).max()), edges[..., :2].mean(axis=-1)
+    for means in (outermost, outermost.mean(axis=1), outermost.mean(axis=(0, 1))):  # pixels, views, both edges
+        found = float(np.abs(means).max())
+        if found > max(_FALLEN * largest, _BY_NOISE * noise * np.sqrt(means.size / outermost.size / 2)):
+            said = f"{name}: the images fall only to {found / largest:.0%} of their largest value at their edge columns"
+            return warnings.warn(f"{said}: what is beyond is missing, and values are wrong", InputWarning, stacklevel=3)
 
 
 def filtered_backprojection(
@@ -112,18 +130,22 @@ def _columns_beyond(matrices: Array, grid: Grid, n_u: int) -> int:
 def shares_of_turn(angles: Array, turn: float) -> tuple[Array, float, float]:
     """How much of a circle of circumference `turn` each angle stands for (M,): half the way to both neighbours.
 
-    Then the first angle after the largest gap, and that gap, if there is one: a gap that is large and far larger than the
-    others is an end and a beginning, and not half of it is added to these. Else the gap is 0.
+    Equal angles share alike what one of them would stand for. Then the first angle after the largest gap, and that gap, if
+    there is one: a gap that is large and far larger than most of the others is an end and a beginning, and not half of it is
+    added to these. Else the gap is 0.
     """
     order = np.argsort(angles % turn, kind="stable")
     angles = (angles % turn)[order]
     gaps = np.diff(angles, append=angles[0] + turn)  # from each to the next
-    widest, usual = int(gaps.argmax()), float(np.median(gaps))
-    gap = float(gaps[widest])
+    is_first = np.roll(gaps, 1) > _EQUAL * turn  # of equal ones
+    which = np.cumsum(is_first) % is_first.sum()
+    widest = int(gaps.argmax())
+    gap, others = float(gaps[widest]), np.sort(np.delete(gaps, widest))
+    usual = float(others[np.searchsorted(others.cumsum(), others.sum() / 2)])  # half of the rest is in gaps as large
     if gap > max(_SMALL_GAP, _OUTSTANDING * usual):
         gaps[widest] = usual
     else:
         gap = 0.0
     shares = np.empty(len(angles))
-    shares[order] = (gaps + np.roll(gaps, 1)) / 2
+    shares[order] = (np.bincount(which, (gaps + np.roll(gaps, 1)) / 2) / np.bincount(which))[which]
     return shares, float(angles[(widest + 1) % len(angles)]), gap

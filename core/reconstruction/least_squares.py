@@ -1,18 +1,23 @@
 """Least squares by iteration: SIRT and CGLS, and what they have in common with TV."""
 
+import warnings
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-from ..errors import InputError
+from ..errors import InputError, InputWarning
 from ..progress import Progress
 from ..projector import Projector
 from ..validation import instance, positive, real_array
 from .loop import Loop, Start, plain, waiting
 from .result import Array, Callback, Reconstruction
 from .stopping import StoppingRule
+
+_LEAN = 0.05
+"""Cosine between a gradient of CGLS and its first, 0 in exact numbers: below it volumes are within 1e-3 of theirs."""
+_LEANS = "CGLS: from iteration {} on rounding puts its volumes up to a few percent beside those of exact numbers"
 
 
 def sirt(
@@ -77,7 +82,7 @@ def sirt(
     relaxation = positive(relaxation, "relaxation")
     if relaxation >= 2:
         raise InputError(f"relaxation: expected less than 2, got {relaxation:g}")
-    problem = Problem.of(A, images, loop)
+    problem = Problem.of(A, images, loop.mask)
     per_pixel = inverse(problem.forward(problem.inside, loop.preparing()))
     per_voxel = np.float32(relaxation) * inverse(problem.adjoint(np.ones(A.shape_out, np.float32), loop.preparing()))
     residual: Array | None = None
@@ -93,13 +98,13 @@ def sirt(
         said(progress)
         return x, 0.5 * float(np.sum(per_pixel * np.square(residual, dtype=float)))
 
-    return loop.run(step, {"relaxation": relaxation, "nonnegative": nonnegative})
+    return loop.run(step, {"relaxation": relaxation, "nonnegative": nonnegative, **problem.record()})
 
 
 def cgls(
     A: Projector,
     images: ArrayLike,
-    iterations: int = 20,
+    iterations: int = 10,
     start: Start = None,
     mask: ArrayLike | None = None,
     callback: Callback | None = None,
@@ -110,6 +115,10 @@ def cgls(
 
     The fastest way to the least squares, whose values may be negative. It ends early where there is noise: about 5 to 20
     iterations are as sharp as hundreds of `sirt`.
+
+    Its gradients are at right angles to each other. Rounding makes those that come late lean to the first, and from then on,
+    often after 10 to 15 iterations, the volumes are not those of exact numbers, but a few percent beside them; they go on
+    towards the same least squares. A warning says where (Paige 1980; in double precision the same happens later).
 
     Parameters
     ----------
@@ -126,24 +135,27 @@ def cgls(
     InputError
         As of `sirt`.
 
+    Warns
+    -----
+    InputWarning
+        Rounding turns it off the way of exact numbers: up to there it keeps to them within 1e-3.
+
     References
     ----------
-    A. Bjorck, "Numerical Methods for Least Squares Problems", SIAM (1996), section 7.4.
+    A. Bjorck, "Numerical Methods for Least Squares Problems", SIAM (1996), section 7.4. C. C. Paige, "Accuracy and
+    effectiveness of the Lanczos algorithm for the symmetric eigenproblem", Linear Algebra and its Applications 34 (1980)
+    235-258.
     """
     loop = least_squares_loop("CGLS", A, iterations, start, mask, callback, progress, stop, nonnegative=False)
-    problem = Problem.of(A, images, loop)
+    problem = Problem.of(A, images, loop.mask)
 
     def step(number: int, x: Array, progress: Progress | None) -> tuple[Array, float]:
         if not loop.state:
             residual: Array = problem.images - problem.forward(x, waiting(progress, 0, 2))
             direction = problem.adjoint(residual, waiting(progress, 0, 2))
-            loop.state = {
-                **problem.known,
-                "residual": residual,
-                "direction": direction,
-                "gradient": _squares(direction),
-            }
+            loop.state = {"residual": residual, "direction": direction, "gradient": _squares(direction)}
         residual, direction, before = (loop.state[name] for name in ("residual", "direction", "gradient"))
+        first = loop.state.setdefault("first", direction)
         change = problem.forward(direction, waiting(progress, 0, 2))
         length = _squares(change)
         if length > 0:  # else the least squares are reached
@@ -153,11 +165,14 @@ def cgls(
             gradient = problem.adjoint(residual, waiting(progress, 1, 2))
             after = _squares(gradient)
             direction = gradient + (after / before).astype(np.float32) * direction
-            loop.state = {**problem.known, "residual": residual, "direction": direction, "gradient": after}
+            loop.state |= {"residual": residual, "direction": direction, "gradient": after}
+            if float(np.vdot(first, gradient)) ** 2 > _LEAN**2 * after * _squares(first):
+                loop.state["first"] = np.zeros_like(first)  # it is said once
+                warnings.warn(_LEANS.format(number + 1), InputWarning, stacklevel=2)
         said(progress)
         return x, 0.5 * float(_squares(residual))
 
-    return loop.run(step, {})
+    return loop.run(step, problem.record())
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,24 +184,15 @@ class Problem:
     inside: Array  # 1 where x may be other than 0
 
     @classmethod
-    def of(cls, A: Projector, images: ArrayLike, loop: Loop) -> "Problem":
-        """Checked: the images without the model's background. Raises InputError, also where a resumed one had others."""
+    def of(cls, A: Projector, images: ArrayLike, mask: NDArray[np.bool_] | None) -> "Problem":
+        """Checked: the images without the model's background. Raises InputError."""
         measured: Array = real_array(plain(images), "images", A.shape_out, np.float32) - A.background.astype(np.float32)
-        everywhere = np.ones(A.shape_in, np.float32)
-        problem = cls(A, measured, everywhere if loop.mask is None else loop.mask.astype(np.float32))
-        if loop.state and not np.allclose(
-            loop.state.get("problem", np.nan), problem.known["problem"], rtol=1e-9, atol=0
-        ):
-            raise InputError(
-                "start: this reconstruction is of other images, views or mask; give its volume to begin with that"
-            )
-        return problem
+        return cls(A, measured, np.ones(A.shape_in, np.float32) if mask is None else mask.astype(np.float32))
 
-    @property
-    def known(self) -> dict[str, Array]:
-        """For an algorithm's state: by what images and mask are known again when it is resumed."""
-        sums = (self.images.sum(dtype=float), self.inside.sum(dtype=float))
-        return {"problem": np.array([*self.images.shape, *sums])}
+    def record(self) -> dict[str, float]:
+        """For a reconstruction's settings: by what images and mask, in their order, are known again when it is resumed."""
+        sums = {"images": self.images.sum(axis=(1, 2), dtype=float), "mask": self.inside.sum(axis=(1, 2), dtype=float)}
+        return {name: float(of_each @ np.linspace(1.0, 2.0, len(of_each))) for name, of_each in sums.items()}
 
     def forward(self, x: Array, progress: Progress | None) -> Array:
         """``A x``, float32."""

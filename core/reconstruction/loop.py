@@ -1,11 +1,12 @@
 """The loop of all iterative reconstructions: start and resume, log, callback, progress, cancelling and stopping."""
 
+import math
 import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from ..arrays import is_tensor, to_numpy
 from ..errors import InputError, naming
@@ -25,6 +26,9 @@ Step = Callable[[int, Array, Progress | None], tuple[Array, float]]
 iteration's own: call it as ``progress(done, total)``, the last time with done = total.
 """
 
+Objective = Callable[[Array, Progress | None], float]
+"""Of any volume, by the data and settings of a call: ``objective(values, progress)``."""
+
 
 class Loop:
     """The iterations of one call of an algorithm. Arguments are checked when it is made.
@@ -38,7 +42,7 @@ class Loop:
             ...
             return new_values, objective
 
-        return loop.run(step, {"relaxation": relaxation})
+        return loop.run(step, {"relaxation": relaxation}, objective)
 
     Parameters
     ----------
@@ -93,9 +97,11 @@ class Loop:
         self.mask = None if mask is None else inside(mask, "mask", A.shape_in)
         self.state: dict[str, Array] = {}
         self._objective: list[float] = []
+        self._resumed: Mapping[str, Any] = {}  # the settings of what is resumed
         if isinstance(start, Reconstruction):
             if start.settings.get("method") == method:
                 self.state, self._objective = dict(start.state), [float(number) for number in start.objective]
+                self._resumed = start.settings
             start = start.volume
         self._quantity = start.quantity if isinstance(start, Volume) else quantity
         self.values = self._first_values(start, default, negative)
@@ -105,21 +111,29 @@ class Loop:
         """Iterations done, those before a resume included."""
         return len(self._objective)
 
+    def inside(self, seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Those of the voxels `seen` that are in the mask, too."""
+        return seen if self.mask is None else seen & self.mask
+
     def preparing(self) -> Progress | None:
         """The progress callback for what is prepared before the first iteration: it only asks whether to go on."""
         return waiting(self._progress, 0, self._iterations)
 
-    def run(self, step: Step, settings: Mapping[str, Any]) -> Reconstruction:
-        """Do the iterations; `settings` are the algorithm's arguments.
+    def run(self, step: Step, settings: Mapping[str, Any], objective: Objective | None = None) -> Reconstruction:
+        """Do the iterations; `settings` are the algorithm's arguments, and what its data are known by.
 
-        A `Cancelled` of progress or callback takes along what was done before, as its `reconstruction`.
+        Where a reconstruction is resumed, they and the objective of its volume must be what they were, else `InputError`. A
+        `Cancelled` of progress or callback takes along what was done before, as its `reconstruction`.
         """
         result = self._result(settings, "cancelled")
         try:
+            if self._objective:
+                asked = {} if objective is None else {"objective": objective(self.values, self.preparing())}
+                self._require_as_before({**settings, **asked})
             for i in range(self._iterations):
-                values, objective = step(self.done, self.values, part_of(self._progress, i, self._iterations))
+                values, reached = step(self.done, self.values, part_of(self._progress, i, self._iterations))
                 self.values = self._only_inside(values)
-                self._objective.append(float(objective))
+                self._objective.append(float(reached))
                 result = self._result(settings, "cancelled")
                 if self._callback is not None and self._callback(self.done, self.values):
                     return self._result(settings, "callback")
@@ -131,6 +145,15 @@ class Loop:
             cancelled.reconstruction = result
             raise
         return self._result(settings, "iterations")
+
+    def _require_as_before(self, settings: Mapping[str, Any]) -> None:
+        known = {**settings, **self._resumed, "objective": self._objective[-1]}
+        said = [f"{key} {known[key]}, now {new}" for key, new in settings.items() if not _same(new, known[key])]
+        if said:
+            raise InputError(
+                "start: this reconstruction is of other images, views or mask, or another model or other settings "
+                f"({'; '.join(said)}): give its volume (--start) to begin with that"
+            )
 
     def _result(self, settings: Mapping[str, Any], stopped: str) -> Reconstruction:
         volume = Volume(self.values, self._A.grid, self._quantity)
@@ -152,6 +175,11 @@ class Loop:
         if self.mask is not None:
             values = np.where(self.mask, values, np.float32(0))
         return freeze(np.ascontiguousarray(values))
+
+
+def _same(one: Any, other: Any) -> bool:
+    """Whether settings are equal, numbers but for the rounding by which backends differ."""
+    return bool(one == other) or (type(one) is type(other) is float and math.isclose(one, other, rel_tol=1e-7))
 
 
 def waiting(progress: Progress | None, done: int, total: int) -> Progress | None:

@@ -3,6 +3,7 @@
 `METHODS` is the only list: settings of recipes, options of ``mphdrr reconstruct`` and Blender's panel follow from it.
 """
 
+import inspect
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -25,6 +26,11 @@ class Method(NamedTuple):
     of_counts: bool = True  # whether it needs counts; else it takes any images
     objective: str = "log-likelihood"  # what `Reconstruction.objective` is
 
+    @property
+    def iterations(self) -> int:
+        """How many it does unless it is told."""
+        return int(inspect.signature(self.function).parameters["iterations"].default)
+
 
 METHODS = {
     method.name: method
@@ -35,11 +41,11 @@ METHODS = {
                mlem, ("background", "prior")),
         Method("bsrem", "BSREM", "Likeliest activity, less the penalty of a prior: the very maximum", bsrem,
                ("subsets", "background", "prior")),
-        Method("sirt", "SIRT", "Least squares of line integrals, steadily (about 100 iterations)", sirt, (), False,
+        Method("sirt", "SIRT", "Least squares of line integrals, steadily", sirt, (), False,
                "squared error"),
-        Method("cgls", "CGLS", "Least squares of line integrals, fast (about 10 iterations); values may be negative", cgls,
+        Method("cgls", "CGLS", "Least squares of line integrals, fast; values may be negative", cgls,
                (), False, "squared error"),
-        Method("tv", "TV", "Areas of one value with sharp edges, from line integrals (about 200 iterations)", tv,
+        Method("tv", "TV", "Areas of one value with sharp edges, from line integrals", tv,
                ("weight",), False, "squared error with variation"),
     )
 }  # fmt: skip

@@ -50,7 +50,8 @@ class Prior(ABC):
     """A penalty ``weight * sum over pairs of neighbours of w_jk psi(x_j, x_k)``; `psi` is the subclass's.
 
     The w_jk are the smallest distance of two voxels divided by that of these two, so that all are 1 or less, and voxels
-    that are longer in one direction count less there.
+    that are longer in one direction count less there. Reconstructions count the pairs of voxels that are both in their mask
+    and seen.
 
     Attributes
     ----------
@@ -92,9 +93,9 @@ class Prior(ABC):
         if self.similar is not None and whole_number(self.similar, "prior: similar") > self.neighbors:
             raise InputError(f"prior: similar: expected at most the {self.neighbors} neighbors, got {self.similar}")
 
-    def on(self, grid: Grid) -> "Penalty":
-        """The penalty of volumes on a grid. Raises InputError where `anatomy` has another."""
-        return Penalty(self, grid)
+    def on(self, grid: Grid, inside: NDArray[np.bool_] | None = None) -> "Penalty":
+        """The penalty of a volume on a grid, of pairs of voxels `inside`. Raises InputError where `anatomy` has another."""
+        return Penalty(self, grid, inside)
 
     def record(self) -> dict[str, Any]:
         """For a reconstruction's settings."""
@@ -277,11 +278,13 @@ class TotalVariation(Prior):
 class Penalty:
     """A prior on a grid: its value, gradient and curvature for volumes (arrays of the grid's shape).
 
-    Results are of the array's type, float32 or float64; the value is a float.
+    Results are of the array's type, float32 or float64; the value is a float. Only pairs count of which both voxels are
+    `inside`, as if the grid ended there: what is beyond, such as the zeros outside a mask, pulls at nothing.
     """
 
-    def __init__(self, prior: Prior, grid: Grid) -> None:
+    def __init__(self, prior: Prior, grid: Grid, inside: NDArray[np.bool_] | None = None) -> None:
         self._prior, self._shape, self._threads = prior, grid.shape, thread_count(None)
+        self._inside = None if inside is None or inside.all() else inside
         steps = _half_of_neighbors(prior.neighbors)
         lengths = [float(np.linalg.norm(grid.affine[:3, :3] @ step)) for step in steps]
         self._closeness = [min(lengths) / length for length in lengths]
@@ -334,6 +337,9 @@ class Penalty:
             ranges = [(slice(0, planes), slice(step[0], step[0] + planes)), *map(_shifted, step[1:])]
             one, other = zip(*ranges, strict=True)
             share = None if self._shares is None else self._shares[number][first : first + planes][:, one[1], one[2]]
+            if self._inside is not None:
+                slab = self._inside[first : end + 1]
+                share = (slab[one] & slab[other]) * (np.uint8(2) if share is None else share)
             found.append(Pairs(one, other, self._closeness[number], share))
         return found
 
@@ -342,7 +348,8 @@ class Penalty:
         if not same_lattice(anatomy.grid, grid):
             raise InputError("prior: anatomy's grid is not the reconstruction's: resample it (resample(volume, grid))")
         require((len(self._steps) + 8) * grid.n_voxels, "the prior's anatomy")
-        padded = np.pad(anatomy.array, 1, constant_values=np.inf)
+        known = anatomy.array if self._inside is None else np.where(self._inside, anatomy.array, np.float32(np.inf))
+        padded = np.pad(known, 1, constant_values=np.inf)
         limits = np.empty(grid.shape, np.float32)
         both = [sign * np.array(step) for step in self._steps for sign in (1, -1)]
         for _, first, end in self._slabs():
@@ -360,14 +367,17 @@ class Penalty:
         return shares
 
 
-def penalty_of(prior: Prior | None, grid: Grid) -> Penalty | None:
-    """The penalty on a grid; None without a prior or weight. Raises InputError where it is no prior, or not for the grid."""
+def penalty_of(prior: Prior | None, grid: Grid, inside: NDArray[np.bool_]) -> Penalty | None:
+    """The penalty of pairs of voxels inside; None without a prior or weight.
+
+    Raises InputError where it is no prior, or not for the grid.
+    """
     if prior is None:
         return None
     if not isinstance(prior, Prior):
         known = "Quadratic, RelativeDifference or TotalVariation"
         raise InputError(f"prior: expected {known}, got {type(prior).__name__}")
-    penalty = prior.on(grid)
+    penalty = prior.on(grid, inside)
     return penalty if prior.weight else None
 
 

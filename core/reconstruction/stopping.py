@@ -1,12 +1,13 @@
 """When an iterative reconstruction ends before its last iteration."""
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..errors import InputError
+from ..errors import InputError, InputWarning
 from ..validation import positive
 from .result import Array
 
@@ -42,7 +43,8 @@ class StopWhen(StoppingRule):
         The objective has changed by at most this share of its size since the iteration before, such as 1e-5.
     noise : float, optional
         The standard deviation of the values in `region` is at least this share of their mean, such as 0.15. While the
-        likelihood grows, so does the noise: this ends before it is larger than wanted.
+        likelihood grows, so does the noise: this ends before it is larger than wanted. A region of zeros has no noise:
+        it ends nothing, and a warning says so.
     region : array of bool, optional
         Of the grid's shape: voxels of the same activity, some voxels away from edges, in which `noise` is measured.
     seconds : float, optional
@@ -83,7 +85,11 @@ class StopWhen(StoppingRule):
                 return "change"
         if self.noise is not None:
             chosen = values[self.region].astype(np.float64)  # type: ignore[index]
-            if chosen.std() >= self.noise * chosen.mean():
+            if not chosen.any():
+                if len(objective) == 1:
+                    text = "stop: region: its voxels are all 0 after iteration 1: no noise ends it while they are"
+                    warnings.warn(text, InputWarning, stacklevel=2)
+            elif chosen.std() >= self.noise * chosen.mean():
                 return "noise"
         if self.seconds is not None and seconds >= self.seconds:
             return "seconds"

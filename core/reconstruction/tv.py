@@ -29,7 +29,8 @@ def tv(
     """The volume with the least ``||A x - images||^2 / 2 + weight TV(x)``: areas of one value with sharp edges.
 
     TV, the total variation, sums the size of the gradient over the voxels: the root of the squared differences to the next
-    voxel along each axis, by the axis's spacing in units of the smallest. It makes up for views that are few or noisy.
+    voxel along each axis, by the axis's spacing in units of the smallest. Differences count between voxels that are both in
+    the mask and met by rays. It makes up for views that are few or noisy.
 
     Parameters
     ----------
@@ -58,11 +59,13 @@ def tv(
     """
     loop = least_squares_loop("TV", A, iterations, start, mask, callback, progress, stop, nonnegative=nonnegative)
     weight = positive(weight, "weight")
-    require(4 * (10 * A.grid.n_voxels + 5 * int(np.prod(A.shape_out))), "the arrays of tv")
-    problem = Problem.of(A, images, loop)
+    require(4 * (13 * A.grid.n_voxels + 5 * int(np.prod(A.shape_out))), "the arrays of tv")
+    problem = Problem.of(A, images, loop.mask)
     closeness = A.grid.spacing.min() / A.grid.spacing
     per_pixel = inverse(problem.forward(problem.inside, loop.preparing()))
     weights = problem.adjoint(np.ones(A.shape_out, np.float32), loop.preparing())
+    is_seen = (weights > 0).astype(np.float32)
+    pairs = (_gradient(is_seen, np.ones(3, np.float32)) == 0) * is_seen  # 1 where a voxel and the next one are seen
     # The gradient is scaled so that it has as much weight in a voxel as its rays have.
     scale = float(weights.mean()) / max(float(problem.inside.mean()), 1e-6) / float(2 * closeness.sum()) or 1.0
     factors = (scale * closeness).astype(np.float32)
@@ -77,7 +80,7 @@ def tv(
             loop.state = {"seen": seen, "ahead": seen, "beyond": x, "misfit": np.zeros_like(seen), "slopes": nothing}
         seen, ahead, beyond, misfit, slopes = (loop.state[s] for s in ("seen", "ahead", "beyond", "misfit", "slopes"))
         misfit = (misfit + per_pixel * (ahead - problem.images)) / (1 + per_pixel)
-        slopes = slopes + per_gradient * _gradient(beyond, factors)
+        slopes = pairs * (slopes + per_gradient * _gradient(beyond, factors))
         slopes /= np.maximum(1, np.sqrt(np.sum(slopes**2, axis=0)) / radius)
         back = problem.adjoint(misfit, waiting(progress, 0, 2)) + _gradient_adjoint(slopes, factors)
         new = x - per_voxel * back
@@ -85,38 +88,27 @@ def tv(
             new = np.maximum(new, np.float32(0))
         now = problem.forward(new, waiting(progress, 1, 2))
         ahead, beyond = 2 * now - seen, 2 * new - x
-        loop.state = {
-            **problem.known, "seen": now, "ahead": ahead, "beyond": beyond, "misfit": misfit, "slopes": slopes
-        }  # fmt: skip
+        loop.state = {"seen": now, "ahead": ahead, "beyond": beyond, "misfit": misfit, "slopes": slopes}
         said(progress)
         squares = float(np.sum(np.square(now - problem.images, dtype=float)))
-        return new, 0.5 * squares + weight * total_variation(new, A.grid)
+        return new, 0.5 * squares + weight * total_variation(new, A.grid, pairs)
 
-    return loop.run(step, {"weight": weight, "nonnegative": nonnegative})
+    return loop.run(step, {"weight": weight, "nonnegative": nonnegative, **problem.record()})
 
 
-def total_variation(x: Array, grid: Grid) -> float:
-    """Sum of the sizes of the gradient of `x`, as `tv` defines them."""
-    slopes = _gradient(x.astype(np.float64), grid.spacing.min() / grid.spacing)
+def total_variation(x: Array, grid: Grid, pairs: Array | float = 1.0) -> float:
+    """Sum of the sizes of the gradient of `x`, as `tv` defines them; `pairs` (3, ...) are 0 where they do not count."""
+    slopes = pairs * _gradient(x.astype(np.float64), grid.spacing.min() / grid.spacing)
     return float(np.sum(np.sqrt(np.sum(slopes**2, axis=0))))
 
 
 def _gradient(x: Array, factors: Array) -> Array:
     """Differences to the next voxel along each axis, times the axis's factor, (3, ...); 0 at the end."""
-    slopes = np.zeros((3, *x.shape), x.dtype)
-    for axis, factor in enumerate(factors):
-        inner = tuple(slice(0, -1) if a == axis else slice(None) for a in range(3))
-        slopes[axis][inner] = factor * np.diff(x, axis=axis)
-    return slopes
+    ends = [np.take(x, [-1], axis) for axis in range(3)]
+    return np.stack([f * np.diff(x, axis=axis, append=ends[axis]) for axis, f in enumerate(factors)])
 
 
 def _gradient_adjoint(slopes: Array, factors: Array) -> Array:
     """The adjoint of `_gradient`."""
-    total = np.zeros_like(slopes[0])
-    for axis, factor in enumerate(factors):
-        lower, upper = [slice(None)] * 3, [slice(None)] * 3
-        lower[axis], upper[axis] = slice(0, -1), slice(1, None)
-        part = factor * slopes[axis][tuple(lower)]
-        total[tuple(lower)] -= part
-        total[tuple(upper)] += part
-    return total
+    inner = [np.delete(slopes[axis], -1, axis) for axis in range(3)]
+    return -sum(f * np.diff(inner[axis], axis=axis, prepend=0, append=0) for axis, f in enumerate(factors))

@@ -91,7 +91,9 @@ def reconstruct_run(
     grid = reconstruction_grid(run, recipe)
     require(16.0 * grid.n_voxels, "a reconstruction of {} x {} x {} voxels".format(*grid.shape))
     modelled = model_of(run, recipe, grid)
-    _warn_if_flattering(run, grid, modelled)
+    flatters = flattering(run, grid, modelled)
+    for text in flatters:
+        _warn(text)
     if recipe["reconstruction.ignore_attenuation"]:
         mu = None
     A = projector_of_run(run, grid, mu, modelled, recipe["compute.backend"], recipe["compute.threads"], stages)
@@ -104,7 +106,7 @@ def reconstruct_run(
     found = method.function(
         A,
         line_integrals(run, recipe),
-        iterations=recipe["reconstruction.iterations"],
+        iterations=recipe["reconstruction.iterations"] or method.iterations,
         start=start,
         stop=rules if watch is None else _Watched(watch, rules),
         progress=stages("reconstructing"),
@@ -113,7 +115,7 @@ def reconstruct_run(
     volume = found.volume
     if run.volume is not None:  # a radiograph's is not of activity
         volume = Volume(volume.array, grid, run.volume.quantity)
-    return replace(found, volume=volume, settings={**found.settings, "recipe": recipe.tables()})
+    return replace(found, volume=volume, settings={**found.settings, "recipe": recipe.tables(), "flatters": flatters})
 
 
 class _Watched(StoppingRule):
@@ -243,28 +245,32 @@ def line_integrals(run: ProjectionRun, recipe: Recipe) -> NDArray[np.float32]:
     return np.asarray(np.log(photons / np.maximum(run.projections, 0.5)), np.float32)
 
 
-def _warn_if_flattering(run: ProjectionRun, grid: Grid, model: Recipe) -> None:
-    """Warn where a run was simulated with a model that is hardly better than that of the reconstruction."""
+def flattering(run: ProjectionRun, grid: Grid, model: Recipe | None = None) -> list[str]:
+    """Why figures of a reconstruction on a grid flatter: the run was simulated with hardly better voxels, or hardly a better
+    model of the hole.
+
+    `model` is that of the reconstruction; without it, what is said holds if it reckons as the run was made.
+    """
     if run.volume is None:  # measured
-        return
-    made = run.recipe
+        return []
+    said, made, points = [], run.recipe if "recipe" in run.settings else Recipe(), "model.aperture_points"
     fine, coarse = float(run.volume.grid.spacing.max()), float(grid.spacing.min())
     if 2 * fine > 1.001 * coarse:
-        _warn(
+        said.append(
             f"the run was made from voxels of {fine:.3g} mm: figures of a reconstruction in voxels of {coarse:.3g} mm "
             f"flatter, unless its voxels are {coarse / 2:.3g} mm or less"
         )
-    points = "model.aperture_points"
-    if made["model.hole"] == model["model.hole"] == "depth":
-        _warn(
-            "the run was made with the hole by depth, as the reconstruction reckons: its figures flatter, unless the run is "
-            "made with rays"
+    if made["model.hole"] == "depth" and (model is None or model["model.hole"] == "depth"):
+        said.append(
+            "the run was made with the hole by depth: figures of a reconstruction that reckons so, too, flatter, unless the "
+            "run is made with rays"
         )
-    if made["model.aperture_tolerance"] is None and 1 < made[points] <= model[points]:
-        _warn(
-            f"the run was made with {made[points]} points of the hole, and the reconstruction reckons with {model[points]}: "
-            "its figures flatter, unless the run has more points"
+    if made["model.aperture_tolerance"] is None and 1 < made[points] <= (model or made)[points]:
+        said.append(
+            f"the run was made with {made[points]} points of the hole: figures of a reconstruction that reckons with as "
+            "many flatter, unless the run has more points"
         )
+    return said
 
 
 def _warn(text: str) -> None:

@@ -266,7 +266,8 @@ _DECLARED = (
             "their expected means", least=0, needs=("model.kind=emission or model.photons", _MADE), option="--noise"),
     Setting("reconstruction.method", str, "osem", "How the volume is found",
             words={method.name: (method.label, method.text) for method in METHODS.values()}),
-    Setting("reconstruction.iterations", int, 10, "How often all images are used", least=1, slider=100),
+    Setting("reconstruction.iterations", int, None, "How often all images are used", "what suits the method: "
+            + ", ".join(f"{method.label} {method.iterations}" for method in METHODS.values()), least=1, slider=100),
     Setting("reconstruction.subsets", int, None, "Of the modules: each of an iteration's updates uses one of them",
             "about a fifth of the modules' number", least=1, slider=80, needs=(_methods("subsets"),)),
     Setting("reconstruction.voxels", int, (64,), "Voxels along x y z, or one number for all", least=1, sizes=(1, 3)),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from unittest.mock import MagicMock
 
 import bpy
@@ -13,6 +14,7 @@ from mphdrr.addon import ids, jobs, plots, reconstructions, registration, scanne
 from mphdrr.addon.reconstruction_properties import PROPERTIES, drawn, settings_recipe
 from mphdrr.core.progress import Cancelled
 from mphdrr.core.runs.files import read_run
+from mphdrr.core.runs.run_recipe import truth_of_run
 from mphdrr.core.runs.settings import SETTINGS
 
 SMALL = {"voxels": 14, "spacing": 7.0, "iterations": 3, "subsets": 2}
@@ -67,6 +69,9 @@ def test_the_volume_is_that_of_the_command_line(render, scene):
     assert known["title"] == "OSEM, 3 iterations" and known["name"] == "log-likelihood"
     np.testing.assert_allclose(known["objective"], expected.objective)
     assert known["scores"][0][0] == "NRMSE" and len(known["scores"]) == 7
+    assert known["flatters"] == expected.settings["flatters"]
+    rods = mph.score_volume(expected.volume, *truth_of_run(run)).derenzo
+    assert [tuple(line) for line in known["scores"][1:]] == [(f"{s.rod_diameter:g} mm rods", s.words) for s in rods]
     assert bpy.data.images[ids.RECONSTRUCTION].size[:] == (1600, 850)
 
 
@@ -81,6 +86,17 @@ def test_panel_settings_count_and_scripts_override_them(render, scene):
         bpy.ops.mphdrr.reconstruct(subsets=2)
     with pytest.raises(RuntimeError, match="weight"):
         bpy.ops.mphdrr.reconstruct(prior="QUADRATIC")
+
+
+def test_without_a_number_each_method_does_its_own(render, scene):
+    panel = scene.mphdrr_reconstruction
+    panel.voxels, panel.spacing = 6, 16.0
+    assert panel.iterations == 0
+    for method, own in (("OSEM", 10), ("MLEM", 50), ("BSREM", 30)):
+        panel.method = method
+        assert bpy.ops.mphdrr.reconstruct() == {"FINISHED"}
+        assert panel.known["title"] == f"{method}, {own} iterations"
+    assert "OSEM 10, MLEM 50, BSREM 30, SIRT 100" in panel.bl_rna.properties["iterations"].description
 
 
 def test_every_setting_is_in_the_panel_or_left_to_files(scene):
@@ -179,7 +195,7 @@ def test_the_scenes_attenuation_is_modelled_and_missed(render, scene):
 
 
 def test_the_panel_draws_the_result(render, scene):
-    bpy.ops.mphdrr.reconstruct(**SMALL)
+    bpy.ops.mphdrr.reconstruct(**SMALL | {"spacing": 4.0})  # not much more than that of the run
     (cls,) = (cls for cls in registration.CLASSES if cls.__name__ == "MPHDRR_PT_reconstruction")
     layout = MagicMock()
     for part in ("box", "column", "row", "split"):
@@ -187,6 +203,14 @@ def test_the_panel_draws_the_result(render, scene):
     cls.draw(MagicMock(layout=layout), bpy.context)
     said = [options["text"] for _, _, options in layout.mock_calls if options.get("text")]
     assert {"OSEM, 3 iterations", "Log-likelihood", "NRMSE", "8 mm rods", "Show Slices", "Reconstruct"} <= set(said)
+    flatters = scene.mphdrr_reconstruction.known["flatters"]
+    assert flatters and all(word in " ".join(said) for word in " ".join(flatters).split()), (
+        "the warning stays with the score"
+    )
+    record = json.loads(scene.mphdrr_reconstruction.record)
+    del record["flatters"]  # as earlier versions have it
+    scene.mphdrr_reconstruction.record = json.dumps(record)
+    cls.draw(MagicMock(layout=layout), bpy.context)
     assert layout.template_icon.call_args.kwargs["icon_value"] > 0 or bpy.app.background
     plots.stop()
     assert plots.objective_icon([1.0]) >= 0

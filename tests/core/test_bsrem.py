@@ -128,6 +128,40 @@ def test_a_prior_that_is_too_strong_stays_positive(small):
     assert found.std() < 0.05 * found.mean()
 
 
+@pytest.fixture(scope="module")
+def even(scanner):
+    """Exact counts of 10 everywhere in a mask, a ball off the centre, in a grid whose corners no module sees."""
+    system = scanner[::8]
+    grid = mph.Grid.centered((12, 11, 10), (14.0, 14.0, 30.0))
+    with pytest.warns(mph.InputWarning):
+        A = mph.Projector(grid, system.views((16, 16), "real"), mph.Emission(system, time=3e5, pixel_points=4))
+    x, y, z = grid.affine[:3, 3, None, None, None] + np.indices(grid.shape) * grid.spacing[:, None, None, None]
+    mask = (x - 5) ** 2 + (y + 7) ** 2 + z**2 < 62**2
+    return A, mask, A(10.0 * mask)
+
+
+@pytest.mark.parametrize("prior", [mph.Quadratic, mph.RelativeDifference, mph.TotalVariation])
+@pytest.mark.parametrize("neighbors", [6, 26])
+@pytest.mark.parametrize("weight", [2.0, 50.0])
+def test_a_uniform_volume_in_its_mask_stays_so_up_to_its_edge(even, prior, neighbors, weight):
+    A, mask, counts = even
+    penalty = prior(weight, neighbors=neighbors)
+    for method, rounds, least in ((mph.bsrem, 8, 1e-3), (mph.osem, 8, 1e-2), (mph.mlem, 16, 1e-2)):
+        more = {} if method is mph.mlem else {"subsets": 2}
+        found = method(A, counts, rounds, prior=penalty, mask=mask, **more).volume.array
+        assert np.abs(found[mask] / 10 - 1).max() < least and not found[~mask].any(), method.__name__
+
+
+@pytest.mark.parametrize("prior", [mph.Quadratic(30.0), mph.RelativeDifference(30.0), mph.TotalVariation(30.0)],
+                         ids=lambda prior: type(prior).__name__)  # fmt: skip
+def test_voxels_that_no_module_sees_pull_at_none(even, prior):
+    A = even[0]
+    unseen = A.T(np.ones(A.shape_out, np.float32)) == 0
+    assert 0.05 < unseen.mean() < 0.9
+    found = mph.bsrem(A, A(np.full(A.shape_in, 10.0)), 10, 2, prior).volume.array
+    assert np.abs(found[~unseen] / 10 - 1).max() < 1e-3 and not found[unseen].any()
+
+
 def test_relaxed_steps_are_shorter_and_zeros_and_masks_are_kept(small):
     start = np.ones(small.A.shape_in)
     start[:3] = 0
@@ -162,3 +196,14 @@ def test_what_cannot_be_is_refused(small, method, given, words):
         method(small.A, small.counts, 1, **given)
     with pytest.raises(mph.InputError, match="relaxation: expected 0 or more"):
         mph.bsrem(small.A, small.counts, 1, relaxation=-1)
+
+
+@pytest.mark.parametrize("prior", PRIORS, ids=lambda prior: type(prior).__name__)
+def test_the_rule_that_the_page_names_leaves_no_voxel_far_from_the_maximum(small, prior):
+    """While 1e-6 of the objective may be a few percent of a voxel."""
+    given = (small.A, small.counts, 150, 2, prior)
+    best = mph.bsrem(*given, background=0.3).volume.array
+    mean = best[best > 0.1 * best.max()].mean()
+    found = mph.bsrem(*given, background=0.3, stop=mph.StopWhen(change=1e-8))
+    assert found.settings["stopped"] == "change" and found.iterations < 100
+    assert np.abs(found.volume.array - best).max() < 0.01 * mean

@@ -172,6 +172,8 @@ def test_noise_is_drawn_when_read(small):
         event.images("spect")
     with pytest.raises(mph.InputError, match="no radon of '7'; there are 6, 8"):
         event.radon(7)
+    found = mph.fbp(event.radon(8), event.radon_views(8), event.truth.grid)
+    assert found.quantity == event.truth.quantity == "activity"
 
 
 def test_a_set_is_read_filtered_joined_and_pickled(small, tmp_path):

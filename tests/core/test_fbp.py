@@ -1,5 +1,7 @@
 """Filtered backprojection of parallel views: values, windows, angles, and the kernel beside numpy."""
 
+import warnings
+
 import numpy as np
 import pytest
 
@@ -144,10 +146,99 @@ def test_derenzo_meets_its_errors():
         assert relative_error(mph.fbp(images, views, grid).array, truth) < most
 
 
+@pytest.mark.parametrize("angles", [
+    np.linspace(0, 2 * np.pi, 13),
+    np.linspace(0, 2 * np.pi, 17) + 0.3,
+    np.linspace(0, np.pi, 9),
+    np.repeat(np.arange(10) * np.pi / 10, [1, 3, 1, 1, 2, 1, 5, 1, 1, 1]),
+    np.tile(np.arange(11) * np.pi / 11, 6),  # six turns
+    np.linspace(0, 2 * np.pi, 13) + np.random.default_rng(4).normal(0, 1e-4, 13),  # as measured
+], ids=["13", "17", "half a turn", "repeated", "six turns", "nearly equal"])  # fmt: skip
+def test_equal_angles_count_once(angles):
+    """The sum is the object's, and nothing is said to be missing."""
+    views = views_of(angles, columns=96)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        volume = mph.fbp(images_of(views), views, mph.Grid.centered((96, 96, 1), 1.0))
+    assert volume.array.sum() == pytest.approx(DISC[:, :, 0].sum(), rel=0.01)
+
+
+def test_equal_angles_share_alike():
+    """So noise falls with the number of turns."""
+    noise = np.random.default_rng(5).standard_normal((4, 40, 3, 64))
+    deviations = []
+    for turns in (1, 4):
+        views = views_of(np.tile(np.arange(40) * np.pi / 40, turns))
+        deviations.append(mph.fbp(noise[:turns].reshape(-1, 3, 64), views, GRID).array.std())
+    assert deviations[1] == pytest.approx(deviations[0] / 2, rel=0.05)
+
+
+def test_views_that_are_missing_among_repeated_ones_are_said():
+    views = views_of(np.repeat(np.linspace(0, 2.0, 30), 3))
+    with pytest.warns(mph.InputWarning, match="65 degrees of the half circle have no view"):
+        mph.fbp(images_of(views), views, GRID)
+
+
+def shifted(views, columns):
+    """Views whose detectors are so many columns aside."""
+    centers = views.detector_centers + columns * views.u_steps
+    return mph.Views(views.sources + columns * views.u_steps, centers, views.u_steps, views.v_steps, views.shape, True)
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.05, 0.5])
+@pytest.mark.parametrize("case", ["displaced", "narrow", "one side of some views", "background"])
+def test_images_that_do_not_fall_to_0_at_their_edges_are_said(case, noise):
+    views = views_of(np.arange(72) * np.pi / 36, rows=8)
+    if case == "displaced":
+        views = shifted(views, 24)
+    elif case == "narrow":
+        views = views_of(np.arange(72) * np.pi / 36, columns=30, rows=8)
+    images = images_of(views, center=(16.0, 0.0) if case == "one side of some views" else (0.0, 0.0))
+    images = images + 8.0 * (case == "background")
+    images = images + noise * 0.1 * images.max() * np.random.default_rng(6).standard_normal(images.shape)
+    with pytest.warns(
+        mph.InputWarning, match=r"fbp: the images fall only to \d+% of their largest value at their edge"
+    ):
+        mph.fbp(images, views, GRID)
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.1, 1.0])
+@pytest.mark.parametrize("rows", [1, 20])
+def test_images_that_hold_the_object_are_not_warned_of(rows, noise):
+    views = views_of(np.arange(90) * np.pi / 45, columns=44, rows=rows)  # the disc is 40 wide
+    images = images_of(views, center=(0.5, -0.5))
+    images = images + noise * 0.1 * images.max() * np.random.default_rng(7).standard_normal(images.shape)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        mph.fbp(images, views, GRID)
+        mph.fbp(0 * images, views, GRID)
+
+
 def test_missing_directions_are_said():
     views = views_of(np.linspace(0, 2.0, 60))
     with pytest.warns(mph.InputWarning, match="65 degrees of the half circle have no view"):
         mph.fbp(images_of(views), views, GRID)
+
+
+def test_a_reconstruction_is_of_what_its_images_are_of():
+    """Images of a `Volume` know its quantity, parts of them and noisy ones, too; those of arrays are of mu."""
+    views = views_of(np.arange(40) * np.pi / 40, columns=72)
+    A = mph.Projector(GRID, views)
+    for quantity in ("activity", "mu"):
+        images = A(mph.Volume(DISC, GRID, quantity))
+        assert isinstance(images, np.ndarray) and images.dtype == np.float32
+        np.testing.assert_array_equal(images, A(DISC))
+        noisy = images[::2] * 1.1 + np.random.default_rng(8).normal(0, 0.1, (20, 3, 72))
+        assert mph.fbp(images, views, GRID).quantity == mph.fbp(noisy, views[::2], GRID, "hann").quantity == quantity
+        assert mph.fbp(images, views, GRID, quantity="hu").quantity == "hu"
+        assert isinstance(images.sum(), np.float32) and round(float(images.max()), 3) > 0
+    assert mph.fbp(A(DISC), views, GRID).quantity == "mu"
+    angles = np.arange(24) * np.pi / 12
+    towards = np.stack([np.cos(angles), np.sin(angles), 0 * angles], axis=1)
+    across = np.stack([-np.sin(angles), np.cos(angles), 0 * angles], axis=1)
+    cone = mph.Views(300 * towards, -200 * towards, 2.5 * across, np.tile([0, 0, 2.5], (24, 1)), (6, 60))
+    images = mph.Projector(GRID, cone)(mph.Volume(DISC, GRID, "activity"))
+    assert mph.fdk(images, cone, GRID).quantity == "activity"
 
 
 def test_progress_counts_views_and_stops():

@@ -137,6 +137,30 @@ def test_an_arc_that_is_too_short_is_said_and_loses_values():
     assert center_of(volume) == pytest.approx(120 / 180, abs=0.05)
 
 
+@pytest.mark.parametrize("shift", [45.0, -60.0])
+def test_images_cut_off_at_an_edge_are_said(shift):
+    """Such as those of a displaced detector, whose values are far from the truth."""
+    views = orbit(FULL, u_shift=shift, shape=(48, 56))
+    with pytest.warns(
+        mph.InputWarning, match=r"fdk: the images fall only to \d+% of their largest value at their edge"
+    ):
+        volume = mph.fdk(ball_images(views), views, GRID)
+    assert abs(center_of(volume) - 1) > 0.1
+    whole = orbit(FULL, u_shift=shift, shape=(48, 112))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert center_of(mph.fdk(ball_images(whole), whole, GRID)) == pytest.approx(1, abs=0.01)
+
+
+def test_turns_that_repeat_are_no_gaps():
+    views = orbit(np.tile(np.arange(15) * 24 * DEGREE, 4))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        many = mph.fdk(ball_images(views), views, GRID)
+    once = orbit(np.arange(15) * 24 * DEGREE)
+    np.testing.assert_allclose(many.array, mph.fdk(ball_images(once), once, GRID).array, atol=1e-4 * MU)
+
+
 def test_it_inverts_the_projector():
     rng = np.random.default_rng(3)
     blocks = np.kron(rng.random((4, 4, 4)), np.ones((5, 5, 5)))

@@ -1,5 +1,7 @@
 """Laws of every iterative reconstruction: resume, callbacks, cancelling, stopping, masks and what is refused."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -51,6 +53,26 @@ class TestEveryMethod:
         rest = method(A, counts, 3, start=half, callback=lambda i, x: seen.append(i))
         assert_same(rest, whole)
         assert seen == [3, 4, 5]
+
+    def test_other_data_cannot_go_on_with_it(self, problem, method):
+        """Refused in a line, that names what differs; its volume is taken as the start of a new one."""
+        A, counts, truth = problem
+        half = method(A, counts, 2)
+        with pytest.warns(mph.InputWarning):
+            slower = mph.Projector(A.grid, A.views, dataclasses.replace(A.model, time=601.0))
+            blurred = mph.Projector(A.grid, A.views, dataclasses.replace(A.model, intrinsic_fwhm=6.0))
+        for B, other, more, said in (
+            (A, counts[::-1], {}, "objective"),  # as many of them
+            (A, mph.sample_counts(A(truth), 3), {}, "counts"),
+            (A, counts, {"background": 0.1}, "background"),
+            (A, counts, {"mask": truth > 0}, "objective"),
+            (slower, counts, {}, "sensitivity"),
+            (blurred, counts, {}, "objective"),
+        ):
+            with pytest.raises(mph.InputError, match=rf"start: .* is of other .*\b{said} .*, now") as caught:
+                method(B, other, 1, start=half, **more)
+            assert "\n" not in str(caught.value)
+            assert method(B, other, 1, start=half.volume, **more).iterations == 1
 
     def test_cancelled_in_the_middle_it_can_be_resumed(self, problem, method):
         A, counts, _ = problem
@@ -195,6 +217,33 @@ def test_another_methods_result_is_only_a_start(problem):
     A, counts, _ = problem
     first = mph.osem(A, counts, 2, subsets=4)
     assert_same(mph.mlem(A, counts, 3, start=first), mph.mlem(A, counts, 3, start=first.volume))
+
+
+@pytest.mark.parametrize("method", [mph.osem, mph.bsrem])
+def test_other_subsets_and_priors_cannot_go_on(problem, method):
+    A, counts, _ = problem
+    prior = mph.RelativeDifference(0.1)
+    half, plain = method(A, counts, 2, 4, prior), method(A, counts, 2, 4)
+    for start, subsets, other, said in (
+        (half, 2, prior, "subsets 4, now 2"),
+        (half, 4, mph.RelativeDifference(0.2), "weight 0.1, now 0.2"),
+        (half, 4, mph.RelativeDifference(0.1, gamma=3), "gamma 2.0, now 3.0"),
+        (half, 4, mph.Quadratic(0.1), "prior RelativeDifference, now Quadratic"),
+        (half, 4, None, "prior RelativeDifference, now None"),
+        (plain, 4, prior, "prior None, now RelativeDifference"),
+    ):
+        with pytest.raises(mph.InputError, match=f"start: .*{said}"):
+            method(A, counts, 1, subsets, other, start=start)
+
+
+def test_a_region_of_zeros_ends_nothing_and_that_is_said(problem):
+    A, counts, truth = problem
+    nowhere = np.zeros(A.shape_in, bool)
+    nowhere[0, 0] = True
+    stop = mph.StopWhen(noise=0.2, region=nowhere)
+    with pytest.warns(mph.InputWarning, match="stop: region: its voxels are all 0 after iteration 1"):
+        found = mph.mlem(A, counts, 4, mask=truth > 0, stop=stop)
+    assert found.settings["stopped"] == "iterations" and found.iterations == 4
 
 
 def test_what_nothing_can_have_caused_and_what_nobody_sees(problem):

@@ -1,7 +1,11 @@
 """SIRT, CGLS and TV: falling objectives, known solutions, resuming, and what they are given."""
 
+import re
+import warnings
+
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 
 import mphdrr.core as mph
 from mphdrr.core.reconstruction.tv import _gradient, _gradient_adjoint, total_variation
@@ -59,6 +63,59 @@ def test_cgls_reaches_the_solution_of_numpys_lstsq():
     assert result.objective[-1] == pytest.approx(residual, rel=1e-4)
 
 
+def cgls_of_double_precision(B, images, iterations, mask):
+    """The textbook's, over the float64 reference: the volume after each iteration."""
+    B = mph.Projector(B.grid, B.views, B.model, backend="numpy")
+    x, residual = np.zeros(B.shape_in), images.astype(float)
+    direction = B.T(residual) * mask
+    size, found = np.sum(direction**2), []
+    for _ in range(iterations):
+        change = B(direction)
+        length = size / np.sum(change**2)
+        x, residual = x + length * direction, residual - length * change
+        gradient = B.T(residual) * mask
+        before, size = size, np.sum(gradient**2)
+        direction = gradient + size / before * direction
+        found.append(x)
+    return found
+
+
+@pytest.mark.parametrize("case", ["few views", "scanner", "scanner in a mask", "even"])
+def test_cgls_keeps_to_double_precision_or_says_where_it_leaves_it(case, scanner):
+    rng = np.random.default_rng(7)
+    grid = mph.Grid.centered((11, 12, 9), 9.0)
+    if case == "few views":
+        B = mph.Projector(grid, mph.parallel_views(np.arange(9) * np.pi / 9 + 0.1, (11, 16), 7.0))
+    else:
+        B = mph.Projector(grid, scanner[::6].views((14, 14)))
+    truth = gaussian_filter(rng.random(grid.shape), 1.0).astype(np.float32)
+    if case == "even":
+        truth += 100
+    mask = truth > np.median(truth) if case == "scanner in a mask" else np.ones(grid.shape, bool)
+    images = B(truth * mask)
+    images += (0.02 * images.std() * rng.standard_normal(images.shape)).astype(np.float32)
+    seen = []
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        mph.cgls(B, images, 30, mask=mask, callback=lambda i, x: seen.append(x) and None)
+    expected = cgls_of_double_precision(B, images, 30, mask)
+    errors = np.array([np.linalg.norm(a - b) / np.linalg.norm(b) for a, b in zip(seen, expected, strict=True)])
+    said = [int(re.search(r"CGLS: from iteration (\d+) on rounding", str(each.message))[1]) for each in caught]
+    assert len(said) <= 1, "it is said once"
+    kept = said[0] - 1 if said else 30
+    assert kept >= 6 and (errors[:kept] < 1e-3).all()
+    assert len(said) == (errors.max() > 1e-3) or errors.max() > 1e-4, "and not of what keeps to it"
+
+
+def test_what_cgls_says_of_its_way_it_says_once_when_resumed_too():
+    with pytest.warns(mph.InputWarning, match="CGLS: from iteration"):
+        first = mph.cgls(A, NOISY, 20)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        mph.cgls(A, NOISY, 5)
+        mph.cgls(A, NOISY, 10, start=first)
+
+
 def test_cgls_is_much_faster_than_sirt():
     def misfit(x):
         return np.sum((A(x) - IMAGES) ** 2)
@@ -111,6 +168,22 @@ def test_tv_reaches_the_minimum_that_another_solver_finds(weight, nonnegative):
     assert not nonnegative or x.min() >= 0
 
 
+@pytest.mark.parametrize("weight", [2.0, 500.0])
+def test_tv_does_not_pull_at_the_edge_of_a_mask_or_of_what_is_seen(weight):
+    grid = mph.Grid.centered((16, 14, 8), (3.0, 3.0, 6.0))
+    x, y, _ = np.indices(grid.shape)
+    mask = (x - 7) ** 2 + (y - 6) ** 2 < 30
+    images = mph.parallel_views(np.arange(16) * np.pi / 16, (16, 26), 3.0)
+    B = mph.Projector(grid, images)
+    found = mph.tv(B, B(7.0 * mask), weight, 80, mask=mask).volume.array
+    assert np.abs(found[mask] / 7 - 1).max() < 2e-3
+    narrow = mph.Projector(grid, mph.parallel_views(np.arange(16) * np.pi / 16, (4, 26), 3.0))  # 12 of 48 mm along z
+    seen = narrow.T(np.ones(narrow.shape_out, np.float32)) > 0
+    assert 0.2 < seen.mean() < 0.6
+    found = mph.tv(narrow, narrow(np.full(grid.shape, 7.0, np.float32)), weight, 80).volume.array
+    assert np.abs(found[seen] / 7 - 1).max() < 2e-3 and not found[~seen].any()
+
+
 def test_tv_is_nearer_to_the_truth_than_least_squares_with_few_noisy_views():
     rng = np.random.default_rng(5)
     grid = mph.Grid.centered((24, 24, 3), 1.0)
@@ -135,18 +208,36 @@ def test_a_resumed_one_gives_the_same_numbers(name, tmp_path):
         np.testing.assert_array_equal(resumed.objective, whole.objective)
 
 
-@pytest.mark.parametrize("name", ["cgls", "tv"])
+@pytest.mark.parametrize("name", ALGORITHMS)
 def test_other_images_views_or_masks_cannot_go_on_with_what_is_known_of_the_first(name):
     run = ALGORITHMS[name]
     half = run(A, NOISY, iterations=2)
     fewer = mph.Projector(GRID, A.views[1:])
     mask = np.zeros(GRID.shape, bool)
     mask[1:] = True
-    for other, images, more in ((A, NOISY + 1, {}), (fewer, NOISY[1:], {}), (A, NOISY, {"mask": mask})):
+    turned = mph.Projector(GRID, A.views[::-1])
+    for other, images, more in (
+        (A, NOISY + 1, {}), (fewer, NOISY[1:], {}), (A, NOISY, {"mask": mask}), (turned, NOISY[::-1], {})
+    ):  # fmt: skip
         with pytest.raises(mph.InputError, match="start: this reconstruction is of other images, views or mask"):
             run(other, images, iterations=1, start=half, **more)
         begun = run(other, images, iterations=1, start=half.volume, **more)
         assert begun.iterations == 1
+    assert run(A, NOISY, iterations=1, start=half).iterations == 3
+
+
+def test_other_arguments_cannot_go_on_with_what_is_known_of_the_first():
+    for half, other, said in (
+        (mph.sirt(A, NOISY, 2), lambda half: mph.sirt(A, NOISY, 1, 1.5, start=half), "relaxation 1.0, now 1.5"),
+        (
+            mph.sirt(A, NOISY, 2),
+            lambda half: mph.sirt(A, NOISY, 1, 1.0, False, start=half),
+            "nonnegative True, now False",
+        ),
+        (mph.tv(A, NOISY, 0.5, 2), lambda half: mph.tv(A, NOISY, 0.7, 1, start=half), "weight 0.5, now 0.7"),
+    ):
+        with pytest.raises(mph.InputError, match=f"start: .*{re.escape(said)}.*give its volume"):
+            other(half)
 
 
 @pytest.mark.parametrize("name", ALGORITHMS)

@@ -47,6 +47,43 @@ def test_gradient_and_curvature_are_those_of_the_value(grid, anatomy, rng, kind,
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("neighbors", [6, 26])
+@pytest.mark.parametrize("with_anatomy", [False, True])
+def test_a_penalty_inside_a_box_is_that_of_a_grid_that_ends_there(rng, kind, neighbors, with_anatomy):
+    """Value, gradient and curvature, also where slabs of planes meet."""
+    shape, box = (9, 70, 80), (slice(2, 8), slice(3, 60), slice(1, 77))
+    grid, part = mph.Grid.centered(shape, SPACING), mph.Grid.centered((6, 57, 76), SPACING)
+    segments, x = rng.integers(0, 3, shape), rng.uniform(0, 5, shape)
+    inside = np.zeros(shape, bool)
+    inside[box] = True
+    own, other = (
+        kind(0.7, neighbors=neighbors, anatomy=mph.Volume(values, place, "mu") if with_anatomy else None)
+        for values, place in ((segments, grid), (segments[box], part))
+    )
+    masked, small = own.on(grid, inside), other.on(part)
+    assert masked.value(x) == pytest.approx(small.value(x[box]), rel=1e-6)
+    for of_masked, of_small in ((masked.gradient, small.gradient), (masked.curvature, small.curvature)):
+        np.testing.assert_allclose(of_masked(x)[box], of_small(x[box]), rtol=1e-6, atol=1e-6)
+        assert not of_masked(x)[~inside].any()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("neighbors", [6, 26])
+def test_gradient_and_curvature_inside_any_mask_are_those_of_the_value(grid, anatomy, rng, kind, neighbors):
+    inside = rng.random(SHAPE) < 0.6
+    penalty = kind(0.7, neighbors=neighbors, anatomy=anatomy).on(grid, inside)
+    x = np.where(inside, rng.uniform(0, 5, SHAPE), 1e3)  # what is outside has no effect
+    gradient, curvature = penalty.gradient(x), penalty.curvature(x)
+    np.testing.assert_allclose(gradient, derivative(lambda y, i: penalty.value(y), x), rtol=1e-6, atol=1e-7)
+    second = derivative(lambda y, i: penalty.gradient(y)[i], x)
+    assert gradient[inside].any() and not gradient[~inside].any()
+    if kind is mph.TotalVariation:
+        assert (curvature >= second - 1e-6).all()
+    else:
+        np.testing.assert_allclose(curvature, second, rtol=1e-6, atol=1e-7)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("neighbors", [6, 26])
 def test_the_value_is_the_sum_that_the_docs_say(grid, rng, kind, neighbors):
     """Over neighbours found by their distances, one by one."""
     x = rng.uniform(0, 5, SHAPE)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import re
 import runpy
 import sys
@@ -99,6 +100,44 @@ def test_a_kept_state_goes_on_as_without_a_break(file, tmp_path, capsys):
     assert "iteration 1 of 1: " in said.err and "MLEM, 1 iteration, 20 x" in said.out
     whole, rest = (mph.read_volume(tmp_path / f"{name}.npz").array for name in ("whole", "rest"))
     np.testing.assert_array_equal(rest, whole)
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_each_method_does_its_own_number_of_iterations_unless_it_is_told(name, scanner, run, tmp_path, capsys):
+    """That of its function; the help names them all, and what is resumed counts on."""
+    pytest.importorskip("h5py")
+    function, own = getattr(mph, name), METHODS[name].iterations
+    assert own == inspect.signature(function).parameters["iterations"].default
+    if not METHODS[name].of_counts:
+        (run,) = mph.run_recipe(
+            mph.Recipe({"phantom.voxels": 12, "detector.rows": 6, "detector.columns": 6}), scanner[::8]
+        )
+    mph.write_run(run, tmp_path / "run.npz")
+    how = {"reconstruction.method": name, "reconstruction.voxels": 8, "reconstruction.spacing": 12.0,
+           **({"reconstruction.weight": 0.1} if name == "tv" else {})}  # fmt: skip
+    done = mph.reconstruct_run(run, mph.Recipe(how)).iterations
+    assert done == own == {"osem": 10, "mlem": 50, "bsrem": 30, "sirt": 100, "cgls": 10, "tv": 200}[name]
+    assert mph.reconstruct_run(run, mph.Recipe(how | {"reconstruction.iterations": 2})).iterations == 2
+    typed = [word for key, value in how.items() for word in (f"--{key.partition('.')[2]}", str(value))]
+    state = tmp_path / "s.h5"
+    command(tmp_path / "run.npz", *typed, "--iterations", "1", "--save-state", state, "-o", tmp_path / "v.npz")
+    capsys.readouterr()
+    command(tmp_path / "run.npz", *typed, "--resume", state, "--stop-seconds", "1e-9", "-o", tmp_path / "v.npz")
+    assert f"iteration 2 of {own + 1}: " in capsys.readouterr().err
+    assert main(["reconstruct", "--help"]) == 0
+    assert f"{METHODS[name].label} {own}" in re.sub(r"\s+", " ", capsys.readouterr().out)
+
+
+def test_a_state_of_other_settings_is_refused_in_a_line(file, tmp_path, capsys):
+    pytest.importorskip("h5py")
+    small, state = ["--voxels", "12", "--spacing", "8", "--iterations", "1"], tmp_path / "s.h5"
+    command(file, *small, "--subsets", "4", "--save-state", state, "-o", tmp_path / "v.npz")
+    for more, said in ((["--subsets", "5"], "subsets 4, now 5"), (["--subsets", "4", "--ignore-blur"], "objective"),
+                       (["--subsets", "4", "--background", "2"], "background 0.0, now ")):  # fmt: skip
+        line = refused(capsys, file, *small, *more, "--resume", state, "-o", tmp_path / "no.npz")
+        assert line.startswith("mphdrr: start: this reconstruction is of other") and said in line and "--start" in line
+        command(file, *small, *more, "--start", state, "-o", tmp_path / "yes.npz")
+    assert not (tmp_path / "no.npz").exists()
 
 
 def test_stopping_and_watching(run):

@@ -47,11 +47,16 @@ def test_all_scores_are_those_of_their_functions(expected):
     rods = mph.derenzo_score(volume, PHANTOM, POSE)
     assert score.derenzo.valley_to_peak == pytest.approx(rods.valley_to_peak, nan_ok=True)
     assert score.nema is None and score.notes == ()
-    table = score.lines
-    assert len(table) == 7 and table[1].split()[:2] == ["Rods", "valley/peak"]  # the empty sector is no line
-    assert re.fullmatch(r"5 mm +\d\.\d\d +100 % of 3 +\d+ %", table[2])
-    assert table[-1] == "1.2 mm  voxels of 1.35 mm are larger than the rods"
-    assert json.loads(json.dumps(score.record, allow_nan=False))["derenzo"][2]["note"] == "no rods"
+    lines = score.lines
+    assert len(lines) == 6  # the empty sector is no line
+    assert re.fullmatch(r"5 mm  resolved, valley/peak \d\.\d\d, contrast \d+ %", lines[1])
+    assert lines[1:] == [f"{sector.rod_diameter:g} mm  {sector.words}" for sector in rods if sector.rod_diameter]
+    assert lines[-1] == "1.2 mm  voxels of 1.35 mm are larger than the rods"
+    record = json.loads(json.dumps(score.record, allow_nan=False))["derenzo"]
+    assert record[2]["note"] == "no rods" and record[2]["resolved"] is None
+    for said, sector in zip(record[:2], rods, strict=False):
+        assert said["resolved"] is bool(sector.resolved) and said["chance"] == sector.chance < 0.02
+        assert said["pairs_resolved"] == sector.pairs_resolved == 1 and said["pairs"] == len(sector.profiles)
 
 
 def test_a_truth_on_another_grid_is_resampled_and_that_is_said(files):
@@ -134,7 +139,7 @@ def test_the_picture_shows_volume_and_truth(files, tmp_path, capsys, suffix):
     else:
         text = picture.read_text(encoding="utf-8")
         assert text.count("<image") == 7  # three slices of each, and the colour bar
-        assert ">reconstruction<" in text and ">3 mm: " in text
+        assert ">reconstruction<" in text and ">3 mm: resolved, valley/peak 0." in text
 
 
 def test_a_run_knows_its_phantom_or_its_volume(files, expected, system, tmp_path, capsys):
@@ -160,6 +165,32 @@ def test_a_run_knows_its_phantom_or_its_volume(files, expected, system, tmp_path
     mph.write_run(dataclasses.replace(made, volume=None, unit="counts"), run)
     assert main(["score", volume, "--truth", str(run)]) == 1
     assert "run.h5: the run was measured: nobody knows the truth" in capsys.readouterr().err
+
+
+def test_that_a_score_flatters_stays_with_it(system, tmp_path, capsys):
+    """As JSON, on standard error, and of a reconstruction in its settings and its file."""
+    made = {"model.kind": "emission", "model.hole": "depth", "model.time": 60.0, "detector.plane": "real",
+            "detector.rows": 12, "detector.columns": 12, "phantom.kind": "derenzo", "phantom.voxels": 24,
+            "phantom.spacing": 4.0}  # fmt: skip
+    (run,) = mph.run_recipe(mph.Recipe(made), system)
+    mph.write_run(run, tmp_path / "run.npz")
+    how = mph.Recipe({"reconstruction.voxels": 16, "reconstruction.spacing": 6.0, "reconstruction.iterations": 2})
+    with pytest.warns(mph.InputWarning) as caught:
+        found = mph.reconstruct_run(run, how)
+    flatters = found.settings["flatters"]
+    assert [str(each.message) for each in caught] == flatters and len(flatters) == 2
+    assert "made from voxels of 4 mm" in flatters[0] and "3 mm or less" in flatters[0] and "by depth" in flatters[1]
+    mph.write_volume(found.volume, tmp_path / "v.npz")
+    arguments = ["score", str(tmp_path / "v.npz"), "--truth", str(tmp_path / "run.npz")]
+    assert main([*arguments, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["notes"] == flatters
+    assert main([*arguments, "--picture", str(tmp_path / "p.svg")]) == 0
+    said = capsys.readouterr().err
+    assert all(f"mphdrr: {text}" in said and text in (tmp_path / "p.svg").read_text("utf-8") for text in flatters)
+    coarse = mph.Volume(np.ones((12, 12, 12)), mph.Grid.centered(12, 8.0))
+    mph.write_volume(coarse, tmp_path / "v.npz")
+    assert main([*arguments, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["notes"] == flatters[1:]
 
 
 def test_a_truth_volume_on_the_command_line(files, tmp_path, capsys):

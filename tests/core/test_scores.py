@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import warnings
 
 import numpy as np
 import pytest
@@ -67,6 +68,108 @@ def test_a_uniform_volume_resolves_nothing():
     assert score.valley_to_peak[:5] == pytest.approx(1.0) and score.contrast_recovery[:5] == pytest.approx(
         0.0, abs=1e-6
     )
+
+
+NARROW = mph.DerenzoPhantom(30.0, (3.5, 6.0, 3.5, 4.5, 3.0, 3.5, 5.0, 3.5, 2.5, 3.5), 16.0, activity=100.0, sectors=10)
+WIDE = mph.DerenzoPhantom(26.0, (6.5, 6.0, 5.0, 4.0, 3.5, 3.0), 16.0, activity=100.0)
+
+
+def smoothed(rng: np.random.Generator, grid: mph.Grid, fwhm: float) -> np.ndarray:
+    """Gaussian noise of mean 0 and deviation 1, smoothed to a width in mm."""
+    noise = gaussian_filter(rng.standard_normal(grid.shape), fwhm / 2.355 / grid.spacing)
+    return noise / noise.std()
+
+
+NOISE = {
+    "white": lambda rng, grid: 100 * rng.standard_normal(grid.shape),
+    "white around a background": lambda rng, grid: rng.gamma(1.5, 15.0, grid.shape),
+    "as wide as thin rods": lambda rng, grid: 60 * smoothed(rng, grid, 3.5),
+    "as wide as thick rods": lambda rng, grid: 60 * smoothed(rng, grid, 7.0),
+    "around a background": lambda rng, grid: 25 * (1 + 0.7 * smoothed(rng, grid, 4.5)),
+    "of OSEM": lambda rng, grid: 25 * np.exp(smoothed(rng, grid, 5.0)),  # in proportion to the activity, correlated
+    "of OSEM, with zeros": lambda rng, grid: np.maximum(60 * smoothed(rng, grid, 4.0) + 20, 0),
+    "few counts": lambda rng, grid: 500 * gaussian_filter(rng.poisson(0.3, grid.shape) / 1.0, 1.0),
+}
+
+
+def falsely_resolved(kind: str, volumes: int, grid: mph.Grid, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Whether each sector of so many volumes of noise is resolved, and which are of one pair or three."""
+    found, small, rng = [], [], np.random.default_rng(seed)
+    for i in range(volumes):
+        volume = mph.Volume(NOISE[kind](rng, grid), grid)
+        for sector in mph.derenzo_score(volume, (NARROW, WIDE)[i % 2]):
+            if sector.profiles:
+                found.append(sector.resolved)
+                small.append(len(sector.profiles) <= 3)
+    return np.array(found), np.array(small)
+
+
+@pytest.mark.parametrize("kind", NOISE)
+def test_noise_resolves_at_most_one_sector_in_twenty(kind):
+    """Eight kinds of 25 volumes: 200. The bound for one kind leaves room for their own chance."""
+    found, small = falsely_resolved(kind, 25, mph.Grid.centered((31, 31, 9), 2.0), 3)
+    assert found.mean() <= 0.05 and found[small].mean() <= 0.05
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("voxel", [1.0, 2.0])
+@pytest.mark.parametrize("kind", NOISE)
+def test_noise_resolves_at_most_one_sector_in_twenty_of_200_volumes(kind, voxel):
+    grid = mph.Grid.centered(np.ceil(np.array([62, 62, 18]) / voxel).astype(int), voxel)
+    found, small = falsely_resolved(kind, 200, grid, 4)
+    assert found.mean() <= 0.03 and found[small].mean() <= 0.04
+
+
+def test_pairs_by_themselves_prove_nothing():
+    """In noise many pairs are below Rayleigh's limit, in some sectors nearly all, and whole sectors: that resolves none."""
+    rng, grid = np.random.default_rng(5), mph.Grid.centered((31, 31, 9), 2.0)
+    sectors = []
+    for _ in range(30):
+        score = mph.derenzo_score(mph.Volume(NOISE["white"](rng, grid), grid), WIDE)
+        sectors += [sector for sector in score if sector.profiles]
+    many = [sector for sector in sectors if sector.pairs_resolved >= 0.66 and sector.contrast_recovery > 0.1]
+    assert len(many) > 10 and np.mean([sector.resolved for sector in many]) < 0.2
+    below = np.mean([sector.valley_to_peak < 0.735 for sector in sectors])
+    assert below > 0.25 and np.mean([sector.resolved for sector in sectors]) < 0.05
+
+
+@pytest.mark.parametrize("voxel", [1.0, 1.6])
+@pytest.mark.parametrize("phantom", [WIDE, NARROW, mph.DerenzoPhantom(
+    30.0, (8.0, 6.0, 5.0, 4.0, 3.5, 3.0), 16.0, 0.0, cylinder_radius=34, cylinder_height=24, background=20)],
+    ids=["wide", "narrow", "cold"])  # fmt: skip
+def test_without_noise_rayleighs_limit_alone_decides(phantom, voxel):
+    truth = phantom.voxelize(mph.Grid.centered(np.ceil(np.array([70, 70, 24]) / voxel).astype(int), voxel))
+    seen = set()
+    for fwhm in (0.0, 2.0, 4.0, 6.0, 8.0):
+        blurred = gaussian_filter(truth.array, fwhm / 2.355 / voxel)
+        for sector in mph.derenzo_score(mph.Volume(blurred, truth.grid), phantom):
+            if sector.profiles:
+                if (
+                    len(sector.profiles) == 1 and sector.chance > 0.01
+                ):  # a valley between two rods that differ proves little
+                    continue
+                assert sector.resolved == (sector.valley_to_peak < 0.735), (fwhm, sector.rod_diameter)
+                assert sector.words.startswith("resolved, " if sector.resolved else "not resolved, ")
+                seen.add(sector.resolved)
+    assert seen == {0.0, 1.0}
+
+
+def test_the_chance_is_that_of_students_t_of_rods_and_valleys(rng):
+    """By scipy, of the profiles' own numbers."""
+    stats = pytest.importorskip("scipy.stats")
+    grid = mph.Grid.centered((56, 56, 18), 1.0)
+    volume = mph.Volume(WIDE.voxelize(grid).array + 150 * smoothed(rng, grid, 4.0), grid)
+    chances = []
+    for sector in filter(lambda sector: sector.profiles, mph.derenzo_score(volume, WIDE)):
+        ends: dict[tuple[float, ...], list[float]] = {}
+        for profile in sector.profiles:
+            for point, value in zip(profile.points[[0, -1]], profile.values[[0, -1]], strict=True):
+                ends.setdefault(tuple(point.round(6)), []).append(value)
+        rods, valleys = [np.mean(values) for values in ends.values()], [profile.valley for profile in sector.profiles]
+        expected = stats.ttest_ind(rods, valleys, alternative="greater").pvalue
+        assert sector.chance == pytest.approx(expected, rel=1e-3, abs=1e-9)
+        chances.append(sector.chance)
+    assert min(chances) < 0.02 < max(chances)
 
 
 def test_noise_alone_has_no_valleys_on_average(rng):
@@ -162,6 +265,54 @@ def test_what_cannot_be_scored_is_nan_and_says_why(truth):
     assert mph.derenzo_score(even, in_water)[0].note == "the rods hold the same mu as what is between them"
     empty = mph.derenzo_score(uniform(0.0, truth.grid), PHANTOM)[0]
     assert np.isnan(empty.valley_to_peak) and empty.note == "the peaks are not above 0" and empty.resolved == 0
+
+
+@pytest.mark.parametrize("pose", [np.eye(4), mph.euler_pose(0.4, 1.1, -0.7, (5, -3, 40))], ids=["straight", "turned"])
+@pytest.mark.parametrize(
+    ("low", "high"), [(-2.0, 2.8), (5.2, 10.0), (-14.0, -5.6), (3.0, 25.0), (-10.0, 3.0), (-3.5, 0.1)]
+)
+def test_where_the_volume_covers_a_part_of_the_rods_that_part_is_scored(pose, low, high):
+    """From one diameter on; else the score says how much of their length is covered, and never that rods lie outside."""
+    n = round((high - low) / 0.4)
+    place = mph.Grid.centered((120, 120, n), (0.5, 0.5, (high - low) / n), center=(0, 0, (low + high) / 2))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", mph.InputWarning)  # the phantom reaches beyond
+        part = PHANTOM.voxelize(place)
+    score = mph.derenzo_score(mph.Volume(part.array, mph.Grid(place.shape, pose @ place.affine)), PHANTOM, pose)
+    covered = min(high, 10) - max(low, -10)
+    for sector in score[:5]:
+        if covered >= sector.rod_diameter - 1e-6:
+            assert sector.note == "" and sector.resolved == 1
+            assert sector.valley_to_peak == pytest.approx(0.0, abs=1e-3)
+            assert sector.contrast_recovery == pytest.approx(1.0, abs=5e-3)
+        else:
+            assert np.isnan(sector.resolved) and sector.words == f"the volume covers {covered:.3g} of 20 mm"
+
+
+@pytest.mark.parametrize(
+    ("center", "thickness", "said"), [(0, 1.0, "1"), (9.5, 3.0, "2"), (30, 2.0, "0"), (-10, 2.0, "1")]
+)
+def test_a_slab_too_thin_says_what_it_covers(center, thickness, said):
+    slab = uniform(1.0, mph.Grid.centered((60, 60, 1), (1.0, 1.0, thickness), center=(0, 0, center)))
+    assert [sector.note for sector in mph.derenzo_score(slab, PHANTOM)[:5]] == [
+        f"the volume covers {said} of 20 mm"
+    ] * 5
+    thick = uniform(1.0, mph.Grid.centered((60, 60, 1), (1.0, 1.0, 8.0)))  # one voxel along the rods
+    assert mph.derenzo_score(thick, PHANTOM)[0].valley_to_peak == pytest.approx(1.0)
+
+
+def test_the_middle_half_counts_where_it_is_covered():
+    """What is beyond, such as the rods' blurred ends, has no effect; where less is covered, that counts."""
+    grid = mph.Grid.centered((60, 60, 40), (1.0, 1.0, 0.5))
+    array = np.array(PHANTOM.voxelize(grid).array)
+    whole = mph.derenzo_score(mph.Volume(array, grid), PHANTOM)
+    array[:, :, :9], array[:, :, 31:] = 7.0, 7.0
+    spoiled = mph.derenzo_score(mph.Volume(array, grid), PHANTOM)
+    assert spoiled.contrast_recovery == pytest.approx(whole.contrast_recovery, nan_ok=True, rel=1e-6)
+    upper = mph.Grid.centered((60, 60, 13), (1.0, 1.0, 0.5), center=(0, 0, 6.75))
+    cut = mph.derenzo_score(mph.Volume(array[:, :, 27:], upper), PHANTOM)
+    # 3.5 to 10 mm is covered. Of the half that is 1.5 mm, less than a diameter: what is spoiled beyond 5.5 mm counts, too.
+    assert cut.contrast_recovery[:5] == pytest.approx(2.0 / np.array(RODS[:5]), rel=0.05)
 
 
 def test_derenzo_score_refuses_what_it_cannot_take(truth):

@@ -14,16 +14,17 @@ from ...progress import Progress
 from ...validation import freeze, instance
 from ...volumes.resampling import values_at
 from ...volumes.volume import Volume, require_quantity
-from .rows import Rows
+from .rows import Rows, column
 
 Floats = NDArray[np.float64]
 
 RESOLVED_BELOW = 0.735
 """Valley-to-peak of two points that are just resolved, by Rayleigh's criterion."""
 
-_LENGTH = (
-    0.5  # of the rods, around their middle, that profiles are means over: their ends blur into what is beside them
-)
+NOISE_BELOW = 0.02
+"""Chance that noise makes a sector's contrast: of one that is resolved it is less."""
+
+_LENGTH = 0.5  # of the rods, around their middle, that profiles are means over: ends blur into what is beside them
 _WIDTH = 0.5  # of a rod's diameter, that profiles are means over
 _ACROSS = 5  # lines over that width
 _ALONG = 33  # points of a profile, odd: one is in the middle
@@ -35,7 +36,7 @@ class RodProfile:
     """The values on the line from one rod's centre to that of its neighbour, as means along the rods and across the line."""
 
     points: Floats
-    """World points (n, 3), mm, halfway along the rods: the first and the last are the rods' centres."""
+    """World points (n, 3), mm, in the middle of the length that counts: the first and the last are on the rods' axes."""
     values: Floats
     """(n,), in the volume's unit."""
     is_hot: bool
@@ -44,25 +45,17 @@ class RodProfile:
     @property
     def peak(self) -> float:
         """Mean of both rods' centres; of cold rods, the value halfway between them."""
-        return self._rods if self.is_hot else self._between
+        return float(np.mean(self.values[[0, -1]] if self.is_hot else self.values[_ALONG // 2]))
 
     @property
     def valley(self) -> float:
         """Value halfway between the rods; of cold rods, the mean of their centres."""
-        return self._between if self.is_hot else self._rods
+        return float(np.mean(self.values[_ALONG // 2] if self.is_hot else self.values[[0, -1]]))
 
     @property
     def valley_to_peak(self) -> float:
         """Valley by peak; infinite where the peak is not above 0."""
         return self.valley / self.peak if self.peak > 0 else np.inf
-
-    @property
-    def _rods(self) -> float:
-        return float(self.values[[0, -1]].mean())
-
-    @property
-    def _between(self) -> float:
-        return float(self.values[len(self.values) // 2])
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,38 +66,39 @@ class DerenzoSector:
     """mm."""
     valley_to_peak: float
     """Mean valley by mean peak of all pairs of neighbours: 0 if nothing is between the rods, 1 if no rods can be seen."""
-    resolved: float
-    """Share of the pairs of neighbours whose valley-to-peak is below 0.735."""
     contrast_recovery: float
     """Difference of mean peak and mean valley, by that of the phantom."""
     profiles: tuple[RodProfile, ...] = ()
     """One for each pair of neighbours."""
     note: str = ""
     """Why something is NaN."""
+    chance: float = np.nan
+    """That noise alone makes as large a difference of mean peak and mean valley, as rods and valleys scatter."""
+
+    @property
+    def resolved(self) -> float:
+        """1 if `valley_to_peak` is below `RESOLVED_BELOW` and `chance` below `NOISE_BELOW`, else 0; see `derenzo_score`."""
+        return float(self.valley_to_peak < RESOLVED_BELOW and self.chance < NOISE_BELOW) if self.profiles else np.nan
+
+    @property
+    def pairs_resolved(self) -> float:
+        """Share of the pairs of neighbours with a valley-to-peak below 0.735; by itself it says nothing, see `resolved`."""
+        return float(np.mean([profile.valley_to_peak < RESOLVED_BELOW for profile in self.profiles] or np.nan))
+
+    @property
+    def words(self) -> str:
+        """The score in a line: whether it is resolved, and by what; or why there is none."""
+        said = f"valley/peak {self.valley_to_peak:.2f}, contrast {np.round(100 * self.contrast_recovery) + 0.0:.0f} %"
+        return self.note or f"{'resolved' if self.resolved else 'not resolved'}, {said}"
 
 
 class DerenzoScore(Rows[DerenzoSector]):
     """The scores of all sectors, in the phantom's order; its attributes are arrays (S,), as of `DerenzoSector`."""
 
-    @property
-    def rod_diameter(self) -> Floats:
-        """mm; 0 of a sector without rods."""
-        return self.column("rod_diameter")
-
-    @property
-    def valley_to_peak(self) -> Floats:
-        """Mean valley by mean peak."""
-        return self.column("valley_to_peak")
-
-    @property
-    def resolved(self) -> Floats:
-        """Shares of the pairs of neighbours."""
-        return self.column("resolved")
-
-    @property
-    def contrast_recovery(self) -> Floats:
-        """Of the phantom's contrast."""
-        return self.column("contrast_recovery")
+    rod_diameter = column("rod_diameter", "mm; 0 of a sector without rods.")
+    valley_to_peak = column("valley_to_peak", "Mean valley by mean peak.")
+    resolved = column("resolved", "1 or 0.")
+    contrast_recovery = column("contrast_recovery", "Of the phantom's contrast.")
 
 
 def derenzo_score(
@@ -116,10 +110,15 @@ def derenzo_score(
     linear interpolation of the voxels, as the mean over the middle half of the rods' length and over half a diameter across
     the line. Its peak is the mean of both centres, its valley lies halfway between them: at these known places, not where
     values are largest and smallest, as these differ by noise alone. (Of cold rods, the peak is halfway and the valley in the
-    rods.) A pair is resolved if valley / peak < 0.735, Rayleigh's criterion, as Hallen et al. propose for hot-rod phantoms.
-    Of rods that cannot be seen at all, noise resolves some pairs by chance, while the sector's own valley-to-peak, of the
-    means of all pairs, stays near 1. Contrast recovery is the mean peak minus the mean valley, by the same of the phantom:
-    it is 1 only where the volume's values are right, too.
+    rods.) Where the volume covers only a part of the rods' length, the mean is over what it covers of their middle half, but
+    over a diameter at least: that which is nearest to the middle.
+
+    A sector is resolved if two things hold. Its mean valley / mean peak is below 0.735, Rayleigh's criterion, which Hallen
+    et al. propose for the pairs of hot-rod phantoms. And noise would make so large a difference of both means with a chance
+    below 2 %: it is compared with how rods scatter around their mean, and valleys around theirs (Student's t test of two
+    samples). Pairs by themselves prove nothing: in noise without any rods a third of the sectors may meet the first
+    condition, but at most 2.1 % met both. Contrast recovery is the mean peak minus the mean valley, by the same of the
+    phantom: it is 1 only where the volume's values are right, too.
 
     Parameters
     ----------
@@ -135,9 +134,10 @@ def derenzo_score(
     Returns
     -------
     DerenzoScore
-        A sequence with an item for each sector: rod_diameter (mm), valley_to_peak, resolved, contrast_recovery, profiles.
-        They are NaN, and the item's `note` says why, in a sector with fewer than two rods, with rods thinner than a voxel
-        or beside the volume, or with rods that hold the same as what is between them.
+        A sequence with an item for each sector: rod_diameter (mm), valley_to_peak, resolved, contrast_recovery, chance,
+        profiles. They are NaN, and the item's `note` says why, in a sector with fewer than two rods, with rods thinner than
+        a voxel or beside the volume, of whose length the volume covers less than a diameter, or that hold the same as what
+        is between them.
 
     Raises
     ------
@@ -147,7 +147,7 @@ def derenzo_score(
     References
     ----------
     Hallen, Schug, Schulz 2020, "Comments on the NEMA NU 4-2008 standard on performance measurement of small animal
-    positron emission tomographs", EJNMMI Physics 7:12.
+    positron emission tomographs", EJNMMI Physics 7:12. Student 1908, "The probable error of a mean", Biometrika 6:1-25.
     """
     instance(volume, Volume, "derenzo_score")
     instance(phantom, Phantom, "derenzo_score")
@@ -178,33 +178,58 @@ class _Sector:
     def score(self) -> DerenzoSector:
         diameter = float(self.rods.rod_diameters[self.sector])
         if note := self._missing(diameter):
-            return DerenzoSector(diameter, np.nan, np.nan, np.nan, note=note)
+            return DerenzoSector(diameter, np.nan, np.nan, note=note)
         rods, between = self._true_values()
         if np.isclose(rods, between, rtol=1e-9, atol=0):
             note = f"the rods hold the same {self.volume.quantity} as what is between them"
-            return DerenzoSector(diameter, np.nan, np.nan, np.nan, note=note)
+            return DerenzoSector(diameter, np.nan, np.nan, note=note)
         profiles = self._profiles(diameter, rods > between)
         peak = float(np.mean([profile.peak for profile in profiles]))
         valley = float(np.mean([profile.valley for profile in profiles]))
         ratio, note = (valley / peak, "") if peak > 0 else (np.nan, "the peaks are not above 0")
-        resolved = float(np.mean([profile.valley_to_peak < RESOLVED_BELOW for profile in profiles]))
-        return DerenzoSector(diameter, ratio, resolved, (peak - valley) / abs(rods - between), tuple(profiles), note)
+        contrast = (peak - valley) / abs(rods - between)
+        return DerenzoSector(diameter, ratio, contrast, tuple(profiles), note, self._chance(profiles))
+
+    def _chance(self, profiles: list[RodProfile]) -> float:
+        """That noise makes as large a difference of rods and valleys: of Student's t."""
+        values = np.array([profile.values for profile in profiles]) * (1 if profiles[0].is_hot else -1)
+        which = np.unique(self._pairs, return_inverse=True)[1].ravel()
+        rods = np.bincount(which, values[:, [0, -1]].ravel()) / np.bincount(which)
+        between = values[:, _ALONG // 2]
+        n, m = len(rods), len(between)
+        scatter = (n * rods.var() + m * between.var()) * (1 / n + 1 / m)
+        # t = sqrt(n + m - 2) tan(angle), and the density of the angle goes with cos(angle)^(n + m - 3).
+        angle, shares = np.arctan2(rods.mean() - between.mean(), np.sqrt(scatter)), _middles(999) + 0.5
+        beyond, half = (a * np.mean(np.sin(a * shares) ** (n + m - 3)) for a in (np.pi / 2 - angle, np.pi / 2))
+        return float(beyond / (2 * half))
 
     def _missing(self, diameter: float) -> str:
         """Why the sector has no score, if that is so."""
-        count = len(self._centers)
-        if not count:
+        if not len(self._centers):
             return "no rods"
         if not len(self._pairs):
             return "a single rod has no neighbour"
         # The sampling of the rods' cross-section where it is coarsest: 1 mm of cubic voxels of 1 mm, however turned.
         voxel = 1 / np.linalg.svd(self._index_from_rods[:3, :2], compute_uv=False)[-1]
-        if voxel > diameter * (1 + 1e-6):
-            return f"voxels of {voxel:.3g} mm are larger than the rods"
-        ends = self._centers[:, None] + np.array([-0.5, 0.5])[:, None] * [0, 0, _LENGTH * self.rods.height]
-        index = ends @ self._index_from_rods[:3, :3].T + self._index_from_rods[:3, 3]
-        beside = ((index < -0.5) | (index > np.array(self.volume.grid.shape) - 0.5)).any(axis=(1, 2))
-        return f"{beside.sum()} of {count} rods lie outside the volume" if beside.any() else ""
+        return f"voxels of {voxel:.3g} mm are larger than the rods" if voxel > diameter * (1 + 1e-6) else self._span[2]
+
+    @cached_property
+    def _span(self) -> tuple[float, float, str]:
+        """The part of the rods' length, from and to in mm along z, that profiles are means over, or why there is none."""
+        index = self._centers @ self._index_from_rods[:3, :3].T + self._index_from_rods[:3, 3]
+        along = self._index_from_rods[:3, 2]
+        ends = np.stack([-0.5 - index, np.array(self.volume.grid.shape) - 0.5 - index])
+        ends /= np.where(np.abs(along) < 1e-9, 1e-9, along)
+        enter, leave = ends.min(axis=0).max(axis=1), ends.max(axis=0).min(axis=1)  # where the rods' endless axes do so
+        if (beside := enter > leave).any():
+            return 0.0, 0.0, f"{beside.sum()} of {len(beside)} rods lie outside the volume"
+        height, diameter = self.rods.height, self.rods.rod_diameters[self.sector] * (1 - 1e-6)
+        low, high = max(float(enter.max()), -height / 2), min(float(leave.min()), height / 2)
+        if high - low < min(diameter, height):
+            return 0.0, 0.0, f"the volume covers {max(high - low, 0.0):.3g} of {height:g} mm"
+        half, least = _LENGTH * height / 2, min(diameter, _LENGTH * height) / 2
+        middle = float(np.clip(0, low + least, high - least))
+        return min(max(low, -half), middle - least), max(min(high, half), middle + least), ""
 
     @cached_property
     def _centers(self) -> Floats:
@@ -216,10 +241,9 @@ class _Sector:
     def _pairs(self) -> NDArray[np.int64]:
         """Numbers (P, 2) of rods that are neighbours."""
         most = 2 * self.rods.rod_diameters[self.sector] * (1 + 1e-6)
-        found = []
-        for i, center in enumerate(self._centers):
-            near = np.flatnonzero(np.linalg.norm(self._centers[i + 1 :] - center, axis=1) <= most) + i + 1
-            found += [(i, int(j)) for j in near]
+        places = self._centers
+        apart = (np.linalg.norm(places[i + 1 :] - place, axis=1) for i, place in enumerate(places))
+        found = [(i, i + 1 + int(j)) for i, each in enumerate(apart) for j in np.flatnonzero(each <= most)]
         return np.array(found, np.int64).reshape(-1, 2)
 
     @cached_property
@@ -233,7 +257,8 @@ class _Sector:
     def _true_values(self) -> tuple[float, float]:
         """The phantom's values in the rods and halfway between them, means over the part of the length that counts."""
         starts, ends = self._centers[self._pairs].transpose(1, 0, 2)
-        along = np.linspace(-0.5, 0.5, 9)[:, None, None] * [0, 0, _LENGTH * self.rods.height]
+        low, high, _ = self._span
+        along = (_middles(9) * (high - low) + (low + high) / 2)[:, None, None] * [0, 0, 1]
         places = [points + along for points in (np.concatenate([starts, ends]), (starts + ends) / 2)]
         own = self.rods.pose
         rods, between = (
@@ -243,19 +268,15 @@ class _Sector:
         return float(rods), float(between)
 
     def _profiles(self, diameter: float, is_hot: bool) -> list[RodProfile]:
-        length = _LENGTH * self.rods.height
-        voxels = length * np.linalg.norm(self._index_from_rods[:3, 2])
-        depths = _middles(max(2, int(np.ceil(2 * voxels)))) * length
+        low, high, _ = self._span
+        voxels = (high - low) * np.linalg.norm(self._index_from_rods[:3, 2])
+        depths = _middles(max(2, int(np.ceil(2 * voxels)))) * (high - low)
         aside = _middles(_ACROSS) * _WIDTH * diameter
-        starts, ends = self._centers[self._pairs].transpose(1, 0, 2)
+        starts, ends = (self._centers[self._pairs] + [0, 0, (low + high) / 2]).transpose(1, 0, 2)
         lines = starts[:, None] + np.linspace(0, 1, _ALONG)[:, None] * (ends - starts)[:, None]  # (P, points, 3)
         normals = np.cross([0.0, 0.0, 1.0], ends - starts)
         normals /= np.linalg.norm(normals, axis=1)[:, None]
-        offsets = aside[:, None, None] * normals[:, None, None] + depths[:, None] * [
-            0.0,
-            0.0,
-            1.0,
-        ]  # (P, across, depths, 3)
+        offsets = aside[:, None, None] * normals[:, None, None] + depths[:, None] * [0, 0, 1]  # (P, across, depths, 3)
         values = np.empty(lines.shape[:2])
         world = self._world_from_rods
         step = max(1, _BLOCK // (_ALONG * _ACROSS * len(depths)))

@@ -12,6 +12,7 @@ from ...memory import require
 from ...progress import Progress, in_threads
 from ...validation import instance, positive, real_array, shape_text
 from ...volumes.volume import Volume
+from ..stopping import inside
 
 Floats = NDArray[np.float64]
 Values = Volume | ArrayLike
@@ -121,11 +122,11 @@ def contrast_to_noise(volume: Values, target: ArrayLike, background: ArrayLike) 
         Booleans of its shape: the voxels of each; at least two of the background.
     """
     values = _values(volume, "contrast_to_noise")
-    inside, around = (
+    target_values, around = (
         values[_mask(mask, values.shape, f"contrast_to_noise: {name}", least)]
         for mask, name, least in ((target, "target", 1), (background, "background", 2))
     )
-    contrast, noise = float(inside.mean() - around.mean()), float(around.std(ddof=1))
+    contrast, noise = float(target_values.mean() - around.mean()), float(around.std(ddof=1))
     if not noise:
         return float(np.copysign(np.inf, contrast)) if contrast else 0.0
     return contrast / noise
@@ -188,8 +189,8 @@ def _pair(volume: Values, truth: Values, name: str, mask: ArrayLike | None = Non
         raise InputError(f"{name}: the volume has no voxels")
     if mask is None:
         return values, true
-    inside = _mask(mask, values.shape, f"{name}: mask", 1)
-    return values[inside], true[inside]
+    which = _mask(mask, values.shape, f"{name}: mask", 1)
+    return values[which], true[which]
 
 
 def _values(volume: Values, name: str) -> Floats:
@@ -209,12 +210,10 @@ def _require_fit(volume: Volume, truth: Volume, name: str) -> None:
 
 
 def _mask(mask: ArrayLike, shape: tuple[int, ...], name: str, least: int) -> NDArray[np.bool_]:
-    inside = np.asarray(mask)
-    if inside.dtype != bool or inside.shape != shape:
-        raise InputError(f"{name}: expected booleans of shape {shape_text(shape)}")
-    if np.count_nonzero(inside) < least:
-        raise InputError(f"{name}: expected at least {least} voxels, got {np.count_nonzero(inside)}")
-    return inside
+    found = inside(mask, name, shape)
+    if np.count_nonzero(found) < least:
+        raise InputError(f"{name}: expected at least {least} voxels, got {np.count_nonzero(found)}")
+    return found
 
 
 def _span(true: Floats, data_range: Any, name: str) -> float:

@@ -12,7 +12,7 @@ from ...phantoms.nema import NemaBody, room, sphere_places
 from ...validation import freeze, instance
 from ...volumes.resampling import values_at
 from ...volumes.volume import Volume, require_quantity
-from .rows import Rows
+from .rows import Rows, column
 
 Floats = NDArray[np.float64]
 
@@ -48,20 +48,9 @@ class NemaScore(Rows[NemaSphere]):
     background_regions: Floats
     """Centres (60, 3) of the background regions, world mm."""
 
-    @property
-    def diameter(self) -> Floats:
-        """mm."""
-        return self.column("diameter")
-
-    @property
-    def contrast_recovery(self) -> Floats:
-        """Percent."""
-        return self.column("contrast_recovery")
-
-    @property
-    def background_variability(self) -> Floats:
-        """Percent."""
-        return self.column("background_variability")
+    diameter = column("diameter", "mm.")
+    contrast_recovery = column("contrast_recovery", "Percent.")
+    background_variability = column("background_variability", "Percent.")
 
 
 def nema_score(volume: Volume, phantom: NemaBody, pose: ArrayLike | None = None) -> NemaScore:

@@ -32,3 +32,8 @@ class Rows(Sequence[Row], Generic[Row]):
 
     def __iter__(self) -> Iterator[Row]:
         return iter(self.rows)
+
+
+def column(name: str, text: str) -> Any:
+    """A property of `Rows`: the attribute of all rows as an array, with its docstring."""
+    return property(lambda rows: rows.column(name), doc=text)

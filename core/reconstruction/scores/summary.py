@@ -17,7 +17,7 @@ from ...progress import Progress
 from ...validation import instance
 from ...volumes.resampling import resample
 from ...volumes.volume import Volume, require_quantity
-from .derenzo import RESOLVED_BELOW, DerenzoScore, DerenzoSector, derenzo_score
+from .derenzo import DerenzoScore, derenzo_score
 from .images import nrmse, psnr, same_grid, ssim
 from .nema import NemaScore, NemaSphere, nema_score
 
@@ -50,8 +50,7 @@ class VolumeScore:
         similarity = "" if self.ssim is None else f", SSIM {self.ssim:.3f}"
         lines = [f"All voxels: NRMSE {self.nrmse:.3f}, PSNR {_number(self.psnr, '.1f')} dB{similarity}"]
         if self.derenzo is not None:
-            heads = ("Rods", "valley/peak", f"pairs below {RESOLVED_BELOW}", "contrast recovery")
-            lines += _table(heads, [_rods_row(sector) for sector in self.derenzo if sector.rod_diameter])
+            lines += [f"{sector.rod_diameter:g} mm  {sector.words}" for sector in self.derenzo if sector.rod_diameter]
         if self.nema is not None:
             lines += _table(("Spheres", "contrast recovery", "background variability"), map(_sphere_row, self.nema))
             if not math.isnan(self.nema.lung_residual):
@@ -63,11 +62,12 @@ class VolumeScore:
         """The scores as JSON can hold them: what cannot be told is None."""
         record: dict[str, Any] = {"nrmse": self.nrmse, "psnr_dB": _finite(self.psnr), "ssim": self.ssim}
         if self.derenzo is not None:
-            names = ("rod_diameter", "valley_to_peak", "resolved", "contrast_recovery")
+            names = ("rod_diameter", "valley_to_peak", "contrast_recovery", "chance", "pairs_resolved")
             record["derenzo"] = [
-                {**{name: _finite(getattr(s, name)) for name in names}, "pairs": len(s.profiles), "note": s.note}
+                {**{name: _finite(getattr(s, name)) for name in names}, "pairs": len(s.profiles), "note": s.note,
+                 "resolved": None if math.isnan(s.resolved) else bool(s.resolved)}
                 for s in self.derenzo
-            ]
+            ]  # fmt: skip
         if self.nema is not None:
             columns = ("diameter", "contrast_recovery", "background_variability")
             record["nema"] = [{name: getattr(s, name) for name in columns} for s in self.nema]
@@ -135,36 +135,16 @@ def _scored(
     )  # fmt: skip
 
 
-def _rods_row(sector: DerenzoSector) -> tuple[str, ...]:
-    if math.isnan(sector.resolved):
-        return f"{sector.rod_diameter:g} mm", sector.note
-    return (
-        f"{sector.rod_diameter:g} mm",
-        _number(sector.valley_to_peak, ".2f"),
-        f"{100 * sector.resolved:.0f} % of {len(sector.profiles)}",
-        f"{100 * sector.contrast_recovery:.0f} %",
-    )
-
-
 def _sphere_row(sphere: NemaSphere) -> tuple[str, ...]:
     percents = (f"{percent:.1f} %" for percent in (sphere.contrast_recovery, sphere.background_variability))
     return f"{sphere.diameter:g} mm", *percents
 
 
-def _table(heads: tuple[str, ...], every: Iterable[tuple[str, ...]]) -> list[str]:
-    """Lines with columns under each other, numbers to the right; a row of two cells is a name and a sentence."""
-    rows = list(every)
-    whole = [row for row in rows if len(row) == len(heads)]
-    widths = [max(len(row[column]) for row in (heads, *whole)) for column in range(len(heads))]
-    widths[0] = max(len(row[0]) for row in (heads, *rows))
-
-    def line(row: tuple[str, ...]) -> str:
-        if len(row) < len(heads):
-            return f"{row[0]:<{widths[0]}}  {row[1]}"
-        cells = (f"{cell:>{width}}" for cell, width in zip(row[1:], widths[1:], strict=True))
-        return "  ".join([f"{row[0]:<{widths[0]}}", *cells])
-
-    return [line(heads), *map(line, rows)]
+def _table(heads: tuple[str, ...], rows: Iterable[tuple[str, ...]]) -> list[str]:
+    """Lines with columns under each other, numbers to the right."""
+    every = [heads, *rows]
+    widths = [max(map(len, column)) for column in zip(*every, strict=True)]
+    return ["  ".join([f"{row[0]:<{widths[0]}}", *map(str.rjust, row[1:], widths[1:])]) for row in every]
 
 
 def _number(value: float, form: str) -> str:

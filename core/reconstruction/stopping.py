@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InputError
-from ..validation import positive
+from ..validation import positive, real_numbers
 from .result import Array
 
 
@@ -68,7 +68,7 @@ class StopWhen(StoppingRule):
         if (self.noise is None) != (self.region is None):
             raise InputError("stop: noise needs region, and region needs noise: the voxels in which it is measured")
         if self.region is not None:
-            object.__setattr__(self, "region", np.asarray(self.region))
+            object.__setattr__(self, "region", real_numbers(self.region, "stop: region"))
 
     def check(self, shape: tuple[int, ...]) -> None:
         """Raise `InputError` unless `region` fits a volume of this shape."""
@@ -92,7 +92,7 @@ class StopWhen(StoppingRule):
 
 def inside(mask: ArrayLike, name: str, shape: tuple[int, ...]) -> NDArray[np.bool_]:
     """`mask` as booleans of a volume's shape, or `InputError`."""
-    found = np.asarray(mask)
+    found = real_numbers(mask, name)
     if found.shape != shape or found.dtype != bool:
         got = f"{found.dtype} of {' x '.join(map(str, found.shape)) or 'no'}"
         raise InputError(f"{name}: expected booleans of {' x '.join(map(str, shape))} voxels, got {got}")

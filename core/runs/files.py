@@ -119,7 +119,7 @@ def _run_of(arrays: dict[str, NDArray[Any]], attributes: dict[str, Any]) -> Proj
         volume = Volume(values, Grid((n_x, n_y, n_z), arrays["volume/affine"]), str(attributes["volume_quantity"]))
     n_v, n_u = arrays["projections"].shape[1:]
     return ProjectionRun(
-        projections=np.asarray(arrays["projections"], np.float32),
+        projections=arrays["projections"],
         system=PinholeSystem(arrays["geometry/center"], **lengths, numbers=arrays["geometry/number"]),
         views=Views(**rays, shape=(n_v, n_u)),
         volume=volume,

@@ -18,7 +18,7 @@ from ..errors import InputError, InputWarning
 from ..geometry.system import Detector, PinholeSystem
 from ..memory import require
 from ..progress import Stages
-from ..validation import instance, one_of, positive, require_finite, shape_text
+from ..validation import instance, one_of, positive, real_numbers, require_finite, shape_text
 from .frame_files import Frames, Layout, differs, read_frames
 from .orientations import ORIENTATIONS, on_crystal
 from .recipe import Recipe, recorded_recipe
@@ -82,7 +82,7 @@ def counts_run(
         no counts.
     """
     instance(system, PinholeSystem, "counts: system")
-    array = np.asarray(counts)
+    array = real_numbers(counts, "counts")
     if array.ndim != 3 or not array.size or array.dtype.kind not in "fiu":
         raise InputError(
             f"counts: expected numbers (frames, rows, columns), got {array.dtype} {shape_text(array.shape)}"

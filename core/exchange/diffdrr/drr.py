@@ -12,7 +12,7 @@ from ...geometry.frames import affine_matrix
 from ...geometry.grid import Grid
 from ...geometry.rotations import SIZES, pose_matrix, rotation_matrix
 from ...projector.tracing import trace_rays
-from ...validation import one_of, positive, whole_shape
+from ...validation import one_of, positive, real_array, whole_shape
 from .detector import Detector
 from .poses import RigidTransform, convert
 from .subject import Subject, as_subject, hu_to_density
@@ -300,7 +300,9 @@ def _since_04(
     volume: Any, spacing: Any, sdr: float, *args: Any, bone_attenuation_multiplier: float = 1.0, **kwargs: Any
 ) -> tuple[tuple[Any, ...], dict[str, Any]]:
     """The arguments before 0.4 as those of `DRR._set_up`: the subject stands for CT numbers and their voxel size."""
-    hu = torch.as_tensor(np.array(volume) if not isinstance(volume, Tensor) else volume).flip([0])
+    if not isinstance(volume, Tensor):
+        volume = torch.from_numpy(real_array(volume, "DRR: volume", None, np.float32))
+    hu = volume.flip([0])
     size = np.array([positive(s, "voxel spacing", "mm") for s in np.asarray(spacing).tolist()])
     affine = affine_matrix(np.diag(size), size / 2)
     subject = Subject(hu_to_density(hu, bone_attenuation_multiplier), affine, torch.eye(4), hu)

@@ -10,7 +10,7 @@ from ...errors import InputError
 from ...geometry.grid import Grid
 from ...memory import require
 from ...progress import Progress, in_threads
-from ...validation import instance, positive, real_array, shape_text
+from ...validation import instance, positive, real_array, real_numbers, shape_text
 from ...volumes.volume import Volume
 
 Floats = NDArray[np.float64]
@@ -209,7 +209,7 @@ def _require_fit(volume: Volume, truth: Volume, name: str) -> None:
 
 
 def _mask(mask: ArrayLike, shape: tuple[int, ...], name: str, least: int) -> NDArray[np.bool_]:
-    inside = np.asarray(mask)
+    inside = real_numbers(mask, name)
     if inside.dtype != bool or inside.shape != shape:
         raise InputError(f"{name}: expected booleans of shape {shape_text(shape)}")
     if np.count_nonzero(inside) < least:

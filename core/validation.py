@@ -80,8 +80,8 @@ def require_finite(array: NDArray[Any], name: str, given: NDArray[Any] | None = 
         index = tuple(int(i) for i in bad[0])
         where = f" at index {index if len(index) != 1 else index[0]}" if index else ""
         value = (array if given is None else given)[index]
-        why = f"more than {array.dtype} holds" if np.isfinite(value) else "not a finite number"
-        raise InputError(f"{name}: {value} is {why}{where}")
+        as_kept = f" in {array.dtype}" if np.isfinite(value) else ""
+        raise InputError(f"{name}: {value} is not a finite number{as_kept}{where}")
 
 
 def instance(value: object, kind: type, name: str) -> None:

@@ -82,11 +82,12 @@ def counts_run(
         no counts.
     """
     instance(system, PinholeSystem, "counts: system")
-    array = real_numbers(counts, "counts")
+    array = np.asarray(counts)
     if array.ndim != 3 or not array.size or array.dtype.kind not in "fiu":
         raise InputError(
             f"counts: expected numbers (frames, rows, columns), got {array.dtype} {shape_text(array.shape)}"
         )
+    real_numbers(counts, "counts")  # none masked
     require_told(frames, orientation, time, Frames(array))
     numbers = frame_numbers(frames, len(array), system)
     words = _words(orientation, len(array))

@@ -102,9 +102,7 @@ def test_masks_labels_and_pictures_are_refused_too():
         lambda: mph.nrmse(voxels, voxels, mask=hidden),
         lambda: mph.split_labels(mph.Volume(voxels, GRID, "hu"), np.ma.array(voxels, mask=True)),
         lambda: as_seen(np.ma.array(np.ones((2, 3, 4)), mask=True)),
-        lambda: mph.counts_run(
-            [np.ma.array(np.ones(PIXELS, int), mask=True)] * 4, SYSTEM, "1-4", "back-v", 3.0
-        ),
+        lambda: mph.counts_run([np.ma.array(np.ones(PIXELS, int), mask=True)] * 4, SYSTEM, "1-4", "back-v", 3.0),
     ):
         refused(call, "masked")
 

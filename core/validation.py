@@ -60,7 +60,7 @@ def _masked(value: Any) -> int:
     """How many numbers are masked, of an array, or of those in a list."""
     if isinstance(value, list | tuple):
         return sum(map(_masked, value))
-    return int(np.ma.count_masked(value)) if isinstance(value, np.ma.MaskedArray) else 0
+    return int(value.mask.sum()) if isinstance(value, np.ma.MaskedArray) else 0
 
 
 def batch_shape(shape: tuple[Any, ...], given: tuple[int, ...]) -> tuple[Any, ...]:

@@ -5,7 +5,6 @@ import math
 import sys
 import time
 import uuid
-import warnings
 from collections.abc import Generator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,7 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.errors import InputError, InputWarning
+from ..core.errors import InputError, warn
 from ..core.geometry.system import chosen_modules
 from ..core.memory import require
 from ..core.progress import Progress, stages_of
@@ -136,7 +135,7 @@ def exporting(scene: bpy.types.Scene, filepath: str) -> jobs.Job:
     path = storage.absolute(filepath)
     if found := runs.changes(scene):
         text = f"the run is not of the scene as it is now ({'; '.join(found)}): {path.name} holds what was rendered"
-        warnings.warn(text, InputWarning, stacklevel=2)
+        warn(text)
 
     def work(progress: Progress) -> None:
         stages_of(progress)("reading the run file")

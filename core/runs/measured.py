@@ -5,7 +5,6 @@ None of these is guessed, not even where the number of frames is that of the mod
 
 import operator
 import re
-import warnings
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -14,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..errors import InputError, InputWarning
+from ..errors import InputError, warn
 from ..geometry.system import Detector, PinholeSystem
 from ..memory import require
 from ..progress import Stages
@@ -271,9 +270,9 @@ def _warn_of_others(found: Counts, used: list[int], words: list[str], run: Proje
     time, times = run.recipe["model.time"], found.exposures(used)
     if any(differs(one, time) for one in times):
         said = "exposures" if len(times) > 1 else "an exposure"
-        _warn(f"{found.name}: the file says {said} of {_and(times)} s; taken as {time:g} s, as given")
+        warn(f"{found.name}: the file says {said} of {_and(times)} s; taken as {time:g} s, as given")
     if len(windows := np.unique(found.about[used, 3])) > 1 and np.isfinite(windows).all():
-        _warn(
+        warn(
             f"{found.name}: frames of the energy windows {_and(windows)} are used; say none of those that are not meant"
         )
     steps = np.linalg.norm([run.views.u_steps, run.views.v_steps], axis=2) / run.settings["magnification"]
@@ -284,7 +283,7 @@ def _warn_of_others(found: Counts, used: list[int], words: list[str], run: Proje
             said, taken = (" x ".join(f"{x:.4g}" for x in sizes) for sizes in (size, own))
             covering = "so that they cover the crystal; if the file is right, give their size (--pitch)"
             why = covering if run.settings["pitch_mm"] is None else "as given"
-            _warn(f"{found.name}: the file says pixels of {said} mm; taken as {taken} mm, {why}")
+            warn(f"{found.name}: the file says pixels of {said} mm; taken as {taken} mm, {why}")
             return
 
 
@@ -294,11 +293,11 @@ def _warn_of_frames(array: NDArray[Any], used: list[int], numbers: list[int | No
     sums = {k: float(array[k].sum(dtype=float)) for k in used}
     usual = float(np.median([total for total in sums.values() if total] or [0.0]))
     if usual > _FEW and (empty := [called[k] for k in used if not sums[k]]):
-        _warn(f"{name}: no counts in {_some(empty)}, {usual:g} in others")
+        warn(f"{name}: no counts in {_some(empty)}, {usual:g} in others")
     known: dict[bytes, int] = {}
     pairs = [(known.setdefault(array[k].tobytes(), k), k) for k in used if np.count_nonzero(array[k]) > _FEW]
     if equal := [f"{called[one]} and {called[k]}" for one, k in pairs if one != k]:
-        _warn(f"{name}: equal in every pixel: {_some(equal)}")
+        warn(f"{name}: equal in every pixel: {_some(equal)}")
     usual = sorted([0.0, *(float(array[k].max()) for k in used)])[len(used) // 2]
     for k in used:
         row, column = divmod(int(array[k].argmax()), array.shape[2])
@@ -306,7 +305,7 @@ def _warn_of_frames(array: NDArray[Any], used: list[int], numbers: list[int | No
         *others, peak = np.sort(near, axis=None).tolist()
         if peak > _BRIGHT * max(1, usual, *others):
             text = f"{called[k]}, row {row + 1}, column {column + 1}: {peak:g} counts"
-            _warn(f"{name}: {text}, at most {max(others, default=0):g} in the pixels around it and {usual:g} in others")
+            warn(f"{name}: {text}, at most {max(others, default=0):g} in the pixels around it and {usual:g} in others")
 
 
 def _and(numbers: Sequence[float]) -> str:
@@ -323,7 +322,3 @@ def _listed(numbers: Sequence[int]) -> str:
     parts = [(numbers[a], numbers[b - 1]) for a, b in pairwise(cuts)]
     texts = [f"{a}-{b}" if b > a else str(a) for a, b in parts]
     return ", ".join(texts if len(texts) <= 6 else [*texts[:5], "…"])
-
-
-def _warn(text: str) -> None:
-    warnings.warn(text, InputWarning, stacklevel=4)

@@ -1,12 +1,13 @@
 """Checks of arguments where they enter the package."""
 
 from collections.abc import Collection
+from math import pi
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .errors import InputError
+from .errors import InputError, warn
 from .memory import require
 
 # Copies of fewer numbers always fit into memory.
@@ -35,6 +36,16 @@ def real_array(
         raise InputError(f"{name}: expected shape {expected}, got {shape_text(array.shape)}")
     require_finite(array, name, raw)
     return array
+
+
+def radians(value: ArrayLike, name: str, shape: tuple[int | None, ...] | None = ()) -> NDArray[np.float64]:
+    """Angles in rad, as of `real_array`; warns where one is more than a full turn, as most in degrees are."""
+    angles = real_array(value, name, shape)
+    if (most := float(np.abs(angles).max(initial=0.0))) > 2.001 * pi:
+        warn(
+            f"{name}: {most:g} rad is more than a full turn: is it in degrees? np.radians({most:g}) is {most * pi / 180:.4g}"
+        )
+    return angles
 
 
 def real_numbers(value: ArrayLike, name: str) -> NDArray[Any]:

@@ -66,13 +66,8 @@ def project_run(
         photons = positive(photons, "photons")
     elif noise_seed is not None and not isinstance(model, Emission):
         raise InputError("noise_seed: only the counts of an Emission, or photons that pass, have noise")
-    lowest, highest = float(volume.array.min()), float(volume.array.max())
-    if isinstance(model, Emission) and lowest < -0.1 * abs(highest):  # interpolation leaves less
-        warn(f"the activity is {lowest:g} to {highest:g} kBq/mL: what is below 0 makes counts below 0")
     views = system.views(shape=shape, detector=detector, magnification=magnification, pitch=pitch)
-    if isinstance(model, Emission) and not model.within_crystal:
-        _warn_of_no_crystal(system, views, magnification)
-    _warn_of_unseen(volume, views, ends_at_plane=not isinstance(model, Emission))
+    warn_of_images(volume, system, views, magnification, model)
     n_v, n_u = views.shape
     require(4.0 * len(views) * n_v * n_u, f"a set of {len(views)} projections of {n_v} x {n_u} pixels")
     projector = Projector(volume.grid, views, model=model, backend=backend, threads=threads)
@@ -97,6 +92,16 @@ def project_run(
     return ProjectionRun(
         images, system, views, volume, unit=unit, settings=record, seed=noise_seed, background=model.background
     )
+
+
+def warn_of_images(volume: Volume, system: PinholeSystem, views: Views, magnification: float, model: Model) -> None:
+    """Warn where images of a volume hardly are what is wanted: activity below 0, pixels beside crystals, unseen parts."""
+    lowest, highest = float(volume.array.min()), float(volume.array.max())
+    if isinstance(model, Emission) and lowest < -0.1 * abs(highest):  # interpolation leaves less
+        warn(f"the activity is {lowest:g} to {highest:g} kBq/mL: what is below 0 makes counts below 0")
+    if isinstance(model, Emission) and not model.within_crystal:
+        _warn_of_no_crystal(system, views, magnification)
+    _warn_of_unseen(volume, views, ends_at_plane=not isinstance(model, Emission))
 
 
 def warn_of_energy(model: Model, energy: float, what: str) -> None:

@@ -296,10 +296,15 @@ def truth_of_run(run: ProjectionRun) -> tuple[Volume | Phantom, NDArray[np.float
 
 def _mu_of_phantom(phantom: Phantom, pose: NDArray[np.float64], grid: Grid, model: Model, stages: Stages) -> Volume:
     """What the phantom attenuates, on a grid."""
+    require_mu(phantom, model)
+    return phantom.voxelize(grid, pose, stages("voxelizing"), "mu")
+
+
+def require_mu(phantom: Phantom, model: Model) -> None:
+    """Raise `InputError` where a phantom attenuates nothing; warn where the model counts photons of another energy."""
     if all(shape.mu is None for shape in phantom.shapes):
         raise InputError(f"attenuation.of_phantom (--phantom-mu): no shape of the {phantom.title} has a mu")
     warn_of_energy(model, phantom.mu_energy, f"the mu of the {phantom.title}")
-    return phantom.voxelize(grid, pose, stages("voxelizing"), "mu")
 
 
 def phantom_pose(recipe: Recipe) -> NDArray[np.float64]:

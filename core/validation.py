@@ -39,12 +39,11 @@ def real_array(
 
 
 def radians(value: ArrayLike, name: str, shape: tuple[int | None, ...] | None = ()) -> NDArray[np.float64]:
-    """Angles in rad, as of `real_array`; warns where one is more than a full turn, as most in degrees are."""
+    """Angles in rad, as of `real_array`; warns where they are, or reach over, more than a full turn, as degrees do."""
     angles = real_array(value, name, shape)
-    if (most := float(np.abs(angles).max(initial=0.0))) > 2.001 * pi:
-        warn(
-            f"{name}: {most:g} rad is more than a full turn: is it in degrees? np.radians({most:g}) is {most * pi / 180:.4g}"
-        )
+    most = max(float(np.ptp(angles)), float(np.abs(angles).min())) if angles.size else 0.0
+    if most > 2.001 * pi:
+        warn(f"{name}: {most:g} rad is more than a full turn: are these degrees? np.radians(...) converts them")
     return angles
 
 

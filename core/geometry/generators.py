@@ -138,7 +138,7 @@ def even_azimuths(ellipse: Ellipse, modules: Any, start: float, end: float, spac
     count = whole_number(modules, "modules")
     if count > _MOST_MODULES:
         raise InputError(f"modules: expected at most {_MOST_MODULES} in a ring, got {count}")
-    start, end = (float(radians(x, name)) for x, name in ((start, "start"), (end, "end")))
+    start, end = (float(real_array(x, name, ())) for x, name in ((start, "start"), (end, "end")))
     turn = abs(end - start)
     if turn > FULL_TURN + 1e-9:
         raise InputError(f"start and end: expected at most a full turn apart, got {math.degrees(turn):g} degrees")

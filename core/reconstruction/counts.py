@@ -17,7 +17,7 @@ from .result import Array
 # Less is nothing: float32 could not hold what it would be divided into.
 LEAST = np.float32(1e-30)
 
-_SURE, _SURE_SHARE = 30.0, 0.01
+_SURE, _SURE_SHARE = 30.0, 0.015
 """Log-likelihood that chance does not give, and, as a share of the counts, that a coarse model does not."""
 
 

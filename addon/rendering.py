@@ -114,9 +114,14 @@ def load_recipe(scene: bpy.types.Scene, path: Path) -> None:
     """Set the scene's panel as a recipe (.toml) or the recipe of a run says."""
     recipe = read_recipe(path) if path.suffix.lower() == ".toml" else read_run(path).recipe
     settings = scene.mphdrr_projections
-    set_panel(settings, recipe)
+    _set_physics(scene, recipe)
     known = {item.name: item for item in volumes.volume_objects(scene)}
     settings.volume, settings.mu = known.get(recipe["volume.object"]), known.get(recipe["attenuation.object"])
+
+
+def _set_physics(scene: bpy.types.Scene, recipe: Recipe) -> None:
+    """Set the panel, and the angle that it has from the scanner; raises InputError for what the panel cannot show."""
+    set_panel(scene.mphdrr_projections, recipe)
     collection = scanner.active_scanner(scene)
     if collection is not None and OPENING_ANGLE in recipe.given:
         collection.mphdrr_scanner.opening_angle = math.radians(recipe[OPENING_ANGLE])
@@ -174,7 +179,7 @@ def taken_over(scene: bpy.types.Scene, run: ProjectionRun, volume: bpy.types.Obj
     except InputError:
         return {}
     with contextlib.suppress(InputError):  # what the panel cannot show is said to have changed
-        set_panel(scene.mphdrr_projections, recipe)
+        _set_physics(scene, recipe)
     state = runs.state_of(run.system, recipe, volume, None)
     if volume is None:
         return state | {"measured": caption(run)}

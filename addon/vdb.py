@@ -138,15 +138,10 @@ def _grid_of(volume: Volume, provenance: dict[str, Any], shift: float) -> Any:
     # OpenVDB's matrices act on row vectors.
     grid.transform = vdb.createLinearTransform(_drawn(affine, volume.grid.shape, mirrored, shift).T.tolist())
     known = {
-        "quantity": volume.quantity,
-        "unit": volume.unit,
-        "shape": json.dumps(volume.grid.shape),
-        "affine": json.dumps(affine.tolist()),
-        "mirrored": mirrored,
-        "center_shift": shift,
-        "provenance": json.dumps(provenance),
-        "version": VERSION,
-    } | ({"note": _NOTE.format(back=-shift)} if shift else {})
+        "quantity": volume.quantity, "unit": volume.unit, "shape": json.dumps(volume.grid.shape),
+        "affine": json.dumps(affine.tolist()), "mirrored": mirrored, "center_shift": shift,
+        "provenance": json.dumps(provenance), "version": VERSION,
+    } | ({"note": _NOTE.format(back=-shift)} if shift else {})  # fmt: skip
     for key, value in known.items():
         grid[f"mphdrr_{key}"] = value
     return grid

@@ -317,12 +317,9 @@ def _interfile(path: Path, layout: Layout) -> Counts:
     times = next(([float(text) for text in header[key]] for key in keys if any(header.get(key, ()))), [])
     windows = int(number("number of energy windows", 1))
     return _counts(
-        _numbers(data, type_, (count, rows, columns), skip),
-        f"{windows} energy windows" if windows > 1 else "",
-        time=times,
-        pixel=[float(said(f"scaling factor (mm/pixel) [{i}]", "nan")) for i in (1, 2)],
-        window=range(1, windows + 1),
-    )
+        _numbers(data, type_, (count, rows, columns), skip), f"{windows} energy windows" if windows > 1 else "", time=times,
+        pixel=[float(said(f"scaling factor (mm/pixel) [{i}]", "nan")) for i in (1, 2)], window=range(1, windows + 1),
+    )  # fmt: skip
 
 
 def _interfile_header(path: Path) -> dict[str, list[str]]:
@@ -371,13 +368,10 @@ def _dicom(path: Path, layout: Layout) -> Counts:
     if (slope, intercept) != (1.0, 0.0):
         array = array * slope + intercept
     several = {name: int(data.get(f"NumberOf{name.replace(' ', '')}s") or 1) for name in _VECTORS}
-    return _counts(
-        array,
-        ", ".join(f"{n} {name.lower()}s" for name, n in several.items() if n > 1),
-        time=_dicom_times(data),
-        pixel=[float(size) for size in data.get("PixelSpacing") or (math.nan, math.nan)][::-1],
-        window=list(data.get("EnergyWindowVector") or range(1, several["Energy Window"] + 1)),
-    )
+    kind = ", ".join(f"{n} {name.lower()}s" for name, n in several.items() if n > 1)
+    pixel = [float(size) for size in data.get("PixelSpacing") or (math.nan, math.nan)][::-1]
+    windows = _which(data, "Energy Window", several["Energy Window"])
+    return _counts(array, kind, time=_dicom_times(data), pixel=pixel, window=windows)
 
 
 _VECTORS = ("Energy Window", "Detector", "Phase", "Rotation", "RR Interval", "Time Slot")
@@ -389,8 +383,14 @@ def _dicom_times(data: Any) -> list[float]:
     for name in ("Rotation", "Phase"):
         parts = [_dicom_time(part) for part in data.get(f"{name}InformationSequence") or ()]
         if any(map(math.isfinite, parts)):
-            return [parts[number - 1] for number in data.get(f"{name}Vector") or range(1, len(parts) + 1)]
+            return [parts[number - 1] for number in _which(data, name, len(parts))]
     return [_dicom_time(data)]
+
+
+def _which(data: Any, name: str, count: int) -> list[int]:
+    """Which of `count` windows, rotations or phases each frame is of; unsaid, those of blocks of frames."""
+    vector = data.get(f"{name.replace(' ', '')}Vector") or np.arange(1, count + 1)
+    return [int(number) for number in np.atleast_1d(vector)]
 
 
 def _dicom_time(place: Any) -> float:

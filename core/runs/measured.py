@@ -113,16 +113,11 @@ def counts_run(
     given |= {"model.kind": "emission", "model.time": time, "detector.plane": detector}
     given |= {"detector.rows": n_v, "detector.columns": n_u, "detector.magnification": float(magnification)}
     record = {
-        "counts": "measured",
-        "frames": numbers,
-        "orientation": words[0] if len(set(words)) == 1 else words,
-        "detector": detector,
-        "magnification": float(magnification),
-        "pitch_mm": None if pitch is None else np.broadcast_to(pitch, 2).tolist(),
-        "model": "emission",
-        **(settings or {}),
-        "recipe": recorded_recipe(Recipe(given)).tables(),
-    }
+        "counts": "measured", "frames": numbers, "orientation": words[0] if len(set(words)) == 1 else words,
+        "detector": detector, "magnification": float(magnification),
+        "pitch_mm": None if pitch is None else np.broadcast_to(pitch, 2).tolist(), "model": "emission",
+        **(settings or {}), "recipe": recorded_recipe(Recipe(given)).tables(),
+    }  # fmt: skip
     used = [place[int(number)] for number in system.numbers]
     background = given.get("model.background", 0.0)
     run = ProjectionRun(images, system, views, unit="counts", settings=record, background=background)
@@ -143,18 +138,11 @@ def recipe_counts(recipe: Recipe, system: PinholeSystem, stages: Stages = lambda
         frames = _read_numbers(Path(recipe["counts.frames_file"]))
     try:
         run = counts_run(
-            found,
-            system,
-            frames,
-            orientation[0] if orientation and len(orientation) == 1 else orientation,
-            recipe.given.get("model.time"),
-            expected=recipe["counts.expected"],
-            detector=recipe.given.get("detector.plane", "real"),
-            magnification=recipe["detector.magnification"],
-            pitch=recipe["detector.pitch"],
-            recipe=recipe,
-            settings={"counts": found.name},
-        )
+            found, system, frames, orientation[0] if orientation and len(orientation) == 1 else orientation,
+            recipe.given.get("model.time"), expected=recipe["counts.expected"],
+            detector=recipe.given.get("detector.plane", "real"), magnification=recipe["detector.magnification"],
+            pitch=recipe["detector.pitch"], recipe=recipe, settings={"counts": found.name},
+        )  # fmt: skip
     except InputError as error:
         raise InputError(f"{found.name}: {error}") from None
     _require_size(recipe, run, found.name)

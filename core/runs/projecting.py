@@ -79,15 +79,11 @@ def project_run(
     if noise_seed is not None:
         images = sample_counts(images, noise_seed).astype(np.float32)
     record = {
-        "detector": detector,
-        "magnification": float(magnification),
-        "pitch_mm": None if pitch is None else np.broadcast_to(pitch, 2).tolist(),
-        "model": model.name,
-        **model.record(),
-        **({} if photons is None else {"photons": photons}),
-        "backend": projector.backend,
+        "detector": detector, "magnification": float(magnification),
+        "pitch_mm": None if pitch is None else np.broadcast_to(pitch, 2).tolist(), "model": model.name,
+        **model.record(), **({} if photons is None else {"photons": photons}), "backend": projector.backend,
         **(settings or {}),
-    }
+    }  # fmt: skip
     unit = model.unit(volume) if photons is None else "photons"
     return ProjectionRun(
         images, system, views, volume, unit=unit, settings=record, seed=noise_seed, background=model.background

@@ -89,20 +89,13 @@ def run_recipe(
         if seed is not None:  # noise of its own for each state
             record = record.updated({"noise.seed": seed + number})
         yield project_run(
-            system,
-            source,
-            shape=(recipe["detector.rows"], recipe["detector.columns"]),
-            detector=recipe["detector.plane"],
-            magnification=recipe["detector.magnification"],
-            pitch=recipe["detector.pitch"],
-            backend=recipe["compute.backend"],
-            threads=recipe["compute.threads"],
+            system, source, (recipe["detector.rows"], recipe["detector.columns"]), detector=recipe["detector.plane"],
+            magnification=recipe["detector.magnification"], pitch=recipe["detector.pitch"],
+            backend=recipe["compute.backend"], threads=recipe["compute.threads"],
             settings={"volume": _volume_name(record), **converted, "recipe": record.tables()},
-            model=recipe_model(recipe, system, mu_of_it),
-            photons=recipe["model.photons"],
-            noise_seed=record["noise.seed"],
-            progress=stages("projecting"),
-        )
+            model=recipe_model(recipe, system, mu_of_it), photons=recipe["model.photons"],
+            noise_seed=record["noise.seed"], progress=stages("projecting"),
+        )  # fmt: skip
 
 
 def recipe_views(recipe: Recipe, system: PinholeSystem) -> Views:

@@ -4,6 +4,7 @@ The studio is a scene with copies of what is shown, so that the user's scene sta
 graphics card.
 """
 
+import sys
 import tempfile
 import time
 from collections.abc import Callable, Generator, Sequence
@@ -17,7 +18,7 @@ from mathutils import Vector
 from numpy.typing import NDArray
 
 from ..core.cli.options import output_path
-from ..core.errors import InputError
+from ..core.errors import InputError, warn
 from ..core.figures.kinds import KINDS, Studio, figure_kind
 from ..core.figures.page import SUFFIXES, Page, box
 from ..core.figures.parts import heading, heading_height
@@ -26,7 +27,9 @@ from ..core.geometry.collimator import Construction
 from ..core.geometry.module_parts import module_parts
 from ..core.geometry.system import PinholeSystem
 from ..core.progress import Cancelled, Progress
+from ..core.recording import recorded_warnings
 from ..core.runs.files import read_run
+from ..core.runs.resizing import resized
 from . import collimators, compat, following, ids, jobs, looks, phantoms, scanner, selection, storage, studio, volumes
 from .choices import items
 
@@ -45,13 +48,13 @@ _NEAR = 1.7  # ROI radii from the isocentre to the edge of a picture from near b
 _CUT = 0.15  # of b: modules whose pinholes are farther to the front are cut away
 _MOST_RUNS = 6  # of module numbers that a title lists
 _PAUSE = 0.02  # s between two looks at Blender's render job
+_REST = 0.5  # s between two looks at Blender's render job where nothing waits for it
+_SMALL, _TRACE = 240, 8  # pixels across, and of 255: what a volume that can be seen changes in a small picture
+_drawn: set[tuple[str, str, float, float]] = set()  # volumes and looks that Cycles is known to draw
+_UNSEEN = ": Low and High draw none of its values, its file is missing, or this Blender's Cycles draws no volumes"
 _RAY_RADIUS, _RAY_COLOR = 0.6, (1.0, 0.94, 0.8, 1.0)  # mm; linear RGBA
-_INK, _FAINT, _UNDER_INK, _AXES = (
-    "#ffffff",
-    "#c4cad2",
-    "#22252a",
-    ("#ff8a80", "#8ee59a", "#8cb8ff"),
-)  # of labels: text, x, y and z
+_INK, _FAINT, _UNDER_INK = "#ffffff", "#c4cad2", "#22252a"  # of labels: text
+_AXES = ("#ff8a80", "#8ee59a", "#8cb8ff")  # x, y and z
 
 _TURNS = np.linspace(0.0, 2 * np.pi, 64, endpoint=False)
 _BALL = np.stack(  # points (N, 3) of a sphere of radius 1
@@ -65,14 +68,9 @@ _BALL = np.stack(  # points (N, 3) of a sphere of radius 1
 
 
 def figure_job(
-    context: bpy.types.Context,
-    name: str,
-    paths: Sequence[Path],
-    size: tuple[int, int] | None = None,
-    modules: str | None = None,
-    labels: bool = True,
-    samples: int = SAMPLES,
-) -> jobs.Job:
+    context: bpy.types.Context, name: str, paths: Sequence[Path], size: tuple[int, int] | None = None,
+    modules: str | None = None, labels: bool = True, samples: int = SAMPLES,
+) -> jobs.Job:  # fmt: skip
     """The job that writes a figure of the context's scene to files (.png, .svg), `size` pixels wide and high.
 
     `modules` are all by default; of figures of one module, the active one. Raises InputError where the scene has not what
@@ -121,13 +119,9 @@ def figure_job(
 
 
 def rendering(
-    page: Page,
-    subject: Subject,
-    shown: Studio,
-    item: bpy.types.Object | None = None,
-    labels: bool = True,
+    page: Page, subject: Subject, shown: Studio, item: bpy.types.Object | None = None, labels: bool = True,
     samples: int = SAMPLES,
-) -> Generator[None, None, None]:
+) -> Generator[None, None, None]:  # fmt: skip
     """Render a subject's scanner, and the volume of an object, onto a page; yields while Blender's own job renders."""
     assert subject.scanner is not None
     system = subject.chosen(subject.scanner)
@@ -142,14 +136,16 @@ def rendering(
         radius = float(subject.scanner.roi_radius.max())
         roi = _put(scene, collimators.new_sphere(ids.STUDIO, radius, collimators.part_material("ROI")))
         roi.visible_shadow = False
+        drawn: list[bpy.types.Object] = []
         if shown.volume and item is not None:
-            _put(scene, item.data).matrix_world = item.matrix_world
+            drawn = [_put(scene, item.data)]
+            drawn[0].matrix_world = item.matrix_world
             surface = looks.surface_of(item)
             if surface is not None:  # of a look that draws no smoke
-                drawn = surface.copy()
-                drawn.data, drawn.parent = surface.data.copy(), None
-                scene.collection.objects.link(drawn)
-                drawn.matrix_world = surface.matrix_world
+                drawn.append(surface.copy())
+                drawn[1].data, drawn[1].parent = surface.data.copy(), None
+                scene.collection.objects.link(drawn[1])
+                drawn[1].matrix_world = surface.matrix_world
         if shown.rays:
             _put(scene, _rays(system))
         points = _corners(system if shown.cut else subject.scanner, radius)
@@ -159,10 +155,9 @@ def rendering(
         with tempfile.TemporaryDirectory(prefix="mphdrr-") as folder:
             path = Path(folder) / "figure.png"
             _set_up(scene, page, samples, path)
-            yield from _render(scene)
-            if not path.is_file():  # the user has pressed Esc
-                raise Cancelled
-            page.image(_pixels(path), 0, 0, page.width, page.height)
+            if item is not None and drawn and not (yield from _leave_a_trace(scene, drawn)):
+                warn(f"the picture shows nothing of {item.name!r}{_UNSEEN}")
+            page.image((yield from _render(scene)), 0, 0, page.width, page.height)
         if labels:
             if shown.near:  # what is shown reaches under the title
                 page.area(box(0, 0, page.width, top), _UNDER_INK, 0.55)
@@ -291,12 +286,63 @@ def _set_up(scene: bpy.types.Scene, page: Page, samples: int, path: Path) -> Non
     render.filepath = str(path)
 
 
-def _render(scene: bpy.types.Scene) -> Generator[None, None, None]:
+def _leave_a_trace(scene: bpy.types.Scene, drawn: list[bpy.types.Object]) -> Generator[None, None, bool]:
+    """Whether objects are to be seen at all, by small pictures with and without them."""
+    render, cycles, pictures = scene.render, scene.cycles, []
+    render.resolution_percentage, cycles.use_denoising = min(100, -(-100 * _SMALL // render.resolution_x)), False
+    samples, cycles.samples = cycles.samples, SAMPLES
+    for hidden in (True, False):
+        for part in drawn:
+            part.hide_render = hidden
+        pictures.append((yield from _render(scene)).astype(int))
+    render.resolution_percentage, cycles.use_denoising, cycles.samples = 100, True, samples
+    rows, columns = (n // 8 for n in pictures[0].shape[:2])  # means, which have less noise
+    return bool(np.abs(resized(pictures[0] - pictures[1], rows, columns)).max() > _TRACE)
+
+
+@bpy.app.handlers.persistent
+def before_render(scene: bpy.types.Scene, *_: Any) -> None:
+    """Blender's own Render: say which volumes of the 3D views the picture lacks; in the window, when it is done."""
+    if bpy.app.background and not scene.name.startswith(ids.STUDIO):
+        _say_what_is_unseen()
+    elif not (scene.name.startswith(ids.STUDIO) or bpy.app.timers.is_registered(_say_what_is_unseen)):
+        bpy.app.timers.register(_say_what_is_unseen, first_interval=_REST)
+
+
+def _say_what_is_unseen() -> float | None:
+    if jobs.is_running() or bpy.app.is_job_running("RENDER"):
+        return _REST
+    scene, missing, collection = bpy.context.scene, storage.missing_volumes(), scanner.active_scanner(bpy.context.scene)
+    for item in (item for item in volumes.volume_objects(scene) if item.visible_get()):
+        look, why = item.mphdrr_volume, ""
+        known = item.data.filepath, look.look, look.display_low, look.display_high
+        if item.hide_render or all(home.hide_render for home in item.users_collection):
+            why = ": it is hidden in renders"
+        elif item.data in missing:
+            why = ": its files are missing"
+        elif collection is not None and scene.render.engine == "CYCLES" and known not in _drawn:
+            with recorded_warnings() as said:
+                subject, near = Subject(scanner.read_scanner(collection)[:1]), Studio(volume=True, near=True)
+                list(rendering(Page(_SMALL, _SMALL), subject, near, item, False, 1))
+            why = _UNSEEN if any(_UNSEEN in text for text in said) else ""
+            _drawn.update([] if why else [known])
+        if why:
+            text = f"the picture shows nothing of {item.name!r}{why}"
+            print(f"mphDRR: {text}", file=sys.stderr)
+            if not bpy.app.background:
+                line = partial(lambda text, menu, _: menu.layout.label(text=text), text)
+                bpy.context.window_manager.popup_menu(line, title="mphDRR", icon="ERROR")
+    return None
+
+
+def _render(scene: bpy.types.Scene) -> Generator[None, None, NDArray[np.uint8]]:
     """Render a scene; in the window as Blender's own job, which its status bar shows and Esc ends."""
+    path = Path(scene.render.filepath)
+    path.unlink(missing_ok=True)
     try:
         if not jobs.is_running():
             bpy.ops.render.render(write_still=True, scene=scene.name)
-            return
+            return _pixels(path)
         view = bpy.context.preferences.view
         before, view.render_display_type = view.render_display_type, "NONE"
         try:
@@ -308,6 +354,9 @@ def _render(scene: bpy.types.Scene) -> Generator[None, None, None]:
     while bpy.app.is_job_running("RENDER"):
         time.sleep(_PAUSE)
         yield
+    if not path.is_file():  # the user has pressed Esc
+        raise Cancelled
+    return _pixels(path)
 
 
 def _pixels(path: Path) -> NDArray[np.uint8]:

@@ -292,11 +292,12 @@ class JobOperator:
             # Drawing is work, too. A window that is drawn slowly has few turns, and does more in each.
             since = time.perf_counter() - self._left
             enough = time.perf_counter() + max(0.0 if is_drawing else _STEP, min(_SHARE * since, _MOST))
-            while True:
-                step = worker.steps.throw(Cancelled()) if worker.is_stoppable else next(worker.steps)
-                worker.show_step(step)
-                if time.perf_counter() >= enough or (step is not None and step[1] == step[2]):
-                    break
+            with warnings_reported(self):  # type: ignore[arg-type]
+                while True:
+                    step = worker.steps.throw(Cancelled()) if worker.is_stoppable else next(worker.steps)
+                    worker.show_step(step)
+                    if time.perf_counter() >= enough or (step is not None and step[1] == step[2]):
+                        break
             self._left = time.perf_counter()
         except StopIteration as end:
             self._end(context)

@@ -35,7 +35,7 @@ def show(item: bpy.types.Object, cut: Cut | None) -> None:
     settings = item.mphdrr_volume
     factor = volume_materials.shown_unit(settings.quantity)[1]
     low = settings.display_low / factor
-    high = max(settings.display_high / factor, low + 1e-30)
+    high = max(settings.display_high / factor, low + max(1e-30, 1e-6 * abs(low)))
     exponent, gain = _SMOKE.get(settings.look, (1.0, 0.0))
     for material in filter(None, item.data.materials):
         volume_materials.set_range(material, low, high)

@@ -1,12 +1,11 @@
 """Volumes whose files are gone, as after a crash that took the temporary folder: those with a recipe are made again."""
 
-import warnings
 from collections.abc import Generator
 from typing import Any
 
 import bpy
 
-from ..core.errors import InputError, InputWarning
+from ..core.errors import InputError, warn
 from ..core.progress import Progress, part_of
 from . import jobs, maps, phantoms, storage, volumes
 
@@ -30,9 +29,9 @@ def remaking(scene: bpy.types.Scene) -> jobs.Job:
             job = phantoms.updating(item) if phantoms.settings_of(item) is not None else maps.again(scene, item)
             made.append((item.name, job))
         except InputError as error:
-            warnings.warn(f"{item.name}: {error}", InputWarning, stacklevel=2)
+            warn(f"{item.name}: {error}")
     if others:
-        warnings.warn(what_to_do(others), InputWarning, stacklevel=2)
+        warn(what_to_do(others))
     if not made:
         raise InputError("no phantom or map misses its files, or none can be made again")
 

@@ -16,6 +16,7 @@ from . import (
     color_bar,
     epipolar_drawing,
     event_notes,
+    figures,
     following,
     framing,
     frustums,
@@ -117,46 +118,26 @@ MENUS.append((bpy.types.STATUSBAR_HT_header, jobs.draw_status))
 MENUS += [(menu, _draw_submenu(*submenu)) for menu, submenu in SUBMENUS.items()]
 MENUS.append((bpy.types.WM_MT_splash, _draw_splash))
 
-# (list in bpy.app.handlers, function): decorate the function with @bpy.app.handlers.persistent.
-HANDLERS: tuple[tuple[list[Any], Any], ...] = (
-    (bpy.app.handlers.load_pre, jobs.stop),
-    (bpy.app.handlers.load_pre, slices.before_load),
-    (bpy.app.handlers.load_pre, preview.stop),
-    (bpy.app.handlers.load_pre, framing.forget),
-    (bpy.app.handlers.load_post, volumes.after_load),
-    (bpy.app.handlers.load_post, recovery.after_load),
-    (bpy.app.handlers.load_post, live_scanner.after_load),
-    (bpy.app.handlers.load_post, runs.after_load),
-    (bpy.app.handlers.load_post, recoloring.check),
-    (bpy.app.handlers.undo_post, recoloring.check),
-    (bpy.app.handlers.redo_post, recoloring.check),
-    (bpy.app.handlers.depsgraph_update_post, live_scanner.after_update),
-    (bpy.app.handlers.depsgraph_update_post, selection.after_update),
-    (bpy.app.handlers.depsgraph_update_post, planes.after_update),
-    (bpy.app.handlers.depsgraph_update_post, frustums.after_update),
-    (bpy.app.handlers.depsgraph_update_post, runs.after_update),
-    (bpy.app.handlers.frame_change_post, runs.after_update),
-    (bpy.app.handlers.undo_post, runs.after_update),
-    (bpy.app.handlers.redo_post, runs.after_update),
-    (bpy.app.handlers.depsgraph_update_post, preview.after_update),
-    (bpy.app.handlers.frame_change_post, live_scanner.after_frame),
-    (bpy.app.handlers.frame_change_post, preview.after_update),
-    (bpy.app.handlers.frame_change_post, slices.after_frame_change),
-    (bpy.app.handlers.undo_post, live_scanner.after_undo),
-    (bpy.app.handlers.redo_post, live_scanner.after_undo),
-    (bpy.app.handlers.undo_post, slices.after_undo),
-    (bpy.app.handlers.redo_post, slices.after_undo),
-    (bpy.app.handlers.undo_pre, framing.before_undo),
-    (bpy.app.handlers.redo_pre, framing.before_undo),
-    (bpy.app.handlers.undo_post, framing.after_undo),
-    (bpy.app.handlers.redo_post, framing.after_undo),
-    (bpy.app.handlers.undo_post, preview.after_update),
-    (bpy.app.handlers.redo_post, preview.after_update),
-    (bpy.app.handlers.save_pre, storage.before_save),
-    (bpy.app.handlers.save_pre, slices.before_save),
-    (bpy.app.handlers.save_post, storage.after_save),
-    (bpy.app.handlers.save_post_fail, storage.restore_paths),
-)
+_UNDONE = (recoloring.check, runs.after_update, live_scanner.after_undo, slices.after_undo, framing.after_undo)
+_UPDATED = (live_scanner.after_update, selection.after_update, planes.after_update, frustums.after_update)
+_LOADED = (volumes.after_load, recovery.after_load, live_scanner.after_load, runs.after_load, recoloring.check)
+_FRAME = (runs.after_update, live_scanner.after_frame, preview.after_update, slices.after_frame_change)
+# By lists of bpy.app.handlers: decorate the functions with @bpy.app.handlers.persistent.
+_HANDLERS: dict[str, tuple[Any, ...]] = {
+    "load_pre": (jobs.stop, slices.before_load, preview.stop, framing.forget),
+    "load_post": _LOADED,
+    "depsgraph_update_post": (*_UPDATED, runs.after_update, preview.after_update),
+    "frame_change_post": _FRAME,
+    "undo_pre": (framing.before_undo,),
+    "redo_pre": (framing.before_undo,),
+    "undo_post": (*_UNDONE, preview.after_update),
+    "redo_post": (*_UNDONE, preview.after_update),
+    "render_init": (figures.before_render,),
+    "save_pre": (storage.before_save, slices.before_save),
+    "save_post": (storage.after_save,),
+    "save_post_fail": (storage.restore_paths,),
+}
+HANDLERS = tuple((getattr(bpy.app.handlers, name), each) for name, group in _HANDLERS.items() for each in group)
 
 # What is drawn over Blender's editors, in a window.
 DRAWINGS = (

@@ -5,7 +5,6 @@ import math
 import sys
 import time
 import uuid
-import warnings
 from collections.abc import Generator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,7 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.errors import InputError, InputWarning
+from ..core.errors import InputError, warn
 from ..core.geometry.system import chosen_modules
 from ..core.memory import require
 from ..core.progress import Progress, stages_of
@@ -115,9 +114,14 @@ def load_recipe(scene: bpy.types.Scene, path: Path) -> None:
     """Set the scene's panel as a recipe (.toml) or the recipe of a run says."""
     recipe = read_recipe(path) if path.suffix.lower() == ".toml" else read_run(path).recipe
     settings = scene.mphdrr_projections
-    set_panel(settings, recipe)
+    _set_physics(scene, recipe)
     known = {item.name: item for item in volumes.volume_objects(scene)}
     settings.volume, settings.mu = known.get(recipe["volume.object"]), known.get(recipe["attenuation.object"])
+
+
+def _set_physics(scene: bpy.types.Scene, recipe: Recipe) -> None:
+    """Set the panel, and the angle that it has from the scanner; raises InputError for what the panel cannot show."""
+    set_panel(scene.mphdrr_projections, recipe)
     collection = scanner.active_scanner(scene)
     if collection is not None and OPENING_ANGLE in recipe.given:
         collection.mphdrr_scanner.opening_angle = math.radians(recipe[OPENING_ANGLE])
@@ -136,7 +140,7 @@ def exporting(scene: bpy.types.Scene, filepath: str) -> jobs.Job:
     path = storage.absolute(filepath)
     if found := runs.changes(scene):
         text = f"the run is not of the scene as it is now ({'; '.join(found)}): {path.name} holds what was rendered"
-        warnings.warn(text, InputWarning, stacklevel=2)
+        warn(text)
 
     def work(progress: Progress) -> None:
         stages_of(progress)("reading the run file")
@@ -175,7 +179,7 @@ def taken_over(scene: bpy.types.Scene, run: ProjectionRun, volume: bpy.types.Obj
     except InputError:
         return {}
     with contextlib.suppress(InputError):  # what the panel cannot show is said to have changed
-        set_panel(scene.mphdrr_projections, recipe)
+        _set_physics(scene, recipe)
     state = runs.state_of(run.system, recipe, volume, None)
     if volume is None:
         return state | {"measured": caption(run)}

@@ -27,6 +27,7 @@ from .scanner_parts import modules_text
 
 UNKNOWN = "made without this scene, or by an earlier version: its state is not known"
 _MOST = 3  # lines of differences
+_PRECISION = float(np.finfo(np.float32).eps)
 _REST = 0.3  # s after a change until the runs are compared with the scene
 _DEFAULTS = {
     key: setting.default
@@ -333,11 +334,17 @@ def _of_settings(old: Mapping[str, Any], now: Mapping[str, Any]) -> Iterator[str
         if other_model and key.startswith(("model.", "noise.")) and key != "model.kind":
             continue
         one, two = old.get(key, default), now.get(key, default)
-        if one != two:
+        if not _same(one, two):
             setting = SETTINGS[key]
             words = setting.label.partition(" (")[0].split()
             name = " ".join(word.lower() if word[1:].islower() else word for word in words)
             yield f"{name} {_now(one, two, setting.unit, setting)}"
+
+
+def _same(old: Any, new: Any) -> bool:
+    """Whether two values of a setting are one in float32, as the scene keeps them."""
+    numbers = all(isinstance(value, float | list) for value in (old, new)) and np.shape(old) == np.shape(new)
+    return np.allclose(old, new, rtol=_PRECISION, atol=0) if numbers else bool(old == new)
 
 
 def _now(old: Any, new: Any, unit: str, setting: Setting | None = None) -> str:

@@ -5,7 +5,6 @@ children are its collimator and its crystal.
 """
 
 import json
-import warnings
 from collections.abc import Iterable
 from dataclasses import asdict
 from pathlib import Path
@@ -14,7 +13,7 @@ import bpy
 import numpy as np
 from mathutils import Quaternion
 
-from ..core.errors import InputError, InputWarning
+from ..core.errors import InputError, warn
 from ..core.geometry import checks
 from ..core.geometry.collimator import Construction
 from ..core.geometry.module_parts import module_parts
@@ -217,7 +216,7 @@ def read_scanner(collection: bpy.types.Collection, *, aimed: bool = False) -> Pi
         cure = "press Aim at Isocentre in the Design panel"
         if aimed:
             raise InputError(f"{text}, which a geometry file cannot express: {cure}")
-        warnings.warn(f"{text}, but calculated as if aimed: {cure}", InputWarning, stacklevel=2)
+        warn(f"{text}, but calculated as if aimed: {cure}")
     as_imported = len(found) == collection.mphdrr_scanner.n_modules and not any(
         camera.mphdrr_module.added or is_moved(camera) or is_edited(camera) for camera in found
     )

@@ -2,14 +2,13 @@
 
 import hashlib
 import math
-import warnings
 from dataclasses import asdict, replace
 from pathlib import Path
 
 import bpy
 import numpy as np
 
-from ..core.errors import InputError, InputWarning
+from ..core.errors import InputError, warn
 from ..core.exchange import FORMATS, write_geometry
 from ..core.geometry.system import LENGTHS, Detector, PinholeSystem
 from ..core.progress import Progress, stages_of
@@ -89,14 +88,12 @@ def _template(collection: bpy.types.Collection) -> Path | None:
         return None
     path = storage.absolute(properties.workbook)
     if not path.is_file():
-        warnings.warn(f"{path} has gone: made a new workbook instead of a copy of it", InputWarning, stacklevel=3)
+        warn(f"{path} has gone: made a new workbook instead of a copy of it")
         return None
     if properties.sha256 and hashlib.sha256(path.read_bytes()).hexdigest() != properties.sha256:
-        warnings.warn(
+        warn(
             f"{path} has changed since the scanner was read from it: the modules' cells are overwritten, all else is "
-            "kept as it is now",
-            InputWarning,
-            stacklevel=3,
+            "kept as it is now"
         )
     return path
 

@@ -9,13 +9,12 @@ import os
 import re
 import shutil
 import time
-import warnings
 from pathlib import Path
 from typing import Any
 
 import bpy
 
-from ..core.errors import InputError, InputWarning
+from ..core.errors import InputError, warn
 from ..core.files import ensure_folder, replacing
 from ..core.memory import readable_size
 from . import ids
@@ -99,7 +98,7 @@ def relocate(directory: str) -> str:
             found.append(data.name)
     _size_at.cache_clear()
     if absent := sorted(data.name for data in missing if data.name not in found):
-        warnings.warn(f"{top}: the files of {', '.join(absent)} are not there either", InputWarning, stacklevel=2)
+        warn(f"{top}: the files of {', '.join(absent)} are not there either")
     return f"Found the files of {', '.join(sorted(found)) or 'no volume'}"
 
 

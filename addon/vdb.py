@@ -8,7 +8,6 @@ and say so in their metadata; files written for other programs are not shifted.
 
 import json
 import struct
-import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -17,7 +16,7 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.errors import InputError, InputWarning
+from ..core.errors import InputError, warn
 from ..core.files import replacing
 from ..core.geometry.grid import Grid
 from ..core.memory import require
@@ -139,15 +138,10 @@ def _grid_of(volume: Volume, provenance: dict[str, Any], shift: float) -> Any:
     # OpenVDB's matrices act on row vectors.
     grid.transform = vdb.createLinearTransform(_drawn(affine, volume.grid.shape, mirrored, shift).T.tolist())
     known = {
-        "quantity": volume.quantity,
-        "unit": volume.unit,
-        "shape": json.dumps(volume.grid.shape),
-        "affine": json.dumps(affine.tolist()),
-        "mirrored": mirrored,
-        "center_shift": shift,
-        "provenance": json.dumps(provenance),
-        "version": VERSION,
-    } | ({"note": _NOTE.format(back=-shift)} if shift else {})
+        "quantity": volume.quantity, "unit": volume.unit, "shape": json.dumps(volume.grid.shape),
+        "affine": json.dumps(affine.tolist()), "mirrored": mirrored, "center_shift": shift,
+        "provenance": json.dumps(provenance), "version": VERSION,
+    } | ({"note": _NOTE.format(back=-shift)} if shift else {})  # fmt: skip
     for key, value in known.items():
         grid[f"mphdrr_{key}"] = value
     return grid
@@ -234,11 +228,10 @@ def _centered(grid: Any, drawn: NDArray[np.float64]) -> NDArray[np.float64]:
     # Has it been resampled? Compare the voxels' sizes and shears; a mirrored grid has its first axis turned round.
     was, is_now = np.abs(before.T @ before), np.abs(now.T @ now)
     if not np.allclose(is_now, was, rtol=0, atol=1e-6 * was.max()):
-        warnings.warn(
+        warn(
             f"the grid {grid.name!r} was written for Blender 4.5, half a voxel off for other programs, and one of them has "
             "resampled it: it may lie that much off",
-            InputWarning,
-            stacklevel=4,
+            4,
         )
         return drawn
     centers = np.eye(4)

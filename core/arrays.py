@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .errors import InputError
-from .validation import batch_shape, real_array, require_finite, shape_text
+from .validation import batch_shape, real_array, real_numbers, require_finite, shape_text
 
 ArrayOrTensor = Any  # a numpy array or a torch tensor; torch may not be installed
 
@@ -48,13 +48,13 @@ def checked(
             require_finite(value.detach().cpu().numpy(), name)
         return value
     dtype = np.float64 if float64 else np.float32
-    if isinstance(value, np.ndarray) and value.dtype == dtype and value.flags.c_contiguous:
+    value = real_numbers(value, name)
+    if value.dtype == dtype and value.flags.c_contiguous:
         wanted = batch_shape(shape, value.shape) if batch else shape
         if value.shape == wanted:
             require_finite(value, name)
             return value
-    with np.errstate(over="ignore"):  # what overflows float32 is refused as not finite
-        return real_array(value, name, shape, dtype, batch)
+    return real_array(value, name, shape, dtype, batch)
 
 
 def require_numbers(tensor: Any, name: str) -> None:

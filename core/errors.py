@@ -1,5 +1,6 @@
 """Errors and warnings about the user's input."""
 
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -10,6 +11,11 @@ class InputError(ValueError):
 
 class InputWarning(UserWarning):
     """The user's input was used, but something about it should be checked."""
+
+
+def warn(text: str, stacklevel: int = 3) -> None:
+    """Give an `InputWarning`; where a function of users gives it itself, not by a helper, the `stacklevel` is 2."""
+    warnings.warn(text, InputWarning, stacklevel=stacklevel + 1)
 
 
 @contextmanager

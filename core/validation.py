@@ -1,12 +1,13 @@
 """Checks of arguments where they enter the package."""
 
 from collections.abc import Collection
+from math import pi
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .errors import InputError
+from .errors import InputError, warn
 from .memory import require
 
 # Copies of fewer numbers always fit into memory.
@@ -19,8 +20,41 @@ def real_array(
     """A copy of `value` as a C-ordered array of real, finite numbers.
 
     In the expected `shape` None is any length; None alone is any shape; of a `batch`, any axes may come before it. Error
-    messages say `name`, and the first index that is not finite.
+    messages say `name`, and the first index that is not finite, or too large for `dtype`.
     """
+    raw = real_numbers(value, name)
+    if raw.size > _MANY:
+        require(raw.size * np.dtype(dtype).itemsize, f"{name} of {shape_text(raw.shape)} numbers")
+    with np.errstate(over="ignore"):  # what overflows is refused below
+        array = np.array(raw, dtype=dtype, order="C")
+    if shape is not None and batch:
+        shape = batch_shape(shape, array.shape)
+    if shape is not None and (
+        array.ndim != len(shape) or any(n is not None and n != m for n, m in zip(shape, array.shape, strict=True))
+    ):
+        expected = " x ".join("any" if n is None else str(n) for n in shape) or "one number"
+        raise InputError(f"{name}: expected shape {expected}, got {shape_text(array.shape)}")
+    require_finite(array, name, raw)
+    return array
+
+
+def radians(value: ArrayLike, name: str, shape: tuple[int | None, ...] | None = ()) -> NDArray[np.float64]:
+    """Angles in rad, as of `real_array`; warns where they are, or reach over, more than a full turn, as degrees do."""
+    angles = real_array(value, name, shape)
+    most = max(float(np.ptp(angles)), float(np.abs(angles).min())) if angles.size else 0.0
+    if most > 2.001 * pi:
+        warn(f"{name}: {most:g} rad is more than a full turn: are these degrees? np.radians(...) converts them")
+    return angles
+
+
+def real_numbers(value: ArrayLike, name: str) -> NDArray[Any]:
+    """`value` as an array of real numbers of its own type and order, not copied without need, or `InputError`.
+
+    Masked numbers are refused: what stands under a mask would count, and nobody has said what does instead.
+    """
+    if hidden := _masked(value):
+        said = f"{hidden} of {np.size(value)} numbers are masked"  # type: ignore[arg-type]
+        raise InputError(f"{name}: {said}; expected all of them: say what counts there, array.filled(...)")
     try:
         raw = np.asarray(value)
         if raw.dtype.kind not in "fiub":
@@ -29,18 +63,14 @@ def real_array(
         raise InputError(f"{name}: expected real numbers, got {type(value).__name__} {_short(value)}") from None
     except RuntimeError as error:  # a torch tensor that requires gradients; torch says what to do
         raise InputError(f"{name}: {error}") from None
-    if raw.size > _MANY:
-        require(raw.size * np.dtype(dtype).itemsize, f"{name} of {shape_text(raw.shape)} numbers")
-    array = np.array(raw, dtype=dtype, order="C")
-    if shape is not None and batch:
-        shape = batch_shape(shape, array.shape)
-    if shape is not None and (
-        array.ndim != len(shape) or any(n is not None and n != m for n, m in zip(shape, array.shape, strict=True))
-    ):
-        expected = " x ".join("any" if n is None else str(n) for n in shape) or "one number"
-        raise InputError(f"{name}: expected shape {expected}, got {shape_text(array.shape)}")
-    require_finite(array, name)
-    return array
+    return raw
+
+
+def _masked(value: Any) -> int:
+    """How many numbers are masked, of an array, or of those in a list."""
+    if isinstance(value, list | tuple):
+        return sum(map(_masked, value))
+    return int(value.mask.sum()) if isinstance(value, np.ma.MaskedArray) else 0
 
 
 def batch_shape(shape: tuple[Any, ...], given: tuple[int, ...]) -> tuple[Any, ...]:
@@ -48,8 +78,8 @@ def batch_shape(shape: tuple[Any, ...], given: tuple[int, ...]) -> tuple[Any, ..
     return given[: max(0, len(given) - len(shape))] + shape
 
 
-def require_finite(array: NDArray[Any], name: str) -> None:
-    """Raise `InputError` naming the first index at which `array` is not finite."""
+def require_finite(array: NDArray[Any], name: str, given: NDArray[Any] | None = None) -> None:
+    """Raise `InputError` naming the first index at which `array` is not finite; it was made of the numbers `given`."""
     # A finite sum proves that all numbers are, in one pass without a mask. The sum of finite numbers may still
     # overflow.
     with np.errstate(over="ignore", invalid="ignore"):
@@ -59,7 +89,9 @@ def require_finite(array: NDArray[Any], name: str) -> None:
     if len(bad):
         index = tuple(int(i) for i in bad[0])
         where = f" at index {index if len(index) != 1 else index[0]}" if index else ""
-        raise InputError(f"{name}: {array[index]} is not a finite number{where}")
+        value = (array if given is None else given)[index]
+        as_kept = f" in {array.dtype}" if np.isfinite(value) else ""
+        raise InputError(f"{name}: {value} is not a finite number{as_kept}{where}")
 
 
 def instance(value: object, kind: type, name: str) -> None:

@@ -4,13 +4,12 @@ import argparse
 import contextlib
 import importlib.util
 import time
-import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from ...core.cli.options import add_command, add_workbook, progress_bar, read_workbook
-from ...core.errors import InputWarning
+from ...core.errors import warn
 from ...core.files import ensure_folder
 from ...core.runs.files import write_run
 from ...core.runs.mosaic import write_sheet
@@ -68,7 +67,7 @@ def _run(arguments: argparse.Namespace) -> None:
         write_sheet(run, out / "mosaic.png")
     if scene is None:
         text = f"no scene and no pictures of it, which need Blender: {INSTALL_BLENDER}"
-        warnings.warn(text, InputWarning, stacklevel=2)
+        warn(text)
     else:
         _make_scene(scene, run, out)
     print(f"{out}: {', '.join(sorted(p.name for p in out.iterdir() if p.suffix in ('.blend', '.h5', '.png')))}")

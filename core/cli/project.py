@@ -112,7 +112,9 @@ def _chosen(arguments: argparse.Namespace) -> tuple[Recipe, dict[str, Any]]:
         recipe = Recipe({"system.file": file})
     before = recipe.tables()
     preset = {} if arguments.preset is None else PRESETS[arguments.preset].changes
-    recipe = recipe.updated({**preset, **_changes(arguments, recipe.updated(preset))})
+    recipe = recipe.updated(preset)
+    said = {key: preset[key] for key in preset if key == "model.isotope"}  # which images of photons alone have
+    recipe = recipe.updated({**said, **_changes(arguments, recipe)})
     if run is None:
         return recipe, {}
     now = recipe.tables()

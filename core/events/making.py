@@ -14,11 +14,13 @@ from ..geometry.parallel_views import parallel_views
 from ..geometry.system import PinholeSystem, chosen_modules
 from ..geometry.views import Views
 from ..memory import readable_size, require
+from ..physics.isotopes import photon_energy
 from ..progress import Progress
 from ..projector import Emission, Projector, intensity
 from ..recording import recorded_warnings
+from ..runs.projecting import warn_of_energy, warn_of_images
 from ..runs.recipe import Recipe
-from ..runs.run_recipe import recipe_model, recipe_views
+from ..runs.run_recipe import recipe_model, recipe_views, require_mu
 from ..validation import freeze
 from ..volumes.rearranging import centered
 from ..volumes.resampling import resample
@@ -149,10 +151,8 @@ class EventMaker:
         """A model's images, and their unit."""
         recipe = self.recipe.models[name]
         own_mu = recipe["attenuation.of_phantom"]
-        if own_mu:
-            phantom = planned.phantom
-            if phantom is not None and all(shape.mu is None for shape in phantom.shapes):
-                raise InputError(f"attenuation: no shape of the {phantom.title} has a mu")
+        if own_mu and planned.phantom is not None:
+            require_mu(planned.phantom, recipe_model(recipe, self.system))
         if own_mu and recipe["model.hole"] == "depth":  # this model's attenuation cannot be changed
             mu = self._voxels(planned, "mu")
             projector = Projector(truth.grid, self.views, recipe_model(recipe, self.system, mu), threads=self.threads)
@@ -163,6 +163,7 @@ class EventMaker:
         else:
             projector = self._projectors[name]
             images = projector(truth)
+        warn_of_images(truth, self.system, self.views, recipe["detector.magnification"], projector.model)
         photons, unit = recipe["model.photons"], projector.model.unit(truth)
         if photons is not None:
             images, unit = intensity(images, photons), "photons"
@@ -185,7 +186,10 @@ class EventMaker:
             mu = Volume(freeze(np.zeros(grid.shape, np.float32)), grid, "mu")
         elif recipe["attenuation.file"] is not None:
             mu = self.recipe.input(recipe["attenuation.file"]).volume()
-        return Projector(grid, self.views, recipe_model(recipe, self.system, mu), threads=self.threads)
+        model = recipe_model(recipe, self.system, mu)
+        if (energy := recipe["attenuation.energy"]) is not None:
+            warn_of_energy(model, photon_energy(energy), f"the mu of {recipe['attenuation.file']}")
+        return Projector(grid, self.views, model, threads=self.threads)
 
     @cached_property
     def _radon(self) -> dict[int, Projector]:

@@ -27,33 +27,13 @@ TRUTH_STORES = ("float32", "float16", "sparse")
 IMAGE_STORES = ("float32", "float16")
 QUANTITIES = ("activity", "mu")
 _TAKEN = (
-    *(
-        "truth",
-        "truth_affine",
-        "affine",
-        "pose",
-        "placement",
-        "position",
-        "euler_degrees",
-        "module_gain",
-        "number",
-        "level",
-    ),
-    *("record", "json"),
+    *("truth", "truth_affine", "affine", "pose", "placement", "position", "euler_degrees", "module_gain", "number"),
+    *("level", "record", "json"),
 )
 """What else exports and batches of an event hold, besides the images of models."""
 
 _TABLES = (
-    "version",
-    "seed",
-    "system",
-    "detector",
-    "truth",
-    "phantoms",
-    "models",
-    "radon",
-    "augmentation",
-    "noise",
+    *("version", "seed", "system", "detector", "truth", "phantoms", "models", "radon", "augmentation", "noise"),
     "storage",
 )
 _KNOWN = (*_TABLES, "splits")

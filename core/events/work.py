@@ -2,12 +2,11 @@
 
 import os
 import re
-import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from ..errors import InputError, InputWarning
+from ..errors import InputError, warn
 from ..progress import Progress
 from ..validation import whole_number
 from .dask_work import in_cluster
@@ -93,7 +92,7 @@ def followed(target: SetFolder, written: Iterator[Written], total: int) -> Itera
         for text in event.warnings:
             if (words := re.sub(r"[\d.]+", "", text)) not in said:  # the same with other numbers says nothing new
                 said.add(words)
-                warnings.warn(f"event {event.number}: {text}", InputWarning, stacklevel=3)
+                warn(f"event {event.number}: {text}", 3)
         yield Made(event.number, target.event_path(event.number), event.size, event.seconds, done, total)
 
 

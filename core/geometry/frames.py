@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InputError
-from ..validation import real_array
+from ..validation import radians, real_array
 
 # z and a principal ray are parallel if the sine of the angle between them is below this.
 _PARALLEL = 1e-9
@@ -54,7 +54,7 @@ def euler_pose(
 
     The object is turned by psi about its z axis, then by theta about world y, then by phi about world z.
     """
-    angles = real_array([phi, theta, psi], "Euler angles", (3,))
+    angles = radians([phi, theta, psi], "Euler angles", (3,))
     rotation = np.eye(3)
     for axis, angle in zip((2, 1, 2), angles, strict=True):
         i, j = (axis + 1) % 3, (axis + 2) % 3

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..errors import InputError
-from ..validation import lengths, positive, real_array, whole_number
+from ..validation import lengths, positive, radians, real_array, whole_number
 from .design_formulas import collimator_length as designed_length
 from .ellipse import Array, Ellipse
 from .system import PinholeSystem
@@ -65,7 +65,7 @@ def ellipse_rings(
     mirrored
         Append the rings' mirror images at z = 0, beginning with that of the last ring.
     """
-    turn = float(real_array(rotation, "rotation", ()))
+    turn = float(radians(rotation, "rotation"))
     ellipse = Ellipse(lengths(semi_axes, "semi_axes", 2), real_array(center, "center", (2,)), turn)
     if not ellipse.holds_isocentre:
         raise InputError(
@@ -74,7 +74,7 @@ def ellipse_rings(
     if np.ndim(modules) == 0:
         azimuths = even_azimuths(ellipse, modules, start, end, spacing)
     else:
-        azimuths = real_array(modules, "azimuths", (None,) * min(np.ndim(modules), 2))
+        azimuths = radians(modules, "azimuths", (None,) * min(np.ndim(modules), 2))
     sizes = (pinhole_diameter, detector_side, detector_thickness, roi_radius)
     return _rings(ellipse.at(azimuths), z, mirrored, collimator_length, *sizes)
 
@@ -128,7 +128,7 @@ def regular_polygon(sides: int, apothem: float, rotation: float = 0.0) -> Array:
     sides = whole_number(sides, "sides")
     if sides < 3:
         raise InputError(f"sides: expected at least 3, got {sides}")
-    angles = float(real_array(rotation, "rotation", ())) + (2 * np.arange(sides) - 1) * math.pi / sides
+    angles = float(radians(rotation, "rotation")) + (2 * np.arange(sides) - 1) * math.pi / sides
     radius = positive(apothem, "apothem", "mm") / math.cos(math.pi / sides)
     return radius * np.stack([np.cos(angles), np.sin(angles)], axis=1)
 

@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..errors import InputError
-from ..validation import lengths, one_for_all, real_array, whole_shape
+from ..validation import lengths, one_for_all, radians, real_array, whole_shape
 from .frames import module_frames
 from .views import Views
 
@@ -51,7 +51,7 @@ def parallel_views(
     >>> views = parallel_views(np.arange(180) * np.pi / 180, (128, 128), 1.0)
     >>> images = Projector(grid, views)(volume)
     """
-    angles = real_array(angles, "angles", (None,))
+    angles = radians(angles, "angles", (None,))
     if not len(angles):
         raise InputError("angles: expected one or more, got none")
     shape = whole_shape(shape, "image shape", 2)

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from ..errors import InputError
-from ..validation import one_of
+from ..validation import one_of, radians
 
 try:
     import roma
@@ -66,6 +66,8 @@ def rotation_matrix(
         case "axis_angle" | "se3_log_map":
             return roma.rotvec_to_rotmat(rotation)
         case "euler_angles":
+            if not degrees:
+                radians(rotation.detach().cpu(), "Euler angles", None)
             return roma.euler_to_rotmat(convention, rotation, degrees=degrees)
         case "rotation_6d":
             return roma.special_gramschmidt(rotation.unflatten(-1, (2, 3)).mT).mT

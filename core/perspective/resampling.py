@@ -1,6 +1,5 @@
 """Volumes in the coordinates of views and back, and from one view's to another's."""
 
-import warnings
 from abc import abstractmethod
 from collections.abc import Iterator
 from typing import Any
@@ -9,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import ArrayOrTensor, checked, to_caller, to_numpy
-from ..errors import InputError, InputWarning
+from ..errors import InputError, warn
 from ..geometry.grid import Grid
 from ..memory import require
 from ..progress import Progress, part_of
@@ -367,12 +366,10 @@ def _warn_of_few_points(operator: _Taking, what: str) -> None:
     """Warn where what is shared out at a cell's points leaves some of the cells between them out."""
     if operator.apart > _APART:
         covered = operator.apart * _MOST_POINTS
-        warnings.warn(
+        warn(
             f"{what} cover up to {covered:.2g} cells along an axis and are shared out at {_MOST_POINTS} points: the total "
             "is kept, but single cells get too much or too little; give fewer pixels and planes, or finer "
-            + what.split()[1],
-            InputWarning,
-            stacklevel=3,
+            + what.split()[1]
         )
 
 
@@ -385,11 +382,9 @@ def _warn_of_gaps(g: PerspectiveGrid, grid: Grid) -> None:
     matrix = _with_ones(grid.index_from_world) @ g.inverse
     apart = max(_longest_step(matrix, g, index, axis) for axis in (0, 1))
     if apart > _GAP:
-        warnings.warn(
+        warn(
             f"from_perspective: rays are up to {apart:.2g} voxels apart, and voxels between them get nothing: give coarser "
-            'voxels or finer pixels, or keep "density"',
-            InputWarning,
-            stacklevel=3,
+            'voxels or finer pixels, or keep "density"'
         )
 
 

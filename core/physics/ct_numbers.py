@@ -5,13 +5,12 @@ The conversion is bilinear: tissue below 0 HU is a mixture of air and water, abo
 Nucl. Sci. 50 (2003) 1510-1515).
 """
 
-import warnings
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError, InputWarning
+from ..errors import InputError, warn
 from ..memory import require
 from ..validation import freeze, instance, real_array
 from ..volumes.volume import AIR_HU, Volume, require_quantity
@@ -59,17 +58,16 @@ def hu_to_mu(volume: Volume, energy: float = 140.5, ct_energy: float = CT_ENERGY
         slab[:] = water + below + above
     lowest, highest = float(volume.array.min()), float(volume.array.max())
     if 0 < max(-lowest, highest) < _WATER_HU:
-        warnings.warn(
+        warn(
             f"values of {lowest:.4g} to {highest:.4g} HU are those of water alone: are they CT numbers, or mu already?",
-            InputWarning,
-            stacklevel=2,
+            2,
         )
     for count, what in (
         (outside, f"below {_PADDING_HU:g} HU: taken as air, outside the scanned region"),
         (metal, f"above {_METAL_HU:g} HU, as of metal: converted as bone, which is only approximate"),
     ):
         if count:
-            warnings.warn(f"{count / mu.size:.2%} of the voxels are {what}", InputWarning, stacklevel=2)
+            warn(f"{count / mu.size:.2%} of the voxels are {what}", 2)
     return Volume(freeze(mu), volume.grid, "mu")
 
 

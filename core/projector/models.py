@@ -167,6 +167,7 @@ def checked_background(
         Another shape, not real, not finite, or below 0.
     """
     array = real_array(value, name, None)
+    real_array(array, name, None, np.float32)  # as which it is added
     if (
         array.ndim not in (0, 1, 3)
         or array.shape[:1] not in ((), (n,))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from typing import Any
@@ -12,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import ArrayOrTensor, cast_like, checked, is_double, is_tensor, promote, to_caller, to_numpy, zeros
-from ..errors import InputError, InputWarning
+from ..errors import InputError, warn
 from ..geometry.grid import Grid
 from ..geometry.views import Views
 from ..memory import require
@@ -22,6 +21,7 @@ from ..volumes.images import Images
 from ..volumes.volume import Volume
 from . import backends
 from .bundles import Bundle, Bundles
+from .doubts import doubts
 from .execution import Execution
 from .lattices import require_no_negative, same_lattice
 from .models import Model, Transmission
@@ -162,8 +162,8 @@ class Projector(LinearOperator):
         self.views = views
         self.model = model
         model.check(views)
-        if caution := model.caution(views, grid):
-            warnings.warn(caution, InputWarning, stacklevel=2)
+        for doubt in doubts(grid, views, model):
+            warn(doubt, 2)
         self._asked, self._auto = backend, backend == "auto"
         self._backend = backends.choose(backend)
         self.threads = thread_count(threads)

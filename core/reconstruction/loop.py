@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..arrays import is_tensor, to_numpy
-from ..errors import InputError, naming
+from ..errors import InputError, naming, warn
 from ..progress import Cancelled, Progress, part_of
 from ..projector import Projector
 from ..validation import freeze, instance, real_array, whole_number
@@ -95,6 +95,8 @@ class Loop:
                 instance(stop, StopWhen, "stop")  # the rule that users know
             stop.check(A.shape_in)
         self.mask = None if mask is None else inside(mask, "mask", A.shape_in)
+        if self.mask is not None and not self.mask.any():
+            warn(f"mask: 0 of {self.mask.size} voxels are inside: the volume will be 0", 4)
         self.state: dict[str, Array] = {}
         self._objective: list[float] = []
         self._resumed: Mapping[str, Any] = {}  # the settings of what is resumed

@@ -1,14 +1,13 @@
 """When an iterative reconstruction ends before its last iteration."""
 
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..errors import InputError, InputWarning
-from ..validation import positive
+from ..errors import InputError, warn
+from ..validation import positive, real_numbers
 from .result import Array
 
 
@@ -70,7 +69,7 @@ class StopWhen(StoppingRule):
         if (self.noise is None) != (self.region is None):
             raise InputError("stop: noise needs region, and region needs noise: the voxels in which it is measured")
         if self.region is not None:
-            object.__setattr__(self, "region", np.asarray(self.region))
+            object.__setattr__(self, "region", real_numbers(self.region, "stop: region"))
 
     def check(self, shape: tuple[int, ...]) -> None:
         """Raise `InputError` unless `region` fits a volume of this shape."""
@@ -87,8 +86,7 @@ class StopWhen(StoppingRule):
             chosen = values[self.region].astype(np.float64)  # type: ignore[index]
             if not chosen.any():
                 if len(objective) == 1:
-                    text = "stop: region: its voxels are all 0 after iteration 1: no noise ends it while they are"
-                    warnings.warn(text, InputWarning, stacklevel=2)
+                    warn("stop: region: its voxels are all 0 after iteration 1: no noise ends it while they are")
             elif chosen.std() >= self.noise * chosen.mean():
                 return "noise"
         if self.seconds is not None and seconds >= self.seconds:
@@ -98,7 +96,7 @@ class StopWhen(StoppingRule):
 
 def inside(mask: ArrayLike, name: str, shape: tuple[int, ...]) -> NDArray[np.bool_]:
     """`mask` as booleans of a volume's shape, or `InputError`."""
-    found = np.asarray(mask)
+    found = real_numbers(mask, name)
     if found.shape != shape or found.dtype != bool:
         got = f"{found.dtype} of {' x '.join(map(str, found.shape)) or 'no'}"
         raise InputError(f"{name}: expected booleans of {' x '.join(map(str, shape))} voxels, got {got}")

@@ -117,12 +117,10 @@ def _pixel_weights(run: ProjectionRun) -> NDArray[np.float64]:
     middle = replace(model, hole="rays", aperture_points=1, aperture_tolerance=None, pixel_points=1, depth_layers=1)
     anywhere = Grid.centered((1, 1, 1), 1.0)  # weights do not depend on it
     every = slice(None)
-    return np.array(
-        [
-            sum(beam.weigh(every, every, every).sum(axis=0) for beam in middle.beams(run.views, m, anywhere))  # type: ignore[misc]
-            for m in range(len(run.views))
-        ]
-    )
+    return np.array([
+        sum(beam.weigh(every, every, every).sum(axis=0) for beam in middle.beams(run.views, m, anywhere))  # type: ignore[misc]
+        for m in range(len(run.views))
+    ])  # fmt: skip
 
 
 def _require_all_count(run: ProjectionRun) -> None:

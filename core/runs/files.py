@@ -71,17 +71,11 @@ def write_run(run: ProjectionRun, path: str | os.PathLike[str]) -> None:
     if np.any(run.background):
         arrays[_BACKGROUND] = np.asarray(run.background)
     attributes = {
-        "format": _FORMAT,
-        "format_version": 1 if of_volume else _FORMAT_VERSION,
-        "conventions": _CONVENTIONS,
-        "projections_unit": run.unit,
-        **of_volume,
-        "seed": "none" if run.seed is None else int(run.seed),
-        "workbook": run.workbook,
-        "workbook_sha256": run.workbook_sha256,
-        "settings": json.dumps(dict(run.settings)),
-        "versions": json.dumps(dict(run.versions)),
-    }
+        "format": _FORMAT, "format_version": 1 if of_volume else _FORMAT_VERSION, "conventions": _CONVENTIONS,
+        "projections_unit": run.unit, **of_volume, "seed": "none" if run.seed is None else int(run.seed),
+        "workbook": run.workbook, "workbook_sha256": run.workbook_sha256,
+        "settings": json.dumps(dict(run.settings)), "versions": json.dumps(dict(run.versions)),
+    }  # fmt: skip
     with replacing(path) as temporary:
         write(arrays, attributes, temporary)
 
@@ -119,18 +113,14 @@ def _run_of(arrays: dict[str, NDArray[Any]], attributes: dict[str, Any]) -> Proj
         volume = Volume(values, Grid((n_x, n_y, n_z), arrays["volume/affine"]), str(attributes["volume_quantity"]))
     n_v, n_u = arrays["projections"].shape[1:]
     return ProjectionRun(
-        projections=np.asarray(arrays["projections"], np.float32),
-        system=PinholeSystem(arrays["geometry/center"], **lengths, numbers=arrays["geometry/number"]),
-        views=Views(**rays, shape=(n_v, n_u)),
-        volume=volume,
-        unit=str(attributes["projections_unit"]),
-        settings=json.loads(attributes["settings"]),
-        seed=None if seed == "none" else int(seed),
-        workbook=str(attributes["workbook"]),
-        workbook_sha256=str(attributes["workbook_sha256"]),
+        arrays["projections"],
+        PinholeSystem(arrays["geometry/center"], **lengths, numbers=arrays["geometry/number"]),
+        Views(**rays, shape=(n_v, n_u)), volume, unit=str(attributes["projections_unit"]),
+        settings=json.loads(attributes["settings"]), seed=None if seed == "none" else int(seed),
+        workbook=str(attributes["workbook"]), workbook_sha256=str(attributes["workbook_sha256"]),
         versions=json.loads(attributes["versions"]),
         background=arrays.get(_BACKGROUND, 0.0),  # type: ignore[arg-type]  # checked there
-    )
+    )  # fmt: skip
 
 
 def _write_hdf5(arrays: dict[str, NDArray[Any]], attributes: dict[str, Any], path: Path) -> None:

@@ -6,7 +6,7 @@ A file says at most what its frames are: which module each is of, and how it lie
 import math
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -34,14 +34,42 @@ _TOMOGRAMS = ("RECON TOMO", "RECON GATED TOMO")
 _SAME_SIZE = 1e-3  # relative; files round pixel sizes
 
 
-@dataclass(frozen=True, eq=False)
-class Frames:
-    """The frames of a file, and what it says about them, None where it says nothing."""
+class Counts(np.ndarray[Any, Any]):
+    """Frames of counts (frames, rows, columns), with what their files say of them: an array like any other.
 
-    array: NDArray[Any]  # (frames, rows, columns), of any real type
-    time: float | None = None  # s, of each frame
-    pixel: tuple[float, float] | None = None  # mm, along a row and down the columns
-    kind: str = ""  # of what the frames are, such as "2 energy windows"
+    Slices of it keep that; what is calculated from it is a plain array.
+
+    Attributes
+    ----------
+    about : array (frames, 4)
+        Of each frame its exposure, s, the size of its pixels along a row and down the columns, mm, and the number of its
+        energy window; NaN where the file does not say it.
+    kind : str
+        What the frames are of, such as "2 energy windows".
+    name : str
+        Of the files.
+    """
+
+    about: NDArray[np.float64]
+
+    def __array_finalize__(self, source: Any) -> None:
+        self.kind, self.name = getattr(source, "kind", ""), getattr(source, "name", "counts")
+        is_same = isinstance(source, Counts) and source.shape == self.shape
+        self.about = source.about if is_same else np.full((*self.shape[:1], 4), math.nan)
+
+    def __getitem__(self, key: Any) -> Any:
+        found = super().__getitem__(key)
+        if isinstance(found, Counts) and found.ndim == 3:
+            about = self.about[key[0] if isinstance(key, tuple) and key else key]
+            found.about = about if about.shape == found.about.shape else found.about
+        return found
+
+    def __array_wrap__(self, array: NDArray[Any], *_: Any) -> Any:  # type: ignore[override]
+        return np.asarray(array)[()]
+
+    def exposures(self, which: Any = slice(None)) -> list[float]:
+        """The exposures, s, that the files say of the frames `which`, each once."""
+        return [time for time in np.unique(self.about[which, 0]).tolist() if math.isfinite(time)]
 
 
 @dataclass(frozen=True)
@@ -66,7 +94,7 @@ def read_counts(
     shape: tuple[int, int, int] | None = None,
     type: str | None = None,
     big_endian: bool = False,
-) -> NDArray[Any]:
+) -> Counts:
     """Read frames of counts (frames, rows, columns) as they are in a file, or in several, one after the other.
 
     Parameters
@@ -81,42 +109,44 @@ def read_counts(
 
     Returns
     -------
-    array of three axes
-        Frames, rows and columns, of the file's own type; `counts_run` checks the numbers.
+    Counts
+        An array of three axes, frames, rows and columns, of the file's own type. `counts_run` checks its numbers, and
+        compares what it is told with the exposure, pixel size and energy windows that the file says.
 
     Raises
     ------
     InputError
         A file cannot be read, holds something else, or has frames of another size than the one before.
     """
-    return read_frames(path, Layout(dataset, shape, type, big_endian)).array
+    return read_frames(path, Layout(dataset, shape, type, big_endian))
 
 
 def read_frames(
     path: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
     layout: Layout = Layout(),
     progress: Progress | None = None,
-) -> Frames:
-    """The frames of one or several files with what these say; `progress` counts files. See `read_counts`."""
+) -> Counts:
+    """The frames of one or several files; `progress` counts files. See `read_counts`."""
     paths = [Path(path)] if isinstance(path, str | os.PathLike) else list(map(Path, path))
     if not paths:
         raise InputError("counts: expected a file, or several")
-    found: list[Frames] = []
+    found: list[Counts] = []
     for number, one in enumerate(paths, 1):
         found.append(_read(one, layout))
-        first, last = found[0].array.shape[1:], found[-1].array.shape[1:]
+        first, last = found[0].shape[1:], found[-1].shape[1:]
         if first != last:
             size = f"{last[0]} x {last[1]} pixels, {paths[0]} of {first[0]} x {first[1]}"
             raise InputError(f"{one}: it holds frames of {size}; expected one size")
         if progress is not None:
             progress(number, len(paths))
-    array = found[0].array if len(found) == 1 else np.concatenate([one.array for one in found])
-    times, pixels, kinds = ({getattr(one, name) for one in found} for name in ("time", "pixel", "kind"))
-    said = (one.pop() if len(one) == 1 else None for one in (times, pixels))
-    return Frames(array, next(said), next(said), ", ".join(sorted(kinds - {""})))
+    counts = found[0] if len(found) == 1 else np.concatenate(found).view(Counts)
+    counts.about = np.concatenate([one.about for one in found])
+    counts.kind = ", ".join(sorted({one.kind for one in found} - {""}))
+    counts.name = ", ".join([*(one.name for one in paths[:3]), *(["…"] if len(paths) > 3 else [])])
+    return counts
 
 
-def _read(path: Path, layout: Layout) -> Frames:
+def _read(path: Path, layout: Layout) -> Counts:
     if not path.is_file():
         raise InputError(
             f"{path}: is a folder; expected a file with counts" if path.is_dir() else f"{path}: no such file"
@@ -124,13 +154,13 @@ def _read(path: Path, layout: Layout) -> Frames:
     ending = path.suffix.lower()
     with reading(path, ending or "counts"):
         if layout.is_raw:
-            return _require_frames(Frames(_raw(path, layout)))
+            return _counts(_raw(path, layout))
         if layout.dataset is not None and ending not in (".npz", *_HDF5):
             raise InputError("dataset (--dataset) names an array in .npz and .h5; this file has no names")
-        return _require_frames(_reader(path, ending)(path, layout))
+        return _reader(path, ending)(path, layout)
 
 
-def _reader(path: Path, ending: str) -> Callable[[Path, Layout], Frames]:
+def _reader(path: Path, ending: str) -> Callable[[Path, Layout], Counts]:
     """What reads a file."""
     for endings, read in ((_NUMPY, _numpy), (_HDF5, _hdf5), (_META, _metaimage), (_INTERFILE, _interfile)):
         if ending in endings:
@@ -145,16 +175,23 @@ def _reader(path: Path, ending: str) -> Callable[[Path, Layout], Frames]:
     )
 
 
-def _require_frames(frames: Frames) -> Frames:
-    """Checked, and with an axis of frames also where there is only one."""
-    array = frames.array
-    if array.ndim == 2:
-        array = array[None]
+def _counts(array: NDArray[Any], kind: str = "", **said: Sequence[float]) -> Counts:
+    """Checked frames, with an axis of frames also where there is only one, and what the file has `said` about them.
+
+    That is their `time` (s), `pixel` (along a row and down the columns, mm) and energy `window` (number). Of these, fewer
+    than frames are those of blocks of frames, which follow each other.
+    """
+    array = array[None] if array.ndim == 2 else array
     if array.ndim != 3 or not array.size:
         raise InputError(f"expected (frames, rows, columns), got shape {' x '.join(map(str, array.shape)) or '()'}")
     if array.dtype.kind not in "fiu":
         raise InputError(f"expected whole or real numbers, found {array.dtype}")
-    return replace(frames, array=array)
+    counts = array.view(Counts)
+    counts.kind, counts.about[:, 1:3] = kind, said.get("pixel", math.nan)
+    for column, name in ((0, "time"), (3, "window")):
+        each = np.array(said.get(name) or [math.nan])
+        counts.about[:, column] = each[np.arange(len(array)) * len(each) // len(array)]
+    return counts
 
 
 def _require_memory(shape: Sequence[int], itemsize: int) -> None:
@@ -186,7 +223,7 @@ def _numbers(path: Path, kind: np.dtype[Any], shape: tuple[int, ...], skip: int 
     return np.fromfile(path, kind, offset=skip).reshape(shape)
 
 
-def _numpy(path: Path, layout: Layout) -> Frames:
+def _numpy(path: Path, layout: Layout) -> Counts:
     with open(path, "rb") as opened:  # not by numpy, which leaves a damaged archive open
         if not opened.read(6).startswith((b"\x93NUMPY", b"PK")):  # numpy would take it for pickled objects
             raise InputError("not a file of numpy")
@@ -195,15 +232,15 @@ def _numpy(path: Path, layout: Layout) -> Frames:
             found = np.load(opened, allow_pickle=False)
             if not isinstance(found, np.ndarray):
                 raise InputError("expected a single array, found an npz archive")
-            return Frames(found)
+            return _counts(found)
         archive = np.load(opened, allow_pickle=False)
         if isinstance(archive, np.ndarray):
             raise InputError("expected an npz archive, found a single array")
         arrays = {name: archive[name] for name in archive.files}
-        return Frames(arrays[_chosen(arrays, layout)])
+        return _counts(arrays[_chosen(arrays, layout)])
 
 
-def _hdf5(path: Path, layout: Layout) -> Frames:
+def _hdf5(path: Path, layout: Layout) -> Counts:
     import h5py
 
     arrays: dict[str, Any] = {}
@@ -216,7 +253,7 @@ def _hdf5(path: Path, layout: Layout) -> Frames:
         file.visititems(take)
         dataset = arrays[_chosen(arrays, layout)]
         _require_memory(dataset.shape, dataset.dtype.itemsize)
-        return Frames(dataset[()])
+        return _counts(dataset[()])
 
 
 def _chosen(arrays: dict[str, Any], layout: Layout) -> str:
@@ -233,16 +270,16 @@ def _chosen(arrays: dict[str, Any], layout: Layout) -> str:
     return found[0]
 
 
-def _metaimage(path: Path, layout: Layout) -> Frames:
+def _metaimage(path: Path, layout: Layout) -> Counts:
     """GATE 10's projections: x along a row, y down the rows, a frame in each z."""
     with recorded_warnings() as unsaid:  # that it does not say how it lies, which is asked anyway
         contents = metaimage.read(path)
-    sizes = np.linalg.norm(contents.affine[:3, :2], axis=0) if contents.affine is not None and not unsaid else None
-    pixel = None if sizes is None else (float(sizes[0]), float(sizes[1]))
-    return Frames(np.ascontiguousarray(contents.array.transpose(2, 1, 0)), None, pixel)
+    affine = np.full((4, 4), math.nan) if contents.affine is None or unsaid else contents.affine
+    pixel = np.linalg.norm(affine[:3, :2], axis=0).tolist()
+    return _counts(np.ascontiguousarray(contents.array.transpose(2, 1, 0)), pixel=pixel)
 
 
-def _interfile(path: Path, layout: Layout) -> Frames:
+def _interfile(path: Path, layout: Layout) -> Counts:
     """An Interfile 3.3 header and the file of numbers that it names, as GATE 9's projections are.
 
     Reference: A. Todd-Pokropek, T. D. Cradduck, F. Deconinck, "A file format for the exchange of nuclear medicine image
@@ -250,8 +287,11 @@ def _interfile(path: Path, layout: Layout) -> Frames:
     """
     header = _interfile_header(path)
 
+    def said(key: str, default: str = "") -> str:
+        return header.get(key, [default])[0]
+
     def number(key: str, default: float | None = None) -> float:
-        text = header.get(key, "" if default is None else str(default))
+        text = said(key, "" if default is None else str(default))
         try:
             value = float(text)
         except ValueError:
@@ -261,39 +301,37 @@ def _interfile(path: Path, layout: Layout) -> Frames:
         return value
 
     columns, rows = (int(number(f"matrix size [{i}]")) for i in (1, 2))
-    size, kind = int(number("number of bytes per pixel")), header.get("number format", "nothing").lower()
+    size, kind = int(number("number of bytes per pixel")), said("number format", "nothing").lower()
     letter = {"unsigned integer": "u", "signed integer": "i"}.get(kind, "f" if kind.endswith("float") else "")
     if letter + str(size) not in ("u1", "u2", "u4", "u8", "i1", "i2", "i4", "i8", "f4", "f8"):
         raise InputError(f"number format {kind} of {size} bytes: expected integers, or floats of 4 or 8 bytes")
-    order = header.get("imagedata byte order", "").upper()
+    order = said("imagedata byte order").upper()
     if size > 1 and order not in ("LITTLEENDIAN", "BIGENDIAN"):
         raise InputError(f"imagedata byte order {order or 'missing'}: expected LITTLEENDIAN or BIGENDIAN")
     type_ = np.dtype((">" if order == "BIGENDIAN" else "<") + letter + str(size))
-    data = _interfile_data(path, header.get("name of data file", ""))
+    data = _interfile_data(path, said("name of data file"))
     skip = int(number("data offset in bytes", 2048 * number("data starting block", 0)))
     frame = rows * columns * size
     count = int(number("total number of images", (data.stat().st_size - skip) // frame if frame else 0))
-    time = header.get("time per projection (sec)") or header.get("study duration (sec)")
-    scales = [header.get(f"scaling factor (mm/pixel) [{i}]") for i in (1, 2)]
+    keys = (f"{name} (sec)" for name in ("time per projection", "image duration", "study duration"))
+    times = next(([float(text) for text in header[key]] for key in keys if any(header.get(key, ()))), [])
     windows = int(number("number of energy windows", 1))
-    return Frames(
-        _numbers(data, type_, (count, rows, columns), skip),
-        None if time is None else float(time),
-        None if None in scales else (float(scales[0] or 0), float(scales[1] or 0)),
-        f"{windows} energy windows" if windows > 1 else "",
-    )
+    return _counts(
+        _numbers(data, type_, (count, rows, columns), skip), f"{windows} energy windows" if windows > 1 else "", time=times,
+        pixel=[float(said(f"scaling factor (mm/pixel) [{i}]", "nan")) for i in (1, 2)], window=range(1, windows + 1),
+    )  # fmt: skip
 
 
-def _interfile_header(path: Path) -> dict[str, str]:
-    """Keys, in lower case, and values; of a key that stands there several times the first."""
+def _interfile_header(path: Path) -> dict[str, list[str]]:
+    """Keys, in lower case, and their values: several where a key stands there several times."""
     lines = path.read_bytes()[: 1 << 20].decode("latin-1").splitlines()
     if not lines or not lines[0].lstrip("!").strip().upper().startswith("INTERFILE"):
         raise InputError("not an Interfile header: expected !INTERFILE in the first line")
-    header: dict[str, str] = {}
+    header: dict[str, list[str]] = {}
     for line in lines:
         key, assigned, value = line.partition(":=")
         if assigned and not line.lstrip().startswith(";"):
-            header.setdefault(" ".join(key.strip().lstrip("!").lower().split()), value.strip())
+            header.setdefault(" ".join(key.strip().lstrip("!").lower().split()), []).append(value.strip())
     return header
 
 
@@ -305,7 +343,7 @@ def _interfile_data(path: Path, name: str) -> Path:
     raise InputError(f"its numbers are in {name or 'no file that it names'}, which is not beside it")
 
 
-def _dicom(path: Path, layout: Layout) -> Frames:
+def _dicom(path: Path, layout: Layout) -> Counts:
     """A nuclear medicine image of several frames (DICOM part 3, C.8.4.8): planar images or projections."""
     import pydicom
 
@@ -329,27 +367,36 @@ def _dicom(path: Path, layout: Layout) -> Frames:
     slope, intercept = float(data.get("RescaleSlope") or 1), float(data.get("RescaleIntercept") or 0)
     if (slope, intercept) != (1.0, 0.0):
         array = array * slope + intercept
-    spacing = data.get("PixelSpacing")
     several = {name: int(data.get(f"NumberOf{name.replace(' ', '')}s") or 1) for name in _VECTORS}
-    return Frames(
-        array,
-        _dicom_time(data),
-        None if not spacing else (float(spacing[1]), float(spacing[0])),
-        ", ".join(f"{n} {name.lower()}s" for name, n in several.items() if n > 1),
-    )
+    kind = ", ".join(f"{n} {name.lower()}s" for name, n in several.items() if n > 1)
+    pixel = [float(size) for size in data.get("PixelSpacing") or (math.nan, math.nan)][::-1]
+    windows = _which(data, "Energy Window", several["Energy Window"])
+    return _counts(array, kind, time=_dicom_times(data), pixel=pixel, window=windows)
 
 
 _VECTORS = ("Energy Window", "Detector", "Phase", "Rotation", "RR Interval", "Time Slot")
 """What a nuclear medicine image may have several of."""
 
 
-def _dicom_time(data: Any) -> float | None:
-    """The duration of each frame, s, where it is the same of all."""
-    places = [data, *(data.get("RotationInformationSequence") or ()), *(data.get("PhaseInformationSequence") or ())]
-    times = {float(place.ActualFrameDuration) for place in places if place.get("ActualFrameDuration")}
-    return times.pop() / 1000 if len(times) == 1 else None
+def _dicom_times(data: Any) -> list[float]:
+    """The durations of frames, s: of each by its rotation or phase, or of all."""
+    for name in ("Rotation", "Phase"):
+        parts = [_dicom_time(part) for part in data.get(f"{name}InformationSequence") or ()]
+        if any(map(math.isfinite, parts)):
+            return [parts[number - 1] for number in _which(data, name, len(parts))]
+    return [_dicom_time(data)]
 
 
-def differs(one: float, other: float) -> bool:
-    """Whether two lengths or times are more than a file's rounding apart."""
-    return not math.isclose(one, other, rel_tol=_SAME_SIZE)
+def _which(data: Any, name: str, count: int) -> list[int]:
+    """Which of `count` windows, rotations or phases each frame is of; unsaid, those of blocks of frames."""
+    vector = data.get(f"{name.replace(' ', '')}Vector") or np.arange(1, count + 1)
+    return [int(number) for number in np.atleast_1d(vector)]
+
+
+def _dicom_time(place: Any) -> float:
+    return float(place.get("ActualFrameDuration") or math.nan) / 1000
+
+
+def differs(said: float, other: float) -> bool:
+    """Whether a length or time that a file says, NaN where it does not, is more than its rounding from another."""
+    return not (math.isnan(said) or math.isclose(said, other, rel_tol=_SAME_SIZE))

@@ -5,7 +5,6 @@ None of these is guessed, not even where the number of frames is that of the mod
 
 import operator
 import re
-import warnings
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -14,17 +13,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..errors import InputError, InputWarning
+from ..errors import InputError, warn
 from ..geometry.system import Detector, PinholeSystem
 from ..memory import require
 from ..progress import Stages
-from ..validation import instance, one_of, positive, require_finite, shape_text
-from .frame_files import Frames, Layout, differs, read_frames
+from ..validation import instance, one_of, positive, real_numbers, require_finite, shape_text
+from .frame_files import Counts, Layout, differs, read_frames
 from .orientations import ORIENTATIONS, on_crystal
 from .recipe import Recipe, recorded_recipe
 from .run import ProjectionRun
 
 _MOST_NUMBERS = 1 << 20  # in a list of frames
+_FEW = 10
+"""Counts of a frame, and pixels: with more, chance leaves hardly a frame empty, or two frames equal."""
+_BRIGHT = 100
+"""Times as many counts as its neighbours has no pixel by hole and crystal, whose blur reaches them."""
 _MOST_EXACT = 1 << 24  # whole numbers above are rounded in float32
 _KEPT = ("system.", "attenuation.", "counts.", "model.", "detector.", "compute.")
 
@@ -87,7 +90,9 @@ def counts_run(
         raise InputError(
             f"counts: expected numbers (frames, rows, columns), got {array.dtype} {shape_text(array.shape)}"
         )
-    require_told(frames, orientation, time, Frames(array))
+    real_numbers(counts, "counts")  # none masked
+    found = np.asanyarray(counts).view(Counts)
+    require_told(frames, orientation, time, found)
     numbers = frame_numbers(frames, len(array), system)
     words = _words(orientation, len(array))
     time = positive(time, "time (--time)", "s")
@@ -108,18 +113,17 @@ def counts_run(
     given |= {"model.kind": "emission", "model.time": time, "detector.plane": detector}
     given |= {"detector.rows": n_v, "detector.columns": n_u, "detector.magnification": float(magnification)}
     record = {
-        "counts": "measured",
-        "frames": numbers,
-        "orientation": words[0] if len(set(words)) == 1 else words,
-        "detector": detector,
-        "magnification": float(magnification),
-        "pitch_mm": None if pitch is None else np.broadcast_to(pitch, 2).tolist(),
-        "model": "emission",
-        **(settings or {}),
-        "recipe": recorded_recipe(Recipe(given)).tables(),
-    }
+        "counts": "measured", "frames": numbers, "orientation": words[0] if len(set(words)) == 1 else words,
+        "detector": detector, "magnification": float(magnification),
+        "pitch_mm": None if pitch is None else np.broadcast_to(pitch, 2).tolist(), "model": "emission",
+        **(settings or {}), "recipe": recorded_recipe(Recipe(given)).tables(),
+    }  # fmt: skip
+    used = [place[int(number)] for number in system.numbers]
     background = given.get("model.background", 0.0)
-    return ProjectionRun(images, system, views, unit="counts", settings=record, background=background)
+    run = ProjectionRun(images, system, views, unit="counts", settings=record, background=background)
+    _warn_of_others(found, used, words, run)
+    _warn_of_frames(array, used, numbers, found.name)
+    return run
 
 
 def recipe_counts(recipe: Recipe, system: PinholeSystem, stages: Stages = lambda stage: None) -> ProjectionRun:
@@ -127,40 +131,29 @@ def recipe_counts(recipe: Recipe, system: PinholeSystem, stages: Stages = lambda
 
     Warns where a file says another exposure time or pixel size than is given.
     """
-    files = recipe["counts.files"]
     layout = Layout(*(recipe[f"counts.{name}"] for name in ("dataset", "raw_shape", "raw_type", "raw_big_endian")))
-    found = read_frames(files, layout, stages("reading"))
+    found = read_frames(recipe["counts.files"], layout, stages("reading"))
     frames, orientation = recipe["counts.frames"], recipe["counts.orientation"]
     if recipe["counts.frames_file"] is not None:
         frames = _read_numbers(Path(recipe["counts.frames_file"]))
-    names = ", ".join(Path(file).name for file in (*files[:3], *(["…"] if len(files) > 3 else [])))
-    time = recipe.given.get("model.time")
     try:
-        require_told(frames, orientation, time, found)
         run = counts_run(
-            found.array,
-            system,
-            frames,
-            orientation[0] if len(orientation) == 1 else orientation,
-            time,
-            expected=recipe["counts.expected"],
-            detector=recipe.given.get("detector.plane", "real"),
-            magnification=recipe["detector.magnification"],
-            pitch=recipe["detector.pitch"],
-            recipe=recipe,
-            settings={"counts": names},
-        )
+            found, system, frames, orientation[0] if orientation and len(orientation) == 1 else orientation,
+            recipe.given.get("model.time"), expected=recipe["counts.expected"],
+            detector=recipe.given.get("detector.plane", "real"), magnification=recipe["detector.magnification"],
+            pitch=recipe["detector.pitch"], recipe=recipe, settings={"counts": found.name},
+        )  # fmt: skip
     except InputError as error:
-        raise InputError(f"{names}: {error}") from None
-    _require_size(recipe, run, names)
-    _warn_of_others(found, run, recipe, names)
+        raise InputError(f"{found.name}: {error}") from None
+    _require_size(recipe, run, found.name)
     return run
 
 
-def require_told(frames: Any, orientation: Any, time: Any, found: Frames) -> None:
+def require_told(frames: Any, orientation: Any, time: Any, found: Counts) -> None:
     """Raise `InputError`, which says all that is missing and what is known, unless the three are given."""
-    count, rows, columns = found.array.shape
-    said = "" if found.time is None else f"; the file says {found.time:g} s: confirm it"
+    count, rows, columns = found.shape
+    times = found.exposures()
+    said = f"; the file says {_and(times)} s: confirm it" if times else ""
     missing = [
         text
         for value, text in (
@@ -260,22 +253,55 @@ def _require_size(recipe: Recipe, run: ProjectionRun, names: str) -> None:
             raise InputError(f"detector.{name}: {given}, but the images of {names} have {found}")
 
 
-def _warn_of_others(found: Frames, run: ProjectionRun, recipe: Recipe, names: str) -> None:
-    """Warn where the file says another time or pixel size."""
-    time = recipe["model.time"]
-    if found.time is not None and differs(found.time, time):
-        _warn(f"{names}: the file says an exposure of {found.time:g} s; taken as {time:g} s, as given")
-    if found.pixel is None or recipe["detector.pitch"] is not None:
-        return
-    n_v, n_u = run.views.shape
-    own = run.system.detector_side / n_u
-    others = own[[any(differs(size, side) for size in found.pixel) for side in own.tolist()]]
-    if n_u == n_v and len(others):
-        size = " x ".join(f"{size:g}" for size in found.pixel)
-        _warn(
-            f"{names}: the file says pixels of {size} mm; taken as {others[0]:.4g} mm, the crystal's side divided by {n_u}; "
-            "if the file is right, give its number (--pitch)"
+def _warn_of_others(found: Counts, used: list[int], words: list[str], run: ProjectionRun) -> None:
+    """Warn where the files say another time or pixel size of the frames `used`, or that they are of several windows."""
+    time, times = run.recipe["model.time"], found.exposures(used)
+    if any(differs(one, time) for one in times):
+        said = "exposures" if len(times) > 1 else "an exposure"
+        warn(f"{found.name}: the file says {said} of {_and(times)} s; taken as {time:g} s, as given")
+    if len(windows := np.unique(found.about[used, 3])) > 1 and np.isfinite(windows).all():
+        warn(
+            f"{found.name}: frames of the energy windows {_and(windows)} are used; say none of those that are not meant"
         )
+    steps = np.linalg.norm([run.views.u_steps, run.views.v_steps], axis=2) / run.settings["magnification"]
+    for k, along_u, along_v in zip(used, *steps, strict=True):
+        size, own = found.about[k, 1:3], (along_u, along_v)
+        own = own[::-1] if words[k].endswith("u") else own  # along the frame's rows, and down its columns
+        if any(map(differs, size, own)):
+            said, taken = (" x ".join(f"{x:.4g}" for x in sizes) for sizes in (size, own))
+            covering = "so that they cover the crystal; if the file is right, give their size (--pitch)"
+            why = covering if run.settings["pitch_mm"] is None else "as given"
+            warn(f"{found.name}: the file says pixels of {said} mm; taken as {taken} mm, {why}")
+            return
+
+
+def _warn_of_frames(array: NDArray[Any], used: list[int], numbers: list[int | None], name: str) -> None:
+    """Warn of frames that hardly are what modules have counted: empty ones, equal ones, single bright pixels."""
+    called = [f"frame {k + 1} (module {number})" for k, number in enumerate(numbers)]
+    sums = {k: float(array[k].sum(dtype=float)) for k in used}
+    usual = float(np.median([total for total in sums.values() if total] or [0.0]))
+    if usual > _FEW and (empty := [called[k] for k in used if not sums[k]]):
+        warn(f"{name}: no counts in {_some(empty)}, {usual:g} in others")
+    known: dict[bytes, int] = {}
+    pairs = [(known.setdefault(array[k].tobytes(), k), k) for k in used if np.count_nonzero(array[k]) > _FEW]
+    if equal := [f"{called[one]} and {called[k]}" for one, k in pairs if one != k]:
+        warn(f"{name}: equal in every pixel: {_some(equal)}")
+    usual = sorted([0.0, *(float(array[k].max()) for k in used)])[len(used) // 2]
+    for k in used:
+        row, column = divmod(int(array[k].argmax()), array.shape[2])
+        near = array[k, max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2]
+        *others, peak = np.sort(near, axis=None).tolist()
+        if peak > _BRIGHT * max(1, usual, *others):
+            text = f"{called[k]}, row {row + 1}, column {column + 1}: {peak:g} counts"
+            warn(f"{name}: {text}, at most {max(others, default=0):g} in the pixels around it and {usual:g} in others")
+
+
+def _and(numbers: Sequence[float]) -> str:
+    return " and ".join(f"{number:g}" for number in numbers)
+
+
+def _some(texts: list[str]) -> str:
+    return "; ".join([*texts[:3], *([f"and {len(texts) - 3} more"] if len(texts) > 3 else [])])
 
 
 def _listed(numbers: Sequence[int]) -> str:
@@ -284,7 +310,3 @@ def _listed(numbers: Sequence[int]) -> str:
     parts = [(numbers[a], numbers[b - 1]) for a, b in pairwise(cuts)]
     texts = [f"{a}-{b}" if b > a else str(a) for a, b in parts]
     return ", ".join(texts if len(texts) <= 6 else [*texts[:5], "…"])
-
-
-def _warn(text: str) -> None:
-    warnings.warn(text, InputWarning, stacklevel=4)

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InputError
 from ..files import replacing
+from ..validation import real_numbers
 from . import letters
 from .display import Display
 from .run import ProjectionRun
@@ -22,7 +23,7 @@ def as_seen(images: ArrayLike) -> NDArray:
     (u, v, k) is right-handed and k points away from the pinhole into the scene, so whoever looks along k with +v up
     has +u to the left: a picture in this order is what a camera in the pinhole sees, not its mirror image.
     """
-    return np.asarray(images)[..., ::-1, ::-1]
+    return real_numbers(images, "images")[..., ::-1, ::-1]
 
 
 COLUMNS = 20

@@ -1,13 +1,12 @@
 """From a system and a volume to a projection run: the main job, as one call."""
 
-import warnings
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..errors import InputError, InputWarning
+from ..errors import InputError, warn
 from ..geometry.system import Detector, PinholeSystem
 from ..geometry.views import Views
 from ..memory import require
@@ -67,13 +66,8 @@ def project_run(
         photons = positive(photons, "photons")
     elif noise_seed is not None and not isinstance(model, Emission):
         raise InputError("noise_seed: only the counts of an Emission, or photons that pass, have noise")
-    lowest, highest = float(volume.array.min()), float(volume.array.max())
-    if isinstance(model, Emission) and lowest < -0.1 * abs(highest):  # interpolation leaves less
-        _warn(f"the activity is {lowest:g} to {highest:g} kBq/mL: what is below 0 makes counts below 0")
     views = system.views(shape=shape, detector=detector, magnification=magnification, pitch=pitch)
-    if isinstance(model, Emission) and not model.within_crystal:
-        _warn_of_no_crystal(system, views, magnification)
-    _warn_of_unseen(volume, views, ends_at_plane=not isinstance(model, Emission))
+    warn_of_images(volume, system, views, magnification, model)
     n_v, n_u = views.shape
     require(4.0 * len(views) * n_v * n_u, f"a set of {len(views)} projections of {n_v} x {n_u} pixels")
     projector = Projector(volume.grid, views, model=model, backend=backend, threads=threads)
@@ -85,26 +79,32 @@ def project_run(
     if noise_seed is not None:
         images = sample_counts(images, noise_seed).astype(np.float32)
     record = {
-        "detector": detector,
-        "magnification": float(magnification),
-        "pitch_mm": None if pitch is None else np.broadcast_to(pitch, 2).tolist(),
-        "model": model.name,
-        **model.record(),
-        **({} if photons is None else {"photons": photons}),
-        "backend": projector.backend,
+        "detector": detector, "magnification": float(magnification),
+        "pitch_mm": None if pitch is None else np.broadcast_to(pitch, 2).tolist(), "model": model.name,
+        **model.record(), **({} if photons is None else {"photons": photons}), "backend": projector.backend,
         **(settings or {}),
-    }
+    }  # fmt: skip
     unit = model.unit(volume) if photons is None else "photons"
     return ProjectionRun(
         images, system, views, volume, unit=unit, settings=record, seed=noise_seed, background=model.background
     )
 
 
+def warn_of_images(volume: Volume, system: PinholeSystem, views: Views, magnification: float, model: Model) -> None:
+    """Warn where images of a volume hardly are what is wanted: activity below 0, pixels beside crystals, unseen parts."""
+    lowest, highest = float(volume.array.min()), float(volume.array.max())
+    if isinstance(model, Emission) and lowest < -0.1 * abs(highest):  # interpolation leaves less
+        warn(f"the activity is {lowest:g} to {highest:g} kBq/mL: what is below 0 makes counts below 0")
+    if isinstance(model, Emission) and not model.within_crystal:
+        _warn_of_no_crystal(system, views, magnification)
+    _warn_of_unseen(volume, views, ends_at_plane=not isinstance(model, Emission))
+
+
 def warn_of_energy(model: Model, energy: float, what: str) -> None:
     """Warn where mu holds at an energy (keV) whose photons the model does not count; `what` names the mu."""
     window = model.window if isinstance(model, Emission) else None
     if window is not None and not window[0] <= energy <= window[1]:
-        _warn(f"{what} holds at {energy:g} keV, photons of {window[0]:g} to {window[1]:g} keV are counted")
+        warn(f"{what} holds at {energy:g} keV, photons of {window[0]:g} to {window[1]:g} keV are counted")
 
 
 def _warn_of_no_crystal(system: PinholeSystem, views: Views, magnification: float) -> None:
@@ -113,7 +113,7 @@ def _warn_of_no_crystal(system: PinholeSystem, views: Views, magnification: floa
     sides = np.linalg.norm(steps, axis=2) * np.array(views.shape[::-1])[:, None] / magnification  # on the crystal, mm
     beyond = int(np.any(sides > 1.001 * system.detector_side, axis=0).sum())
     if beyond:
-        _warn(
+        warn(
             f"{beyond} of {len(views)} images are wider than the crystal: pixels beside it count photons that nothing "
             "detects, unless within_crystal (Crystal's Side) leaves them out"
         )
@@ -123,13 +123,9 @@ def _warn_of_unseen(volume: Volume, views: Views, ends_at_plane: bool) -> None:
     """Warn where a volume lies beside the isocentre, or beyond the plane at which the rays end."""
     index = volume.grid.index_from_world[:3, 3]
     if np.any(index < -0.5) or np.any(index > np.array(volume.grid.shape) - 0.5):
-        _warn("the isocentre, at which the modules aim, lies outside the volume's grid: check the volume's position")
+        warn("the isocentre, at which the modules aim, lies outside the volume's grid: check the volume's position")
     corners = np.concatenate([volume.grid.corners(), np.ones((8, 1))], axis=1)
     depth = corners @ views.projection_matrices()[:, 2].T  # (8, M), 1 at the virtual detector's plane
     cut = int(np.any(depth > 1, axis=0).sum())
     if ends_at_plane and cut:
-        _warn(f"{cut} of {len(views)} virtual detectors stand in front of parts of the volume: raise the magnification")
-
-
-def _warn(text: str) -> None:
-    warnings.warn(text, InputWarning, stacklevel=4)
+        warn(f"{cut} of {len(views)} virtual detectors stand in front of parts of the volume: raise the magnification")

@@ -97,13 +97,17 @@ def recorded_recipe(recipe: Recipe) -> Recipe:
 
 
 def recipe_of_tables(tables: Mapping[str, Any]) -> Recipe:
-    """The recipe of values by table and name, as `Recipe.tables` gives them; `InputError` as of `Recipe`."""
+    """The recipe of values by table and name, as `Recipe.tables` gives them, without defaults that have no effect.
+
+    `InputError` as of `Recipe`.
+    """
     values: dict[str, Any] = {}
     for table, entries in tables.items():
         if table not in TABLES or not isinstance(entries, Mapping):
             raise InputError(f"{table}: expected one of the tables {', '.join(f'[{name}]' for name in TABLES)}")
         values |= {f"{table}.{name}": value for name, value in entries.items()}
-    return Recipe(values)
+    # Versions record defaults that have no effect in later ones.
+    return fitting_recipe(values, [k for k, v in values.items() if k not in SETTINGS or v != SETTINGS[k].default])
 
 
 def read_recipe(path: str | os.PathLike[str]) -> Recipe:

@@ -10,11 +10,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arrays import checked
 from ..errors import InputError
 from ..geometry.system import PinholeSystem
 from ..geometry.views import Views
 from ..projector.models import checked_background
-from ..validation import freeze, real_array
+from ..validation import freeze, real_numbers
 from ..version import VERSION
 from ..volumes.volume import Volume
 from .recipe import Recipe, recipe_of_tables
@@ -56,11 +57,8 @@ class ProjectionRun:
         if len(self.views) != len(self.system):
             raise InputError(f"run: {len(self.system)} modules, but {len(self.views)} views")
         shape = (len(self.views), *self.views.shape)
-        projections = self.projections
-        if not (isinstance(projections, np.ndarray) and projections.dtype == np.float32):
-            projections = real_array(projections, "projections", shape, np.float32)
-        if projections.shape != shape:
-            raise InputError(f"run: expected projections of shape {shape}, got {projections.shape}")
+        name = "run: projections"
+        projections = checked(real_numbers(self.projections, name), name, shape, False)
         object.__setattr__(self, "projections", freeze(projections.view()))
         background = checked_background(self.background, "run: background", len(self.views), self.views.shape)
         object.__setattr__(self, "background", background)

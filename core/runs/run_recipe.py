@@ -89,20 +89,13 @@ def run_recipe(
         if seed is not None:  # noise of its own for each state
             record = record.updated({"noise.seed": seed + number})
         yield project_run(
-            system,
-            source,
-            shape=(recipe["detector.rows"], recipe["detector.columns"]),
-            detector=recipe["detector.plane"],
-            magnification=recipe["detector.magnification"],
-            pitch=recipe["detector.pitch"],
-            backend=recipe["compute.backend"],
-            threads=recipe["compute.threads"],
+            system, source, (recipe["detector.rows"], recipe["detector.columns"]), detector=recipe["detector.plane"],
+            magnification=recipe["detector.magnification"], pitch=recipe["detector.pitch"],
+            backend=recipe["compute.backend"], threads=recipe["compute.threads"],
             settings={"volume": _volume_name(record), **converted, "recipe": record.tables()},
-            model=recipe_model(recipe, system, mu_of_it),
-            photons=recipe["model.photons"],
-            noise_seed=record["noise.seed"],
-            progress=stages("projecting"),
-        )
+            model=recipe_model(recipe, system, mu_of_it), photons=recipe["model.photons"],
+            noise_seed=record["noise.seed"], progress=stages("projecting"),
+        )  # fmt: skip
 
 
 def recipe_views(recipe: Recipe, system: PinholeSystem) -> Views:
@@ -296,10 +289,15 @@ def truth_of_run(run: ProjectionRun) -> tuple[Volume | Phantom, NDArray[np.float
 
 def _mu_of_phantom(phantom: Phantom, pose: NDArray[np.float64], grid: Grid, model: Model, stages: Stages) -> Volume:
     """What the phantom attenuates, on a grid."""
+    require_mu(phantom, model)
+    return phantom.voxelize(grid, pose, stages("voxelizing"), "mu")
+
+
+def require_mu(phantom: Phantom, model: Model) -> None:
+    """Raise `InputError` where a phantom attenuates nothing; warn where the model counts photons of another energy."""
     if all(shape.mu is None for shape in phantom.shapes):
         raise InputError(f"attenuation.of_phantom (--phantom-mu): no shape of the {phantom.title} has a mu")
     warn_of_energy(model, phantom.mu_energy, f"the mu of the {phantom.title}")
-    return phantom.voxelize(grid, pose, stages("voxelizing"), "mu")
 
 
 def phantom_pose(recipe: Recipe) -> NDArray[np.float64]:

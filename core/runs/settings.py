@@ -110,6 +110,7 @@ def _named(names: Iterable[str], text: str) -> Words:
 
 
 _COUNTS = "model.kind=emission"
+_BY_RAYS = (_COUNTS, "no model.hole=depth")
 _METHOD_OF_COUNTS = " or ".join(f"reconstruction.method={m.name}" for m in METHODS.values() if m.of_counts)
 _RAYS = "no model.kind=inverse-square"
 _FILE = "volume.file or volume.states"
@@ -213,10 +214,11 @@ _DECLARED = (
             "line", unit="keV", least=0, slider=1000, sizes=(2,), needs=(_COUNTS, "model.isotope"),
             label="Window (keV)"),
     Setting("model.aperture_points", int, 1, "Points of the hole that rays pass; 1: its middle, no blur, 7 and more: the "
-            "blur of a hole of this size", least=1, slider=64, needs=(_COUNTS,), label="Hole Points"),
+            "blur of a hole of this size", least=1, slider=64, needs=(*_BY_RAYS, "no model.aperture_tolerance"),
+            label="Hole Points"),
     Setting("model.aperture_tolerance", float, None, "In place of a number of points, as many as bring a voxel's image "
             "this close, such as 0.1, to that of the whole hole", "the number of points holds", above=0, slider=1,
-            needs=(_COUNTS,), label="Hole Tolerance"),
+            needs=_BY_RAYS, label="Hole Tolerance"),
     Setting("model.hole", str, "rays", "How the hole's blur is computed", label="Hole's Blur", option="--hole", words={
         "rays": ("Rays", "By rays through points of the hole"),
         "depth": ("By Depth", "Of the whole hole, depth by depth, without rays: for reconstruction"),
@@ -229,12 +231,12 @@ _DECLARED = (
     Setting("model.edge", str, "paix", "How photons penetrate the aperture's edge", label="Knife Edge", words={
         "paix": ("Effective Diameter", "As if the hole were wider (Paix 1967)"),
         "path": ("Path Length", "Each by its path through the edge: more rays"),
-    }, needs=(_COUNTS, "model.aperture_mu")),
+    }, needs=(*_BY_RAYS, "model.aperture_mu")),
     Setting("model.crystal_mu", float, None, "Material of the crystal that stops the photons, or its attenuation "
             "coefficient at their energy", "all photons are counted", unit="1/mm", words=_named(CRYSTALS, _BY_NAME),
             above=0, slider=5, needs=(_COUNTS,), label="Crystal"),
     Setting("model.depth_layers", int, 1, "Depths in the crystal at which photons are recorded (parallax); 1: where they "
-            "enter", least=1, slider=8, needs=(_COUNTS, "model.crystal_mu")),
+            "enter", least=1, slider=8, needs=(*_BY_RAYS, "model.crystal_mu")),
     Setting("model.intrinsic_fwhm", float, 0.0, "Full width at half maximum of the detector's own blur, on the crystal",
             unit="mm", least=0, slider=10, needs=(_COUNTS,), label="Blur (mm)"),
     Setting("model.within_cone", bool, False, "Nothing passes steeper than the knife edge's cone", needs=(_COUNTS,),

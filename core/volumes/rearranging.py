@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..errors import InputError
 from ..geometry.grid import Grid
 from ..memory import require
-from ..validation import freeze, instance, one_for_all, real_array
+from ..validation import freeze, instance, one_for_all, real_array, real_numbers
 from .volume import Volume, outside_value
 
 
@@ -96,8 +96,8 @@ def split_labels(volume: Volume, labels: Volume | NDArray) -> dict[int, Volume]:
         if not same:
             raise InputError("labels: expected the volume's own grid; resample them onto it, method 'nearest'")
         labels = labels.array
-    array = np.asarray(labels)
-    if array.shape != volume.grid.shape or array.dtype.kind not in "fiub":
+    array = real_numbers(labels, "labels")
+    if array.shape != volume.grid.shape:
         expected = " x ".join(map(str, volume.grid.shape))
         raise InputError(f"labels: expected {expected} whole numbers, got {array.dtype} of shape {array.shape}")
     found = np.unique(array)

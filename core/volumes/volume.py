@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..geometry.grid import Grid
-from ..validation import freeze, instance, one_of, real_array, require_finite
+from ..validation import freeze, instance, one_of, real_array, real_numbers, require_finite
 
 UNITS = {
     "activity": "kBq/mL",
@@ -51,13 +51,13 @@ class Volume:
     def __post_init__(self) -> None:
         instance(self.grid, Grid, "volume")
         one_of(self.quantity, UNITS, "quantity")
-        given = self.array
-        fits = isinstance(given, np.ndarray) and (given.dtype, given.shape) == (np.float32, self.grid.shape)
+        given = real_numbers(self.array, "volume")
+        fits = (given.dtype, given.shape) == (np.float32, self.grid.shape)
         if fits and given.flags.c_contiguous and not given.flags.writeable:
             require_finite(given, "volume")
-            return
-        with np.errstate(over="ignore"):  # what overflows float32 is refused as not finite
-            object.__setattr__(self, "array", freeze(real_array(self.array, "volume", self.grid.shape, np.float32)))
+        else:
+            given = freeze(real_array(given, "volume", self.grid.shape, np.float32))
+        object.__setattr__(self, "array", given)
 
     @property
     def unit(self) -> str:

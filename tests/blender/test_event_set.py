@@ -13,6 +13,7 @@ from mphdrr.core import events
 from mphdrr.core.events.templates import TEMPLATES
 from mphdrr.core.progress import Cancelled
 from mphdrr.core.runs.files import read_run
+from mphdrr.core.workbook import read_system
 
 WORKBOOK = Path(__file__).parents[2] / "examples" / "dc-spect-80.xlsx"
 TEXT = f"""
@@ -199,6 +200,64 @@ def test_an_event_is_opened_with_truth_phantom_and_projections(recipe, scene, tm
     np.testing.assert_array_equal(read_run(storage.absolute(item.file)).projections, event.images("lines"))
     assert item.name == f"Event {number} derenzo, lines" and runs.changes(scene) == []
     assert len(scanner.modules(scanner.active_scanner(scene))) == 4, "the set's, since the scene had none"
+
+
+ODD = """[models.odd]
+kind = "emission"
+time = 33.333333333333336
+isotope = "Tl-201"
+window = [63.1234567891, 87.7]
+aperture_mu = 1.2345678901234
+opening_angle_degrees = 83.7
+crystal_mu = "NaI"
+intrinsic_fwhm = 2.1234567890123
+within_cone = true
+pixel_points = 1
+tolerance = 1234567.8901234
+background = 0.1
+[models.path]
+kind = "emission"
+isotope = "Tc-99m"
+aperture_mu = "tungsten"
+edge = "path"
+crystal_mu = "CZT"
+depth_layers = 2
+pixel_points = 1
+tolerance = 0.7
+"""
+
+
+@pytest.mark.parametrize("has_scanner", [False, True])
+def test_an_opened_event_is_current_until_something_is_changed(recipe, scene, tmp_path, has_scanner):
+    """Float64 in the recipe, float32 in the scene: the same numbers; 84 degrees are others."""
+    pitch = TEXT.replace("columns = 8", "columns = 8\npitch = 12.345678901234567\nmagnification = 9.87654321")
+    (tmp_path / "odd.toml").write_text(pitch.replace("[augmentation]", f"{ODD}[augmentation]"), encoding="utf-8")
+    events.make(events.read_recipe(tmp_path / "odd.toml"), tmp_path / "set", 1)
+    if has_scanner:
+        scanner.build_scanner(scene, read_system(WORKBOOK)[:4])
+    for model in ("lines", "counts", "odd", "path"):
+        bpy.ops.mphdrr.open_event(opened=0, model=model)
+        assert runs.changes(scene) == [], model
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "kept.blend"))
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "kept.blend"))
+    scene = bpy.context.scene
+    assert runs.changes(scene) == []
+    bpy.ops.mphdrr.open_event(opened=0, model="odd")
+    settings, own = scene.mphdrr_projections, scanner.active_scanner(scene).mphdrr_scanner
+    for owner, name, value, said in (
+        (settings, "time", 33.3334, "time"),
+        (settings, "window", (63.1235, 87.7), "window"),
+        (settings, "intrinsic_fwhm", 2.12346, "blur"),
+        (settings, "pitch", 12.3457, "pixel size"),
+        (own, "opening_angle", np.radians(83.701), "opening angle"),
+    ):
+        before = getattr(owner, name)
+        before = before[:] if name == "window" else before
+        setattr(owner, name, value)
+        (line,) = runs.changes(scene)
+        assert line.startswith(said) and ", now " in line
+        setattr(owner, name, before)
+        assert runs.changes(scene) == []
 
 
 def test_the_next_event_takes_the_place_of_the_one_before(recipe, scene, tmp_path):

@@ -11,9 +11,11 @@ import pytest
 from PIL import Image
 
 import mphdrr.core as mph
-from mphdrr.addon import figures, jobs, rendering, scanner, volumes
+from mphdrr.addon import figures, jobs, rendering, scanner, storage, volumes
+from mphdrr.addon.cli import main
 from mphdrr.addon.cli.scene import save_scene
 from mphdrr.core.figures.page import Page
+from mphdrr.core.recording import recorded_warnings
 
 
 def state() -> tuple:
@@ -145,3 +147,117 @@ def test_pixels_of_a_rendered_picture_are_read_exactly(scene, tmp_path):
     page.write(tmp_path / "page.png")
     assert np.array_equal(figures._pixels(tmp_path / "page.png"), page.picture)
     assert "page.png" not in bpy.data.images
+
+
+def warned(call) -> list[str]:
+    with recorded_warnings() as texts:
+        call()
+    return texts
+
+
+def test_a_picture_that_a_volume_does_not_change_is_warned_of(example, tmp_path, monkeypatch):
+    """As where this Blender's Cycles draws no volumes: pictures with and without it are the same."""
+    (item,) = volumes.volume_objects(example)
+    changes, sizes, path = 0, [], tmp_path / "figure.png"
+
+    def render(scene):
+        yield
+        width, height = (n * scene.render.resolution_percentage // 100 for n in (640, 480))
+        sizes.append((width, scene.cycles.use_denoising))
+        shown = [o for o in scene.collection.all_objects if o.type == "VOLUME" and not o.hide_render]
+        picture = np.full((height, width, 3), 90, np.uint8)
+        picture[height // 2 :: 50, width // 2 :: 50] += np.uint8(len(shown) * changes)
+        picture[height // 3 : height // 2, width // 3 : width // 2] += np.uint8(len(shown) * changes)
+        return picture
+
+    monkeypatch.setattr(figures, "_render", render)
+    for kind in ("cut-away", "inside"):
+        sizes.clear()
+        job = figures.figure_job(bpy.context, kind, [path], (640, 480), samples=1)
+        (text,) = warned(lambda job=job: jobs.run(job))
+        assert text.startswith(f"the picture shows nothing of {item.name!r}: ") and path.is_file()
+        assert sizes[-1] == (640, True) and {width for width, _ in sizes[:-1]} == {243}
+    changes = 60
+    assert warned(lambda: jobs.run(figures.figure_job(bpy.context, "inside", [path], (640, 480)))) == []
+    sizes.clear()
+    assert warned(lambda: jobs.run(figures.figure_job(bpy.context, "scanner", [path], (640, 480)))) == []
+    assert len(sizes) == 1, "a figure without a volume is rendered once"
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("look", ["DENSITY", "SHELL", "BRIGHTEST"])
+def test_a_volume_is_seen_or_its_absence_is_said(example, tmp_path, look):
+    (item,) = volumes.volume_objects(example)
+    item.mphdrr_volume.look, path = look, tmp_path / "a.png"
+    for kind in ("cut-away", "inside"):
+        job = figures.figure_job(bpy.context, kind, [path], (480, 300), samples=1)
+        assert warned(lambda job=job: jobs.run(job)) == []
+    item.mphdrr_volume.display_high = item.mphdrr_volume.surface = 1e7
+    item.mphdrr_volume.display_low = 9e6
+    (text,) = warned(lambda: jobs.run(figures.figure_job(bpy.context, "inside", [path], (480, 300), samples=1)))
+    assert "Low and High draw none of its values" in text
+
+
+def rendered(scene, capfd) -> str:
+    """What is said beside Blender's own Render, which writes its picture all the same."""
+    path = storage.folder() / "render.png"
+    path.unlink(missing_ok=True)
+    scene.render.filepath = str(path)
+    capfd.readouterr()
+    bpy.ops.render.render(write_still=True)
+    assert path.is_file() and not any(s.name.startswith("mphDRR studio") for s in bpy.data.scenes)
+    return "\n".join(line for line in capfd.readouterr().err.splitlines() if line.startswith("mphDRR"))
+
+
+@pytest.fixture
+def small_render(example):
+    render, example.camera = example.render, scanner.modules(scanner.active_scanner(example))[0]
+    render.engine, example.cycles.samples = "CYCLES", 1
+    render.resolution_x = render.resolution_y = 16
+    bpy.context.view_layer.update()
+    return example
+
+
+def test_render_says_which_volumes_of_the_view_it_lacks(small_render, capfd, monkeypatch):
+    (item,) = volumes.volume_objects(small_render)
+    monkeypatch.setattr(figures, "rendering", lambda *_: iter(()))  # whose own tests are above
+    assert rendered(small_render, capfd) == ""
+    item.hide_render = True
+    assert (
+        rendered(small_render, capfd) == f"mphDRR: the picture shows nothing of {item.name!r}: it is hidden in renders"
+    )
+    item.hide_set(True)
+    assert rendered(small_render, capfd) == "", "it is seen nowhere, as is meant"
+    item.hide_set(False)
+    item.hide_render = False
+    home = bpy.data.collections.new("Home")
+    small_render.collection.children.link(home)
+    home.objects.link(item)
+    small_render.collection.objects.unlink(item)
+    home.hide_render = True
+    assert "is hidden in renders" in rendered(small_render, capfd)
+    home.hide_render = False
+    bpy.context.view_layer.update()
+    assert rendered(small_render, capfd) == ""
+    volumes.file_of(item).unlink()
+    storage._size_at.cache_clear()
+    assert rendered(small_render, capfd).endswith(f"nothing of {item.name!r}: its files are missing")
+
+
+@pytest.mark.long
+def test_render_says_what_cycles_does_not_draw(small_render, capfd):
+    (item,) = volumes.volume_objects(small_render)
+    assert rendered(small_render, capfd) == ""
+    item.mphdrr_volume.display_high = 9e9
+    item.mphdrr_volume.display_low = 8e9
+    assert "Low and High draw none of its values" in rendered(small_render, capfd)
+
+
+def test_figures_of_volumes_are_not_made_of_runs_that_have_none(dc_spect, tmp_path, capsys):
+    system = dc_spect[:3]
+    counts = np.random.default_rng(1).poisson(4.0, (3, 4, 4))
+    mph.write_run(mph.counts_run(counts, system, "1-3", "back-v", 9.0), tmp_path / "run.h5")
+    for kind in ("cut-away", "inside", "sums"):
+        assert main(["figure", kind, str(tmp_path / "run.h5"), "-o", str(tmp_path / "a.png")]) == 1
+        assert "needs a volume" in capsys.readouterr().err
+    assert not (tmp_path / "a.png").exists()

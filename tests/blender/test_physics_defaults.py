@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from types import SimpleNamespace
 from typing import Any
 
@@ -9,11 +10,12 @@ import bpy
 import numpy as np
 import pytest
 
-from mphdrr.addon import rendering, scanner, volumes
-from mphdrr.addon.projection_properties import USUAL_TIME, _volume_chosen, recipe_values
+from mphdrr.addon import rendering, runs, scanner, volumes
+from mphdrr.addon.projection_properties import PROPERTIES, USUAL_TIME, _volume_chosen, recipe_values
 from mphdrr.core.geometry.grid import Grid
 from mphdrr.core.runs.presets import PRESETS
 from mphdrr.core.runs.recipe import Recipe, write_recipe
+from mphdrr.core.runs.run_recipe import recipe_model
 from mphdrr.core.volumes.volume import Volume
 
 
@@ -93,3 +95,24 @@ def test_all_modules_or_a_range_of_real_numbers(scene, settings, ring_system):
     assert not settings.all_modules
     settings.all_modules = True
     assert (settings.first, settings.last) == (0, 0)
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_a_preset_goes_with_every_choice_of_the_panel(settings, objects, ring_system, name):
+    """What is chosen in any menu or by any switch before the preset or after it, the panel's model is made."""
+    collection = scanner.build_scanner(settings.id_data, ring_system)
+    for key in PROPERTIES:
+        kind = settings.bl_rna.properties[key]
+        values = [item.identifier for item in kind.enum_items] if kind.type == "ENUM" else []
+        values += [True] if kind.type == "BOOLEAN" else []
+        for value, is_after in itertools.product(values, (True, False)):
+            for other in PROPERTIES:
+                settings.property_unset(other)
+            if is_after:
+                bpy.ops.mphdrr.use_preset(preset=name)
+            setattr(settings, key, value)
+            if not is_after:
+                bpy.ops.mphdrr.use_preset(preset=name)
+            if settings.isotope == "NONE":  # at whose energy would materials attenuate? That is refused, and must be
+                settings.aperture_material = settings.crystal_material = "NUMBER"
+            recipe_model(runs.panel_recipe(settings.id_data), scanner.read_scanner(collection))

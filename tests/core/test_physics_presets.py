@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import itertools
+import math
+
 import pytest
 
 import mphdrr.core as mph
 from mphdrr.addon.cli import main
 from mphdrr.core.runs.presets import PRESETS
-from mphdrr.core.runs.recipe import Recipe
+from mphdrr.core.runs.recipe import Recipe, fitting_recipe, recipe_of_tables, recorded_recipe
 from mphdrr.core.runs.run_recipe import recipe_model
+from mphdrr.core.runs.settings import SETTINGS
 
 WORKBOOK = "examples/dc-spect-80.xlsx"
 RUN = {
@@ -71,3 +75,80 @@ def test_the_command_takes_a_preset_that_options_override(tmp_path, capsys):
     assert (recipe["model.isotope"], recipe["model.crystal_mu"], recipe["model.time"]) == ("Tl-201", "CZT", 60)
     assert main([*given, "--transmission"]) == 1
     assert "model.kind = emission" in capsys.readouterr().err
+
+
+def states() -> list[tuple[str, object]]:
+    """Every setting of model, detector and noise with what it may be: its words, and numbers small and large."""
+    found: list[tuple[str, object]] = []
+    for key, setting in SETTINGS.items():
+        if not key.startswith(("model.", "detector.", "noise.")):
+            continue
+        values: list[object] = list(setting.words)
+        if setting.kind is bool:
+            values += [False, True]
+        elif key == "model.window":
+            values += [(10.0, 1000.0)]  # of whatever is counted
+        elif setting.kind in (int, float):
+            least = setting.above if setting.least is None else setting.least
+            numbers = [(least or 0.0) + 2, (least or 0.0) + 7, setting.default]
+            most = setting.most or math.inf
+            values += [setting.kind(number) for number in numbers if number is not None and number <= most]
+        found += [(key, value) for value in values]
+    return found
+
+
+STATES = states()
+
+
+def accepted(values: dict[str, object], system: mph.PinholeSystem) -> None:
+    """What the panel asks for is understood by recipe and model, and a run's record of it by the next version."""
+    recipe = fitting_recipe(values)
+    if not recipe["model.isotope"]:  # a material attenuates as its photons do: without any it is refused, and must be
+        numbers = {"model.aperture_mu": 3.6, "model.crystal_mu": 0.4}
+        recipe = recipe.updated({key: numbers[key] for key in numbers if isinstance(recipe[key], str)})
+    recipe_model(recipe, system)
+    kept = recorded_recipe(recipe)
+    assert recipe_of_tables(kept.tables()) == kept
+
+
+BEFORE = {"model.kind": "emission", "model.isotope": "I-123", "model.aperture_mu": "lead", "model.crystal_mu": "NaI"}
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_no_preset_and_state_of_the_panel_refuse_each_other(system, name):
+    """All pairs, in either order."""
+    changes = PRESETS[name].changes
+    for key, value in STATES:
+        accepted({**BEFORE, key: value, **changes}, system)
+        accepted({**BEFORE, **changes, key: value}, system)
+    for word in SETTINGS["model.hole"].words:  # as the command has it: an option is meant, and what it leaves goes
+        recipe = Recipe().updated(changes).updated({"model.hole": word})
+        assert recipe["model.hole"] == word and recipe_model(recipe, system).hole == word
+
+
+def test_no_two_states_of_the_panel_refuse_each_other_after_a_preset(system):
+    changes = PRESETS["i123-tungsten-czt"].changes
+    for (key, value), (other, another) in itertools.combinations([s for s in STATES if s[0].startswith("model.")], 2):
+        if key != other:
+            accepted({**BEFORE, **changes, key: value, other: another}, system)
+
+
+@pytest.mark.parametrize("hole", list(SETTINGS["model.hole"].words))
+def test_the_command_takes_a_preset_beside_every_hole(hole, tmp_path):
+    path = tmp_path / "run.toml"
+    given = ["project", WORKBOOK, "--preset", "tc99m-lead-nai", "--hole", hole, "--write-recipe", str(path)]
+    assert main(given) == 0
+    recipe = mph.read_recipe(path)
+    assert recipe["model.hole"] == hole and recipe["model.isotope"] == "Tc-99m"
+    recipe_model(recipe, mph.read_system(WORKBOOK))
+
+
+def test_recipes_that_say_defaults_without_an_effect_are_read(system, tmp_path):
+    """As runs of earlier versions have recorded them."""
+    tables = {"model": {"kind": "emission", "hole": "depth", "aperture_points": 1, "edge": "paix", "depth_layers": 1}}
+    recipe = recipe_of_tables(tables)
+    assert recipe["model.hole"] == "depth" and recipe_model(recipe, system).hole == "depth"
+    with pytest.raises(
+        mph.InputError, match=r"model.aperture_points \(--aperture-points\) does not go with model.hole"
+    ):
+        recipe_of_tables({"model": tables["model"] | {"aperture_points": 7}})

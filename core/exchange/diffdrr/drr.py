@@ -293,7 +293,7 @@ def _since_04(
     volume: Any, spacing: Any, sdr: float, *args: Any, bone_attenuation_multiplier: float = 1.0, **kwargs: Any
 ) -> tuple[tuple[Any, ...], dict[str, Any]]:
     """The arguments before 0.4 as those of `DRR._set_up`: the subject stands for CT numbers and their voxel size."""
-    ct = volume if isinstance(volume, Tensor) else torch.from_numpy(real_array(volume, "volume", None, np.float32))
+    ct = volume if isinstance(volume, Tensor) else torch.from_numpy(real_array(volume, "DRR: volume", None, np.float32))
     hu = ct.flip([0])
     size = np.array([positive(s, "voxel spacing", "mm") for s in np.asarray(spacing).tolist()])
     affine = affine_matrix(np.diag(size), size / 2)

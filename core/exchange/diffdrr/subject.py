@@ -12,6 +12,7 @@ from torch import Tensor
 from ...errors import InputError
 from ...geometry.rotations import pose_matrix
 from ...physics.ct_numbers import DIFFDRR_AIR, DIFFDRR_BONE, diffdrr_density
+from ...validation import real_array, real_numbers
 from ...volumes.volume import LINE_INTEGRALS, Volume, require_quantity
 from ...volumes.volume_files import read_volume, read_volume_of
 
@@ -73,8 +74,8 @@ def read(
     density = hu_to_density(hu, bone_attenuation_multiplier)
     mask = None
     if labelmap is not None:
-        array = read_volume(Path(labelmap)).array if isinstance(labelmap, str | PathLike) else np.asarray(labelmap)
-        mask = torch.from_numpy(np.array(array))
+        array = read_volume(Path(labelmap)).array if isinstance(labelmap, str | PathLike) else labelmap
+        mask = torch.from_numpy(np.array(real_numbers(array, "labelmap")))
         if mask.shape != hu.shape:
             raise InputError(f"labelmap: expected {tuple(hu.shape)} voxels, as the volume has, got {tuple(mask.shape)}")
     if labels is not None:
@@ -118,5 +119,5 @@ def as_subject(given: Any, affine: Any) -> Subject:
         return Subject(given.density.data.squeeze(), given.volume.affine, given.reorient, hu, mask)
     if affine is None:
         raise InputError(f"DRR: expected a subject, a Volume, or an array with `affine`, got {type(given).__name__}")
-    array = given if isinstance(given, Tensor) else torch.from_numpy(np.array(given, dtype=np.float32))
+    array = given if isinstance(given, Tensor) else torch.from_numpy(real_array(given, "DRR: volume", None, np.float32))
     return Subject(array, np.asarray(affine, dtype=np.float64), reorientation("AP"))

@@ -21,7 +21,6 @@ that the backend's `to_backend` returns.
 
 import functools
 import importlib
-import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from types import ModuleType
@@ -30,7 +29,7 @@ from typing import Any
 import numpy as np
 
 from ...arrays import ArrayOrTensor, to_numpy, to_tensor
-from ...errors import InputError, InputWarning
+from ...errors import InputError, warn
 
 
 @dataclass(frozen=True)
@@ -178,8 +177,4 @@ def _reason(error: BaseException) -> str:
 
 @functools.cache
 def _warn_slower(name: str, reason: str) -> None:
-    warnings.warn(
-        f"projections run with {name}, many times slower than with the backend cpu ({reason})",
-        InputWarning,
-        stacklevel=5,
-    )
+    warn(f"projections run with {name}, many times slower than with the backend cpu ({reason})", 5)

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...errors import InputError, InputWarning
+from ...errors import InputError, warn
 from ...geometry.frames import affine_matrix
 from ...progress import Progress
 from .contents import RAS_FROM_LPS, Contents, first_line, reading, require_voxels
@@ -260,7 +260,7 @@ def _ordered(slices: list[_Slice]) -> tuple[list[_Slice], NDArray[np.float64]]:
         raise InputError(f"{what}: {gaps[k]:g} mm apart at {places[k]:g} mm, the others {usual:g} mm")
     if usual > 1.5 * first.thickness > 0:
         text = f"the slices are {first.thickness:g} mm thick and lie {usual:g} mm apart: there are gaps between them, "
-        warnings.warn(f"{text}or some are missing", InputWarning, stacklevel=2)
+        warn(f"{text}or some are missing")
     step = (last.position - first.position) / (len(slices) - 1)
     moved = positions - first.position
     sideways = moved - np.outer(moved @ normal, normal)
@@ -356,7 +356,7 @@ def _spacing(header: Any) -> float:
         f"{Path(header.filename).name}: it has no SpacingBetweenSlices: its SliceThickness, {thickness:g} mm, was taken, "
         "along the normal; check that head and feet are not exchanged"
     )
-    warnings.warn(text, InputWarning, stacklevel=2)
+    warn(text)
     return thickness
 
 

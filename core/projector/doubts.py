@@ -1,0 +1,38 @@
+"""What of a projector's arguments looks wrong, though it may be meant: texts of warnings, each with its number."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from ..geometry.grid import Grid
+from ..geometry.views import Views
+from ..physics.materials import APERTURES, attenuation
+from .emission import Emission
+from .models import Model
+
+_NARROW = 1.0
+"""mm: a body is wider, and what is so many metres wide hardly fits into a scanner."""
+_UNNAMED = ((140.5, 1.0),)  # Tc-99m's line, where no isotope is named
+_ABOVE_BONE, _ABOVE_METALS = 2.0, 1.2
+"""Times the coefficient of bone, which attenuates most in a body (metal has more, but not much room), and the largest one of
+`APERTURES` (iridium's and platinum's are a little above gold's)."""
+
+
+def doubts(grid: Grid, views: Views, model: Model) -> Iterator[str]:
+    """Of a projector's arguments."""
+    if caution := model.caution(views, grid):
+        yield caution
+    wide = float(np.ptp(grid.corners(), axis=0).max())
+    if wide < _NARROW and max(grid.shape) > 3:
+        near = float(np.linalg.norm(views.sources - grid.center, axis=1).min())
+        yield f"the grid is {wide:.3g} mm wide, {near:.3g} mm from the sources: lengths are in mm; is it in metres?"
+    if not isinstance(model, Emission):
+        return
+    lines = model.isotope.lines_within(*model.window) if model.isotope else ()  # type: ignore[union-attr, misc]
+    bone, *metals = (max(attenuation(x, energy) for energy, _ in lines or _UNNAMED) for x in ("bone", *APERTURES))
+    for name in ("aperture_mu", "crystal_mu"):
+        if (value := getattr(model, name) or 0.0) > _ABOVE_METALS * max(metals):
+            yield f"{name} is {value:g} 1/mm, more than any material's at its energy ({max(metals):.3g}): is it in 1/cm?"
+    mu = np.zeros(1, np.float32) if model.mu is None else model.mu.array
+    if (high := mu[mu > _ABOVE_BONE * bone]).sum(dtype=float) > 0.5 * mu.sum(dtype=float):
+        yield f"mu is {high.mean():.3g} 1/mm where most photons are lost, bone's is {bone:.3g}: is it in 1/cm?"

@@ -1,0 +1,223 @@
+"""What files say of their counts, and what the counts themselves say, is used or contradicted: never passed over."""
+
+from __future__ import annotations
+
+import pickle
+import warnings
+
+import numpy as np
+import pytest
+
+import mphdrr.core as mph
+from mphdrr.core.recording import recorded_warnings
+
+from . import dicom_files
+from .test_measured_counts import write_hdr, write_mhd
+
+
+def warned(call) -> list[str]:
+    with recorded_warnings() as texts:
+        call()
+    return texts
+
+
+def counted(rng, shape=(12, 6, 6), mean=9.0) -> np.ndarray:
+    return rng.poisson(mean, shape).astype(np.uint16)
+
+
+def both_ways(system, path, frames, orientation, time, **more) -> list[str]:
+    """The warnings of `read_counts` and `counts_run`, after those of the recipe were seen to be the same."""
+    recipe = mph.Recipe(
+        {
+            "counts.files": [str(path)] if not isinstance(path, list) else list(map(str, path)),
+            "counts.frames": frames,
+            "counts.orientation": orientation,
+            "model.kind": "emission",
+            "model.time": time,
+        }
+        | ({"detector.pitch": more["pitch"]} if "pitch" in more else {})
+    )
+    of_recipe = warned(lambda: next(mph.run_recipe(recipe, system)))
+    own = warned(lambda: mph.counts_run(mph.read_counts(path), system, frames, orientation, time, **more))
+    assert own == of_recipe
+    assert not any("\n" in text for text in own)
+    return own
+
+
+def test_the_files_time_and_pixels_reach_the_run_by_either_way(system, rng, tmp_path):
+    pytest.importorskip("pydicom")
+    path, side = tmp_path / "nm.dcm", system.detector_side
+    dicom_files.write_frames(counted(rng), path, 90_000, PixelSpacing=["2.5", "2.5"])
+    time, pixels = both_ways(system, path, "101-112", "back-v", 30.0)
+    assert time == "nm.dcm: the file says an exposure of 90 s; taken as 30 s, as given"
+    own = side[np.abs(side / 6 - 2.5) > 2.5e-3][0] / 6
+    assert pixels.startswith(
+        f"nm.dcm: the file says pixels of 2.5 x 2.5 mm; taken as {own:.4g} x {own:.4g} mm, so that"
+    )
+    (other,) = both_ways(system, path, "101-112", "back-v", 90.0, pitch=3.0)
+    assert other.endswith("pixels of 2.5 x 2.5 mm; taken as 3 x 3 mm, as given")
+    assert both_ways(system, path, "101-112", "back-v", 90.0, pitch=2.5) == []
+    with pytest.raises(mph.InputError, match=r"exposure time in seconds \(--time; the file says 90 s: confirm it\)"):
+        mph.counts_run(mph.read_counts(path), system, "101-112", "back-v")
+
+
+@pytest.mark.parametrize("word", ["back-v", "front+u", "back-u", "front+v"])
+def test_pixels_are_compared_along_rows_and_columns_however_frames_lie(system, rng, word, tmp_path):
+    """Frames of 8 x 5 pixels of 3 x 4.8 mm: on a crystal of 24 mm, turned or not."""
+    system = mph.PinholeSystem(system.centers, 2.0, 60.0, 24.0, 9.0, 75.0, numbers=system.numbers)
+    path = tmp_path / "gate.mhd"
+    write_mhd(counted(rng, (12, 5, 8)), path)
+    text = path.read_text()
+    for along, down, is_right in ((3.0, 4.8, True), (4.8, 3.0, False), (3.0, 3.0, False)):
+        path.write_text(text.replace("ElementSpacing = 4 4 1", f"ElementSpacing = {along} {down} 1"))
+        found = both_ways(system, path, "101-112", word, 60.0)
+        assert (found == []) == is_right, found
+        if not is_right:
+            assert f"pixels of {along:g} x {down:g} mm; taken as 3 x 4.8 mm" in found[0]
+    virtual = warned(
+        lambda: mph.counts_run(
+            mph.read_counts(path), system, "101-112", word, 60.0, detector="virtual", magnification=7
+        )
+    )
+    assert "pixels of 3 x 3 mm; taken as 3 x 4.8 mm" in virtual[0], "on the crystal, wherever the images are taken"
+
+
+def test_several_exposures_are_said_of_the_frames_that_are_used(system, rng, tmp_path):
+    pytest.importorskip("pydicom")
+    from pydicom.dataset import Dataset
+
+    parts = [Dataset(), Dataset()]
+    parts[0].ActualFrameDuration, parts[1].ActualFrameDuration = 20_000, 35_000
+    path, vector = tmp_path / "d.dcm", [1] * 12 + [2] * 12
+    dicom_files.write_frames(
+        counted(rng, (24, 6, 6)), path, RotationInformationSequence=parts, RotationVector=vector, NumberOfRotations=2
+    )
+    (text,) = both_ways(system, path, "101-106, none*6, none*6, 107-112", "back-v", 20.0)
+    assert text == "d.dcm: the file says exposures of 20 and 35 s; taken as 20 s, as given"
+    assert both_ways(system, path, "101-112, none*12", "back-v", 20.0) == []
+    (text,) = both_ways(system, path, "none*12, 101-112", "back-v", 20.0)
+    assert "an exposure of 35 s; taken as 20 s" in text
+    with pytest.raises(mph.InputError, match="the file says 20 and 35 s: confirm it"):
+        mph.counts_run(mph.read_counts(path), system, "101-112, none*12", "back-v")
+    counts = mph.read_counts(path)
+    for part, time in ((counts[12:], 35), (counts[:12], 20), (counts[np.arange(24) % 2 == 0], None)):
+        found = warned(lambda part=part: mph.counts_run(part, system, "101-112", "back-v", 20.0))
+        assert (found == []) == (time == 20)
+        assert time is not None or "exposures of 20 and 35 s" in found[0]
+
+
+def test_exposures_of_an_interfile_are_those_of_its_images(system, rng, tmp_path):
+    path = tmp_path / "c.hdr"
+    write_hdr(counted(rng), path)
+    header = path.read_text()
+    assert both_ways(system, path, "101-112", "back-v", 600.0) == []
+    for number in range(12):
+        seconds = 600 if number < 7 else 150
+        header = header.replace("!time per projection (sec) := 600", f"!image duration (sec) := {seconds}", 1)
+    path.write_text(header)
+    (text,) = both_ways(system, path, "101-112", "back-v", 600.0)
+    assert "exposures of 150 and 600 s; taken as 600 s" in text
+    both_of_150 = "none*7, 101, 102, none*3"
+    assert both_ways(system[:2], path, both_of_150, "back-v", 150.0) == []
+    path.write_text(header + "\n" + "scaling factor (mm/pixel) [1] := 2\nscaling factor (mm/pixel) [2] := 2.1\n")
+    (text,) = both_ways(system[:2], path, both_of_150, "back-v", 150.0)
+    assert "pixels of 2 x 2.1 mm" in text
+
+
+def test_several_files_say_each_its_own(system, rng, tmp_path):
+    paths = []
+    for number, time in enumerate((40, 40, 55), 1):
+        paths.append(tmp_path / f"{number}.hdr")
+        write_hdr(counted(rng, (4, 6, 6)), paths[-1])
+        paths[-1].write_text(paths[-1].read_text().replace(":= 600", f":= {time}"))
+    (text,) = both_ways(system, paths, "101-112", "back-v", 40.0)
+    assert text == "1.hdr, 2.hdr, 3.hdr: the file says exposures of 40 and 55 s; taken as 40 s, as given"
+    assert both_ways(system[:8], paths, "101-108, none*4", "back-v", 40.0) == []
+
+
+def test_frames_of_several_energy_windows_are_not_taken_together_in_silence(system, rng, tmp_path):
+    pytest.importorskip("pydicom")
+    path = tmp_path / "w.dcm"
+    dicom_files.write_frames(
+        counted(rng, (24, 6, 6)), path, 60_000, NumberOfEnergyWindows=2, EnergyWindowVector=[1, 2] * 12
+    )
+    one = ", ".join(f"{number}, none" for number in range(101, 113))
+    assert both_ways(system, path, one, "back-v", 60.0) == []
+    (text,) = both_ways(system, path, "101-112, none*12", "back-v", 60.0)
+    assert text.startswith("w.dcm: frames of the energy windows 1 and 2 are used")
+    assert warned(lambda: mph.counts_run(mph.read_counts(path)[1::2], system, "101-112", "back-v", 60.0)) == []
+
+
+def test_counts_are_an_array_like_any_other(rng, tmp_path):
+    frames = counted(rng, (5, 4, 3))
+    np.save(tmp_path / "c.npy", frames)
+    counts = mph.read_counts(tmp_path / "c.npy")
+    np.testing.assert_array_equal(counts, frames)
+    assert counts.dtype == np.uint16 and isinstance(counts, np.ndarray)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for found, expected in (
+            (counts + counts, frames + frames),
+            (counts.sum(), frames.sum()),
+            (counts.mean(axis=0), frames.mean(axis=0)),
+            (np.sqrt(counts), np.sqrt(frames)),
+            (np.concatenate([counts, counts]), np.concatenate([frames, frames])),
+            (counts[counts > 9], frames[frames > 9]),
+            (counts[..., ::-1], frames[..., ::-1]),
+            (counts[None, 0], frames[None, 0]),
+            (counts[()], frames),
+            (counts.reshape(5, 12)[2], frames.reshape(5, 12)[2]),
+            (counts[2, 1, 1], frames[2, 1, 1]),
+            (pickle.loads(pickle.dumps(counts)), frames),
+        ):
+            np.testing.assert_array_equal(found, expected)
+    assert type(counts + 1) is type(counts.mean(axis=0)) is np.ndarray
+
+
+FRAMES = {"frames": "101-112", "orientation": "front+v", "time": 60.0}
+
+
+def test_usual_counts_are_taken_without_a_word(system, rng):
+    point = np.zeros((12, 9, 9), int)
+    point[np.arange(12), rng.integers(0, 9, 12), rng.integers(0, 9, 12)] = rng.poisson(40_000, 12)
+    spread = rng.poisson(0.05, (12, 20, 20))
+    for counts in (counted(rng), point, spread, np.zeros((12, 5, 5), int), counted(rng, (12, 3, 3), 900)):
+        assert warned(lambda counts=counts: mph.counts_run(counts, system, **FRAMES)) == []
+
+
+def test_an_empty_frame_among_others_is_named(system, rng):
+    counts = counted(rng, (14, 7, 7), 6.0)
+    counts[[3, 9]] = 0
+    frames = "none, 112-101, none"
+    (text,) = warned(lambda: mph.counts_run(counts, system, frames, "front+v", 60.0))
+    usual = np.median([counts[k].sum() for k in range(1, 13) if k not in (3, 9)])
+    assert text.startswith("counts: no counts in ") and text.endswith(f", {usual:g} in others")
+    assert "frame 4 (module 110)" in text and "frame 10 (module 104)" in text
+    counts[[3, 9]] = counted(rng, (2, 7, 7))
+    counts[[0, 13]] = 0
+    assert warned(lambda: mph.counts_run(counts, system, frames, "front+v", 60.0)) == [], "they are not used"
+
+
+def test_equal_frames_are_named(system, rng):
+    counts = counted(rng, (12, 8, 8), 0.7)
+    counts[11] = counts[2]
+    (text,) = warned(lambda: mph.counts_run(counts, system, **FRAMES))
+    assert text == "counts: equal in every pixel: frame 3 (module 103) and frame 12 (module 112)"
+    counts[:] = counts[0]
+    (text,) = warned(lambda: mph.counts_run(counts, system, **FRAMES))
+    assert text.endswith("frame 1 (module 101) and frame 4 (module 104); and 8 more")
+
+
+@pytest.mark.parametrize("place", [(0, 0), (4, 8), (7, 3), (9, 9)])
+@pytest.mark.parametrize("expected", [False, True])
+def test_a_single_bright_pixel_is_named(system, rng, place, expected):
+    counts = counted(rng, (12, 10, 10), 150.0)
+    counts = counts.astype(float) if expected else counts.astype(int)
+    counts[(6, *place)] = 10**6
+    run = {}
+    (text,) = warned(lambda: run.update(made=mph.counts_run(counts, system, **FRAMES, expected=expected)))
+    row, column = place
+    assert text.startswith(f"counts: frame 7 (module 107), row {row + 1}, column {column + 1}: 1e+06 counts, at most ")
+    assert run["made"].projections.max() == 10**6, "it counts all the same"
+    alone = warned(lambda: mph.counts_run(counts[6:7], system[6:7], "107", "front+v", 60.0, expected=expected))
+    assert len(alone) == 1 and f"column {column + 1}: 1e+06 counts" in alone[0]

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import re
-import warnings
 from dataclasses import MISSING, dataclass, fields
 from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..errors import InputError, InputWarning
+from ..errors import InputError, warn
 from ..system_source import SystemSource
 from ..validation import freeze, lengths, one_for_all, positive, real_array, whole_shape
 from .frames import module_frames, module_poses, principal_rays
@@ -167,7 +166,7 @@ def warn_of_size(pixels: tuple[int, int], pitches: NDArray[np.float64], sides: N
     covered = np.array(pixels) * pitches + 0 * sides
     for m, axis in np.argwhere((covered < 0.45 * sides) | (covered > 1.1 * sides))[:1]:
         said = f"{pixels[axis]} pixels of {covered[m, axis] / pixels[axis]:g} mm are {covered[m, axis]:g} mm"
-        warnings.warn(f"{said}, but the {name} is {sides[m, 0]:g} mm", InputWarning, stacklevel=3)
+        warn(f"{said}, but the {name} is {sides[m, 0]:g} mm")
 
 
 LATER_LENGTHS = tuple(f.name for f in fields(PinholeSystem) if f.name in LENGTHS and f.default is not MISSING)

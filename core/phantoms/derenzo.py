@@ -1,7 +1,6 @@
 """The Derenzo phantom: parallel rods, of one diameter in each sector, alone or in a cylinder of water."""
 
 import math
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -10,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError, InputWarning
+from ..errors import InputError, warn
 from ..physics.isotopes import WATER_MU
 from ..validation import freeze, positive, real_array
 from .intervals import Interval, Points, Real
@@ -195,7 +194,7 @@ class DerenzoPhantom(Phantom):
         empty = [f"{w:g}" for w, (_, n) in zip(self.rod_diameters, self._rods._rows, strict=True) if w > 0 and n == 0]
         if empty:
             text = f"no rod of {', '.join(empty)} mm fits into a radius of {self.radius:g} mm: such sectors stay empty"
-            warnings.warn(text, InputWarning, stacklevel=3)
+            warn(text)
         if not self.cylinder_radius:
             if self.background or self.cylinder_height:
                 raise InputError(

@@ -2,7 +2,6 @@
 
 import itertools
 import math
-import warnings
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -11,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..errors import InputError, InputWarning, naming
+from ..errors import InputError, naming, warn
 from ..geometry.frames import checked_affine
 from ..geometry.grid import Grid
 from ..geometry.views import Views
@@ -99,7 +98,7 @@ class Phantom:
         held = float(image.sum(dtype=np.float64)) * grid.voxel_volume / whole if whole > 0 else 1.0
         if held < _HELD:
             text = f"{1 - held:.0%} of the {self.title} lies outside the grid: take larger or more voxels"
-            warnings.warn(text, InputWarning, stacklevel=2)
+            warn(text, 2)
         return Volume(freeze(image), grid, quantity)
 
     def line_integrals(

@@ -1,11 +1,9 @@
 """Filtered backprojection of parallel views."""
 
-import warnings
-
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..errors import InputError, InputWarning
+from ..errors import InputError, warn
 from ..geometry.grid import Grid
 from ..geometry.views import Views
 from ..progress import Progress
@@ -80,7 +78,7 @@ def fbp(
     shares, _, gap = shares_of_turn(np.arctan2(along @ second, along @ first), np.pi)
     if gap:
         empty = f"{np.degrees(gap):.0f} degrees of the half circle have no view"
-        warnings.warn(f"fbp: {empty}: edges along their directions are lost", InputWarning, stacklevel=2)
+        warn(f"fbp: {empty}: edges along their directions are lost", 2)
     # The pixels' distance as the rays see it, across their direction.
     pitch = np.abs(np.einsum("mi,mi->m", views.u_steps, np.cross(axis, along)))
     weights = shares / pitch

@@ -1,13 +1,12 @@
 """Filtered backprojection of cone-beam views from an arc or a circle."""
 
-import warnings
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..errors import InputError, InputWarning
+from ..errors import InputError, warn
 from ..geometry.grid import Grid
 from ..geometry.views import Views
 from ..progress import Progress
@@ -88,7 +87,7 @@ def fdk(
     reach, missing = orbit.reach(views)
     if missing > 0:
         arc = f"the arc is {np.degrees(missing):.0f} degrees too short for half a circle and the fan's angle"
-        warnings.warn(f"fdk: {arc}: edges along the missing rays are lost", InputWarning, stacklevel=2)
+        warn(f"fdk: {arc}: edges along the missing rays are lost", 2)
 
     def weights(m: int) -> Array:
         # With s the source and theta a ray's direction, a ray counts for |ds x theta|, which is the measure of lines in the

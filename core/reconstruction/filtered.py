@@ -1,6 +1,5 @@
 """What FBP and FDK have in common: images weighted, filtered row by row, and backprojected."""
 
-import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -8,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..errors import InputError, InputWarning
+from ..errors import InputError, warn
 from ..geometry.grid import Grid
 from ..geometry.views import Views
 from ..memory import require
@@ -73,7 +72,7 @@ def warn_of_cut(images: Array, name: str) -> None:
         found = float(np.abs(means).max())
         if found > max(_FALLEN * largest, _BY_NOISE * noise * np.sqrt(means.size / outermost.size / 2)):
             said = f"{name}: the images fall only to {found / largest:.0%} of their largest value at their edge columns"
-            return warnings.warn(f"{said}: what is beyond is missing, and values are wrong", InputWarning, stacklevel=3)
+            return warn(f"{said}: what is beyond is missing, and values are wrong")
 
 
 def filtered_backprojection(

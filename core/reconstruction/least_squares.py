@@ -1,13 +1,12 @@
 """Least squares by iteration: SIRT and CGLS, and what they have in common with TV."""
 
-import warnings
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..errors import InputError, InputWarning
+from ..errors import InputError, warn
 from ..progress import Progress
 from ..projector import Projector
 from ..validation import instance, positive, real_array
@@ -168,7 +167,7 @@ def cgls(
             loop.state |= {"residual": residual, "direction": direction, "gradient": after}
             if float(np.vdot(first, gradient)) ** 2 > _LEAN**2 * after * _squares(first):
                 loop.state["first"] = np.zeros_like(first)  # it is said once
-                warnings.warn(_LEANS.format(number + 1), InputWarning, stacklevel=2)
+                warn(_LEANS.format(number + 1), 2)
         said(progress)
         return x, 0.5 * float(_squares(residual))
 

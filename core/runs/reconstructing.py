@@ -1,6 +1,5 @@
 """From a run's images back to a volume: the job of ``mphdrr reconstruct`` and of Blender's Reconstruction panel."""
 
-import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
@@ -8,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError, InputWarning
+from ..errors import InputError, warn
 from ..geometry.grid import Grid
 from ..memory import require
 from ..progress import Stages
@@ -274,4 +273,4 @@ def flattering(run: ProjectionRun, grid: Grid, model: Recipe | None = None) -> l
 
 
 def _warn(text: str) -> None:
-    warnings.warn(text, InputWarning, stacklevel=4)
+    warn(text, 4)

@@ -5,13 +5,12 @@ Its formulas are not recalculated yet.
 
 import itertools
 import math
-import warnings
 from collections import Counter
 from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from ..errors import InputError, InputWarning
+from ..errors import InputError, warn
 from ..geometry.system import PinholeSystem
 from .book import module_number
 from .column_map import ColumnMap
@@ -175,11 +174,9 @@ class Edit:
             own = {workbook.text((name, row, column)) for row in rows.new for column in rows.columns}
             found = [text for text in workbook.ranges_ending_at(name, last) if text not in own] if rows.added else []
             if found:
-                warnings.warn(
+                warn(
                     f"{workbook.name}: {several(found)} end{'s' * (len(found) == 1)} at row {last} of sheet {name}, so the "
-                    "modules added below are left out there",
-                    InputWarning,
-                    stacklevel=3,
+                    "modules added below are left out there"
                 )
 
     def column_map(self) -> ColumnMap | None:
@@ -195,11 +192,10 @@ class Edit:
         file, sheet = self.workbook.name, self.modules.sheet.name
         numbers = self.system.numbers
         if not self.numbered and not np.array_equal(numbers, np.arange(1, len(numbers) + 1)):
-            warnings.warn(
+            warn(
                 f"{file}: sheet {sheet} has no column of the modules' numbers: {several(numbers)} will be read as "
                 "1, 2, ... in the order of their rows",
-                InputWarning,
-                stacklevel=4,
+                4,
             )
         for name, is_default in self.is_default.items():
             if name not in self.columns and not is_default.all():

@@ -2,7 +2,6 @@
 
 import itertools
 import math
-import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -10,7 +9,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError, InputWarning
+from ..errors import InputError, warn
 from .book import HEADING_ROWS, Book, Sheet, module_number
 from .calculation import Uncomputed
 from .column_map import ColumnMap
@@ -139,7 +138,7 @@ def mapped_layout(book: Book, columns: ColumnMap) -> Layout:
         number = None if said.number is None else index(said.number)
         tables.append(Table(book.sheets[said.sheet], cells, said.row_numbers(), number))
         for contradiction in itertools.islice(_contradictions(tables[-1]), 1):
-            warnings.warn(contradiction, InputWarning, stacklevel=2)
+            warn(contradiction, 2)
     modules, layout = tables[0], Layout(tables[0])
     for table, said in zip(tables, columns.tables, strict=True):
         rows = modules.rows
@@ -187,11 +186,10 @@ def by_label(modules: Table, table: Table) -> tuple[int, ...]:
     extra = [label for label in table.labels if label not in set(modules.labels)]
     if extra:
         more = f" and {len(extra) - 1} more modules" if len(extra) > 1 else ""
-        warnings.warn(
+        warn(
             f"{table.sheet.where(row_of[extra[0]], table.label_column or 1)} has module {extra[0]}{more} without "
             f"coordinates in sheet {modules.sheet.name}: left out",
-            InputWarning,
-            stacklevel=2,
+            2,
         )
     return tuple(row_of[label] for label in modules.labels)
 

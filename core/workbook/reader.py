@@ -2,7 +2,6 @@
 
 import math
 import os
-import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -10,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError, InputWarning
+from ..errors import InputError, warn
 from ..geometry.system import PinholeSystem
 from ..system_source import QuantityCells, SystemSource
 from .book import Book
@@ -92,7 +91,7 @@ def read(book: Book, columns: ColumnMap | None = None) -> Reading:
         **fields,
     )
     for doubtful in _doubtful(book, cells, given, defaults, system):
-        warnings.warn(doubtful, InputWarning, stacklevel=3)
+        warn(doubtful)
     return Reading(layout, given, system)
 
 

@@ -6,12 +6,11 @@ is unaccounted for. `recognized_layout` refuses a workbook with any; `core.workb
 
 import itertools
 import re
-import warnings
 from collections import defaultdict
 from collections.abc import Iterator
 from typing import NamedTuple
 
-from ..errors import InputError, InputWarning
+from ..errors import InputError, warn
 from .book import HEADING_ROWS, Book, Sheet
 from .headed_table import HeadedTable, headed_table, headed_tables, is_number
 from .headings import UNIT_WORDS, heading_of, may_mean, quoted, rivals, shows_as_stored, unit_of, units_mentioned
@@ -102,7 +101,7 @@ def recognized_layout(book: Book) -> Layout:
         rows = (table.rows[0],) * len(modules.rows) if once else layout.rows_of[table]
         layout.columns[name] = Column(table, name, modules, rows)
     for note in _notes(layout, recognized):
-        warnings.warn(f"{book.path.name}: {note}", InputWarning, stacklevel=4)
+        warn(f"{book.path.name}: {note}", 4)
     return layout
 
 

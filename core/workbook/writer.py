@@ -2,7 +2,6 @@
 
 import io
 import os
-import warnings
 from collections import defaultdict
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import InputError, InputWarning
+from ..errors import InputError, warn
 from ..files import replacing
 from ..geometry.system import PinholeSystem
 from ..recording import recorded_warnings
@@ -164,7 +163,7 @@ def _warn_of_formulas(workbook: WorkbookXml, recalculated: Recalculation) -> Non
             "value"
         )
     for message in messages:
-        warnings.warn(f"{workbook.name}: {message}", InputWarning, stacklevel=3)
+        warn(f"{workbook.name}: {message}")
 
 
 def _new_workbook(system: PinholeSystem) -> bytes:

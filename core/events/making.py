@@ -153,16 +153,8 @@ class EventMaker:
             phantom = planned.phantom
             if phantom is not None and all(shape.mu is None for shape in phantom.shapes):
                 raise InputError(f"attenuation: no shape of the {phantom.title} has a mu")
-        if own_mu and recipe["model.hole"] == "depth":  # this model's attenuation cannot be changed
-            mu = self._voxels(planned, "mu")
-            projector = Projector(truth.grid, self.views, recipe_model(recipe, self.system, mu), threads=self.threads)
-            images = projector(truth)
-        elif own_mu:
-            projector = self._projectors[name]
-            images = projector(truth, mu=self._voxels(planned, "mu").array)
-        else:
-            projector = self._projectors[name]
-            images = projector(truth)
+        projector = self._projectors[name]
+        images = projector(truth, mu=self._voxels(planned, "mu").array) if own_mu else projector(truth)
         photons, unit = recipe["model.photons"], projector.model.unit(truth)
         if photons is not None:
             images, unit = intensity(images, photons), "photons"

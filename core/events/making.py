@@ -153,16 +153,8 @@ class EventMaker:
         own_mu = recipe["attenuation.of_phantom"]
         if own_mu and planned.phantom is not None:
             require_mu(planned.phantom, recipe_model(recipe, self.system))
-        if own_mu and recipe["model.hole"] == "depth":  # this model's attenuation cannot be changed
-            mu = self._voxels(planned, "mu")
-            projector = Projector(truth.grid, self.views, recipe_model(recipe, self.system, mu), threads=self.threads)
-            images = projector(truth)
-        elif own_mu:
-            projector = self._projectors[name]
-            images = projector(truth, mu=self._voxels(planned, "mu").array)
-        else:
-            projector = self._projectors[name]
-            images = projector(truth)
+        projector = self._projectors[name]
+        images = projector(truth, mu=self._voxels(planned, "mu").array) if own_mu else projector(truth)
         warn_of_images(truth, self.system, self.views, recipe["detector.magnification"], projector.model)
         photons, unit = recipe["model.photons"], projector.model.unit(truth)
         if photons is not None:

@@ -5,117 +5,193 @@ What the numbers of a view are comes from `hole_response`; the work is done by f
 
 from __future__ import annotations
 
+import itertools
+import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import ModuleType
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arrays import cropped
+from ..geometry.grid import Grid
+from ..volumes.volume import Volume
 from .parallel import in_order, run_all
-from .transmittance import Transmittances
 
 Array = NDArray[Any]
+Index = tuple[int, int, int]
 
-PLANES = 4
-"""Planes of depth, evenly spaced in 1 / h: between two, an image is interpolated."""
-
-TAPS_TOGETHER = 4
-"""A row of a kernel is a multiple of so many taps."""
-
-# Layers of voxels that a thread adds to before it takes others, and views whose cells are in memory.
-_SLAB, _VIEWS_AT_ONCE = 4, 16
+# Layers of voxels that a thread adds to before it takes others, and bytes of the views' cells that are in memory.
+_SLAB, _CELLS_AT_ONCE = 4, 2**28
+# Bytes of transmittances that are kept from call to call.
+_KEPT = 2**30
 
 
 @dataclass(frozen=True, eq=False)
 class DepthResponse:
-    """One view: where its voxels lie in the fine image, and what its pixels count of the cells there."""
+    """A view's voxels in a zone of depth: where they lie in a fine image, and what pixels count of the cells there."""
 
     matrix: Array
     """(3, 4): of a voxel's indices (x, y, z, 1), to (column h, row h, h)."""
+    parts: Array
+    """(n, 3): from a voxel's middle to those of its parts, as indices; each part is shared out by itself."""
     nearest: float
-    """Depth, mm, up to which voxels count nothing."""
+    """Depth, mm, up to which voxels count nothing,"""
+    farthest: float
+    """and beyond which they count nothing."""
     first_plane: float
     """1 / h of the farthest plane, 1/mm."""
     planes_per_inverse: float
     """Planes in 1 / mm of 1 / h."""
-    cells: tuple[int, int]
-    """Rows and columns of the fine image."""
     before: Array
-    """(rows, columns): what a voxel counts there in all, times h^2, and without `after`."""
+    """(rows, columns): what a part counts at a cell of the fine image in all, times h^2, and without `after`."""
     kernel: Array
-    """(taps, taps, PLANES): what a pixel counts of the cells around it."""
+    """(planes, taps, taps): what a pixel counts of the cells from its first on."""
     steps: tuple[int, int]
     """Rows and columns of cells from a pixel to the next."""
     after: Array
     """(n_v, n_u): factors of the pixels."""
 
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Planes of depth, and rows and columns of cells in each."""
+        return len(self.kernel), *self.before.shape  # type: ignore[return-value]
 
+    def of_part(self, origin: Index, shape: Index) -> tuple[DepthResponse, tuple[slice, slice]]:
+        """The response to a part of the volume alone, and the rows and columns of pixels that may see it."""
+        matrix = self.matrix.copy()
+        matrix[:, 3] += matrix[:, :3] @ origin
+        corners = np.array(list(itertools.product(*((-0.5, n - 0.5) for n in shape), (1,))))
+        column, row, depth = matrix @ corners.T
+        if depth.min() <= self.nearest / 2:  # seen from among the voxels, they may be anywhere
+            return replace(self, matrix=matrix), (slice(None), slice(None))
+        pixels = []
+        for at, taps, step, n in zip((row, column), self.kernel.shape[1:], self.steps, self.after.shape, strict=True):
+            low, high = float((at / depth).min()) - 2, float((at / depth).max()) + 2
+            start = min(max(math.floor((low - taps) / step) + 1, 0), n - 1)
+            pixels.append(slice(start, max(start, min(math.floor(high / step), n - 1)) + 1))
+        cells = [
+            slice(step * pixel.start, step * pixel.stop + n - step * size)
+            for pixel, step, n, size in zip(pixels, self.steps, self.before.shape, self.after.shape, strict=True)
+        ]
+        planes = (1 / depth - self.first_plane) * self.planes_per_inverse
+        nearer = min(max(math.ceil(planes.max()), 1), len(self.kernel) - 1)
+        farther = min(max(math.floor(planes.min()), 0), nearer - 1)
+        matrix[0] -= cells[1].start * matrix[2]
+        matrix[1] -= cells[0].start * matrix[2]
+        return replace(
+            self,
+            matrix=matrix,
+            first_plane=self.first_plane + farther / self.planes_per_inverse,
+            before=self.before[tuple(cells)],
+            kernel=self.kernel[farther : nearer + 1],
+            after=self.after[tuple(pixels)],
+        ), (pixels[0], pixels[1])
+
+
+@dataclass(eq=False)
 class DepthResponses:
-    """`n` views of volumes of a shape, each with its response, made when first needed by ``make(m)``.
+    """`n` views of `pixels` (n_v, n_u) of volumes on a grid, each with a response for every zone of depth, made when first needed."""
 
-    `transmittances` are what attenuation leaves, if anything attenuates.
-    """
+    n: int
+    pixels: tuple[int, int]
+    grid: Grid
+    make: Callable[[int, float, float], DepthResponse]
+    """Of a view and the far and near end of a zone, mm: its response."""
+    zones: Callable[[int], tuple[Array, list[tuple[float, float]]]]
+    """Of a view: the row (4,) that gives the depth of a voxel (x, y, z, 1), and the ends of the zones, each from far to near."""
+    close: Callable[[int], tuple[tuple[slice, ...], Array] | None]
+    """Of a view: voxels nearer than all zones, a box of the grid and which in it; None where none may be seen."""
+    transmittance: Callable[[int, Any, Grid], Array]
+    """Of a view, what attenuates and a grid: what is left of the photons from each of its voxels."""
+    mu: Volume | None
+    """What attenuates, if anything."""
 
-    def __init__(
-        self,
-        n: int,
-        shape: tuple[int, int, int],
-        make: Callable[[int], DepthResponse],
-        transmittances: Transmittances | None = None,
-    ) -> None:
-        self._n, self._shape, self._make, self._transmittances = n, shape, make, transmittances
-        self._made: dict[int, DepthResponse] = {}
+    def __post_init__(self) -> None:
+        self._made: dict[tuple[int, float], DepthResponse] = {}
+        self._passing: dict[int, tuple[Index, Array]] = {}
+        self._room = _KEPT
 
-    def __getitem__(self, m: int) -> DepthResponse:
-        if m not in self._made:
-            self._made[m] = self._make(m)
-        return self._made[m]
-
-    def _passes(self, m: int, like: Array) -> Array | None:
-        return (
-            None if self._transmittances is None else self._transmittances[m].astype(like.dtype, order="C", copy=False)
-        )
-
-    def _prepare(self) -> None:
-        """What is not to be done within threads."""
-        if self._transmittances is not None:
-            self._transmittances.prepare()
-
-    def images(self, volume: Array, functions: ModuleType, workers: int) -> Iterator[Array]:
-        """The images of `volume` one by one."""
-        self._prepare()
+    def images(
+        self, volume: Array, functions: ModuleType, workers: int, mu: Volume | None = None
+    ) -> Iterator[Array]:
+        """The images of `volume` one by one; `mu` may attenuate in place of the usual."""
+        (filled,), origin = cropped(volume)
+        filled = np.ascontiguousarray(filled)
 
         def image(m: int) -> Array:
-            of = self[m]
-            cells = functions.voxels_to_cells(volume, of, self._passes(m, volume))
-            cells *= of.before.astype(cells.dtype)[..., None]
-            return functions.cells_to_pixels(cells, of) * of.after.astype(cells.dtype)  # type: ignore[no-any-return]
+            image, parts = np.zeros(self.pixels, volume.dtype), self._of_part(m, origin, filled.shape)
+            passes = self._passes(m, origin, filled, mu) if parts else None
+            for of, pixels in parts:
+                cells = functions.voxels_to_cells(filled, of, passes)
+                image[pixels] += functions.cells_to_pixels(cells, of)
+            return image
 
-        return in_order(image, range(self._n), workers)
+        return in_order(image, range(self.n), workers)
 
-    def backproject(self, images: Array, functions: ModuleType, workers: int, report: Callable[[int], None]) -> Array:
+    def backproject(
+        self,
+        images: Array,
+        functions: ModuleType,
+        workers: int,
+        report: Callable[[int], None],
+        mu: Volume | None = None,
+    ) -> Array:
         """The adjoint. Each thread has a slab of the volume, so the result does not depend on their number."""
-        self._prepare()
-        volume = np.zeros(self._shape, images.dtype)
-        n, n_x = len(images), len(volume)
-        slabs = [slice(x, min(x + _SLAB, n_x)) for x in range(0, n_x, _SLAB)]
+        volume = np.zeros(self.grid.shape, images.dtype)
+        slabs = [slice(x, x + _SLAB) for x in range(0, len(volume), _SLAB)]
+        whole = (0, 0, 0), self.grid.shape
 
-        def cells_of(m: int) -> Array:
-            of = self[m]
-            cells = functions.pixels_to_cells(images[m] * of.after.astype(images.dtype), of)
-            cells *= of.before.astype(cells.dtype)[..., None]
-            return cells  # type: ignore[no-any-return]
+        def give(m: int) -> tuple[Array | None, list[tuple[DepthResponse, Array]]]:
+            given = [(of, functions.pixels_to_cells(images[m][pixels], of)) for of, pixels in self._of_part(m, *whole)]
+            return self._passes(m, whole[0], volume, mu) if given else None, given
 
-        for first in range(0, n, _VIEWS_AT_ONCE):
-            views = range(first, min(first + _VIEWS_AT_ONCE, n))
-            cells = list(in_order(lambda m: (cells_of(m), self._passes(m, volume)), views, workers))
+        n, first = len(images), 0
+        while first < n:
+            size = sum(4 * math.prod(of.shape) for of, _ in self._of_part(first, *whole))
+            last = min(first + max(workers, _CELLS_AT_ONCE // max(size, 1)), n)
+            given = list(in_order(give, range(first, last), workers))
 
-            def add(slab: slice, views: range = views, cells: list[Any] = cells) -> None:
-                for m, (own, passes) in zip(views, cells, strict=True):
-                    functions.cells_to_voxels(volume, own, self[m], passes, slab)
+            def take(slab: slice, given: list[Any] = given) -> None:
+                for passes, cells in given:
+                    for of, own in cells:
+                        functions.cells_to_voxels(volume, own, of, passes, slab)
 
-            run_all(add, slabs, workers)
-            report(views.stop)
+            run_all(take, slabs, workers)
+            first = last
+            report(first)
         return volume
+
+    def _of_part(self, m: int, origin: Index, shape: Index) -> list[tuple[DepthResponse, tuple[slice, slice]]]:
+        """View m's responses to a part of the volume, of the zones that it reaches into, and the pixels that may see it."""
+        row, zones = self.zones(m)
+        depths = [row @ (*np.add(origin, corner), 1) for corner in itertools.product(*((0, n - 1) for n in shape))]
+        reached = [(far, near) for far, near in zones if max(depths) > near and min(depths) <= far]
+        return [self._response(m, far, near).of_part(origin, shape) for far, near in reached]
+
+    def _response(self, m: int, far: float, near: float) -> DepthResponse:
+        if (m, far) not in self._made:
+            self._made[m, far] = self.make(m, far, near)
+        return self._made[m, far]
+
+    def _passes(self, m: int, origin: Index, part: Array, mu: Volume | None) -> Array | None:
+        """What attenuation leaves of the photons from each voxel of a part of the volume."""
+        if mu is None and self.mu is None:
+            return None
+        affine = self.grid.affine.copy()
+        affine[:3, 3] += affine[:3, :3] @ origin
+        grid = Grid(part.shape, affine)
+        if mu is not None:
+            return self.transmittance(m, mu, grid).astype(part.dtype, copy=False)
+        start, kept = self._passing.get(m, (origin, None))
+        first = np.subtract(origin, start)
+        if kept is None or first.min() < 0 or (first + part.shape > kept.shape).any():
+            self._room += self._passing.pop(m)[1].nbytes if m in self._passing else 0
+            first, kept = np.zeros(3, int), self.transmittance(m, self.mu, grid)
+            if kept.nbytes <= self._room:
+                self._room -= kept.nbytes
+                self._passing[m] = origin, kept
+        inside = tuple(slice(a, a + n) for a, n in zip(first.tolist(), part.shape, strict=True))
+        return np.ascontiguousarray(kept[inside], part.dtype)

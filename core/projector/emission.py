@@ -24,11 +24,11 @@ from ..validation import instance, positive, real_array, strict_whole
 from ..volumes.volume import Volume, require_quantity
 from .bundles import Beam
 from .depth_response import DepthResponse, DepthResponses
-from .hole_response import hole_response
+from .hole_response import close_voxels, depths_of, hole_response, require_depths, zones_of
 from .models import Array, Model, checked_background, view_rays
 from .pixel_points import TOLERANCE, expected_error, lattice, offsets, points_needed, require_points, shadow_edges
 from .rays import Fan
-from .transmittance import Transmittances
+from .transmittance import mean_transmittance
 
 # Views may differ from their system by a file's rounding (mm; sine of an angle).
 _SAME_PLACE = 1e-3
@@ -39,7 +39,10 @@ _FWHM_PER_SIGMA = 2 * math.sqrt(2 * math.log(2))
 _BOX_PER_SIGMA = math.sqrt(12)
 
 Edge = Literal["paix", "path"]
-Hole = Literal["rays", "depth"]
+Hole = Literal["auto", "depth", "rays", "point"]
+
+# Rays that are not told through how many points of the hole go through as many as keep a voxel's image this close to the whole hole's.
+_APERTURE_TOLERANCE = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,17 +86,18 @@ class Emission(Model):
         Largest relative error of the total counts of a single voxel in any module, wherever it lies between the rays: 2 %
         by default. Larger sources are more accurate.
     hole : str
-        ``"rays"``: the hole's blur is by rays through `aperture_points`. ``"depth"``: it is of the whole hole, without rays
-        (`hole_response`). Every voxel's total is exact, and its image within 1 % (2 % without intrinsic blur) of the
-        converged one, at any size of voxels, in about the time of seven rays. It takes no ``edge="path"`` or
-        `depth_layers`, no grid that comes close to a pinhole, and only the backends numpy, torch on the CPU and cpu.
-    aperture_points : int
+        ``"depth"``: the blur is that of the whole hole, without rays (`hole_response`). Every voxel's total is right to 0.1 %, and its
+        image within 1 % of the converged one, at any size of voxels. It takes no ``edge="path"`` or `depth_layers`, no grid that
+        comes close to a pinhole, and no backend cuda. ``"rays"``: through `aperture_points`. ``"point"``: through the hole's
+        middle, an ideal pinhole without blur. ``"auto"``: by depth wherever that can be, voxels close to a pinhole by rays;
+        by rays alone where depth cannot be, and where numbers of points are given.
+    aperture_points : int, optional
         Points of the hole's disk that rays pass, all with the same weight: the blur of a hole of diameter d_e.
-        With 1 all rays pass the centre and there is no blur; otherwise at least 3.
+        With 1 all rays pass the centre and there is no blur; otherwise at least 3. None: by `aperture_tolerance`.
     aperture_tolerance : float, optional
         Instead of `aperture_points`: as few points as keep the image of one voxel at the isocentre close to that of the
         whole hole. The absolute differences of the pixels sum to at most this share of the counts, and, as errors at most
-        add up, so they do for any activity around the isocentre.
+        add up, so they do for any activity around the isocentre. None: 0.1.
     aperture_mu : float or str, optional
         Attenuation coefficient of the aperture's material at the photons' energy, 1/mm, or the material's name
         (``"tungsten"``, see `MATERIALS`). Of several lines in the window the coefficient is the one that lets as many
@@ -144,7 +148,7 @@ class Emission(Model):
     mu: Volume | None = None
     time: float = 1.0
     photons_per_decay: float = None  # type: ignore[assignment]  # always a number once made
-    aperture_points: int = 1
+    aperture_points: int | None = None
     aperture_mu: float | str | None = None  # a number once made
     opening_angle: float = OPENING_ANGLE
     crystal_mu: float | str | None = None  # likewise
@@ -160,7 +164,7 @@ class Emission(Model):
     pixel_points: int | None = None
     tolerance: float = TOLERANCE
     background: float | Array = 0.0  # type: ignore[assignment]  # no class of mutable values: checked, and frozen
-    hole: Hole = "rays"
+    hole: Hole = "auto"
 
     name = "emission"
     takes = ("activity",)
@@ -185,11 +189,13 @@ class Emission(Model):
         self._set("intrinsic_fwhm", float(real_array(self.intrinsic_fwhm, "emission: intrinsic_fwhm", ())))
         if self.intrinsic_fwhm < 0:
             raise InputError(f"emission: intrinsic_fwhm must not be negative, got {self.intrinsic_fwhm:g} mm")
-        self._set("aperture_points", strict_whole(self.aperture_points, "emission: aperture_points", "1, 3 or more"))
-        if self.aperture_points == 2:
-            raise InputError("emission: aperture_points: expected 1, 3 or more, got 2")
-        if self.aperture_tolerance is not None and self.aperture_points != 1:
-            raise InputError("emission: give aperture_points or aperture_tolerance, not both")
+        if self.aperture_points is not None:
+            points = strict_whole(self.aperture_points, "emission: aperture_points", "1, 3 or more")
+            self._set("aperture_points", points)
+            if points == 2:
+                raise InputError("emission: aperture_points: expected 1, 3 or more, got 2")
+            if self.aperture_tolerance is not None:
+                raise InputError("emission: give aperture_points or aperture_tolerance, not both")
         if self.edge not in ("paix", "path"):
             raise InputError(f"emission: edge: expected 'paix' or 'path', got {self.edge!r}")
         if self.edge == "path" and self.aperture_mu is None:
@@ -204,13 +210,31 @@ class Emission(Model):
         self._check_hole()
 
     def _check_hole(self) -> None:
-        if self.hole not in ("rays", "depth"):
-            raise InputError(f"emission: hole: expected 'rays' or 'depth', got {self.hole!r}")
-        points = self.aperture_points > 1 or self.aperture_tolerance is not None
-        refused = {"edge 'path'": self.edge == "path", "depth_layers": self.depth_layers > 1}
-        for what, given in {**refused, "points: it is the whole hole": points}.items():
-            if self.hole == "depth" and given:
-                raise InputError(f"emission: hole 'depth' takes no {what}; use hole 'rays', or leave that out")
+        if self.hole not in ("auto", "depth", "rays", "point"):
+            raise InputError(f"emission: hole: expected 'auto', 'depth', 'rays' or 'point', got {self.hole!r}")
+        refused = {
+            "edge 'path'": self.hole == "depth" and self.edge == "path",
+            "depth_layers": self.hole == "depth" and self.depth_layers > 1,
+            "points of it": self.hole in ("depth", "point")
+            and (self.aperture_points, self.aperture_tolerance) != (None, None),
+        }
+        for what, given in refused.items():
+            if given:
+                raise InputError(f"emission: hole {self.hole!r} takes no {what}; use hole 'rays', or leave that out")
+
+    @property
+    def _is_by_depth(self) -> bool:
+        """Whether the hole's blur is computed without rays."""
+        if self.hole != "auto":
+            return self.hole == "depth"
+        numbers = self.aperture_points, self.aperture_tolerance, self.pixel_points
+        return self.edge == "paix" and self.depth_layers == 1 and numbers == (None, None, None)
+
+    def by_rays(self) -> Self:
+        """The model for what can only be done with rays; `InputError` with hole "depth"."""
+        if self.hole == "depth":
+            raise InputError("emission: hole 'depth' takes no backend 'cuda' and has no gradients by mu: use hole 'auto'")
+        return replace(self, hole="rays") if self.hole == "auto" else self
 
     def _set(self, name: str, value: Any) -> None:
         object.__setattr__(self, name, value)
@@ -407,24 +431,44 @@ class Emission(Model):
         return gaussian_blur(n_v, sigma / pitch_v), gaussian_blur(n_u, sigma / pitch_u)
 
     def by_depth(self, views: Views, grid: Grid) -> DepthResponses | None:
-        """What projects in place of rays, for hole "depth"."""
-        if self.hole != "depth":
+        """What projects in place of rays, where the hole's blur is computed without them."""
+        if not self._is_by_depth:
             return None
+        of_view = self._response_by_depth, self._zones, self._close_voxels, self._transmittance
+        make, zones, close, transmittance = (partial(function, views, grid) for function in of_view)
+        return DepthResponses(len(views), views.shape, grid, make, zones, close, transmittance, self.mu)
 
-        def make(m: int) -> DepthResponse:
-            l, d = float(self.system.collimator_length[m]), float(self.effective_diameter[m])
-            on_crystal = self.within_crystal or self.within_walls
-            side = float(self.system.detector_side[m]) if on_crystal else math.inf
-            whole = Opening(0.0, 0.0, math.pi / 4 * d**2)
-            anywhere = replace(self, within_crystal=False, within_walls=False)
+    def _sizes(self, m: int) -> tuple[Array, float, float]:
+        """Module m's frame, the collimator's length and the hole's diameter."""
+        return self.system.frames()[m], float(self.system.collimator_length[m]), float(self.effective_diameter[m])
 
-            def weigh(u: Array, v: Array) -> Array:
-                return anywhere.pixel_weights(m, u, v, (1.0, 1.0), l, whole)  # type: ignore[return-value]
+    def _response_by_depth(self, views: Views, grid: Grid, m: int, far: float, near: float) -> DepthResponse:
+        frame, l, d = self._sizes(m)
+        if self.hole == "depth":
+            require_depths(grid, views.sources[m], frame[2], l)
+        on_crystal = self.within_crystal or self.within_walls
+        side = float(self.system.detector_side[m]) if on_crystal else math.inf
+        whole = Opening(0.0, 0.0, math.pi / 4 * d**2)
+        anywhere = replace(self, within_crystal=False, within_walls=False)
 
-            return hole_response(views, m, grid, self.system.frames()[m], l, d, side, weigh)
+        def weigh(u: Array, v: Array) -> Array:
+            return anywhere.pixel_weights(m, u, v, (1.0, 1.0), l, whole)  # type: ignore[return-value]
 
-        passes = None if self.mu is None else Transmittances(self.mu, grid, views)
-        return DepthResponses(len(views), grid.shape, make, passes)
+        return hole_response(views, m, grid, frame, l, d, side, weigh, far, near)
+
+    def _zones(self, views: Views, grid: Grid, m: int) -> tuple[Array, list[tuple[float, float]]]:
+        (_, _, k), l, _ = self._sizes(m)
+        row = k @ grid.affine[:3]
+        row[3] -= k @ views.sources[m]
+        return row, zones_of(grid, views.sources[m], k, l)
+
+    def _close_voxels(self, views: Views, grid: Grid, m: int) -> tuple[tuple[slice, ...], NDArray[np.bool_]] | None:
+        return close_voxels(views, m, grid, *self._sizes(m))
+
+    def _transmittance(self, views: Views, grid: Grid, m: int, mu: Volume, part: Grid) -> NDArray[np.float32]:
+        frame, l, d = self._sizes(m)
+        near, _ = depths_of(grid, views.sources[m], frame[2], l)
+        return mean_transmittance(mu, grid, part, views, m, frame, d / 2 * (1 / l + 1 / near))
 
     def rays(self, views: Views, m: int, grid: Grid) -> int:
         """Rays of each pixel of view m."""
@@ -433,7 +477,7 @@ class Emission(Model):
 
     def caution(self, views: Views, grid: Grid) -> str | None:
         """A warning where there are too few rays for the tolerance."""
-        if self.hole == "depth":  # has none
+        if self._is_by_depth:  # has none
             return None
         worst, module = 0.0, 0
         for m in range(len(views)):
@@ -462,15 +506,16 @@ class Emission(Model):
 
     def hole_points(self, views: Views, m: int, grid: Grid) -> int:
         """Points of the hole that rays of view m pass: `aperture_points`, or what `aperture_tolerance` takes."""
-        if self.aperture_tolerance is None:
-            return self.aperture_points
+        if self.hole == "point" or self.aperture_points is not None:
+            return self.aperture_points or 1
         l, b = self.system.collimator_length[m], self.system.pinhole_distance[m]
         pitch_u, pitch_v = self._crystal_pitch(views, m)
         sigma = self.intrinsic_fwhm / _FWHM_PER_SIGMA
         voxel = grid.voxel_volume ** (1 / 3) * l / b
         blur = math.hypot(voxel, _BOX_PER_SIGMA * sigma)
         shadow = self.effective_diameter[m] * (1 + l / b)
-        return hole_points_needed(self.aperture_tolerance, float(shadow), (pitch_u, pitch_v), (blur, blur))
+        tolerance = self.aperture_tolerance or _APERTURE_TOLERANCE
+        return hole_points_needed(tolerance, float(shadow), (pitch_u, pitch_v), (blur, blur))
 
     def openings(self, m: int, n: int) -> list[Opening]:
         """Where rays of module m cross the pinhole's plane: n points of the hole, and those of its edge."""

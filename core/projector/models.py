@@ -78,6 +78,10 @@ class Model(ABC):
         """What projects in place of rays, if the model is of that kind."""
         return None
 
+    def by_rays(self) -> "Model":
+        """The model for what can only be done with rays; `InputError` where it is not to take any."""
+        return self
+
     def response(self, views: Views, m: int) -> tuple[Array, Array] | None:
         """The detector's response in view m: matrices (n_v, n_v) along v and (n_u, n_u) along u, None if ideal."""
         return None

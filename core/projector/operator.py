@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -160,17 +162,17 @@ class Projector(LinearOperator):
                 raise InputError(f"projector: expected {what}, got {type(value).__name__}")
         self.grid = grid
         self.views = views
+        self._asked, self._auto = backend, backend == "auto"
+        self._backend = backends.choose(backend)
+        if self._backend.name == "cuda":
+            model = model.by_rays()
         self.model = model
         model.check(views)
         for doubt in doubts(grid, views, model):
             warn(doubt, 2)
-        self._asked, self._auto = backend, backend == "auto"
-        self._backend = backends.choose(backend)
         self.threads = thread_count(threads)
         self._bundles = Bundles(len(views), self._bundle)
         self._depths = model.by_depth(views, grid)
-        if self._depths is not None and self._backend.name == "cuda":
-            raise InputError("projector: hole 'depth' runs on the backends cpu and numpy, not on 'cuda'")
         self._adjoint = AdjointProjector(self)
 
     def __call__(
@@ -204,8 +206,8 @@ class Projector(LinearOperator):
         x = self._check(x)
         if self.model.mu is None:
             raise InputError("mu: the projector's model has none; give it one to say on which grid mu is")
-        if self._depths is not None:
-            raise InputError("mu: the projector's model has hole 'depth', whose attenuation is that of the model alone")
+        if self._depths is not None and getattr(mu, "requires_grad", False):
+            return self._by_rays(x, progress, mu)
         x, mu = promote(x, require_no_negative(checked(mu, "mu", self.model.mu.grid.shape, self._float64)))
         if not is_tensor(x):
             return self._run(x, progress, mu)
@@ -308,12 +310,15 @@ class Projector(LinearOperator):
             if response is not None:
                 along_v, along_u = (cast_like(matrix, image) for matrix in response)
                 image = along_v @ image @ along_u.T
+            for view, box, close, A in self._close_parts:
+                if view == m and (part := np.where(close, to_numpy(x[box], None), 0)).any():
+                    image = image + A(part, mu=mu)[0]
             yield self._finished(image, x)
 
     def _projected(self, execution: Execution, x: ArrayOrTensor, mu: ArrayOrTensor) -> Iterator[ArrayOrTensor]:
         """The images before the detector's response."""
         if self._depths is not None:
-            yield from self._depths.images(*self._depth_arguments(x))
+            yield from self._depths.images(*self._depth_arguments(x), self._mu_volume(mu))
             return
         if not self.model.weights_voxels:
             yield from execution.images(x, self._bundles, self._mu(mu))
@@ -359,6 +364,30 @@ class Projector(LinearOperator):
         double = self._backend.always_float64 or is_double(x)
         functions = backends.load("cpu" if self._backend.name == "cpu" else "reference_depth")
         return np.ascontiguousarray(to_numpy(x, np.float64 if double else np.float32)), functions, self.threads
+
+    @functools.cached_property
+    def _by_rays(self) -> Projector:
+        """What projects where only rays can."""
+        return Projector(self.grid, self.views, self.model.by_rays(), self._asked, self.threads)
+
+    @functools.cached_property
+    def _close_parts(self) -> list[tuple[int, Any, NDArray[np.bool_], Projector]]:
+        """The voxels so close to a pinhole that rays project them: view, a box of the grid, which in it, their projector."""
+        parts = []
+        for m in range(len(self.views)):
+            found = None if self._depths is None else self._depths.close(m)
+            if found is not None:
+                box, close = found
+                affine, which = self.grid.affine.copy(), np.array([m])
+                affine[:3, 3] += affine[:3, :3] @ [each.start for each in box]
+                grid, model = Grid(close.shape, affine), self.model.of_views(which).by_rays()
+                with recorded_warnings():
+                    parts.append((m, box, close, Projector(grid, self.views[which], model, self._asked, self.threads)))
+        return parts
+
+    def _mu_volume(self, mu: ArrayOrTensor) -> Volume | None:
+        """`mu` on the grid of the model's."""
+        return None if mu is None else replace(self.model.mu, array=to_numpy(mu, np.float32))  # type: ignore[type-var]
 
     def _mu(self, mu: ArrayOrTensor) -> ArrayOrTensor:
         return self.model.mu.array if mu is None and self.model.mu is not None else mu
@@ -423,7 +452,7 @@ class AdjointProjector(LinearOperator):
     ) -> ArrayOrTensor:
         A = self._projector
         execution = A._execution(x)
-        images = execution.to_backend(x)
+        given = images = execution.to_backend(x)
         needed = images.itemsize * A.grid.n_voxels + A._extra_bytes(images.itemsize)
         require(needed, f"the adjoint into {_times(A.grid.shape)} voxels")
         A._require_rays()
@@ -431,7 +460,10 @@ class AdjointProjector(LinearOperator):
         _report(progress, 0, n)
         images = A._responded(images)
         if A._depths is not None:
-            volume = A._depths.backproject(*A._depth_arguments(images), lambda done: _report(progress, done, n))
+            arguments = *A._depth_arguments(images), lambda done: _report(progress, done, n), A._mu_volume(mu)
+            volume = A._depths.backproject(*arguments)
+            for m, box, close, of_part in A._close_parts:
+                volume[box] += np.where(close, of_part.T._run(to_numpy(given[m : m + 1], None), mu=mu), 0)
         elif not A.model.weights_voxels:
             volume = execution.backproject(images, A._bundles, A._mu(mu), lambda done: _report(progress, done, n))
         else:  # each view's volume is weighted before it is added to the total

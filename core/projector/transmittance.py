@@ -2,55 +2,62 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
 from ..geometry.grid import Grid
 from ..geometry.views import Views
 from ..volumes.volume import Volume
-from .tracing import trace_rays
+from . import backends
+from .bundles import Beam, Bundle, Bundles
+from .execution import Execution
+from .rays import Fan
 
-Array = NDArray[np.float32]
+Array = NDArray[np.float64]
 
-_NODES_APART = 3.0  # mm, at most
+# Rays across a voxel, where that is farthest and looks narrowest. Across a voxel of mu there are not fewer than its edges need, nor
+# more than they show.
+_RAYS_ACROSS, _RAYS_ACROSS_MU = 4, (1.5, 6)
+# The rays' lattice is turned by this slope, along which no edges of voxels run: they meet the rays at many different places.
+_SLOPE = (math.sqrt(5) - 1) / 2
 
 
-class Transmittances:
-    """``exp(-integral of mu)`` from the middle of each voxel of `grid` to each view's source.
+def mean_transmittance(
+    mu: Volume, grid: Grid, part: Grid, views: Views, m: int, frame: Array, margin: float
+) -> NDArray[np.float32]:
+    """The mean over each voxel of a `part` of `grid` of ``exp(-integral of mu)`` from there to the pinhole, ``part.shape``.
 
-    The integrals are exact at nodes at most 3 mm apart, and interpolated between them: they change slowly.
+    Of every ray through a voxel the mean over its chord is exact; that over the voxel is the mean over the rays that meet it, weighted
+    by their chords, up to 16 where it is farthest.
+
+    Parameters
+    ----------
+    mu
+        What attenuates, 1/mm.
+    grid, part
+        All voxels, which say where the rays run, and those of which it is.
+    views, m, frame
+        The view, and its module's u, v, k.
+    margin
+        How far beyond the outermost pixels rays are cast, as a slope: mm per mm of depth. Voxels that no ray meets get 0.
     """
-
-    def __init__(self, mu: Volume, grid: Grid, views: Views) -> None:
-        self._mu, self._grid, self._views = mu, grid, views
-        ticks = [
-            np.linspace(0, n - 1, max(min(n, 2), int(np.ceil((n - 1) * size / _NODES_APART)) + 1))
-            for n, size in zip(grid.shape, grid.spacing, strict=True)
-        ]
-        self._to_voxels = [_interpolation(n, at) for n, at in zip(grid.shape, ticks, strict=True)]
-        self._ticks = ticks
-        self._integrals: list[Array] | None = None
-
-    def prepare(self) -> None:
-        """Trace the rays to the nodes, with threads of their own, if that is not done yet."""
-        if self._integrals is not None:
-            return
-        nodes = np.stack(np.meshgrid(*self._ticks, indexing="ij"), axis=-1)
-        points = (nodes @ self._grid.affine[:3, :3].T + self._grid.affine[:3, 3]).reshape(-1, 3)
-        self._integrals = [
-            np.asarray(trace_rays(self._mu, source, points), np.float32).reshape(nodes.shape[:3])
-            for source in self._views.sources
-        ]
-
-    def __getitem__(self, m: int) -> Array:
-        """Of view m, of the grid's shape, once prepared."""
-        integrals = self._integrals[m]  # type: ignore[index]
-        for matrix in self._to_voxels:  # axis by axis: the first becomes the last
-            integrals = np.tensordot(integrals, matrix, axes=(0, 1))
-        return np.exp(-integrals)  # type: ignore[no-any-return]
-
-
-def _interpolation(n: int, at: NDArray[np.float64]) -> Array:
-    """Matrix (n, nodes) of linear interpolation from nodes at indices `at` to all n."""
-    hats = [np.interp(np.arange(n), at, one) for one in np.eye(len(at))]
-    return np.stack(hats, axis=1).astype(np.float32)
+    pinhole, k = views.sources[m], frame[2]
+    across = np.stack([views.v_steps[m] * views.shape[0], views.u_steps[m] * views.shape[1]])
+    middle = views.detector_centers[m] - pinhole
+    far = float(((grid.corners() - pinhole) @ k).max())
+    sides = far * (np.linalg.norm(across, axis=1) / (middle @ k) + 2 * margin)
+    width, mu_width = (np.linalg.svd(frame[:2] @ g.affine[:3, :3], compute_uv=False)[-1] for g in (grid, mu.grid))
+    fewest, most = _RAYS_ACROSS_MU
+    step = max(min(width / _RAYS_ACROSS, mu_width / fewest), min(width, mu_width / most))
+    turned = np.array([[1, _SLOPE], [-_SLOPE, 1]]) / math.hypot(1, _SLOPE)
+    rows, columns = np.ceil(np.abs(turned) @ sides / step).astype(int).tolist()
+    row_step, column_step = step * turned @ frame[1::-1]
+    corner = pinhole + far / (middle @ k) * middle - (rows - 1) / 2 * row_step - (columns - 1) / 2 * column_step
+    bundle = Bundle.along(part, Beam(Fan(pinhole, corner, row_step, column_step, (rows, columns))))
+    execution = Execution(backends.choose("auto"), part, mu.grid)
+    rays, bundles = np.ones((1, rows, columns), np.float32), Bundles(1, lambda _: bundle)
+    chords = np.asarray(execution.backproject(rays, bundles))
+    passing = np.asarray(execution.backproject(rays, bundles, mu.array))
+    return np.divide(passing, chords, out=np.zeros(part.shape, np.float32), where=chords > 0)

@@ -114,7 +114,7 @@ def _pixel_weights(run: ProjectionRun) -> NDArray[np.float64]:
     """What pixels (M, n_v, n_u) count of a line integral of 1 along their rays through the middle of the hole."""
     model: Any = recipe_model(run.recipe, run.system)
     assert isinstance(model, Emission)
-    middle = replace(model, hole="rays", aperture_points=1, aperture_tolerance=None, pixel_points=1, depth_layers=1)
+    middle = replace(model, hole="point", aperture_points=None, aperture_tolerance=None, pixel_points=1, depth_layers=1)
     anywhere = Grid.centered((1, 1, 1), 1.0)  # weights do not depend on it
     every = slice(None)
     return np.array([

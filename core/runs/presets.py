@@ -15,7 +15,7 @@ _RESET = (
 )
 """Settings of the model that every preset decides: those that it does not give have their defaults."""
 
-_REAL = {"aperture_points": 7, "within_cone": True, "within_walls": True, "within_crystal": True}
+_REAL = {"within_cone": True, "within_walls": True, "within_crystal": True}
 """A hole with a size in a plate, with walls and a crystal of finite size."""
 
 
@@ -47,7 +47,7 @@ _ROWS = (
         "ideal",
         "Ideal Pinhole",
         "One photon per decay through the middle of the hole; nothing blurs, penetrates or is missed",
-        {"intrinsic_fwhm": None},
+        {"hole": "point", "intrinsic_fwhm": None},
     ),
     _camera("Tc-99m", "tungsten", "CZT"),
     _camera("Tc-99m", "tungsten", "NaI"),

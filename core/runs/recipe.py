@@ -14,7 +14,7 @@ from ..files import replacing
 from ..phantoms.kinds import KINDS
 from ..phantoms.settings import setting_names
 from ..toml import read_toml, toml_value
-from .settings import SETTINGS, TABLES
+from .settings import SAMPLING, SETTINGS, TABLES
 
 _PLACED = ("phantom.position", "phantom.euler_degrees")
 
@@ -34,7 +34,7 @@ class Recipe:
     given: Mapping[str, Any] = dataclasses.field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        checked = {key: _checked(self.given, key) for key in self.given}
+        checked = _with_hole({key: _checked(self.given, key) for key in self.given})
         object.__setattr__(self, "given", checked)
         for key in checked:
             for need in _unmet(checked, key):
@@ -77,7 +77,7 @@ class Recipe:
 
 def fitting_recipe(values: Mapping[str, Any], kept: Collection[str] = ()) -> Recipe:
     """The recipe of those values, None aside, that have an effect; `InputError` where one of `kept` has none."""
-    values = {key: value for key, value in values.items() if value is not None}
+    values = _with_hole({key: value for key, value in values.items() if value is not None})
 
     def is_stale(key: str) -> bool:
         is_known = key in SETTINGS or key.partition(".")[2] in _phantom_fields(values)
@@ -96,9 +96,10 @@ def recorded_recipe(recipe: Recipe) -> Recipe:
     return fitting_recipe({**defaults, **recipe.given}, recipe.given)
 
 
-def recipe_of_tables(tables: Mapping[str, Any]) -> Recipe:
+def recipe_of_tables(tables: Mapping[str, Any], recorded: bool = False) -> Recipe:
     """The recipe of values by table and name, as `Recipe.tables` gives them, without defaults that have no effect.
 
+    With `recorded` it is one of a run: earlier versions wrote numbers of rays that had no effect, and these go, too.
     `InputError` as of `Recipe`.
     """
     values: dict[str, Any] = {}
@@ -107,7 +108,9 @@ def recipe_of_tables(tables: Mapping[str, Any]) -> Recipe:
             raise InputError(f"{table}: expected one of the tables {', '.join(f'[{name}]' for name in TABLES)}")
         values |= {f"{table}.{name}": value for name, value in entries.items()}
     # Versions record defaults that have no effect in later ones.
-    return fitting_recipe(values, [k for k, v in values.items() if k not in SETTINGS or v != SETTINGS[k].default])
+    dropped = SAMPLING if recorded else ()
+    given = [k for k, v in values.items() if k not in SETTINGS or (v != SETTINGS[k].default and k not in dropped)]
+    return fitting_recipe(values, given)
 
 
 def read_recipe(path: str | os.PathLike[str]) -> Recipe:
@@ -149,6 +152,12 @@ def write_recipe(recipe: Recipe, path: str | os.PathLike[str]) -> None:
             lines.append(line if key in recipe.given else f"# {line}")
     with replacing(path) as temporary:
         temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def _with_hole(values: dict[str, Any]) -> dict[str, Any]:
+    """The values, with hole "rays" where there are numbers of rays and nothing is said of the hole."""
+    is_said = "model.hole" in values or values.get("model.kind") != "emission"
+    return values if is_said or not any(key in values for key in SAMPLING) else {**values, "model.hole": "rays"}
 
 
 def is_met(values: Mapping[str, Any], need: str) -> bool:

@@ -12,7 +12,6 @@ from ..geometry.grid import Grid
 from ..memory import require
 from ..progress import Stages
 from ..projector.backends import choose
-from ..projector.hole_response import depths_of
 from ..reconstruction.methods import METHODS, PRIORS
 from ..reconstruction.priors import Prior
 from ..reconstruction.result import Reconstruction
@@ -23,6 +22,7 @@ from ..volumes.volume_files import read_volume
 from .recipe import Recipe
 from .run import ProjectionRun
 from .run_recipe import projector_of_run
+from .settings import SAMPLING
 
 Watch = Callable[[int, NDArray[Any], Sequence[float]], bool | None]
 """Called as ``watch(iteration, values, objective)`` after each iteration, with the volume's values and the objective after
@@ -89,7 +89,7 @@ def reconstruct_run(
         raise InputError(f"reconstruction.method: {method.name} needs a run of counts, not of line integrals{also}")
     grid = reconstruction_grid(run, recipe)
     require(16.0 * grid.n_voxels, "a reconstruction of {} x {} x {} voxels".format(*grid.shape))
-    modelled = model_of(run, recipe, grid)
+    modelled = model_of(run, recipe)
     flatters = flattering(run, grid, modelled)
     for text in flatters:
         _warn(text)
@@ -181,30 +181,28 @@ def reconstruction_grid(run: ProjectionRun, recipe: Recipe) -> Grid:
     return Grid.centered((n_x, n_y, n_z), np.broadcast_to(spacing, 3), recipe["reconstruction.center"])
 
 
-def model_of(run: ProjectionRun, recipe: Recipe, grid: Grid) -> Recipe:
+def model_of(run: ProjectionRun, recipe: Recipe) -> Recipe:
     """The recipe of the model that a reconstruction reckons with.
 
-    Of the hole's blur it is, unless `recipe` says which: the whole hole by depth, where the run's counts have its blur and
-    `hole` "depth" is possible; else rays, through as many points as the run has, but 7 at most.
+    Of the hole's blur it is, unless `recipe` says which: that of the whole hole, where the run's counts have it; else that of
+    rays through as many points as the run has, but 7 at most.
     """
     if recipe["model.kind"] != "emission":
         return recipe
     hole, points = recipe["reconstruction.hole"], recipe["reconstruction.aperture_points"]
-    is_blurred = run.is_measured or recipe["model.hole"] == "depth" or bool(recipe["model.aperture_tolerance"])
+    made = None if run.is_measured else 1 if recipe["model.hole"] == "point" else recipe["model.aperture_points"]
+    is_whole = made is None or made >= _POINTS
     if hole == "auto":
         is_free = points is None and recipe["reconstruction.pixel_points"] == 1
-        is_whole = is_blurred or recipe["model.aperture_points"] >= _POINTS
-        hole = "depth" if is_free and is_whole and _whole_hole(run, recipe, grid) else "rays"
+        hole = "auto" if is_free and is_whole and _by_depth(recipe) else "rays"
     if hole == "rays" and points is None:
-        points = _POINTS if is_blurred else min(_POINTS, recipe["model.aperture_points"])
+        points = _POINTS if is_whole else made
     changes: dict[str, Any] = {
-        "model.hole": hole,
-        "model.aperture_points": None if hole == "depth" else points,
-        "model.aperture_tolerance": None,
-        "model.pixel_points": recipe["reconstruction.pixel_points"],
+        **dict.fromkeys(SAMPLING), "model.hole": hole, "model.aperture_points": points,
+    }  # fmt: skip
+    if hole == "rays":
         # The tolerance is for images of single voxels; neighbours make up for each other's errors.
-        "model.tolerance": 1e9,
-    }
+        changes |= {"model.pixel_points": recipe["reconstruction.pixel_points"], "model.tolerance": 1e9}
     if recipe["reconstruction.ignore_blur"]:
         changes["model.intrinsic_fwhm"] = None
     if recipe["reconstruction.ignore_attenuation"]:
@@ -212,8 +210,8 @@ def model_of(run: ProjectionRun, recipe: Recipe, grid: Grid) -> Recipe:
     return recipe.updated(changes)
 
 
-def _whole_hole(run: ProjectionRun, recipe: Recipe, grid: Grid) -> bool:
-    """Whether `hole` "depth" is possible, and fast; a warning says why not."""
+def _by_depth(recipe: Recipe) -> bool:
+    """Whether the whole hole's blur is possible without rays, and fast; a warning says why not."""
     why, backend = None, choose(recipe["compute.backend"]).name
     if recipe["model.edge"] == "path":
         why = "the run's edge is 'path'"
@@ -221,13 +219,6 @@ def _whole_hole(run: ProjectionRun, recipe: Recipe, grid: Grid) -> bool:
         why = "the run has depth_layers"
     elif backend != "cpu":  # others refuse it, or take minutes for an iteration
         why = f"the backend is {backend}, not cpu"
-    else:
-        system = run.system
-        try:
-            for m, (_, _, k) in enumerate(system.frames()):
-                depths_of(grid, run.views.sources[m], k, float(system.collimator_length[m]))
-        except InputError:
-            why = "voxels come close to a pinhole"
     if why is not None:
         _warn(f"the hole's blur is that of rays through {_POINTS} points, not of the whole hole by depth: {why}")
     return why is None
@@ -259,15 +250,11 @@ def flattering(run: ProjectionRun, grid: Grid, model: Recipe | None = None) -> l
             f"the run was made from voxels of {fine:.3g} mm: figures of a reconstruction in voxels of {coarse:.3g} mm "
             f"flatter, unless its voxels are {coarse / 2:.3g} mm or less"
         )
-    if made["model.hole"] == "depth" and (model is None or model["model.hole"] == "depth"):
+    points, reckoned = made["model.aperture_points"], (model or made)["model.aperture_points"]
+    if None not in (points, reckoned) and 1 < points <= reckoned:
         said.append(
-            "the run was made with the hole by depth: figures of a reconstruction that reckons so, too, flatter, unless the "
-            "run is made with rays"
-        )
-    if made["model.aperture_tolerance"] is None and 1 < made[points] <= (model or made)[points]:
-        said.append(
-            f"the run was made with {made[points]} points of the hole: figures of a reconstruction that reckons with as "
-            "many flatter, unless the run has more points"
+            f"the run was made with {points} points of the hole: figures of a reconstruction that reckons with as many "
+            "flatter, unless the run has more points"
         )
     return said
 

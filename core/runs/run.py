@@ -81,7 +81,7 @@ class ProjectionRun:
         """What was asked for; `InputError` where the run does not say it, as those of version 0.1.0 do not."""
         if "recipe" not in self.settings:
             raise InputError("the run holds no recipe: it was made by version 0.1.0, or without one")
-        return recipe_of_tables(self.settings["recipe"])
+        return recipe_of_tables(self.settings["recipe"], recorded=True)
 
     def intrinsics(self) -> NDArray[np.float64]:
         """Camera matrices K (M, 3, 3), pixels: ``K @ (x_u, x_v, x_k)`` is a multiple of ``(column, row, 1)``.

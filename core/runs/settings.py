@@ -112,7 +112,7 @@ def _named(names: Iterable[str], text: str) -> Words:
 _COUNTS = "model.kind=emission"
 _BY_RAYS = (_COUNTS, "no model.hole=depth")
 _METHOD_OF_COUNTS = " or ".join(f"reconstruction.method={m.name}" for m in METHODS.values() if m.of_counts)
-_RAYS = "no model.kind=inverse-square"
+_RAYS = "model.kind=transmission or model.hole=rays or model.hole=point"
 _FILE = "volume.file or volume.states"
 _MADE = "no counts.files"
 _PHANTOM = ("no volume.file", "no volume.states", _MADE)
@@ -213,16 +213,18 @@ _DECLARED = (
     Setting("model.window", float, None, "Energies that are counted, from and to", "10 % around the isotope's strongest "
             "line", unit="keV", least=0, slider=1000, sizes=(2,), needs=(_COUNTS, "model.isotope"),
             label="Window (keV)"),
-    Setting("model.aperture_points", int, 1, "Points of the hole that rays pass; 1: its middle, no blur, 7 and more: the "
-            "blur of a hole of this size", least=1, slider=64, needs=(*_BY_RAYS, "no model.aperture_tolerance"),
-            label="Hole Points"),
-    Setting("model.aperture_tolerance", float, None, "In place of a number of points, as many as bring a voxel's image "
-            "this close, such as 0.1, to that of the whole hole", "the number of points holds", above=0, slider=1,
-            needs=_BY_RAYS, label="Hole Tolerance"),
-    Setting("model.hole", str, "rays", "How the hole's blur is computed", label="Hole's Blur", option="--hole", words={
-        "rays": ("Rays", "By rays through points of the hole"),
-        "depth": ("By Depth", "Of the whole hole, depth by depth, without rays: for reconstruction"),
+    Setting("model.hole", str, "auto", "What the hole does to the image", label="Hole", option="--hole", words={
+        "auto": ("Automatic", "The blur of the whole hole, by depth; by rays where that cannot be"),
+        "depth": ("By Depth", "The blur of the whole hole, depth by depth, without rays"),
+        "rays": ("Rays", "The blur of rays through points of the hole"),
+        "point": ("Point", "An ideal pinhole: rays through the middle of the hole, no blur"),
     }, needs=(_COUNTS,)),
+    Setting("model.aperture_points", int, None, "Points of the hole that rays pass; 1: its middle, no blur, 7 and more: the "
+            "blur of a hole of this size", "as many as the hole's tolerance asks for", least=1, slider=64,
+            needs=(_COUNTS, "model.hole=rays"), label="Hole Points"),
+    Setting("model.aperture_tolerance", float, None, "In place of a number of points, as many as bring a voxel's image "
+            "this close to that of the whole hole", "0.1, where rays are used", above=0, slider=1,
+            needs=(_COUNTS, "model.hole=rays"), label="Hole Tolerance"),
     Setting("model.aperture_mu", float, None, "Material of the aperture's edge, or its attenuation coefficient at the "
             "photons' energy", "nothing penetrates it", unit="1/mm", words=_named(APERTURES, _BY_NAME), above=0,
             slider=10, needs=(_COUNTS,), label="Aperture"),
@@ -321,3 +323,6 @@ SETTINGS: Mapping[str, Setting] = MappingProxyType({setting.key: setting for set
 """Every setting by its key, table by table. A phantom's own numbers come beside them, from the class of its kind."""
 
 TABLES = tuple(dict.fromkeys(key.partition(".")[0] for key in SETTINGS))
+
+SAMPLING = tuple(f"model.{name}" for name in ("aperture_points", "aperture_tolerance", "pixel_points", "tolerance"))
+"""Numbers of rays and what sets them: counts have them only where the hole is by rays."""

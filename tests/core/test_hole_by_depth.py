@@ -112,7 +112,7 @@ def test_tensors_have_gradients(rng):
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"hole": "cone"}, "hole: expected 'rays' or 'depth'"),
+        ({"hole": "cone"}, "hole: expected 'auto', 'depth', 'rays' or 'point'"),
         ({"hole": "depth", "aperture_points": 7}, "hole 'depth' takes no points"),
         ({"hole": "depth", "edge": "path", "aperture_mu": 3.0}, "hole 'depth' takes no edge 'path'"),
         ({"hole": "depth", "crystal_mu": 0.2, "depth_layers": 2}, "hole 'depth' takes no depth_layers"),

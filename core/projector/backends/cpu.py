@@ -6,6 +6,7 @@ float64, all others in float32.
 """
 
 import ctypes
+import math
 import os
 import sys
 from ctypes import POINTER, Structure, c_char_p, c_double, c_int64, c_void_p
@@ -16,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import InputError
-from ..depth_response import PLANES, DepthResponse
+from ..depth_response import DepthResponse
 from ..rays import Attenuation, IndexFans, IndexRays, Rays
 
 Array = NDArray[Any]  # of float32 or float64
@@ -24,11 +25,12 @@ Array = NDArray[Any]  # of float32 or float64
 LEVEL_VARIABLE = "MPHDRR_CPU_LEVEL"
 """Environment variable that names a lower level of processor, `levels`, than this one's."""
 
-_CONTRACT = 5
+_CONTRACT = 6
 _NAMES = {"win32": "siddon.dll", "darwin": "libsiddon.dylib"}
 _MOST_VOXELS = 2**31 - 1  # their indices are of 32 bits
 _PRODUCT = 2  # in kernels.h
 _MOST_PLACES_ALONG = 2**16  # where float32 knows a place to 1/256 of an element; beyond 2^24 it would miss whole ones
+_READ_ON = 16  # numbers that kernels read beyond the last of what they use
 _MOST_ALONG = 2**12  # where float32 knows the length of a segment to 0.1 %
 
 _FAN = np.dtype(
@@ -63,9 +65,9 @@ class _Job(Structure):
 class _DepthJob(Structure):
     _fields_ = [
         ("is_double", c_int64), ("volume", _Lattice), ("first", c_int64), ("last", c_int64), ("matrix", c_double * 12),
-        ("nearest", c_double), ("first_plane", c_double), ("planes_per_inverse", c_double), ("passes", c_void_p),
-        ("cells", c_void_p), ("rows", c_int64), ("columns", c_int64), ("kernel", c_void_p), ("taps", c_int64 * 2),
-        ("step", c_int64 * 2), ("image", c_void_p), ("pixels", c_int64 * 2),
+        ("shift", c_double * 3), ("nearest", c_double), ("farthest", c_double), ("first_plane", c_double), ("planes_per_inverse", c_double), ("passes", c_void_p),
+        ("cells", c_void_p), ("planes", c_int64), ("rows", c_int64), ("columns", c_int64), ("kernel", c_void_p),
+        ("taps", c_int64 * 2), ("step", c_int64 * 2), ("image", c_void_p), ("row", c_int64), ("pixels", c_int64 * 2),
     ]  # fmt: skip
 
 
@@ -280,57 +282,82 @@ def _lattice(voxels: Array, like: Array, written: bool = False) -> _Lattice:
 
 
 def voxels_to_cells(volume: Array, of: DepthResponse, passes: Array | None = None) -> Array:
-    """What `volume` (n_x, n_y, n_z) gives to the cells (rows, columns, PLANES) of a view's fine image.
+    """What `volume` (n_x, n_y, n_z) gives to the cells (planes, rows, columns) of a view's fine image.
 
     `passes`, of the volume's shape, are the shares of photons that attenuation leaves.
     """
-    cells = np.zeros((*of.cells, PLANES), volume.dtype)
-    _run_depth(_library.voxels_to_cells, of, cells, volume, passes)
+    cells = np.zeros(of.shape, volume.dtype)
+    _run_voxels(_library.voxels_to_cells, of, cells, volume, passes)
     return cells
 
 
 def cells_to_voxels(volume: Array, cells: Array, of: DepthResponse, passes: Array | None, slab: slice) -> None:
     """Add to the `slab` of `volume` along x, in place, what the adjoint of `voxels_to_cells` gives."""
-    _run_depth(_library.cells_to_voxels, of, cells, volume, passes, slab)
+    _run_voxels(_library.cells_to_voxels, of, cells, volume, passes, slab)
 
 
 def cells_to_pixels(cells: Array, of: DepthResponse) -> Array:
     """The image (n_v, n_u) of a view's cells."""
-    image = np.empty(of.after.shape, cells.dtype)
-    _run_depth(_library.cells_to_pixels, of, cells, image=image)
+    image = np.zeros(of.after.shape, cells.dtype)
+    sorted_cells = _sorted_cells(of, cells.dtype)
+    sorted_cells[...] = _by_place(cells * of.before, of)
+    _run_pixels(_library.cells_to_pixels, of, sorted_cells, image)
+    image *= of.after
     return image
 
 
 def pixels_to_cells(image: Array, of: DepthResponse) -> Array:
     """The adjoint of `cells_to_pixels`."""
-    cells = np.zeros((*of.cells, PLANES), image.dtype)
-    _run_depth(_library.pixels_to_cells, of, cells, image=np.ascontiguousarray(image))
+    n_v, n_u = image.shape
+    before, together = (of.kernel.shape[2] - 1) // of.steps[1], of.shape[2] // of.steps[1]
+    padded = np.zeros((n_v, before + -(-together // _READ_ON) * _READ_ON), image.dtype)
+    padded[:, before : before + n_u] = image * of.after
+    sorted_cells = _sorted_cells(of, image.dtype)
+    sorted_cells[...] = 0
+    _run_pixels(_library.pixels_to_cells, of, sorted_cells, padded[:, before:])
+    cells = np.empty(of.shape, image.dtype)
+    _by_place(cells, of)[...] = sorted_cells
+    cells *= of.before
     return cells
 
 
-def _run_depth(
-    kernel: Any,
-    of: DepthResponse,
-    cells: Array,
-    volume: Array | None = None,
-    passes: Array | None = None,
-    slab: slice = slice(None),
-    image: Array | None = None,
+def _by_place(cells: Array, of: DepthResponse) -> Array:
+    """`cells` (…, rows, columns) as (…, rows, places in a pixel, pixels)."""
+    return cells.reshape(*cells.shape[:-1], -1, of.steps[1]).swapaxes(-1, -2)
+
+
+def _sorted_cells(of: DepthResponse, kind: Any) -> Array:
+    """Room for cells as `_by_place` has them, in a row, with what kernels read beyond."""
+    planes, rows, columns = of.shape
+    shape = planes, rows, of.steps[1], columns // of.steps[1]
+    return np.empty(math.prod(shape) + _READ_ON, kind)[:-_READ_ON].reshape(shape)
+
+
+def _run_voxels(
+    kernel: Any, of: DepthResponse, cells: Array, volume: Array, passes: Array | None, slab: slice = slice(None)
 ) -> None:
-    """Run a kernel on one view."""
-    taps = np.ascontiguousarray(of.kernel, cells.dtype)
-    job = _DepthJob(
-        is_double=cells.dtype == np.float64,
-        matrix=tuple(of.matrix.ravel().tolist()),
-        nearest=of.nearest, first_plane=of.first_plane, planes_per_inverse=of.planes_per_inverse,
-        cells=cells.ctypes.data, rows=of.cells[0], columns=of.cells[1],
-        kernel=taps.ctypes.data, taps=taps.shape[:2], step=of.steps, pixels=of.after.shape,
-        passes=None if passes is None else passes.ctypes.data,
-        image=None if image is None else image.ctypes.data,
-    )  # fmt: skip
-    if volume is not None:
-        job.volume = _lattice(volume, cells, kernel is _library.cells_to_voxels)
-        job.first, job.last, _ = slab.indices(len(volume))
-    if passes is not None and (passes.shape != volume.shape or passes.dtype != cells.dtype):  # type: ignore[union-attr]
+    """Run a kernel between the voxels and the cells of one view."""
+    if passes is not None and (passes.shape != volume.shape or passes.dtype != cells.dtype):
         raise ValueError(f"expected passes of the volume's shape and type, got {passes.shape}, {passes.dtype}")
+    first, last, _ = slab.indices(len(volume))
+    for shift in of.parts @ of.matrix[:, :3].T:
+        job = _DepthJob(
+            is_double=cells.dtype == np.float64, volume=_lattice(volume, cells, kernel is _library.cells_to_voxels),
+            first=first, last=last, matrix=tuple(of.matrix.ravel().tolist()), shift=tuple(shift.tolist()),
+            nearest=of.nearest, farthest=of.farthest, first_plane=of.first_plane, planes_per_inverse=of.planes_per_inverse,
+            cells=cells.ctypes.data, planes=of.shape[0], rows=of.shape[1], columns=of.shape[2],
+            passes=None if passes is None else passes.ctypes.data, step=of.steps,
+        )  # fmt: skip
+        kernel(level, job)
+
+
+def _run_pixels(kernel: Any, of: DepthResponse, sorted_cells: Array, image: Array) -> None:
+    """Run a kernel between the sorted cells and the pixels of one view."""
+    taps = np.pad(of.kernel, ((0, 0), (of.steps[0],) * 2, (0, 0))).astype(image.dtype, copy=False)
+    job = _DepthJob(
+        is_double=image.dtype == np.float64,
+        cells=sorted_cells.ctypes.data, planes=of.shape[0], rows=of.shape[1], columns=of.shape[2],
+        kernel=taps.ctypes.data, taps=of.kernel.shape[1:], step=of.steps,
+        image=image.ctypes.data, row=image.strides[0] // image.itemsize, pixels=of.after.shape,
+    )  # fmt: skip
     kernel(level, job)

@@ -6,17 +6,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..depth_response import PLANES, DepthResponse
+from ..depth_response import DepthResponse
 
 Array = NDArray[Any]
 
 
 def voxels_to_cells(volume: Array, of: DepthResponse, passes: Array | None = None) -> Array:
-    """What `volume` (n_x, n_y, n_z) gives to the cells (rows, columns, PLANES) of a view's fine image.
+    """What `volume` (n_x, n_y, n_z) gives to the cells (planes, rows, columns) of a view's fine image.
 
     `passes`, of the volume's shape, are the shares of photons that attenuation leaves.
     """
-    cells = np.zeros((*of.cells, PLANES))
+    cells = np.zeros(of.shape)
     for x in range(len(volume)):
         given = volume[x] if passes is None else volume[x] * passes[x]
         for where, weights in _shares(of, volume.shape, x):
@@ -33,46 +33,48 @@ def cells_to_voxels(volume: Array, cells: Array, of: DepthResponse, passes: Arra
 
 def cells_to_pixels(cells: Array, of: DepthResponse) -> Array:
     """The image (n_v, n_u) of a view's cells."""
-    image = np.zeros(of.after.shape)
+    image, weighted = np.zeros(of.after.shape), cells * of.before
     for where, tap in _taps(of):
-        image += cells[where] @ tap
-    return image
+        image += np.einsum("pij,p->ij", weighted[where], tap)
+    return image * of.after
 
 
 def pixels_to_cells(image: Array, of: DepthResponse) -> Array:
     """The adjoint of `cells_to_pixels`."""
-    cells = np.zeros((*of.cells, PLANES))
+    cells, weighted = np.zeros(of.shape), image * of.after
     for where, tap in _taps(of):
-        cells[where] += image[..., None] * tap
-    return cells
+        cells[where] += weighted * tap[:, None, None]
+    return cells * of.before
 
 
-def _taps(of: DepthResponse) -> Iterator[tuple[tuple[slice, slice], Array]]:
-    """For every tap of the kernel: the cells that it takes, as many as pixels, and its weights of the planes."""
-    for a, row in enumerate(of.kernel):
-        for b, tap in enumerate(row):
-            first = zip((a, b), of.steps, of.after.shape, strict=True)
-            rows, columns = (slice(start, start + step * (n - 1) + 1, step) for start, step, n in first)
-            yield (rows, columns), tap
+def _taps(of: DepthResponse) -> Iterator[tuple[tuple[slice, ...], Array]]:
+    """For every tap of the kernels: the cells that it takes, as many as pixels, and its weights of the planes."""
+    for a, b in np.ndindex(of.kernel.shape[1:]):
+        first = zip((a, b), of.steps, of.after.shape, strict=True)
+        rows, columns = (slice(start, start + step * (n - 1) + 1, step) for start, step, n in first)
+        yield (slice(None), rows, columns), of.kernel[:, a, b]
 
 
 def _shares(of: DepthResponse, shape: tuple[int, ...], x: int) -> Iterator[tuple[tuple[Array, ...], Array]]:
     """For a layer of voxels, all (n_y, n_z): indices of 3 x 3 x 2 cells each, and weights."""
+    planes, rows, columns = of.shape
     y, z = np.meshgrid(np.arange(shape[1]), np.arange(shape[2]), indexing="ij")
-    column, row, depth = np.einsum("ij,jyz->iyz", of.matrix, np.stack([np.full(y.shape, x), y, z, np.ones(y.shape)]))
-    inverse = 1 / np.where(depth > of.nearest, depth, np.inf)
-    column, row = column * inverse, row * inverse
-    rows, columns = of.cells
-    inside = (inverse > 0) & (column >= 1) & (column <= columns - 2) & (row >= 1) & (row <= rows - 2)
-    column, row = np.where(inside, column, 1.0), np.where(inside, row, 1.0)
-    weight = inside * inverse**2
-    plane = np.clip((inverse - of.first_plane) * of.planes_per_inverse, 0, PLANES - 1)
-    lower = np.minimum(plane.astype(int), PLANES - 2)
-    middle_row, middle_column = (np.floor(place + 0.5).astype(int) for place in (row, column))
-    for a, by_row in enumerate(_spline(row - middle_row), -1):
-        for b, by_column in enumerate(_spline(column - middle_column), -1):
-            for k, by_plane in enumerate((1 - (plane - lower), plane - lower)):
-                yield (middle_row + a, middle_column + b, lower + k), weight * by_row * by_column * by_plane
+    voxels = np.einsum("ij,jyz->iyz", of.matrix, np.stack([np.full(y.shape, x), y, z, np.ones(y.shape)]))
+    in_zone = (voxels[2] > of.nearest) & (voxels[2] <= of.farthest)
+    for shift in of.parts @ of.matrix[:, :3].T:
+        column, row, depth = voxels + shift[:, None, None]
+        inverse = 1 / np.where(in_zone, depth, np.inf)
+        column, row = column * inverse, row * inverse
+        inside = (inverse > 0) & (column >= 1) & (column <= columns - 3) & (row >= 1) & (row <= rows - 2)
+        column, row = np.where(inside, column, 1.0), np.where(inside, row, 1.0)
+        weight = inside * inverse**2
+        plane = np.clip((inverse - of.first_plane) * of.planes_per_inverse, 0, planes - 1)
+        farther = np.minimum(plane.astype(int), planes - 2)
+        middle_row, middle_column = (np.floor(place + 0.5).astype(int) for place in (row, column))
+        for a, by_row in enumerate(_spline(row - middle_row), -1):
+            for b, by_column in enumerate(_spline(column - middle_column), -1):
+                for k, by_plane in enumerate((1 - (plane - farther), plane - farther)):
+                    yield (farther + k, middle_row + a, middle_column + b), weight * by_row * by_column * by_plane
 
 
 def _spline(offset: Array) -> tuple[Array, Array, Array]:

@@ -1,5 +1,4 @@
 // The image of a pinhole blurred depth by depth: voxels to planes of a fine image and back, planes to pixels and back.
-// Four planes lie side by side in memory, so that one vector holds a cell of all of them.
 
 #include "kernels.h"
 #include "lanes.h"
@@ -8,43 +7,43 @@
 #define JOIN(name, level, real) JOIN_(name, level, real)
 #define KERNEL(name) JOIN(name, LEVEL, REAL)
 
-typedef REAL Cell __attribute__((ext_vector_type(PLANES), aligned(sizeof(REAL)))); // of the fine image, in all planes
-
 // Where some voxels of a row, neighbours along z, lie in the fine image. In memory: they are taken one by one.
 typedef struct {
-    I cell;                // the first of 3 x 3 cells, a number in `cells`
-    F along[3], across[3]; // shares of their columns and rows: a quadratic B-spline
-    F plane;               // between 0 and PLANES - 1
-    F weight;              // 1 / depth^2; 0 outside the image
+    I cell;           // the first of 3 x 3 cells in the farther of two planes, a number in `cells`
+    F along;          // columns from the middle one of the three
+    F across[3];      // shares of their rows: a quadratic B-spline
+    F nearer;         // share of the nearer plane
+    F weight;         // 1 / depth^2; 0 outside the image
 } Places;
-
-INLINE void spline(F offset, F shares[3]) {
-    const F left = (F)0.5 - offset, right = (F)0.5 + offset;
-    shares[0] = left * left * (F)0.5;
-    shares[1] = (F)0.75 - offset * offset;
-    shares[2] = right * right * (F)0.5;
-}
 
 INLINE void find_places(const DepthJob *job, const double row_start[3], F z, Places *p) {
     F at[3];
     EACH_AXIS(a) at[a] = (F)(REAL)row_start[a] + z * (F)(REAL)job->matrix[a][2];
-    const I in_front = at[2] > (F)(REAL)job->nearest;
-    const F inverse = 1 / (in_front ? at[2] : (F)1);
+    const I in_zone = (at[2] > (F)(REAL)job->nearest) & (at[2] <= (F)(REAL)job->farthest);
+    EACH_AXIS(a) at[a] += (F)(REAL)job->shift[a];
+    const F inverse = 1 / (in_zone ? at[2] : (F)1);
     const F u = at[0] * inverse, v = at[1] * inverse;
-    const I inside = in_front & (u >= (F)1) & (u <= (F)(job->columns - 2)) & (v >= (F)1) & (v <= (F)(job->rows - 2));
+    const I inside = in_zone & (u >= (F)1) & (u <= (F)(job->columns - 3)) & (v >= (F)1) & (v <= (F)(job->rows - 2));
     const I column = AS(I, inside ? u + (F)0.5 : (F)1), row = AS(I, inside ? v + (F)0.5 : (F)1);
-    p->cell = ((row - 1) * (I)job->columns + column - 1) * PLANES;
-    spline(inside ? u - AS(F, column) : (F)0, p->along);
-    spline(inside ? v - AS(F, row) : (F)0, p->across);
-    p->plane = MIN(MAX((inverse - (F)(REAL)job->first_plane) * (F)(REAL)job->planes_per_inverse, (F)0), (F)(PLANES - 1));
+    const F last = (F)(REAL)(job->planes - 1);
+    const F plane = MIN(MAX((inverse - (F)(REAL)job->first_plane) * (F)(REAL)job->planes_per_inverse, (F)0), last);
+    const I farther = AS(I, MIN(plane, last - 1));
+    p->cell = (farther * (I)job->rows + row - 1) * (I)job->columns + column - 1;
+    p->along = inside ? u - AS(F, column) : (F)0;
+    const F offset = inside ? v - AS(F, row) : (F)0, before = (F)0.5 - offset, after = (F)0.5 + offset;
+    p->across[0] = before * before * (F)0.5;
+    p->across[1] = (F)0.75 - offset * offset;
+    p->across[2] = after * after * (F)0.5;
+    p->nearer = plane - AS(F, farther);
     p->weight = inside ? inverse * inverse : (F)0;
 }
 
-INLINE REAL sum_of(Cell cell) { return (cell.x + cell.y) + (cell.z + cell.w); }
+typedef REAL Cells __attribute__((ext_vector_type(4), aligned(sizeof(REAL)))); // neighbours in a row
 
-INLINE Cell shares_of_planes(REAL plane) {
-    const Cell number = {0, 1, 2, 3};
-    return MAX(1 - ABS(number - plane), (Cell)0);
+// Shares of three cells in a row, a quadratic B-spline, and 0 of a fourth.
+INLINE Cells shares(REAL offset) {
+    const Cells none = {0.125, 0.75, 0.125, 0}, once = {-0.5, 0, 0.5, 0}, twice = {0.5, -1, 0.5, 0};
+    return none + offset * (once + offset * twice);
 }
 
 INLINE F some(const REAL *numbers, int n) {
@@ -55,7 +54,7 @@ INLINE F some(const REAL *numbers, int n) {
 
 // Voxels to cells, or cells to voxels.
 INLINE void between(const DepthJob *job, const int gathers) {
-    const int64_t *n = job->volume.n, width = job->columns * PLANES;
+    const int64_t *n = job->volume.n, of_plane = job->rows * job->columns;
     F lane;
     EACH_LANE(i) lane[i] = i;
     for (int64_t x = job->first; x < job->last; x++) for (int64_t y = 0; y < n[1]; y++) {
@@ -63,6 +62,8 @@ INLINE void between(const DepthJob *job, const int gathers) {
         const REAL *passes = job->passes ? (const REAL *)job->passes + (x * n[1] + y) * n[2] : 0;
         double start[3];
         EACH_AXIS(a) start[a] = job->matrix[a][0] * x + job->matrix[a][1] * y + job->matrix[a][3];
+        const double end = start[2] + job->matrix[2][2] * (n[2] - 1), margin = 1e-4 * (job->farthest - job->nearest);
+        if (MAX(start[2], end) < job->nearest - margin || MIN(start[2], end) > job->farthest + margin) continue;
         for (int64_t z = 0; z < n[2]; z += LANES) {
             const int lanes = (int)MIN((int64_t)LANES, n[2] - z);
             const F f = gathers ? (F)0 : some(voxels + z, lanes);
@@ -73,28 +74,26 @@ INLINE void between(const DepthJob *job, const int gathers) {
             if (passes) p.weight *= some(passes + z, lanes);
             const F value = gathers ? p.weight : p.weight * f;
             // Each voxel's numbers by their addresses: an element of a vector in a register is dear.
-            const REAL *values = (const REAL *)&value, *planes = (const REAL *)&p.plane, *along = (const REAL *)p.along;
-            const REAL *across = (const REAL *)p.across;
+            const REAL *values = (const REAL *)&value, *nearer = (const REAL *)&p.nearer;
+            const REAL *along = (const REAL *)&p.along, *across = (const REAL *)p.across;
             const __typeof__(p.cell[0]) *first = (const void *)&p.cell;
             for (int i = 0; i < lanes; i++) {
                 if (values[i] == 0) continue;
-                REAL *cell = (REAL *)job->cells + first[i];
-                const Cell of_voxel = shares_of_planes(planes[i]) * values[i];
-                const Cell left = (Cell)along[i], middle = (Cell)along[LANES + i], right = (Cell)along[2 * LANES + i];
-                Cell sum = 0;
-                UNROLLED for (int a = 0; a < 3; a++, cell += width) {
-                    Cell *of = (Cell *)cell;
-                    const Cell share = (Cell)across[a * LANES + i];
-                    if (gathers) {
-                        sum += share * (left * of[0] + middle * of[1] + right * of[2]);
-                    } else {
-                        const Cell given = of_voxel * share;
-                        of[0] += given * left;
-                        of[1] += given * middle;
-                        of[2] += given * right;
+                const Cells row = shares(along[i]) * values[i];
+                REAL *cells = (REAL *)job->cells + first[i];
+                REAL of[2] = {1 - nearer[i], nearer[i]}, sum = 0;
+                UNROLLED for (int k = 0; k < 2; k++, cells += of_plane) {
+                    const Cells given = row * of[k];
+                    Cells taken = 0;
+                    UNROLLED for (int a = 0; a < 3; a++) {
+                        Cells *at = (Cells *)(cells + a * job->columns);
+                        const REAL share = across[a * LANES + i];
+                        if (gathers) taken += share * *at;
+                        else *at += share * given;
                     }
+                    if (gathers) taken *= given, sum += (taken.x + taken.y) + taken.z;
                 }
-                if (gathers) voxels[z + i] += sum_of(sum * of_voxel);
+                if (gathers) voxels[z + i] += sum;
             }
         }
     }
@@ -103,37 +102,112 @@ INLINE void between(const DepthJob *job, const int gathers) {
 void KERNEL(voxels_to_cells)(const DepthJob *job) { between(job, 0); }
 void KERNEL(cells_to_voxels)(const DepthJob *job) { between(job, 1); }
 
-// A pixel is a sum over the cells around its centre, row by row: the taps of all planes are one run of numbers, a multiple
-// of RUN long, and as many sums run side by side.
-typedef REAL Run __attribute__((ext_vector_type(RUN), aligned(sizeof(REAL))));
+// The sums below run side by side for neighbours in a row, up to `WIDE` vectors of them, and for `TALL` rows, so that what is read
+// counts for several.
+enum { WIDE = 5, TALL = LEVEL ? 2 : 1 };
+
+typedef REAL Run __attribute__((ext_vector_type(LANES), aligned(sizeof(REAL))));
+
+// sums += numbers, and those beside them, times taps of as many rows; the rows' taps lie `apart`.
+INLINE void add_tapped(F sums[TALL][WIDE], const int wide, const REAL *numbers, const REAL *taps, int64_t apart) {
+    REAL tap[TALL];
+    int any = 0;
+    UNROLLED for (int r = 0; r < TALL; r++) tap[r] = taps[r * apart], any |= tap[r] != 0;
+    if (!any) return; // the corners around a disc
+    UNROLLED for (int w = 0; w < wide; w++) {
+        const F some = *(const Run *)(numbers + w * LANES);
+        UNROLLED for (int r = 0; r < TALL; r++) sums[r][w] += tap[r] * some;
+    }
+}
+
+// target += the first `n` of a row of sums.
+INLINE void add_sums(REAL *target, const F sums[WIDE], int64_t n) {
+    const REAL *sum = (const REAL *)sums;
+    for (int64_t i = 0; i < n; i++) target[i] += sum[i];
+}
+
+// A row of cells has those with the same place in their pixel side by side, `together` of them.
+typedef struct {
+    const DepthJob *job;
+    const REAL *kernel;  // the taps of a plane
+    REAL *cells;         // of the plane
+    int64_t together;
+} Plane;
+
+INLINE Plane plane_of(const DepthJob *job, int64_t number) {
+    return (Plane){
+        job, (const REAL *)job->kernel + (number * (job->taps[0] + 2 * job->step[0]) + job->step[0]) * job->taps[1],
+        (REAL *)job->cells + number * job->rows * job->columns, job->columns / job->step[1],
+    };
+}
+
+// Pixels from (i, j) on: each is a sum over the cells from its first on.
+INLINE void sum_cells(const Plane *of, int64_t i, int64_t j, const int wide) {
+    const DepthJob *job = of->job;
+    const int64_t *taps = job->taps, *step = job->step, first = i * step[0];
+    const int64_t rows = MIN(taps[0] + (TALL - 1) * step[0], job->rows - first);
+    F sums[TALL][WIDE] = {0};
+    for (int64_t a = 0; a < rows; a++) for (int64_t place = 0; place < step[1]; place++) {
+        const REAL *cells = of->cells + (first + a) * job->columns + place * of->together + j;
+        const REAL *const row = of->kernel + a * taps[1];
+        for (int64_t b = place; b < taps[1]; b += step[1], cells++) add_tapped(sums, wide, cells, row + b, -step[0] * taps[1]);
+    }
+    for (int64_t r = 0; r < MIN((int64_t)TALL, job->pixels[0] - i); r++) {
+        add_sums((REAL *)job->image + (i + r) * job->row + j, sums[r], MIN(wide * (int64_t)LANES, job->pixels[1] - j));
+    }
+}
+
+// The adjoint: cells from row r on, at one place of pixels j on. Rows at the same place in their pixels are done together.
+INLINE void sum_pixels(const Plane *of, int64_t r, int64_t place, int64_t j, const int wide) {
+    const DepthJob *job = of->job;
+    const int64_t *taps = job->taps, *step = job->step;
+    const int64_t first = r < taps[0] ? 0 : (r - taps[0]) / step[0] + 1, last = MIN(job->pixels[0] - 1, r / step[0] + TALL - 1);
+    F sums[TALL][WIDE] = {0};
+    for (int64_t i = first; i <= last; i++) {
+        const REAL *pixels = (const REAL *)job->image + i * job->row + j;
+        const REAL *const row = of->kernel + (r - i * step[0]) * taps[1];
+        for (int64_t b = place; b < taps[1]; b += step[1], pixels--) add_tapped(sums, wide, pixels, row + b, step[0] * taps[1]);
+    }
+    for (int64_t t = 0; t < TALL && r + t * step[0] < job->rows; t++) {
+        REAL *const cells = of->cells + (r + t * step[0]) * job->columns + place * of->together + j;
+        add_sums(cells, sums[t], MIN(wide * (int64_t)LANES, of->together - j));
+    }
+}
+
+// DO(wide) for every `wide` vectors from j on, until n numbers of a row are done.
+#define EACH_RUN(j, n, DO)                                       \
+    for (int64_t j = 0, wide; j < n; j += wide * LANES) {        \
+        wide = MIN((n - j - 1) / (int64_t)LANES + 1, WIDE);      \
+        switch (wide) {                                          \
+        case 1: DO(1); break;                                    \
+        case 2: DO(2); break;                                    \
+        case 3: DO(3); break;                                    \
+        case 4: DO(4); break;                                    \
+        default: DO(5);                                          \
+        }                                                        \
+    }
 
 void KERNEL(cells_to_pixels)(const DepthJob *job) {
-    const int64_t run = job->taps[1] * PLANES, width = job->columns * PLANES;
-    for (int64_t i = 0; i < job->pixels[0]; i++) for (int64_t j = 0; j < job->pixels[1]; j++) {
-        const REAL *taps = job->kernel;
-        const REAL *cells = (const REAL *)job->cells + i * job->step[0] * width + j * job->step[1] * PLANES;
-        Run sums[2] = {0, 0}; // of even and odd rows: none waits for the other
-        for (int64_t a = 0; a < job->taps[0]; a++, taps += run, cells += width) {
-            Run sum = sums[a % 2];
-            for (int64_t b = 0; b < run; b += RUN) sum += *(const Run *)(taps + b) * *(const Run *)(cells + b);
-            sums[a % 2] = sum;
+    for (int64_t number = 0; number < job->planes; number++) {
+        const Plane plane = plane_of(job, number);
+        for (int64_t i = 0; i < job->pixels[0]; i += TALL) {
+#define SUM(wide) sum_cells(&plane, i, j, wide)
+            EACH_RUN(j, job->pixels[1], SUM);
+#undef SUM
         }
-        const Run sum = sums[0] + sums[1];
-        REAL total = 0;
-        UNROLLED for (int b = 0; b < RUN; b++) total += sum[b];
-        ((REAL *)job->image)[i * job->pixels[1] + j] = total;
     }
 }
 
 void KERNEL(pixels_to_cells)(const DepthJob *job) {
-    const int64_t run = job->taps[1] * PLANES, width = job->columns * PLANES;
-    for (int64_t i = 0; i < job->pixels[0]; i++) for (int64_t j = 0; j < job->pixels[1]; j++) {
-        const REAL *taps = job->kernel;
-        REAL *cells = (REAL *)job->cells + i * job->step[0] * width + j * job->step[1] * PLANES;
-        const REAL value = ((const REAL *)job->image)[i * job->pixels[1] + j];
-        if (value == 0) continue;
-        for (int64_t a = 0; a < job->taps[0]; a++, taps += run, cells += width) {
-            for (int64_t b = 0; b < run; b += RUN) *(Run *)(cells + b) += value * *(const Run *)(taps + b);
+    for (int64_t number = 0; number < job->planes; number++) {
+        const Plane plane = plane_of(job, number);
+        for (int64_t r = 0; r < job->rows; r++) {
+            if (r / job->step[0] % TALL) continue; // done with the row above
+            for (int64_t place = 0; place < job->step[1]; place++) {
+#define SUM(wide) sum_pixels(&plane, r, place, j, wide)
+                EACH_RUN(j, plane.together, SUM);
+#undef SUM
+            }
         }
     }
 }

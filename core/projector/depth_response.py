@@ -93,7 +93,7 @@ class DepthResponse:
 
 @dataclass(eq=False)
 class DepthResponses:
-    """`n` views of `pixels` (n_v, n_u) of volumes on a grid, each with a response for every zone of depth, made when first needed."""
+    """`n` views of `pixels` (n_v, n_u) of volumes on a grid, each with responses for its zones of depth, made on demand."""
 
     n: int
     pixels: tuple[int, int]
@@ -101,7 +101,7 @@ class DepthResponses:
     make: Callable[[int, float, float], DepthResponse]
     """Of a view and the far and near end of a zone, mm: its response."""
     zones: Callable[[int], tuple[Array, list[tuple[float, float]]]]
-    """Of a view: the row (4,) that gives the depth of a voxel (x, y, z, 1), and the ends of the zones, each from far to near."""
+    """Of a view: the row (4,) that gives a voxel's (x, y, z, 1) depth, and the ends of zones, each from far to near."""
     close: Callable[[int], tuple[tuple[slice, ...], Array] | None]
     """Of a view: voxels nearer than all zones, a box of the grid and which in it; None where none may be seen."""
     transmittance: Callable[[int, Any, Grid], Array]
@@ -114,9 +114,7 @@ class DepthResponses:
         self._passing: dict[int, tuple[Index, Array]] = {}
         self._room = _KEPT
 
-    def images(
-        self, volume: Array, functions: ModuleType, workers: int, mu: Volume | None = None
-    ) -> Iterator[Array]:
+    def images(self, volume: Array, functions: ModuleType, workers: int, mu: Volume | None = None) -> Iterator[Array]:
         """The images of `volume` one by one; `mu` may attenuate in place of the usual."""
         (filled,), origin = cropped(volume)
         filled = np.ascontiguousarray(filled)

@@ -41,7 +41,7 @@ _BOX_PER_SIGMA = math.sqrt(12)
 Edge = Literal["paix", "path"]
 Hole = Literal["auto", "depth", "rays", "point"]
 
-# Rays that are not told through how many points of the hole go through as many as keep a voxel's image this close to the whole hole's.
+# Rays that are not told how many points of the hole to pass keep a voxel's image this close to that of the whole hole.
 _APERTURE_TOLERANCE = 0.1
 
 
@@ -86,11 +86,11 @@ class Emission(Model):
         Largest relative error of the total counts of a single voxel in any module, wherever it lies between the rays: 2 %
         by default. Larger sources are more accurate.
     hole : str
-        ``"depth"``: the blur is that of the whole hole, without rays (`hole_response`). Every voxel's total is right to 0.1 %, and its
-        image within 1 % of the converged one, at any size of voxels. It takes no ``edge="path"`` or `depth_layers`, no grid that
-        comes close to a pinhole, and no backend cuda. ``"rays"``: through `aperture_points`. ``"point"``: through the hole's
-        middle, an ideal pinhole without blur. ``"auto"``: by depth wherever that can be, voxels close to a pinhole by rays;
-        by rays alone where depth cannot be, and where numbers of points are given.
+        ``"depth"``: the blur is that of the whole hole, without rays (`hole_response`). Every voxel's total is right to
+        0.1 %, and its image within 1 % of the converged one, at any size of voxels. It takes no ``edge="path"`` or
+        `depth_layers`, no grid that comes close to a pinhole, and no backend cuda. ``"rays"``: through `aperture_points`.
+        ``"point"``: through the hole's middle, an ideal pinhole without blur. ``"auto"``: by depth wherever that can be,
+        voxels close to a pinhole by rays; by rays alone where depth cannot be, and where numbers of points are given.
     aperture_points : int, optional
         Points of the hole's disk that rays pass, all with the same weight: the blur of a hole of diameter d_e.
         With 1 all rays pass the centre and there is no blur; otherwise at least 3. None: by `aperture_tolerance`.
@@ -233,7 +233,9 @@ class Emission(Model):
     def by_rays(self) -> Self:
         """The model for what can only be done with rays; `InputError` with hole "depth"."""
         if self.hole == "depth":
-            raise InputError("emission: hole 'depth' takes no backend 'cuda' and has no gradients by mu: use hole 'auto'")
+            raise InputError(
+                "emission: hole 'depth' takes no backend 'cuda' and has no gradients by mu: use hole 'auto'"
+            )
         return replace(self, hole="rays") if self.hole == "auto" else self
 
     def _set(self, name: str, value: Any) -> None:

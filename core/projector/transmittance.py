@@ -17,8 +17,8 @@ from .rays import Fan
 
 Array = NDArray[np.float64]
 
-# Rays across a voxel, where that is farthest and looks narrowest. Across a voxel of mu there are not fewer than its edges need, nor
-# more than they show.
+# Rays across a voxel, where that is farthest and looks narrowest. Across a voxel of mu there are not fewer than its edges
+# need, nor more than they show.
 _RAYS_ACROSS, _RAYS_ACROSS_MU = 4, (1.5, 6)
 # The rays' lattice is turned by this slope, along which no edges of voxels run: they meet the rays at many different places.
 _SLOPE = (math.sqrt(5) - 1) / 2
@@ -29,8 +29,8 @@ def mean_transmittance(
 ) -> NDArray[np.float32]:
     """The mean over each voxel of a `part` of `grid` of ``exp(-integral of mu)`` from there to the pinhole, ``part.shape``.
 
-    Of every ray through a voxel the mean over its chord is exact; that over the voxel is the mean over the rays that meet it, weighted
-    by their chords, up to 16 where it is farthest.
+    Of every ray through a voxel the mean over its chord is exact; that over the voxel is the mean over the rays that meet
+    it, weighted by their chords, up to 16 where it is farthest.
 
     Parameters
     ----------

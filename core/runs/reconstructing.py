@@ -184,8 +184,8 @@ def reconstruction_grid(run: ProjectionRun, recipe: Recipe) -> Grid:
 def model_of(run: ProjectionRun, recipe: Recipe) -> Recipe:
     """The recipe of the model that a reconstruction reckons with.
 
-    Of the hole's blur it is, unless `recipe` says which: that of the whole hole, where the run's counts have it; else that of
-    rays through as many points as the run has, but 7 at most.
+    Of the hole's blur it is, unless `recipe` says which: that of the whole hole, where the run's counts have it; else that
+    of rays through as many points as the run has, but 7 at most.
     """
     if recipe["model.kind"] != "emission":
         return recipe

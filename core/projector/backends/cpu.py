@@ -65,8 +65,9 @@ class _Job(Structure):
 class _DepthJob(Structure):
     _fields_ = [
         ("is_double", c_int64), ("volume", _Lattice), ("first", c_int64), ("last", c_int64), ("matrix", c_double * 12),
-        ("shift", c_double * 3), ("nearest", c_double), ("farthest", c_double), ("first_plane", c_double), ("planes_per_inverse", c_double), ("passes", c_void_p),
-        ("cells", c_void_p), ("planes", c_int64), ("rows", c_int64), ("columns", c_int64), ("kernel", c_void_p),
+        ("shift", c_double * 3), ("nearest", c_double), ("farthest", c_double), ("first_plane", c_double),
+        ("planes_per_inverse", c_double), ("passes", c_void_p), ("cells", c_void_p), ("planes", c_int64),
+        ("rows", c_int64), ("columns", c_int64), ("kernel", c_void_p),
         ("taps", c_int64 * 2), ("step", c_int64 * 2), ("image", c_void_p), ("row", c_int64), ("pixels", c_int64 * 2),
     ]  # fmt: skip
 

@@ -191,9 +191,7 @@ def _draw_plot(page: Page, plot: _Plot, frame: tuple[float, float, float, float]
     em, (left, top, width, height), (low, high) = page.em, frame, span
     first, last = float(plot.curves[0].x[0]), float(plot.curves[0].x[-1])
     page.line([*box(left, top, width, height), (left, top)], FAINT, 0.06 * em)
-    size = (
-        0.8 * em * min(1.0, width / letters.width(plot.title, 0.8 * em))
-    )  # a title that is too long is written smaller
+    size = 0.8 * em * min(1.0, width / letters.width(plot.title, 0.8 * em))  # smaller where the title is too long
     page.text(plot.title, left, top - 0.5 * em, size, INK)
     for value in ticks(low, high, max(2, int(height / (2.5 * em)))):
         y = top + height * (high - value) / (high - low)

@@ -1,10 +1,12 @@
 """Maximum likelihood by expectation maximisation: MLEM and OSEM."""
 
+import warnings
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..errors import InputWarning
 from ..memory import require
 from ..progress import Progress
 from ..projector import Projector
@@ -17,6 +19,8 @@ from .stopping import StoppingRule
 
 # Of the sensitivity: less than this share a prior leaves nowhere.
 _LEAST_SHARE = 0.1
+_TOO_LATE = 0.05
+"""Of the voxels: where a prior goes below that share in more, volumes swing from iteration to iteration."""
 
 
 def mlem(
@@ -129,16 +133,19 @@ def _em(loop: Loop, A: Projector, data: CountData, subsets: Any, prior: Prior | 
     penalty = penalty_of(prior, A.grid, visible)
     loop.values = np.where(visible, loop.values, np.float32(0))
     images: Array | None = None  # of the current volume, where they are known
+    too_late = 0.0  # largest share of the voxels in which the prior outweighs the counts
 
     def step(number: int, x: Array, progress: Progress | None) -> tuple[Array, float]:
-        nonlocal images
+        nonlocal images, too_late
         for k, s in enumerate(access_order(n)):
             part, own = parts[s]
             asked = waiting(progress, k, n)
             factor = part.T(own.ratio(part(x, asked) if images is None or n > 1 else images), asked)
             divisor = seen[s]
             if penalty is not None:
-                divisor = np.maximum(divisor + penalty.gradient(x) / n, _LEAST_SHARE * divisor)
+                late, least = divisor + penalty.gradient(x) / n, _LEAST_SHARE * divisor
+                too_late = max(too_late, float(np.mean((late < least)[visible])))
+                divisor = np.maximum(late, least)
             factor = np.divide(factor, divisor, out=np.ones_like(x), where=seen[s] > LEAST)
             x = np.multiply(x, factor, out=factor)
             if progress is not None:
@@ -151,7 +158,11 @@ def _em(loop: Loop, A: Projector, data: CountData, subsets: Any, prior: Prior | 
         likelihood = data.log_likelihood(images)
         return likelihood if penalty is None else likelihood - penalty.value(x)
 
-    return loop.run(step, {"subsets": n, **data.record(total, prior)}, objective)
+    result = loop.run(step, {"subsets": n, **data.record(total, prior)}, objective)
+    if too_late > _TOO_LATE:
+        text = f"prior: too strong for one step late in {too_late:.0%} of the voxels: take less weight, or bsrem"
+        warnings.warn(text, InputWarning, stacklevel=3)
+    return result
 
 
 def subsets_of(A: Projector, data: CountData, n: Any) -> list[tuple[Projector, CountData]]:

@@ -188,10 +188,12 @@ class Problem:
         measured: Array = real_array(plain(images), "images", A.shape_out, np.float32) - A.background.astype(np.float32)
         return cls(A, measured, np.ones(A.shape_in, np.float32) if mask is None else mask.astype(np.float32))
 
-    def record(self) -> dict[str, float]:
-        """For a reconstruction's settings: by what images and mask, in their order, are known again when it is resumed."""
-        sums = {"images": self.images.sum(axis=(1, 2), dtype=float), "mask": self.inside.sum(axis=(1, 2), dtype=float)}
-        return {name: float(of_each @ np.linspace(1.0, 2.0, len(of_each))) for name, of_each in sums.items()}
+    def record(self) -> dict[str, Any]:
+        """For a reconstruction's settings: by what model, views, images and mask are known again when it is resumed."""
+        all_of = {"views": self.A.views.projection_matrices(), "images": self.images, "mask": self.inside}
+        sums = {name: numbers.sum(axis=(1, 2), dtype=float) for name, numbers in all_of.items()}  # in their order
+        known = {name: float(of_each @ np.linspace(1.0, 2.0, len(of_each))) for name, of_each in sums.items()}
+        return {"model": self.A.model.name, **known}
 
     def forward(self, x: Array, progress: Progress | None) -> Array:
         """``A x``, float32."""

@@ -1,5 +1,6 @@
 """BSREM, and one-step-late priors: their optimum, found by others too."""
 
+import warnings
 from typing import NamedTuple
 
 import numpy as np
@@ -150,6 +151,17 @@ def test_a_uniform_volume_in_its_mask_stays_so_up_to_its_edge(even, prior, neigh
         more = {} if method is mph.mlem else {"subsets": 2}
         found = method(A, counts, rounds, prior=penalty, mask=mask, **more).volume.array
         assert np.abs(found[mask] / 10 - 1).max() < least and not found[~mask].any(), method.__name__
+
+
+@pytest.mark.parametrize("method", [mph.osem, mph.mlem])
+def test_a_prior_too_strong_for_one_step_late_is_said(even, method):
+    A, mask, counts = even
+    with pytest.warns(mph.InputWarning, match=r"^prior: too strong for one step late in \d+% of the voxels") as said:
+        found = method(A, counts, 20, prior=mph.Quadratic(3e4), mask=mask).volume.array
+    assert len(said) == 1 and np.ptp(found[mask]) > 20, "it is indeed not the volume, which is even"
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert np.ptp(method(A, counts, 8, prior=mph.Quadratic(50.0), mask=mask).volume.array[mask]) < 1
 
 
 @pytest.mark.parametrize("prior", [mph.Quadratic(30.0), mph.RelativeDifference(30.0), mph.TotalVariation(30.0)],

@@ -226,7 +226,12 @@ def test_other_images_views_or_masks_cannot_go_on_with_what_is_known_of_the_firs
     assert run(A, NOISY, iterations=1, start=half).iterations == 3
 
 
-def test_other_arguments_cannot_go_on_with_what_is_known_of_the_first():
+def test_other_arguments_cannot_go_on_with_what_is_known_of_the_first(scanner):
+    other_views = mph.Projector(A.grid, A.views[::-1])
+    system, grid, blank = scanner[:2], mph.Grid.centered((4, 4, 4), 20.0), np.ones((2, 5, 5), np.float32)
+    B, other_model = (
+        mph.Projector(grid, system.views((5, 5)), m) for m in (mph.Transmission(), mph.InverseSquareSum(system))
+    )
     for half, other, said in (
         (mph.sirt(A, NOISY, 2), lambda half: mph.sirt(A, NOISY, 1, 1.5, start=half), "relaxation 1.0, now 1.5"),
         (
@@ -235,6 +240,13 @@ def test_other_arguments_cannot_go_on_with_what_is_known_of_the_first():
             "nonnegative True, now False",
         ),
         (mph.tv(A, NOISY, 0.5, 2), lambda half: mph.tv(A, NOISY, 0.7, 1, start=half), "weight 0.5, now 0.7"),
+        (mph.sirt(A, NOISY, 2), lambda half: mph.sirt(other_views, NOISY, 1, start=half), "views "),
+        (mph.cgls(A, NOISY, 2), lambda half: mph.cgls(other_views, NOISY, 1, start=half), "views "),
+        (
+            mph.tv(B, blank, 0.5, 2),
+            lambda half: mph.tv(other_model, blank, 0.5, 1, start=half),
+            "model transmission, now",
+        ),
     ):
         with pytest.raises(mph.InputError, match=f"start: .*{re.escape(said)}.*give its volume"):
             other(half)

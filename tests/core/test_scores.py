@@ -255,7 +255,7 @@ def test_what_cannot_be_scored_is_nan_and_says_why(truth):
     assert np.isnan(coarse[2].resolved) and not np.isnan(coarse[0].resolved)
     cut = mph.Volume(truth.array[:, :60], mph.Grid((120, 60, 20), truth.grid.affine))  # the half at -y
     notes = [sector.note for sector in mph.derenzo_score(cut, PHANTOM)]
-    assert notes[0] == "" and notes[3] == "6 of 6 rods lie outside the volume"
+    assert notes[0] == "" and notes[3] == "the volume covers 0 of 6 rods"
     single = mph.DerenzoPhantom(17.0, (6, 0, 0, 0, 0, 2), 10.0)
     assert (
         mph.derenzo_score(uniform(1.0, mph.Grid.centered(36, 1.0)), single)[0].note == "a single rod has no neighbour"

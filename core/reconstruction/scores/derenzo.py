@@ -222,7 +222,7 @@ class _Sector:
         ends /= np.where(np.abs(along) < 1e-9, 1e-9, along)
         enter, leave = ends.min(axis=0).max(axis=1), ends.max(axis=0).min(axis=1)  # where the rods' endless axes do so
         if (beside := enter > leave).any():
-            return 0.0, 0.0, f"{beside.sum()} of {len(beside)} rods lie outside the volume"
+            return 0.0, 0.0, f"the volume covers {(~beside).sum()} of {len(beside)} rods"
         height, diameter = self.rods.height, self.rods.rod_diameters[self.sector] * (1 - 1e-6)
         low, high = max(float(enter.max()), -height / 2), min(float(leave.min()), height / 2)
         if high - low < min(diameter, height):

@@ -312,7 +312,7 @@ def before_render(scene: bpy.types.Scene, *_: Any) -> None:
 def _say_what_is_unseen() -> float | None:
     if jobs.is_running() or bpy.app.is_job_running("RENDER"):
         return _REST
-    scene, missing, collection = bpy.context.scene, storage.missing_volumes(), scanner.active_scanner(bpy.context.scene)
+    scene, missing = bpy.context.scene, storage.missing_volumes()
     for item in (item for item in volumes.volume_objects(scene) if item.visible_get()):
         look, why = item.mphdrr_volume, ""
         known = item.data.filepath, look.look, look.display_low, look.display_high
@@ -320,10 +320,12 @@ def _say_what_is_unseen() -> float | None:
             why = ": it is hidden in renders"
         elif item.data in missing:
             why = ": its files are missing"
-        elif collection is not None and scene.render.engine == "CYCLES" and known not in _drawn:
+        elif scene.render.engine == "CYCLES" and known not in _drawn:
+            reach = max((item.matrix_world @ Vector(corner)).length for corner in item.bound_box) + 1.0
+            sizes = reach / np.array([50, 10, 10, 50, 1])  # of a small module behind it, as seen
             with recorded_warnings() as said:
-                subject, near = Subject(scanner.read_scanner(collection)[:1]), Studio(volume=True, near=True)
-                list(rendering(Page(_SMALL, _SMALL), subject, near, item, False, 1))
+                subject = Subject(PinholeSystem(-2 * reach * np.array([_DIRECTION]), *sizes))
+                list(rendering(Page(_SMALL, _SMALL), subject, Studio(volume=True, near=True), item, False, 1))
             why = _UNSEEN if any(_UNSEEN in text for text in said) else ""
             _drawn.update([] if why else [known])
         if why:

@@ -99,10 +99,8 @@ def _warn_if_reversed(A: Projector, system: PinholeSystem, data: CountData) -> N
     for data in (CountData(part.counts, everywhere), CountData(part.counts[::-1], everywhere)):
         likelihoods.append(data.log_likelihood(B(even / seen * B.T(data.ratio(B(even))))))
     if (gain := likelihoods[1] - likelihoods[0]) > max(_SURE, _SURE_SHARE * total):
-        said = f"log-likelihood {gain:.4g} higher, {total:.4g} counts of {len(chosen)} modules"
-        warn(
-            f"counts: likelier of the modules in reversed order ({said}): are counts and modules in the same order?", 4
-        )
+        said = f"(log-likelihood {gain:.4g} higher, {total:.4g} counts of {len(chosen)} modules)"
+        warn(f"counts: likelier of the modules in reversed order {said}: are both in the same order?", 4)
 
 
 def _require_none_below_0(numbers: Array, name: str) -> None:

@@ -85,12 +85,11 @@ def counts_run(
         no counts.
     """
     instance(system, PinholeSystem, "counts: system")
-    array = np.asarray(counts)
+    array = real_numbers(counts, "counts")
     if array.ndim != 3 or not array.size or array.dtype.kind not in "fiu":
         raise InputError(
             f"counts: expected numbers (frames, rows, columns), got {array.dtype} {shape_text(array.shape)}"
         )
-    real_numbers(counts, "counts")  # none masked
     found = np.asanyarray(counts).view(Counts)
     require_told(frames, orientation, time, found)
     numbers = frame_numbers(frames, len(array), system)
@@ -260,9 +259,8 @@ def _warn_of_others(found: Counts, used: list[int], words: list[str], run: Proje
         said = "exposures" if len(times) > 1 else "an exposure"
         warn(f"{found.name}: the file says {said} of {_and(times)} s; taken as {time:g} s, as given")
     if len(windows := np.unique(found.about[used, 3])) > 1 and np.isfinite(windows).all():
-        warn(
-            f"{found.name}: frames of the energy windows {_and(windows)} are used; say none of those that are not meant"
-        )
+        said = f"{found.name}: frames of the energy windows {_and(windows)} are used"
+        warn(f"{said}; say none (--frames) for those that are not meant")
     steps = np.linalg.norm([run.views.u_steps, run.views.v_steps], axis=2) / run.settings["magnification"]
     for k, along_u, along_v in zip(used, *steps, strict=True):
         size, own = found.about[k, 1:3], (along_u, along_v)

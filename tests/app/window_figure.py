@@ -3,8 +3,10 @@
 Arguments after ``--``: the workbook, the folder for the results and the file for what was seen.
 """
 
+import io
 import json
 import sys
+import time
 import traceback
 from pathlib import Path
 
@@ -15,6 +17,8 @@ bpy.context.preferences.view.show_splash = False
 seen: dict[str, object] = {"ok": False, "ticks": 0}
 view = bpy.context.preferences.view
 FIGURES = ["cut-away", "sums"]
+_WAIT = 20.0  # s that what is said after a render may take
+rendered = 0.0
 
 
 def start() -> None:
@@ -29,14 +33,27 @@ def start() -> None:
         )  # fmt: skip
 
 
+def render() -> None:
+    """Blender's own Render, as F12 starts it; what is said goes to standard error, which is kept."""
+    global rendered
+    rendered, sys.stderr, scene = time.monotonic(), io.StringIO(), bpy.context.scene
+    scene.render.engine, scene.cycles.samples = "CYCLES", 1
+    scene.render.resolution_x = scene.render.resolution_y = 32
+    scene.camera = next(item for item in scene.objects if item.type == "CAMERA")
+    bpy.ops.render.render("INVOKE_DEFAULT")
+
+
 def step() -> float | None:
     try:
         if len(bpy.context.window_manager.windows[0].modal_operators) or bpy.app.is_job_running("RENDER"):
             seen["ticks"] += 1
         elif FIGURES:
             start()
-        else:
-            seen.update(ok=True, scenes=len(bpy.data.scenes), display=[before, view.render_display_type])
+        elif not rendered:
+            seen.update(scenes=len(bpy.data.scenes), display=[before, view.render_display_type])
+            render()
+        elif sys.stderr.getvalue() or time.monotonic() > rendered + _WAIT:
+            seen.update(ok=True, said=sys.stderr.getvalue())
     except Exception:
         seen["error"] = traceback.format_exc()
     result_file.write_text(json.dumps(seen))

@@ -245,9 +245,19 @@ def test_render_says_which_volumes_of_the_view_it_lacks(small_render, capfd, mon
 
 
 @pytest.mark.long
-def test_render_says_what_cycles_does_not_draw(small_render, capfd):
+@pytest.mark.parametrize("has_scanner", [True, False])
+def test_render_says_what_cycles_does_not_draw(small_render, capfd, has_scanner):
+    """Also of a volume far off, and in a scene without a scanner."""
     (item,) = volumes.volume_objects(small_render)
+    if not has_scanner:
+        small_render.camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
+        small_render.collection.objects.link(small_render.camera)
+        small_render.collection.children.unlink(scanner.active_scanner(small_render))
+        item.location = (250.0, -300.0, 120.0)
+        bpy.context.view_layer.update()
+    figures._drawn.clear()
     assert rendered(small_render, capfd) == ""
+    assert figures._drawn, "it was tried"
     item.mphdrr_volume.display_high = 9e9
     item.mphdrr_volume.display_low = 8e9
     assert "Low and High draw none of its values" in rendered(small_render, capfd)

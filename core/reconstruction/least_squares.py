@@ -16,6 +16,8 @@ from .stopping import StoppingRule
 
 _LEAN = 0.05
 """Cosine between a gradient of CGLS and its first, 0 in exact numbers: below it volumes are within 1e-3 of theirs."""
+_DONE = 1e-6
+"""Of the first gradient: what is left of it at the least squares in single precision."""
 _LEANS = "CGLS: from iteration {} on rounding puts its volumes up to a few percent beside those of exact numbers"
 
 
@@ -165,7 +167,9 @@ def cgls(
             after = _squares(gradient)
             direction = gradient + (after / before).astype(np.float32) * direction
             loop.state |= {"residual": residual, "direction": direction, "gradient": after}
-            if float(np.vdot(first, gradient)) ** 2 > _LEAN**2 * after * _squares(first):
+            first_squares = _squares(first)
+            leans = float(np.vdot(first, gradient)) ** 2 > _LEAN**2 * after * first_squares
+            if leans and after > _DONE**2 * first_squares:
                 loop.state["first"] = np.zeros_like(first)  # it is said once
                 warn(_LEANS.format(number + 1), 2)
         said(progress)

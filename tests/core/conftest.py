@@ -73,8 +73,12 @@ def general_grid(rng: np.random.Generator, shape: tuple[int, int, int]) -> Grid:
 
 
 def emission(system: PinholeSystem, mu: Volume | None = None, **options: Any) -> Emission:
-    """Emission with one ray to each pixel's centre, for laws of single rays; without the warning that these are too few."""
-    return Emission(system, mu, **({"pixel_points": 1, "tolerance": 1e9} | options))
+    """Emission with one ray to each pixel's centre, for laws of single rays; without the warning that these are too few.
+
+    Through the middle of the hole, if nothing is said of the hole.
+    """
+    said = {"hole", "aperture_points", "aperture_tolerance"} & set(options)
+    return Emission(system, mu, **({"pixel_points": 1, "tolerance": 1e9, "hole": "rays" if said else "point"} | options))
 
 
 def same_matter(grid: Grid, mu: np.ndarray) -> list[Volume]:

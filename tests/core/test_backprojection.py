@@ -271,9 +271,9 @@ def derenzo_scores(system, pixels, spacing, ways=WAYS) -> dict[tuple[str, str], 
     phantom = mph.DerenzoPhantom(40, (8, 6, 5, 4, 3, 2), 40, 100)
     grid, views = mph.Grid.centered((84, 84, 42), 1.0), system.views((pixels, pixels))
     truth = phantom.voxelize(mph.Grid.centered(np.rint(np.array([84, 84, 42]) / spacing), spacing))
-    ideal = mph.Emission(system, pixel_points=1, tolerance=1e9)
+    ideal = mph.Emission(system, hole="point", pixel_points=1, tolerance=1e9)
     scores = {}
-    for hole, model in (("ideal", ideal), ("real", mph.Emission(system, hole="depth"))):
+    for hole, model in (("ideal", ideal), ("real", mph.Emission(system))):
         counts = mph.Projector(truth.grid, views, model)(truth)
         settings = {"recipe": {"model": {"kind": "emission"}}}
         images = mph.run_line_integrals(mph.ProjectionRun(counts, system, views, unit="counts", settings=settings))

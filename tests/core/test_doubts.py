@@ -18,7 +18,7 @@ from .conftest import EVENT_RECIPE, WORKBOOK
 from .small_events import small_recipe
 
 GRID = mph.Grid.centered(8, 12.0)
-USUAL = {"pixel_points": 1, "tolerance": 1e9}
+USUAL = {"hole": "point", "pixel_points": 1, "tolerance": 1e9}
 
 
 def warned(call) -> list[str]:

@@ -23,18 +23,21 @@ from .shapes import Shape
 
 Points = NDArray[np.float64]
 Floats = NDArray[np.float32]
+Indices = NDArray[np.int64]
 
 # Points of one call of a shape's `distance`: few enough that its temporaries stay in the processor's cache.
 _BLOCK = 1 << 15
 _MIN_SAMPLES, _MAX_SAMPLES = 128, 1 << 13  # of a voxel that a surface cuts
+_CELLS = 64  # of a voxel that is longer than wide, unless fewer are about cubes
 _SEQUENCE = 1 << 16  # points that voxels take their samples from, each another stretch, so that their errors cancel
 # Over several values beneath, few voxels get more samples: about so many altogether.
 _SAMPLES_OF_MIXED = 1 << 21
-# A shape with parts smaller than a voxel that touches at most `_FEW` voxels is sampled in its own box.
+# A shape that fills no voxel and touches at most `_FEW` of them is sampled in its own box.
 _FEW = 1 << 11
 _SAMPLES_OF_FEW = 1 << 10  # per voxel
 _BOX_BLOCK = 1 << 13  # points at a time
 _SAMPLES_OF_OVERLAP = 1 << 18
+_ROUNDING = 1e-6  # of a voxel
 _RAYS, _PARTS = 1 << 14, 256  # at a time; fewer rays where a shape has more parts
 
 
@@ -159,18 +162,21 @@ def paint_voxels(
     """The mean of the painting over each voxel, float32 array of the grid's shape.
 
     A voxel farther from a surface than its own half diagonal lies inside or outside as a whole. Of the others, the share
-    that a shape covers is counted at points of a low-discrepancy sequence; the shares are then corrected so that the total
-    change is the known one. For a shape that is small beside the voxels, the points fill the shape instead.
+    that a shape covers is counted at points of a low-discrepancy sequence, in long voxels cell by cell; the shares are then
+    corrected so that the total change is the known one. For a shape that is small beside the voxels, the points fill the
+    shape instead.
 
     `layers` run from bottom to top; `changes` are those of `mean_changes`; `progress` is called with (done, total).
     """
     require(5.0 * grid.n_voxels, "a volume of {} x {} x {} voxels".format(*grid.shape))
     image = np.zeros(grid.shape, np.float32)
-    strokes = [_Stroke(grid, *each) for each in zip(layers, _seen_beneath(layers), changes, strict=True)]
-    total, done = sum(stroke.steps for stroke in strokes), 0
+    painted = zip(layers, _seen_beneath(layers), changes, strict=True)
+    strokes = [stroke for each in painted if (stroke := _Stroke(grid, *each)).blocks]
+    total, done = sum(len(stroke.blocks) for stroke in strokes), 0
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         for stroke in strokes:
-            for _ in stroke.paint(image, pool):
+            box = image[tuple(map(slice, stroke.start, stroke.stop))]
+            for _ in (stroke.paint_points if stroke.is_small else stroke.paint_cells)(box, pool):
                 done += 1
                 if progress is not None:
                     progress(done, total)
@@ -191,60 +197,57 @@ class _Stroke:
         # Bounds of the indices of the shape's points: the tighter of its box and its ball.
         index_from_shape = np.linalg.inv(shape_from_index)
         linear, middle = index_from_shape[:3, :3], index_from_shape[:3, 3]
-        of_box = np.abs(linear) @ np.array(shape.half_box)
-        half = np.minimum(of_box, np.linalg.norm(linear, axis=1) * shape.ball_radius)
+        half = np.minimum(np.abs(linear) @ shape.half_box, np.linalg.norm(linear, axis=1) * shape.ball_radius)
         low, high = middle - half, middle + half
         # Clipped as floats: a far-away box must not overflow the integers.
         self.start = np.clip(np.floor(low + 0.5), 0, grid.shape).astype(np.int64)
         self.stop = np.clip(np.floor(high + 0.5) + 1, self.start, grid.shape).astype(np.int64)
-        self.in_grid = bool(np.all(low >= -0.5) and np.all(high <= np.array(grid.shape) - 0.5))
+        n_voxels = int(np.prod(self.stop - self.start))
+        self.in_grid = bool(np.all(np.maximum(-0.5 - low, high + 0.5 - grid.shape) < _ROUNDING))
         self.in_voxels = shape.volume / abs(float(np.linalg.det(shape_from_index[:3, :3])))  # the shape's volume
-        edge = float(np.linalg.norm(shape_from_index[:3, :3], axis=0).max())
-        touched = float(np.prod(2 * np.array(shape.half_box) / edge + 1))
-        self.is_small = shape.finest < edge and touched < _FEW
+        narrowest = 1 / float(np.linalg.norm(linear, axis=1).max())  # of the voxels' widths
+        # The voxels in the shape's box or, where it lies across them, cubes of that width in it.
+        touched = float(min(np.prod(2 * half + 1), np.prod(2 * np.array(shape.half_box) / narrowest + 1)))
+        fills_none = self.in_voxels < 1 or 2 * min(shape.half_box) < narrowest
+        self.is_small = fills_none and touched < _FEW
         # What the shape covers is mixed unless one layer surely lies beneath all of it.
         is_mixed = len(beneath) > 1 or (len(beneath) == 1 and beneath[0].relation(layer) != 1)
         if self.is_small:
             points = _SAMPLES_OF_FEW * max(touched, 8.0)
-            if is_mixed:
+            if is_mixed or not self.in_grid:
                 points = max(points, min(8 * points, _SAMPLES_OF_MIXED))
-            self.n_blocks = int(np.ceil(points / _BOX_BLOCK))
-        else:
-            samples = 4 * _MIN_SAMPLES * edge / shape.finest
-            if is_mixed:
-                samples = max(samples, _SAMPLES_OF_MIXED / touched)
-            if not self.in_grid:
-                # No known total corrects the shares c. With n samples their errors are about n^(-2/3) / 2. A surface below
-                # 6 V / s, s being the smallest part, cuts some 9 V / (s h^2) voxels of h^3: this n keeps the sum of
-                # their random errors below 1/5000 of V.
-                samples = max(samples, (7500 * edge**2 / float(np.sqrt(shape.finest * shape.volume))) ** 1.5)
-            self.n_samples = int(np.clip(samples, _MIN_SAMPLES, _MAX_SAMPLES))
+            self.blocks = range(0, int(points) if n_voxels else 0, _BOX_BLOCK)
+            return
+        self.blocks = range(0, n_voxels, min(max(n_voxels >> 6, 1 << 10), _BLOCK))
+        # A long voxel is halved and halved again, until its cells are about cubes, or many and finer than the shape.
+        edges, self.levels = np.linalg.norm(shape_from_index[:3, :3], axis=0), [np.ones(3, np.int64)]
+        while (cell := edges / (parts := self.levels[-1])).max() > 2 * cell.min() and (
+            cell.max() > shape.finest / 2 or parts.prod() < _CELLS
+        ):
+            self.levels.append(parts * np.where(cell > cell.max() / 2, 2, 1))
+        n_cells, ratio = int(parts.prod()), float(cell.max()) / shape.finest
+        # The errors of a voxel's cells cancel.
+        samples = _MIN_SAMPLES * max(1.0, 4 * ratio) / min(n_cells, 4 * _CELLS) ** 0.5
+        if is_mixed or n_cells > 1:
+            samples = max(samples, _SAMPLES_OF_MIXED / (touched * n_cells))
+        if not self.in_grid:
+            # No known total corrects the shares c. With n samples their errors are about n^(-2/3) / 2. A surface below
+            # 6 V / s, s being the smallest part, cuts some 9 V h / (s v) cells of the volume v and the length h: this n
+            # keeps the sum of their random errors below 1/5000 of V.
+            samples = max(samples, (7500 * float(np.sqrt(ratio / (self.in_voxels * n_cells)))) ** 1.5)
+        self.n_samples = int(min(samples, _MAX_SAMPLES))
 
-    @property
-    def steps(self) -> int:
-        """How many times `paint` yields."""
-        if np.any(self.stop <= self.start):
-            return 0
-        return self.n_blocks if self.is_small else int(self.stop[0] - self.start[0])
-
-    def paint(self, image: Floats, pool: ThreadPoolExecutor) -> Iterator[None]:
-        """Change `image`, step by step."""
-        if not self.steps:
-            return iter(())
-        box = image[tuple(map(slice, self.start, self.stop))]
-        return self._paint_small(box, pool) if self.is_small else self._paint_voxels(box, pool)
-
-    def _paint_small(self, box: Floats, pool: ThreadPoolExecutor) -> Iterator[None]:
+    def paint_points(self, box: Floats, pool: ThreadPoolExecutor) -> Iterator[None]:
         """Points of the shape, each with an equal share of its volume, are added to the voxels that they fall into."""
         total, hits = np.zeros(box.shape), 0
         index_from_shape = np.linalg.inv(self.grid.affine) @ self.layer.pose
 
-        def sample(block: int) -> tuple[NDArray[np.int64], Points]:
-            points = _shape_points(self.layer.shape, block * _BOX_BLOCK)
+        def sample(first: int) -> tuple[Indices, Points]:
+            points = _shape_points(self.layer.shape, first)
             change = self.layer.value - values_at(self.beneath, _moved(self.layer.pose, points))
             return np.rint(_moved(index_from_shape, points)).astype(np.int64), change
 
-        for index, change in pool.map(sample, range(self.n_blocks)):
+        for index, change in pool.map(sample, self.blocks):
             hits += len(change)
             index -= self.start[:, None]
             held = np.all((index >= 0) & (index < np.array(total.shape)[:, None]), axis=0)
@@ -252,88 +255,105 @@ class _Stroke:
             yield
         box += total * (self.in_voxels / max(hits, 1))
 
-    def _paint_voxels(self, box: Floats, pool: ThreadPoolExecutor) -> Iterator[None]:
+    def paint_cells(self, box: Floats, pool: ThreadPoolExecutor) -> Iterator[None]:
         """Voxels inside the shape are filled; those that its surface cuts are sampled."""
         stretches = max(1, _SEQUENCE // self.n_samples)
         offsets = (_r3_sequence(stretches * self.n_samples) - 0.5).reshape(3, stretches, self.n_samples)
-        own, *lower = (_Sampled(layer, self.grid, offsets) for layer in (self.layer, *self.beneath))
+        layers = [_Sampled(layer, self.grid, self.levels, offsets) for layer in (self.layer, *self.beneath)]
 
-        def fill(slab: int) -> tuple[float, list[tuple[NDArray[np.int64], Floats, Floats]]]:
-            of_whole, cuts, values = 0.0, [], box[slab].ravel()
-            for first in range(0, values.size, _BLOCK):
-                number = slab * values.size + np.arange(first, min(first + _BLOCK, values.size))
-                index = np.stack(np.unravel_index(number, box.shape)) + self.start[:, None]
-                whole, cut = own.sort(index)
-                block = values[first : first + _BLOCK]
-                painted = self.layer.over(block[whole])
-                of_whole += float(np.sum(painted - block[whole], dtype=np.float64))
-                block[whole] = painted
-                cuts.append((number[cut], *_coverage(index[:, cut], own, lower)))
-            box[slab] = values.reshape(box[slab].shape)
-            return of_whole, cuts
+        def fill(first: int) -> tuple[Indices, Floats]:
+            number = np.arange(first, min(first + self.blocks.step, box.size))
+            place = np.stack(np.unravel_index(number, box.shape))
+            index = place + self.start[:, None]
+            side = layers[0].sort(index, 0)
+            whole, cut = tuple(place[:, side > 0]), np.flatnonzero(side == 0)
+            box[whole] = self.layer.over(box[whole])
+            changes = np.zeros((2, len(cut)), np.float32)
+            _add_changes(changes, np.arange(len(cut)), index[:, cut], 0, layers)
+            return number[cut], changes
 
-        missing, cuts = self.mean_change * self.in_voxels, []
-        for of_whole, of_slab in pool.map(fill, range(len(box))):
-            missing -= of_whole
-            cuts += of_slab
+        missing, cuts = self.mean_change * self.in_voxels + float(box.sum(dtype=np.float64)), []
+        for of_block in pool.map(fill, self.blocks):
+            cuts.append(of_block)
             yield
-        cut, coverage, change = map(np.concatenate, zip(*cuts, strict=True))
+        cut, (change, uncertain) = (np.concatenate(parts, axis=-1) for parts in zip(*cuts, strict=True))
         if self.in_grid:
             # What is missing goes to where the shares c are uncertain, as c (1 - c): so they stay between 0 and 1.
-            missing -= float(change.sum(dtype=np.float64))
-            uncertain = float(np.sum(np.abs(change) * (1 - coverage), dtype=np.float64))
-            factor = 1 + np.float32(missing / uncertain if uncertain else 0.0) * np.sign(change) * (1 - coverage)
-            change *= np.clip(factor, 0, 1 / np.maximum(coverage, np.float32(1e-6)))
+            missing -= float(box.sum(dtype=np.float64) + change.sum(dtype=np.float64))
+            spread = max(float(uncertain.sum(dtype=np.float64)), 1e-300)
+            change += np.float32(np.clip(missing / spread, -1, 1)) * uncertain
         box[np.unravel_index(cut, box.shape)] += change
 
 
 class _Sampled:
-    """A layer's shape and sample points of voxels."""
+    """A layer's shape, and voxels cut into cells, so many (3,) along each axis at each of the `levels`."""
 
-    def __init__(self, layer: Layer, grid: Grid, offsets: Points) -> None:
-        """Of points at `offsets` (3, stretches, n), in voxels, from the voxels' centres."""
+    def __init__(self, layer: Layer, grid: Grid, levels: Sequence[Indices], offsets: Points) -> None:
+        """The last level's cells are sampled at `offsets` (3, stretches, n), in cells, from their centres."""
         shape_from_index = layer.from_world @ grid.affine
-        self.layer = layer
-        self._linear, self._origin = shape_from_index[:3, :3], shape_from_index[:3, 3:]
-        self.n_samples = offsets.shape[2]
-        self._offsets = np.tensordot(self._linear, offsets, 1).astype(np.float32)
-        # The distance of a voxel's farthest corner from its centre, over the four diagonals of a parallelepiped.
-        signs = np.array([[1, 1, 1], [1, 1, -1], [1, -1, 1], [-1, 1, 1]])
-        self._half_diagonal = 0.5 * np.linalg.norm(signs @ self._linear.T, axis=1).max() * (1 + 1e-5)
+        linear, origin = shape_from_index[:3, :3], shape_from_index[:3, 3:]
+        self.layer, self.levels, self.n_samples = layer, levels, offsets.shape[2]
+        self._offsets = np.tensordot(linear / levels[-1], offsets, 1).astype(np.float32)
+        self._cells = [(linear / parts, origin + linear @ (0.5 / parts - 0.5)[:, None]) for parts in levels]
+        # The distance of a cell's farthest corner from its centre, over the four diagonals of a parallelepiped.
+        corners = 0.5 * (1 + 1e-5) * np.array([[1, 1, 1, -1], [1, 1, -1, 1], [1, -1, 1, 1]])
+        self._half_diagonals = [np.linalg.norm(edges @ corners, axis=0).max() for edges, _ in self._cells]
 
-    def sort(self, index: NDArray[np.int64]) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
-        """Which voxels (3, n) are inside, (n,), and the numbers of those that the surface may cut."""
-        distance = self.layer.shape.distance(self._centers(index))
-        return distance < -self._half_diagonal, np.flatnonzero(np.abs(distance) <= self._half_diagonal)
+    def sort(self, index: Indices, level: int) -> NDArray[np.int8]:
+        """1 for the cells (3, n) inside, -1 for those outside, 0 for those that the surface may cut, (n,)."""
+        distance, half = self.layer.shape.distance(self._centers(index, level)), self._half_diagonals[level]
+        return np.subtract(distance < -half, distance > half, dtype=np.int8)
 
-    def inside(self, index: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Which points of voxels (3, n) are inside, (n, samples)."""
+    def inside(self, index: Indices) -> NDArray[np.bool_]:
+        """Which points of the last level's cells (3, n) are inside, (n, samples)."""
         # The factors are primes that seldom divide the number of stretches: neighbours along any axis take different ones.
         stretch = (np.array([1, 53, 211]) @ index) % self._offsets.shape[1]
-        points = self._centers(index)[:, :, None] + self._offsets[:, stretch]
+        points = self._centers(index, -1)[:, :, None] + self._offsets[:, stretch]
         return (self.layer.shape.distance(points.reshape(3, -1)) < 0).reshape(points.shape[1:])
 
-    def _centers(self, index: NDArray[np.int64]) -> Floats:
-        return (self._linear @ index + self._origin).astype(np.float32)
+    def paint(self, values: Floats, index: Indices, level: int) -> None:
+        """Paint the layer over the `values` (n, points) of cells; its surface may cut those of the last level only."""
+        side = self.sort(index, level)
+        whole, cut = side > 0, np.flatnonzero(side == 0)
+        values[whole] = self.layer.over(values[whole])
+        if len(cut):
+            values[cut] = np.where(self.inside(index[:, cut]), self.layer.over(values[cut]), values[cut])
+
+    def _centers(self, index: Indices, level: int) -> Floats:
+        edges, first = self._cells[level]
+        return (edges @ index + first).astype(np.float32)
 
 
-def _coverage(index: NDArray[np.int64], own: _Sampled, lower: Sequence[_Sampled]) -> tuple[Floats, Floats]:
-    """For voxels (3, n): the share that the shape covers, and the change of the mean that painting it makes."""
-    coverage, change = np.empty((2, index.shape[1]), np.float32)
-    step = max(1, _BLOCK // own.n_samples)
-    for first in range(0, index.shape[1], step):
-        some = slice(first, first + step)
-        inside = own.inside(index[:, some])
+def _add_changes(changes: Floats, voxel: Indices, index: Indices, level: int, layers: Sequence[_Sampled]) -> None:
+    """Add what painting the first layer over the others changes in cells (3, n) of a level that their surfaces may cut.
+
+    `voxel` (n,) are the columns of `changes` to add to: the change of the voxel's mean, and how much of it is uncertain.
+    """
+    own, *lower = layers
+    finer = min(level + 1, len(own.levels) - 1)
+    factor = own.levels[finer] // own.levels[level]
+    places = np.indices(tuple(factor.tolist())).reshape(3, 1, -1)
+    step = max(1, _BLOCK // (own.n_samples if finer == level else places.shape[2]))
+    for first in range(0, len(voxel), step):
+        cells, of = index[:, first : first + step], voxel[first : first + step]
+        if finer == level:
+            inside = own.inside(cells)
+        else:
+            cells = (cells[:, :, None] * factor[:, None, None] + places).reshape(3, -1)
+            of = np.repeat(of, places.shape[2])
+            sides = np.stack([layer.sort(cells, finer) for layer in layers])
+            whole = sides.all(axis=0)
+            cut, whole = ~whole & (sides[0] >= 0), whole & (sides[0] > 0)
+            _add_changes(changes, of[cut], cells[:, cut], finer, layers)
+            cells, of, inside = cells[:, whole], of[whole], np.ones((np.count_nonzero(whole), 1), bool)
         beneath = np.zeros(inside.shape, np.float32)
         for layer in lower:
-            filled, crossed = layer.sort(index[:, some])
-            beneath[filled] = layer.layer.over(beneath[filled])
-            if len(crossed):
-                within = layer.inside(index[:, some][:, crossed])
-                beneath[crossed] = np.where(within, layer.layer.over(beneath[crossed]), beneath[crossed])
-        coverage[some] = inside.mean(axis=1)
-        change[some] = np.where(inside, np.float32(own.layer.value) - beneath, 0).mean(axis=1)
-    return coverage, change
+            layer.paint(beneath, cells, finer)
+        change = np.where(inside, np.float32(own.layer.value) - beneath, 0).mean(axis=1)
+        change /= np.float32(own.levels[finer].prod())
+        np.add.at(changes[0], of, change)
+        # A share c is uncertain as c (1 - c).
+        np.add.at(changes[1], of, np.abs(change) * (1 - inside.mean(axis=1, dtype=np.float32)))
 
 
 def line_integrals(layers: Sequence[Layer], starts: Points, ends: Points) -> Points:

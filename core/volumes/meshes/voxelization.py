@@ -24,7 +24,6 @@ from ..volume import Volume
 from .mesh import Mesh, as_mesh, require_closed
 
 _VOXELS, _POLYGONS = 1 << 21, 1 << 14  # at once
-_FEWEST = 16  # voxels across a mesh
 # Where a mesh intersects itself: rays for all of it, their largest distance in voxels, and pairs of triangle and ray to
 # test at once.
 _RAYS, _STEP, _CANDIDATES = 1 << 18, 0.25, 1 << 20
@@ -76,7 +75,7 @@ def mesh_coverage(mesh: Mesh, grid: Grid, progress: Progress | None = None) -> N
     """Share of each voxel that lies inside a closed mesh, 0 to 1, float32 array of the grid's shape.
 
     Where the mesh intersects itself, everything that any part of it encloses is inside; there the shares are approximate,
-    their sum to about 1/10000.
+    their sum to about 1/10000, in long voxels to 1/1000.
     """
     require_closed(mesh)
     coverage = np.zeros(grid.shape, np.float32)
@@ -94,18 +93,20 @@ def mesh_coverage(mesh: Mesh, grid: Grid, progress: Progress | None = None) -> N
     in_front = _clip(surface[surface[:, :, 2].min(axis=1) < 0], 2, 0, -1)
     in_front[:, :, 2] = 0
     surface = _seen(_joined([in_front, _slab(surface, 2, 0, n_z)]))
-    finer = -(-_FEWEST // max(box.shape))  # smaller voxels, so that overlaps also show in few, large voxels
-    step = min(math.sqrt(n_x * n_y / _RAYS), _STEP)
-    thickness = max(1, min(_VOXELS // (n_y * n_z * finer**3), int(_RAYS * step**2 / n_y)))
+    # A voxel's mean does not tell the winding numbers 0 and 2, or -1 and 1, from 1 and 0: rays through the whole box do.
+    is_mixed = _along_rays((corners - start) / [n_x, n_y, 1], (1, 1, 1), (_STEP / 32, _STEP / 32))[1].any()
+    # Rays for the shares there: their area in columns, and their distance along x, in proportion to the box if possible.
+    area = min(n_x * n_y / _RAYS, _STEP**2)
+    step = min(max(math.sqrt(area * n_x / n_y), area / _STEP), _STEP)
+    thickness = max(1, min(_VOXELS // (n_y * n_z), int(_RAYS * area / n_y)))
     low, high = surface[:, :, 0].min(axis=1), surface[:, :, 0].max(axis=1)
     for first in range(0, n_x, thickness):
         last = min(first + thickness, n_x)
         n = last - first
         pieces = _slab(surface[(low < last) & (high > first)], 0, first, last) - [first, 0, 0]
-        winding = np.abs(_winding(pieces * finer, (n * finer, n_y * finer, n_z * finer)))
-        covered = np.minimum(winding, 1).reshape(n, finer, n_y, finer, n_z, finer).mean(axis=(1, 3, 5))
-        if winding.max() > 1 + _ROUNDING:
-            by_rays, overlap = _along_rays(pieces, (n, n_y, n_z), step)
+        covered = np.abs(_winding(pieces, (n, n_y, n_z)))
+        if is_mixed or covered.max() > 1 + _ROUNDING:
+            by_rays, overlap = _along_rays(pieces, (n, n_y, n_z), (step, area / step))
             covered[overlap] = by_rays[overlap]
         box[first:last] = np.where(covered < _ROUNDING, 0, np.where(covered > 1 - _ROUNDING, 1, covered))
         if progress is not None:
@@ -114,16 +115,16 @@ def mesh_coverage(mesh: Mesh, grid: Grid, progress: Progress | None = None) -> N
 
 
 def _along_rays(
-    surface: NDArray[np.float64], shape: tuple[int, int, int], step: float
+    surface: NDArray[np.float64], shape: tuple[int, int, int], step: tuple[float, float]
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """The shares of voxels inside the surface of polygons (N, V, 3), from rays along z that are `step` voxels apart.
+    """The shares of voxels inside the surface of polygons (N, V, 3), from rays along z, `step` voxels apart in x and y.
 
-    Also the columns of voxels (n_x, n_y) in which the winding number exceeds 1.
+    Also the columns of voxels (n_x, n_y) in which there are winding numbers other than 0 and 1, or 0 and -1.
     """
     n_x, n_y, n_z = shape
-    # A square lattice whose rows follow no axis, so that walls along the voxels are met at many different places.
+    # A lattice whose rows follow no axis, so that walls along the voxels are met at many different places.
     slope = (math.sqrt(5) - 1) / 2
-    lattice = step / math.hypot(1, slope) * np.array([[1, slope], [-slope, 1]])  # its two steps, in voxels
+    lattice = np.array([[1, slope], [-slope, 1]]) / math.hypot(1, slope) * step  # its two steps, in voxels
     corners = np.array([[0, 0], [n_x, 0], [0, n_y], [n_x, n_y]]) @ np.linalg.inv(lattice)
     start = np.floor(corners.min(axis=0)).astype(np.int64)
     size = np.ceil(corners.max(axis=0)).astype(np.int64) + 1 - start
@@ -146,8 +147,11 @@ def _along_rays(
     np.add.at(steps, place, own)
     np.add.at(steps, place + 1, enters - own)
     covered = np.cumsum(steps.reshape(n_x, n_y, n_z + 1), axis=2)[:, :, :n_z] / n_rays
-    overlap = np.bincount(column[ray], np.abs(after) > 1, n_x * n_y).reshape(n_x, n_y) > 0
-    return covered, overlap
+    numbers = after * (np.diff(z, append=0) > _ROUNDING)  # not where one part ends and the next begins
+    lowest, highest = np.zeros((2, n_x * n_y), np.int64)
+    np.minimum.at(lowest, column[ray], numbers)
+    np.maximum.at(highest, column[ray], numbers)
+    return covered, (highest - lowest).reshape(n_x, n_y) > 1
 
 
 def _crossings(

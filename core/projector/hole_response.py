@@ -91,12 +91,16 @@ def hole_response(
     # A photon's direction, on which its counts depend, lies between that of the voxel and that of the pixel as seen from
     # the hole's middle, l / (l + h) of the way: so the factors of either are powers that are 1 together.
     share = l / (l + 2 / (1 / near + 1 / far))
-    kernel = _kernel(d, l * inverses, np.stack(shadows), np.abs(pitches), steps, 1.5 * share * (1 - share) / l**2)
-    # In all, a voxel counts (1 + t^2)^(-3/2) / h^2, t being its slope. The mean of this over hole and voxel differs to
-    # second order from what the powers are at their middles, by this times (1 + t^2)^-2.
+    bend = 1.5 * share * (1 - share)
+    kernel = _kernel(d, l * inverses, np.stack(shadows), np.abs(pitches), steps, bend / l**2)
+    # In all, a voxel counts (1 + t^2)^(-3/2) / h^2, t being its slope. The mean of this over the hole, and to second order
+    # that over the voxel, differ from what the powers make of it, by this share times (1 + t^2)^-2.
+    holes = (np.arange(16)[:, None] + 0.5) / 16 * (d / 2) ** 2  # squared distances from its middle, of equal areas
+    shadow = holes * (1 / l + inverses) ** 2
+    made = np.average((1 + shadow) ** (-1.5 * share), 0, 1 + bend * shadow)
     of_u, of_v, of_k = np.square(edges).sum(axis=1) / 12
-    spread = (d / 4 * (1 / l + inverses)) ** 2 + (of_u + of_v) / 2 * inverses**2
-    second = 3 * (share * spread + (of_k - (of_u + of_v) / 2 - d**2 / 16) * inverses**2)
+    of_voxel = 3 * (of_k - (1 - share) / 2 * (of_u + of_v)) * inverses**2
+    second = ((1 + holes * inverses**2) ** -1.5).mean(axis=0) / made - 1 + of_voxel
     kernel *= (1 + second - second.mean())[:, None, None]
     margin = kernel.shape[1] // 2, kernel.shape[2] // 2
     matrix = np.empty((3, 4))

@@ -78,7 +78,9 @@ def emission(system: PinholeSystem, mu: Volume | None = None, **options: Any) ->
     Through the middle of the hole, if nothing is said of the hole.
     """
     said = {"hole", "aperture_points", "aperture_tolerance"} & set(options)
-    return Emission(system, mu, **({"pixel_points": 1, "tolerance": 1e9, "hole": "rays" if said else "point"} | options))
+    return Emission(
+        system, mu, **({"pixel_points": 1, "tolerance": 1e9, "hole": "rays" if said else "point"} | options)
+    )
 
 
 def same_matter(grid: Grid, mu: np.ndarray) -> list[Volume]:

@@ -46,6 +46,7 @@ kind = "transmission"
 [models.emission]
 kind = "emission"
 time = 100
+hole = "point"
 pixel_points = 1
 tolerance = 1e6
 background = 0.25

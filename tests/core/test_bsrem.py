@@ -135,7 +135,9 @@ def even(scanner):
     system = scanner[::8]
     grid = mph.Grid.centered((12, 11, 10), (14.0, 14.0, 30.0))
     with pytest.warns(mph.InputWarning):
-        A = mph.Projector(grid, system.views((16, 16), "real"), mph.Emission(system, time=3e5, hole="point", pixel_points=4))
+        A = mph.Projector(
+            grid, system.views((16, 16), "real"), mph.Emission(system, time=3e5, hole="point", pixel_points=4)
+        )
     x, y, z = grid.affine[:3, 3, None, None, None] + np.indices(grid.shape) * grid.spacing[:, None, None, None]
     mask = (x - 5) ** 2 + (y + 7) ** 2 + z**2 < 62**2
     return A, mask, A(10.0 * mask)

@@ -38,7 +38,7 @@ def test_the_derenzo_template_is_the_users_event():
     assert recipe.grid.shape == (256, 256, 256)
     np.testing.assert_allclose(recipe.grid.spacing, 1.0)
     assert recipe.radon is not None and recipe.radon.counts == (96, 256)
-    assert list(recipe.models) == ["emission"] and recipe.models["emission"]["model.aperture_points"] == 7
+    assert list(recipe.models) == ["emission"] and recipe.models["emission"]["model.hole"] == "auto"
     maker = mph.events.EventMaker(recipe)
     assert (len(maker.system), maker.views.shape) == (80, (256, 256))
 

@@ -11,8 +11,10 @@ import pytest
 import mphdrr.core as mph
 
 from .conftest import BACKENDS, WORKBOOK, general_grid, refused
+from .test_batch_axes import check_batch
 from .test_emission import assert_adjoint, assert_real_is_virtual, sensitivity
 from .test_projector import rotation
+from .test_volume_formats import CHEST
 
 SYSTEM = mph.read_system(WORKBOOK)[[0, 47]]
 
@@ -34,13 +36,13 @@ def disc_up_to(x, y):
     return np.where(y >= 0, 2 * under(x) + math.pi / 2 - segment, segment) / math.pi
 
 
-def exact_image(system, pixels, edges, at):
+def exact_image(system, pixels, edges, at, work):
     """The image of a voxel in module 0, all of it on the crystal: the discs of its points, as pixels cut them."""
     (u, v, k), l = system.frames()[0], float(system.collimator_length[0])
     d, pitch = float(system.pinhole_diameter[0]), float(system.detector_side[0]) / pixels
     from_hole = at - system.centers[0]
     wide = int(d * (1 + l / (from_hole @ k - np.abs(edges).sum() / 2)) / pitch) + 2  # pixels around a disc
-    n = int(np.clip(8e7 / wide**2, 400, 100_000))
+    n = int(np.clip(work / wide**2, 400, 100_000))
     points = (
         (0.5 + np.arange(n)[:, None] * [0.8191725134, 0.6710436067, 0.5497004779]) % 1 - 0.5
     ) @ edges.T + from_hole
@@ -66,14 +68,14 @@ def exact_image(system, pixels, edges, at):
     return image[wide:-wide, wide:-wide] * d**2 / 16 * abs(np.linalg.det(edges)) / n
 
 
-def errors_of_voxels(rng, size, pixels, hole, near=False, voxels=2):
+def errors_of_voxels(rng, size, pixels, hole, near=False, voxels=1, depth=80, work=6e6):
     """Share of counts misplaced, and of the total, of single voxels anywhere in a grid that is seen aslant or straight.
 
-    With `near`, the grid is as close to the pinhole as "depth" takes it.
+    The grid is 50 mm wide, or `depth` voxels. With `near`, it is as close to the pinhole as "depth" takes it.
     """
     system = mph.read_system(WORKBOOK)[[int(rng.integers(80))]]
     system = dataclasses.replace(system, pinhole_diameter=hole)
-    n = 2 * round(25 / size) + 1
+    n = 2 * round(min(25 / size, depth / 2)) + 1
     turn = rotation(rng) if rng.random() < 0.6 else np.eye(3)
     affine, (u, v, k) = np.eye(4), system.frames()[0]
     affine[:3, :3] = turn * size
@@ -94,17 +96,16 @@ def errors_of_voxels(rng, size, pixels, hole, near=False, voxels=2):
             continue
         x = np.zeros(A.shape_in, np.float32)
         x[tuple(index)] = 1
-        exact = exact_image(system, pixels, A.grid.affine[:3, :3], at + system.centers[0])
+        exact = exact_image(system, pixels, A.grid.affine[:3, :3], at + system.centers[0], work)
         image = A(x)[0]
         assert image.min() >= 0
         found.append((np.abs(image - exact).sum() / exact.sum(), abs(image.sum() / exact.sum() - 1)))
     return found
 
 
-SIZES = [  # of a voxel, mm; pixels along the crystal's side; of the hole, mm
-    (0.2, 512, 0.2), (0.2, 32, 12.0), (0.3, 256, 2.3), (0.5, 64, 5.0), (0.8, 256, 7.0), (1.3, 64, 12.0), (2.1, 512, 1.1),
-    (3.4, 32, 0.6), (4.4, 64, 2.3), (6.0, 128, 0.3), (6.0, 256, 12.0),
-]  # fmt: skip
+# Of a voxel, mm; pixels along the crystal's side; of the hole, mm.
+SIZES = [(0.2, 32, 12.0), (0.4, 256, 2.3), (0.8, 128, 6.0), (3.4, 32, 0.6), (4.4, 64, 2.3), (6.0, 128, 0.3)]
+NEAR = [(0.3, 32, 11.0), (0.5, 64, 5.0), (2.1, 128, 0.9)]
 
 
 def assert_right(errors):
@@ -114,11 +115,11 @@ def assert_right(errors):
 
 
 def test_voxels_of_any_size_have_the_whole_holes_image(rng):
-    assert_right([error for sizes in SIZES for error in errors_of_voxels(rng, *sizes, voxels=1)])
+    assert_right([error for sizes in SIZES for error in errors_of_voxels(rng, *sizes)])
 
 
 def test_so_they_have_as_near_to_the_pinhole_as_it_goes(rng):
-    assert_right([error for sizes in SIZES[2::3] for error in errors_of_voxels(rng, *sizes, near=True)])
+    assert_right([error for sizes in NEAR for error in errors_of_voxels(rng, *sizes, near=True)])
 
 
 @pytest.mark.long
@@ -128,7 +129,7 @@ def test_many_voxels_have_the_whole_holes_image(near, rng):
         size, hole = np.exp(rng.uniform(*np.log([[0.2, 0.2], [6, 12]]))).tolist()
         return size, int(rng.choice([32, 64, 128, 256, 512])), hole
 
-    assert_right([error for _ in range(40) for error in errors_of_voxels(rng, *any_sizes(), near)])
+    assert_right([error for _ in range(40) for error in errors_of_voxels(rng, *any_sizes(), near, 2, 400, 8e7)])
 
 
 def test_blurred_by_the_crystal_it_is_within_one_per_cent(rng):
@@ -222,9 +223,143 @@ def centres(grid):
     return np.moveaxis(np.indices(grid.shape), 0, -1) @ grid.affine[:3, :3].T + grid.affine[:3, 3]
 
 
-def test_grids_near_the_pinhole_and_other_attenuation_are_refused():
+def test_grids_near_the_pinhole_are_refused():
     A = depth_projector(mph.Grid.centered((4, 4, 4), 90.0), 8)
-    refused(lambda: A(np.ones(A.shape_in)), "take a smaller grid")
-    mu = mph.Volume(np.zeros((4, 4, 4)), mph.Grid.centered((4, 4, 4), 10.0), "mu")
-    A = depth_projector(mu.grid, 8, mu=mu)
-    refused(lambda: A(np.ones(A.shape_in), mu=mu.array), "that of the model alone")
+    refused(lambda: A(np.ones(A.shape_in)), "take a smaller grid", "hole 'auto' or 'rays'")
+
+
+def test_so_near_to_a_pinhole_rays_take_over(rng):
+    """A grid around pinholes: what "auto" leaves to rays has their images, and the adjoint is exact."""
+    affine = np.eye(4)
+    affine[:3, :3] = 8 * rotation(rng)
+    affine[:3, 3] = 0.8 * SYSTEM.centers[0] - affine[:3, :3] @ np.array([12, 11, 10])
+    grid = mph.Grid((25, 23, 21), affine)
+    views = SYSTEM.views((24, 20))
+    mu = mph.Volume(np.where(rng.random(grid.shape) < 0.5, 0.01, 0.0), grid, "mu")
+    A = mph.Projector(grid, views, mph.Emission(SYSTEM, mu, intrinsic_fwhm=1.0))
+    assert_adjoint(A, rng)
+    rays = mph.Projector(grid, views, mph.Emission(SYSTEM, mu, hole="rays", aperture_points=19, pixel_points=9,
+                                                   tolerance=1e9, intrinsic_fwhm=1.0))  # fmt: skip
+    x = rng.random(grid.shape) * (np.linalg.norm(centres(grid) - SYSTEM.centers[0], axis=-1) < 60)
+    found, expected = A(x)[0], rays(x)[0]
+    assert expected.sum() > 0
+    assert np.abs(found - expected).sum() < 0.03 * expected.sum()
+
+
+@pytest.mark.parametrize("backend", [b for b in BACKENDS if b in ("cpu", "numpy")])
+def test_attenuation_given_in_the_call_is_that_of_the_model(backend, rng):
+    grid, own = general_grid(rng, (9, 8, 7)), general_grid(rng, (5, 4, 6))
+    mu, other = (mph.Volume(rng.uniform(0, 0.05, own.shape), own, "mu") for _ in range(2))
+    A, expected = (depth_projector(grid, 12, backend, mu=each) for each in (mu, other))
+    x, y = rng.random(grid.shape), rng.random(A.shape_out)
+    assert np.abs(A(x) - expected(x)).max() > 1e-3 * expected(x).max()
+    np.testing.assert_array_equal(A(x, mu=other.array), expected(x))
+    np.testing.assert_array_equal(A(x), A(x, mu=mu.array))
+    torch = pytest.importorskip("torch")
+    x = torch.tensor(x, requires_grad=True)
+    (A(x, mu=torch.tensor(other.array)) * torch.tensor(y)).sum().backward()
+    np.testing.assert_allclose(x.grad, expected.T(y), rtol=1e-6)
+
+
+def test_gradients_by_attenuation_are_those_of_rays(rng):
+    torch = pytest.importorskip("torch")
+    grid = mph.Grid.centered((5, 5, 5), 8.0)
+    mu = mph.Volume(np.full(grid.shape, 0.01), grid, "mu")
+    views, given = SYSTEM.views((6, 6)), torch.full(grid.shape, 0.02, requires_grad=True)
+    A, rays = (mph.Projector(grid, views, mph.Emission(SYSTEM, mu, hole=hole)) for hole in ("auto", "rays"))
+    (by_auto,), (by_rays,) = (
+        torch.autograd.grad(each(torch.ones(grid.shape), mu=given).sum(), given) for each in (A, rays)
+    )
+    torch.testing.assert_close(by_auto, by_rays)
+    refused(
+        lambda: depth_projector(grid, 6, mu=mu)(torch.ones(grid.shape), mu=given), "no gradients by mu", "hole 'auto'"
+    )
+
+
+def test_a_batch_is_each_alone(rng):
+    grid = mph.Grid.centered((9, 8, 7), 6.0)
+    mu = mph.Volume(rng.uniform(0, 0.02, grid.shape), grid, "mu")
+    check_batch(depth_projector(grid, 10, mu=mu), rng, (2,))
+
+
+def test_a_part_of_a_volume_has_its_part_of_the_images(rng):
+    """What is empty is left out, and changes nothing, whatever was projected before."""
+    grid = general_grid(rng, (30, 28, 26))
+    mu = mph.Volume(rng.uniform(0, 0.02, grid.shape), grid, "mu")
+    x, parts = rng.random(grid.shape), np.zeros((2, *grid.shape))
+    parts[0, 7:19, :, 5:9], parts[1] = x[7:19, :, 5:9], x
+    parts[1, 7:19, :, 5:9] = 0
+    A = depth_projector(grid, 20, mu=mu)
+    small, rest, whole = A(parts[0]), A(parts[1]), A(x)
+    np.testing.assert_allclose(small + rest, whole, rtol=1e-4, atol=2e-6 * whole.max())
+    np.testing.assert_array_equal(depth_projector(grid, 20, mu=mu)(parts[0]), small)
+
+
+@pytest.mark.parametrize("changes", [
+    {"edge": "path", "aperture_mu": 3.0, "aperture_points": 4}, {"crystal_mu": 0.2, "depth_layers": 2}, {"pixel_points": 4},
+    {"aperture_points": 5}, {"aperture_tolerance": 0.3}, {"edge": "path", "aperture_mu": 3.0},
+])  # fmt: skip
+def test_by_itself_it_takes_rays_where_depth_cannot_be_and_where_they_are_asked_for(changes, rng):
+    grid, views = mph.Grid.centered((6, 6, 6), 8.0), SYSTEM.views((8, 8))
+    x, common = rng.random(grid.shape), {"tolerance": 1e9, **changes}
+    found, rays = (
+        mph.Projector(grid, views, mph.Emission(SYSTEM, hole=hole, **common))(x) for hole in ("auto", "rays")
+    )
+    np.testing.assert_array_equal(found, rays)
+
+
+def test_a_hole_is_a_hole_unless_a_point_is_asked_for(rng):
+    grid, views = mph.Grid.centered((6, 6, 6), 4.0), SYSTEM.views((64, 64))
+    x = np.zeros(grid.shape)
+    x[3, 3, 3] = 1
+    plain, depth, point = (mph.Projector(grid, views, mph.Emission(SYSTEM, **hole))(x)
+                           for hole in ({}, {"hole": "depth"}, {"hole": "point"}))  # fmt: skip
+    np.testing.assert_array_equal(plain, depth)
+    assert plain.max() < 0.6 * point.max()
+    assert plain.sum() == pytest.approx(point.sum(), rel=0.02)
+    refused(lambda: mph.Emission(SYSTEM, hole="point", aperture_points=7), "hole 'point' takes no points")
+
+
+def transmitted(mu, edges, at, m, n=40_000):
+    """The mean of exp(-integral of mu) of straight photons from anywhere in a voxel through anywhere in the hole."""
+    u, v, _ = SYSTEM.frames()[m]
+    sequence = (0.5 + np.arange(n)[:, None] / 1.1673039782614187 ** np.arange(1, 6)) % 1  # R5 of M. Roberts
+    points = (sequence[:, :3] - 0.5) @ edges.T + at
+    radius, angle = SYSTEM.pinhole_diameter[m] / 2 * np.sqrt(sequence[:, 3]), 2 * np.pi * sequence[:, 4]
+    hole = SYSTEM.centers[m] + np.outer(radius * np.cos(angle), u) + np.outer(radius * np.sin(angle), v)
+    return float(np.exp(-mph.trace_rays(mu, hole, points).astype(float)).mean())
+
+
+def worst_share_off(mu, grid, region, rng, n):
+    """The largest relative error of what is left of photons from `n` voxels of a region."""
+    views, errors = SYSTEM.views((64, 64)), []
+    attenuated, free = (mph.Projector(grid, views, mph.Emission(SYSTEM, each)) for each in (mu, None))
+    for index in rng.permutation(np.argwhere(region))[:n]:
+        x = np.zeros(grid.shape, np.float32)
+        x[tuple(index)] = 1
+        left = attenuated(x).sum(axis=(1, 2), dtype=float) / free(x).sum(axis=(1, 2), dtype=float)
+        at = grid.affine[:3, :3] @ index + grid.affine[:3, 3]
+        errors += [abs(left[m] / transmitted(mu, grid.affine[:3, :3], at, m) - 1) for m in range(len(SYSTEM))]
+    return max(errors)
+
+
+@pytest.mark.parametrize(("coefficient", "size", "voxel"), [(0.028, 2.0, 3.0), (0.06, 1.0, 4.0), (0.06, 2.0, 2.0)])
+def test_attenuation_of_a_thin_shell_beside_air_is_within_one_per_cent(coefficient, size, voxel, rng):
+    spheres = [mph.Sphere(radius=radius, mu=value) for radius, value in ((40, coefficient), (36, 0))]
+    shapes = [mph.Cylinder(radius=70, height=140, mu=0.0154), *spheres]
+    mu = mph.ShapePhantom(shapes).voxelize(mph.Grid.centered(round(150 / size), size), quantity="mu")
+    grid = mph.Grid.centered(round(100 / voxel), voxel, (0.3, 0.4, -0.2))
+    radius = np.linalg.norm(centres(grid), axis=-1)
+    assert worst_share_off(mu, grid, (radius > 30) & (radius < 44), rng, 15) < 0.01
+
+
+@pytest.mark.long
+def test_attenuation_of_a_chest_is_within_one_per_cent(rng):
+    if not CHEST.exists():
+        pytest.skip("no chest CT")
+    mu = mph.hu_to_mu(mph.read_volume(CHEST))
+    affine = mu.grid.affine.copy()
+    affine[:3, 3] -= mu.grid.center
+    grid = mph.Grid(mu.grid.shape, affine)
+    middle = np.linalg.norm(centres(grid), axis=-1) < 75
+    assert worst_share_off(mph.Volume(mu.array, grid, "mu"), grid, middle, rng, 40) < 0.01

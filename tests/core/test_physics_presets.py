@@ -35,13 +35,11 @@ def counts(recipe: Recipe, system: mph.PinholeSystem) -> float:
 def test_a_preset_is_the_model_of_its_materials(system, name):
     model = recipe_model(Recipe().updated(PRESETS[name].changes), system)
     if name == "ideal":
-        expected = mph.Emission(system)
+        expected = mph.Emission(system, hole="point")
     else:
         isotope, aperture, crystal = PRESETS[name].label.split(", ")
         walls = {"within_cone": True, "within_walls": True, "within_crystal": True}
-        expected = mph.Emission(
-            system, isotope=isotope, aperture_mu=aperture.lower(), crystal_mu=crystal, aperture_points=7, **walls
-        )
+        expected = mph.Emission(system, isotope=isotope, aperture_mu=aperture.lower(), crystal_mu=crystal, **walls)
     assert model.record() == expected.record()
 
 
@@ -63,7 +61,7 @@ def test_a_preset_leaves_the_acquisition_alone_and_takes_other_physics_away(syst
     assert (after["model.isotope"], after["model.window"], after["model.depth_layers"]) == ("Tc-99m", None, 1)
     ideal = before.updated(PRESETS["ideal"].changes)
     assert {key for key in ideal.given if key.startswith("model.")} == {
-        "model.kind", "model.time", "model.pixel_points", "model.tolerance",
+        "model.kind", "model.time", "model.hole", "model.pixel_points", "model.tolerance",
     }  # fmt: skip
 
 
@@ -146,9 +144,20 @@ def test_the_command_takes_a_preset_beside_every_hole(hole, tmp_path):
 def test_recipes_that_say_defaults_without_an_effect_are_read(system, tmp_path):
     """As runs of earlier versions have recorded them."""
     tables = {"model": {"kind": "emission", "hole": "depth", "aperture_points": 1, "edge": "paix", "depth_layers": 1}}
-    recipe = recipe_of_tables(tables)
-    assert recipe["model.hole"] == "depth" and recipe_model(recipe, system).hole == "depth"
-    with pytest.raises(
-        mph.InputError, match=r"model.aperture_points \(--aperture-points\) does not go with model.hole"
-    ):
-        recipe_of_tables({"model": tables["model"] | {"aperture_points": 7}})
+    for points in (1, 7):
+        tables["model"]["aperture_points"] = points
+        recipe = recipe_of_tables(tables, recorded=True)
+        assert recipe["model.hole"] == "depth" and recipe_model(recipe, system).hole == "depth"
+        with pytest.raises(
+            mph.InputError, match=r"model.aperture_points \(--aperture-points\) needs model.hole = rays"
+        ):
+            recipe_of_tables(tables)
+
+
+def test_recipes_of_before_that_have_numbers_of_rays_mean_rays(system):
+    """Nothing was said of the hole: its blur was that of so many points."""
+    for name, value in {"aperture_points": 7, "aperture_tolerance": 0.2, "pixel_points": 3, "tolerance": 0.1}.items():
+        recipe = Recipe({"model.kind": "emission", f"model.{name}": value})
+        assert recipe["model.hole"] == "rays" and recipe_model(recipe, system).hole == "rays"
+    assert Recipe({"model.kind": "emission"})["model.hole"] == "auto"
+    assert Recipe({"model.pixel_points": 3})["model.kind"] == "transmission"

@@ -29,7 +29,8 @@ def law(system, grid):
 
 
 def totals(grid, n, backend="auto", **options):
-    A = mph.Projector(grid, MODULES.views((n, n), "real"), mph.Emission(MODULES, **options), backend)
+    hole = "rays" if "aperture_points" in options else "point"
+    A = mph.Projector(grid, MODULES.views((n, n), "real"), mph.Emission(MODULES, hole=hole, **options), backend)
     return A(np.ones(grid.shape)).sum(axis=(1, 2), dtype=float)
 
 
@@ -64,7 +65,7 @@ def test_a_voxel_of_a_large_grid_counts_by_the_point_law(rng):
         volume = np.zeros(grid.shape)
         volume[tuple(index)] = 1
         place = grid.affine[:3, :3] @ index + grid.affine[:3, 3]
-        A = mph.Projector(grid, MODULES.views((64, 64), "real"), mph.Emission(MODULES))
+        A = mph.Projector(grid, MODULES.views((64, 64), "real"), mph.Emission(MODULES, hole="point"))
         expected = law(MODULES, mph.Grid.centered(1, 1.5, place))
         np.testing.assert_allclose(A(volume).sum(axis=(1, 2), dtype=float), expected, rtol=0.02)
         # The adjoint of ones is the voxel's sensitivity, without gaps.
@@ -84,13 +85,13 @@ def test_too_few_points_are_warned_of_with_the_error_that_they_make(options):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         mph.Projector(mph.Grid.centered(1, 2.0), views, mph.Emission(MODULES, tolerance=10.0, **options))
-        mph.Projector(mph.Grid.centered(1, 2.0), views, mph.Emission(MODULES))
+        mph.Projector(mph.Grid.centered(1, 2.0), views, mph.Emission(MODULES, hole="rays"))
         mph.Projector(mph.Grid.centered(1, 40.0), views, mph.Emission(MODULES, pixel_points=1))
 
 
 def test_what_no_number_of_points_can_do_is_said():
     with pytest.warns(InputWarning, match="smaller pixels"):
-        mph.Projector(mph.Grid.centered(1, 0.05), MODULES.views((8, 8), "real"), mph.Emission(MODULES))
+        mph.Projector(mph.Grid.centered(1, 0.05), MODULES.views((8, 8), "real"), mph.Emission(MODULES, hole="point"))
 
 
 @pytest.mark.parametrize("hole_points", [1, 5])

@@ -200,7 +200,9 @@ def test_runs_of_version_0_1_0_open(suffix, tmp_path, capsys):
     assert run.projections.shape == (2, 6, 8) and run.unit == "counts" and run.seed == 7
     assert list(run.system.numbers) == [1, 41] and run.volume.array.shape == (10, 10, 10)
     assert run.settings["phantom"]["kind"] == "derenzo" and run.settings["euler_degrees"] == [10, 20, 30]
-    model = mph.Emission(run.system, isotope="Tc-99m", aperture_mu="tungsten", time=600, hole="point", pixel_points=21, tolerance=9)
+    model = mph.Emission(
+        run.system, isotope="Tc-99m", aperture_mu="tungsten", time=600, hole="point", pixel_points=21, tolerance=9
+    )
     means = mph.Projector(run.volume.grid, run.views, model)(run.volume)
     np.testing.assert_array_equal(mph.sample_counts(means, 7), run.projections)
     assert main(["project", str(DATA / f"run-0.1.0{suffix}"), "-o", str(tmp_path / "a.npz")]) == 1

@@ -55,8 +55,7 @@ def test_the_command_does_what_python_does_and_logs_each_iteration(run, file, tm
     printed = capsys.readouterr()
     lines = [line for line in printed.err.splitlines() if line.startswith("iteration")]
     found = mph.read_volume(output)
-    A = mph.projector_of_run(run, found.grid, recipe=run.recipe.updated(
-        {"model.hole": "depth", "model.aperture_points": None, "model.tolerance": 1e9}))  # fmt: skip
+    A = mph.projector_of_run(run, found.grid, recipe=run.recipe.updated({"model.hole": "auto"}))
     expected = mph.osem(A, run.projections, 3, subsets=4)
     np.testing.assert_allclose(found.array, expected.volume.array, rtol=1e-5, atol=1e-5)
     assert found.quantity == "activity" and found.grid == mph.Grid.centered(20, 5.0)
@@ -175,25 +174,24 @@ def test_voxels_cover_the_roi_and_the_model_is_that_of_the_run(run):
 
     def model(**changes):
         recipe = run.recipe.updated({key.replace("__", "."): value for key, value in changes.items()})
-        found = model_of(run, recipe, grid)
+        found = model_of(run, recipe)
         return found["model.hole"], found["model.aperture_points"], found["model.intrinsic_fwhm"]
 
-    assert model() == ("depth", 1, 1.0)  # the whole hole has no points
+    assert model() == ("auto", None, 1.0)  # the whole hole has no points
     assert model(reconstruction__hole="rays") == ("rays", 7, 1.0)
     assert model(reconstruction__pixel_points=3) == ("rays", 7, 1.0)
     assert model(reconstruction__aperture_points=1, reconstruction__ignore_blur=True) == ("rays", 1, 0)
     assert model(model__aperture_points=3) == ("rays", 3, 1.0)
     assert model(model__aperture_points=1) == ("rays", 1, 1.0)  # counts of an ideal hole
-    assert model(model__aperture_points=None, model__aperture_tolerance=0.1) == ("depth", 1, 1.0)
-    assert model(model__hole="depth", model__aperture_points=None) == ("depth", 1, 1.0)
+    assert model(model__aperture_points=None, model__aperture_tolerance=0.1) == ("auto", None, 1.0)
+    assert model(model__hole="depth") == ("auto", None, 1.0)
+    assert model(model__hole="point") == ("rays", 1, 1.0)
     with pytest.warns(
         mph.InputWarning, match="rays through 7 points, not of the whole hole by depth: the run has depth"
     ):
         assert model(model__crystal_mu="NaI", model__depth_layers=2) == ("rays", 7, 1.0)
     with pytest.warns(mph.InputWarning, match="the backend is numpy, not cpu"):
         assert model(compute__backend="numpy") == ("rays", 7, 1.0)
-    with pytest.warns(mph.InputWarning, match="voxels come close to a pinhole"):
-        assert model_of(run, run.recipe, mph.Grid.centered(8, 40.0))["model.aperture_points"] == 7
     centre = reconstruction_grid(run, run.recipe.updated({"reconstruction.center": (1, 2, 3)})).center
     np.testing.assert_allclose(centre, (1, 2, 3))
 

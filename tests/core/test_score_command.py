@@ -169,17 +169,22 @@ def test_a_run_knows_its_phantom_or_its_volume(files, expected, system, tmp_path
 
 def test_that_a_score_flatters_stays_with_it(system, tmp_path, capsys):
     """As JSON, on standard error, and of a reconstruction in its settings and its file."""
-    made = {"model.kind": "emission", "model.hole": "depth", "model.time": 60.0, "detector.plane": "real",
+    made = {"model.kind": "emission", "model.aperture_points": 7, "model.time": 60.0, "detector.plane": "real",
             "detector.rows": 12, "detector.columns": 12, "phantom.kind": "derenzo", "phantom.voxels": 24,
             "phantom.spacing": 4.0}  # fmt: skip
     (run,) = mph.run_recipe(mph.Recipe(made), system)
     mph.write_run(run, tmp_path / "run.npz")
-    how = mph.Recipe({"reconstruction.voxels": 16, "reconstruction.spacing": 6.0, "reconstruction.iterations": 2})
+    how = mph.Recipe({"reconstruction.voxels": 16, "reconstruction.spacing": 6.0, "reconstruction.iterations": 2,
+                      "reconstruction.hole": "rays"})  # fmt: skip
     with pytest.warns(mph.InputWarning) as caught:
         found = mph.reconstruct_run(run, how)
     flatters = found.settings["flatters"]
     assert [str(each.message) for each in caught] == flatters and len(flatters) == 2
-    assert "made from voxels of 4 mm" in flatters[0] and "3 mm or less" in flatters[0] and "by depth" in flatters[1]
+    assert (
+        "made from voxels of 4 mm" in flatters[0]
+        and "3 mm or less" in flatters[0]
+        and "7 points of the hole" in flatters[1]
+    )
     mph.write_volume(found.volume, tmp_path / "v.npz")
     arguments = ["score", str(tmp_path / "v.npz"), "--truth", str(tmp_path / "run.npz")]
     assert main([*arguments, "--json"]) == 0

@@ -38,6 +38,12 @@ class Grid:
         first = real_array(center, "grid centre", (3,)) - spacing * (np.array(counts) - 1) / 2
         return cls(counts, affine_matrix(np.diag(spacing), first))
 
+    def box(self, start: ArrayLike, shape: tuple[int, ...]) -> Grid:
+        """The grid of a box of these voxels, or beside them: of `shape` voxels from the one with the index `start` on."""
+        affine = self.affine.copy()
+        affine[:3, 3] += affine[:3, :3] @ np.asarray(start)
+        return Grid(shape, affine)  # type: ignore[arg-type]
+
     @property
     def spacing(self) -> NDArray[np.float64]:
         """Voxel size (3,), mm, along each index axis."""

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from types import ModuleType
@@ -21,7 +22,9 @@ from ..volumes.volume import Volume
 from .parallel import in_order, run_all
 
 Array = NDArray[Any]
-Index = tuple[int, int, int]
+Index = tuple[int, ...]
+VoxelBox = tuple[tuple[slice, ...], NDArray[np.bool_]]
+"""A box of a grid, and which of its voxels."""
 
 # Layers of voxels that a thread adds to before it takes others, and bytes of the views' cells that are in memory.
 _SLAB, _CELLS_AT_ONCE = 4, 2**28
@@ -91,28 +94,37 @@ class DepthResponse:
         ), (pixels[0], pixels[1])
 
 
-@dataclass(eq=False)
-class DepthResponses:
-    """`n` views of `pixels` (n_v, n_u) of volumes on a grid, each with responses for its zones of depth, made on demand."""
+class DepthResponses(ABC):
+    """`n` views of `pixels` (n_v, n_u) of volumes on a grid, attenuated by `mu`, if any.
 
-    n: int
-    pixels: tuple[int, int]
-    grid: Grid
-    make: Callable[[int, float, float], DepthResponse]
-    """Of a view and the far and near end of a zone, mm: its response."""
-    zones: Callable[[int], tuple[Array, list[tuple[float, float]]]]
-    """Of a view: the row (4,) that gives a voxel's (x, y, z, 1) depth, and the ends of zones, each from far to near."""
-    close: Callable[[int], tuple[tuple[slice, ...], Array] | None]
-    """Of a view: voxels nearer than all zones, a box of the grid and which in it; None where none may be seen."""
-    transmittance: Callable[[int, Any, Grid], Array]
-    """Of a view, what attenuates and a grid: what is left of the photons from each of its voxels."""
-    mu: Volume | None
-    """What attenuates, if anything."""
+    Each view has a response for every zone of depth, made when first needed.
+    """
 
-    def __post_init__(self) -> None:
+    def __init__(self, n: int, pixels: tuple[int, int], grid: Grid, mu: Volume | None) -> None:
+        self.n, self.pixels, self.grid, self.mu = n, pixels, grid, mu
         self._made: dict[tuple[int, float], DepthResponse] = {}
         self._passing: dict[int, tuple[Index, Array]] = {}
         self._room = _KEPT
+
+    @abstractmethod
+    def make(self, m: int, far: float, near: float) -> DepthResponse:
+        """View m's response to voxels in a zone from far to near, mm."""
+
+    @abstractmethod
+    def depths(self, m: int) -> Array:
+        """The row (4,) that gives the depth of a voxel (x, y, z, 1) before view m's pinhole, mm."""
+
+    @abstractmethod
+    def zones(self, m: int) -> list[tuple[float, float]]:
+        """Of view m the zones of depth, each from far to near, mm."""
+
+    @abstractmethod
+    def close(self, m: int) -> VoxelBox | None:
+        """Voxels before view m's pinhole that are nearer than all zones; None where it may see none."""
+
+    @abstractmethod
+    def transmittance(self, m: int, mu: Volume, part: Grid) -> Array:
+        """What `mu` leaves of the photons from each voxel of a part of the grid, on their way to view m's pinhole."""
 
     def images(self, volume: Array, functions: ModuleType, workers: int, mu: Volume | None = None) -> Iterator[Array]:
         """The images of `volume` one by one; `mu` may attenuate in place of the usual."""
@@ -164,9 +176,9 @@ class DepthResponses:
 
     def _of_part(self, m: int, origin: Index, shape: Index) -> list[tuple[DepthResponse, tuple[slice, slice]]]:
         """View m's responses to a part of the volume, of the zones that it reaches into, and the pixels that may see it."""
-        row, zones = self.zones(m)
+        row = self.depths(m)
         depths = [row @ (*np.add(origin, corner), 1) for corner in itertools.product(*((0, n - 1) for n in shape))]
-        reached = [(far, near) for far, near in zones if max(depths) > near and min(depths) <= far]
+        reached = [(far, near) for far, near in self.zones(m) if max(depths) > near and min(depths) <= far]
         return [self._response(m, far, near).of_part(origin, shape) for far, near in reached]
 
     def _response(self, m: int, far: float, near: float) -> DepthResponse:
@@ -178,16 +190,14 @@ class DepthResponses:
         """What attenuation leaves of the photons from each voxel of a part of the volume."""
         if mu is None and self.mu is None:
             return None
-        affine = self.grid.affine.copy()
-        affine[:3, 3] += affine[:3, :3] @ origin
-        grid = Grid(part.shape, affine)
+        grid = self.grid.box(origin, part.shape)
         if mu is not None:
             return self.transmittance(m, mu, grid).astype(part.dtype, copy=False)
         start, kept = self._passing.get(m, (origin, None))
         first = np.subtract(origin, start)
         if kept is None or first.min() < 0 or (first + part.shape > kept.shape).any():
             self._room += self._passing.pop(m)[1].nbytes if m in self._passing else 0
-            first, kept = np.zeros(3, int), self.transmittance(m, self.mu, grid)
+            first, kept = np.zeros(3, int), self.transmittance(m, self.mu, grid)  # type: ignore[arg-type]
             if kept.nbytes <= self._room:
                 self._room -= kept.nbytes
                 self._passing[m] = origin, kept

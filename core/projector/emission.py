@@ -23,12 +23,10 @@ from ..physics.materials import module_coefficients
 from ..validation import instance, positive, real_array, strict_whole
 from ..volumes.volume import Volume, require_quantity
 from .bundles import Beam
-from .depth_response import DepthResponse, DepthResponses
-from .hole_response import close_voxels, depths_of, hole_response, require_depths, zones_of
+from .hole_response import WholeHoles
 from .models import Array, Model, checked_background, view_rays
 from .pixel_points import TOLERANCE, expected_error, lattice, offsets, points_needed, require_points, shadow_edges
 from .rays import Fan
-from .transmittance import mean_transmittance
 
 # Views may differ from their system by a file's rounding (mm; sine of an angle).
 _SAME_PLACE = 1e-3
@@ -57,7 +55,7 @@ class Emission(Model):
     effective diameter and l the collimator's length. Summed over the pixels this is the sensitivity to a point source at
     height h above the pinhole's plane and elevation theta: ``g = d_e^2 sin^3(theta) / (16 h^2)``. The 1/r^2 of that law
     is in the density of the rays. Rays run from the pinhole through the whole grid, wherever a virtual detector stands.
-    By default the pinhole is ideal: no attenuation, penetration, blur or missed photons.
+    By default the hole has its size and its blur, and nothing attenuates, penetrates or is missed.
 
     Attributes
     ----------
@@ -79,25 +77,23 @@ class Emission(Model):
         Instead of the isotope's.
     pixel_points : int, optional
         Points of each pixel's area, for each point of the hole, from which rays start. None: as many as `tolerance`
-        requires, which depends on the sizes of voxels and pixels and on the voxels' distance and orientation: small
-        voxels on large pixels take many. A given number is used as it is, with a warning if it is too small for the
-        tolerance. 1, with one point of the hole: only the pixels' centres.
+        requires: small voxels on large pixels take many. A given number is used as it is, with a warning if it is too
+        small for the tolerance. 1, with one point of the hole: only the pixels' centres.
     tolerance : float
         Largest relative error of the total counts of a single voxel in any module, wherever it lies between the rays: 2 %
         by default. Larger sources are more accurate.
     hole : str
-        ``"depth"``: the blur is that of the whole hole, without rays (`hole_response`). Every voxel's total is right to
-        0.1 %, and its image within 1 % of the converged one, at any size of voxels. It takes no ``edge="path"`` or
-        `depth_layers`, no grid that comes close to a pinhole, and no backend cuda. ``"rays"``: through `aperture_points`.
-        ``"point"``: through the hole's middle, an ideal pinhole without blur. ``"auto"``: by depth wherever that can be,
-        voxels close to a pinhole by rays; by rays alone where depth cannot be, and where numbers of points are given.
+        ``"depth"``: the blur of the whole hole, without rays (`hole_response`). Every voxel's image is right to 1 % and its
+        total to 0.1 %. It takes no ``edge="path"`` or `depth_layers`, no grid that comes close to a pinhole, and no backend
+        cuda. ``"rays"``: through `aperture_points`. ``"point"``: through the hole's middle, an ideal pinhole without blur.
+        ``"auto"``: by depth, voxels close to a pinhole by rays; by rays alone where that cannot be or they have numbers.
     aperture_points : int, optional
         Points of the hole's disk that rays pass, all with the same weight: the blur of a hole of diameter d_e.
         With 1 all rays pass the centre and there is no blur; otherwise at least 3. None: by `aperture_tolerance`.
     aperture_tolerance : float, optional
         Instead of `aperture_points`: as few points as keep the image of one voxel at the isocentre close to that of the
-        whole hole. The absolute differences of the pixels sum to at most this share of the counts, and, as errors at most
-        add up, so they do for any activity around the isocentre. None: 0.1.
+        whole hole. The absolute differences of the pixels sum to at most this share of the counts; so they do for any
+        activity around the isocentre. None: 0.1.
     aperture_mu : float or str, optional
         Attenuation coefficient of the aperture's material at the photons' energy, 1/mm, or the material's name
         (``"tungsten"``, see `MATERIALS`). Of several lines in the window the coefficient is the one that lets as many
@@ -207,19 +203,12 @@ class Emission(Model):
         for name in ("within_crystal", "within_walls", "within_cone"):
             self._set(name, bool(getattr(self, name)))
         self._set("background", checked_background(self.background, "emission: background", len(self.system)))
-        self._check_hole()
-
-    def _check_hole(self) -> None:
         if self.hole not in ("auto", "depth", "rays", "point"):
             raise InputError(f"emission: hole: expected 'auto', 'depth', 'rays' or 'point', got {self.hole!r}")
-        refused = {
-            "edge 'path'": self.hole == "depth" and self.edge == "path",
-            "depth_layers": self.hole == "depth" and self.depth_layers > 1,
-            "points of it": self.hole in ("depth", "point")
-            and (self.aperture_points, self.aperture_tolerance) != (None, None),
-        }
-        for what, given in refused.items():
-            if given:
+        has_points = (self.aperture_points, self.aperture_tolerance) != (None, None)
+        given = {"edge 'path'": self.edge == "path", "depth_layers": self.depth_layers > 1, "points of it": has_points}
+        for what in {"depth": list(given), "point": ["points of it"]}.get(self.hole, []):
+            if given[what]:
                 raise InputError(f"emission: hole {self.hole!r} takes no {what}; use hole 'rays', or leave that out")
 
     @property
@@ -227,8 +216,8 @@ class Emission(Model):
         """Whether the hole's blur is computed without rays."""
         if self.hole != "auto":
             return self.hole == "depth"
-        numbers = self.aperture_points, self.aperture_tolerance, self.pixel_points
-        return self.edge == "paix" and self.depth_layers == 1 and numbers == (None, None, None)
+        numbers = {self.aperture_points, self.aperture_tolerance, self.pixel_points}
+        return self.edge == "paix" and self.depth_layers == 1 and numbers == {None}
 
     def by_rays(self) -> Self:
         """The model for what can only be done with rays; `InputError` with hole "depth"."""
@@ -432,45 +421,20 @@ class Emission(Model):
         n_v, n_u = views.shape
         return gaussian_blur(n_v, sigma / pitch_v), gaussian_blur(n_u, sigma / pitch_u)
 
-    def by_depth(self, views: Views, grid: Grid) -> DepthResponses | None:
+    def by_depth(self, views: Views, grid: Grid) -> WholeHoles | None:
         """What projects in place of rays, where the hole's blur is computed without them."""
         if not self._is_by_depth:
             return None
-        of_view = self._response_by_depth, self._zones, self._close_voxels, self._transmittance
-        make, zones, close, transmittance = (partial(function, views, grid) for function in of_view)
-        return DepthResponses(len(views), views.shape, grid, make, zones, close, transmittance, self.mu)
+        within = self.within_crystal or self.within_walls
+        sides = self.system.detector_side if within else np.full(len(self.system), np.inf)
+        weigh = replace(self, within_crystal=False, within_walls=False)._weights_of_area
+        of_modules = self.system, self.effective_diameter, sides, weigh
+        return WholeHoles(views, grid, *of_modules, self.mu, self.hole == "depth")
 
-    def _sizes(self, m: int) -> tuple[Array, float, float]:
-        """Module m's frame, the collimator's length and the hole's diameter."""
-        return self.system.frames()[m], float(self.system.collimator_length[m]), float(self.effective_diameter[m])
-
-    def _response_by_depth(self, views: Views, grid: Grid, m: int, far: float, near: float) -> DepthResponse:
-        frame, l, d = self._sizes(m)
-        if self.hole == "depth":
-            require_depths(grid, views.sources[m], frame[2], l)
-        on_crystal = self.within_crystal or self.within_walls
-        side = float(self.system.detector_side[m]) if on_crystal else math.inf
-        whole = Opening(0.0, 0.0, math.pi / 4 * d**2)
-        anywhere = replace(self, within_crystal=False, within_walls=False)
-
-        def weigh(u: Array, v: Array) -> Array:
-            return anywhere.pixel_weights(m, u, v, (1.0, 1.0), l, whole)  # type: ignore[return-value]
-
-        return hole_response(views, m, grid, frame, l, d, side, weigh, far, near)
-
-    def _zones(self, views: Views, grid: Grid, m: int) -> tuple[Array, list[tuple[float, float]]]:
-        (_, _, k), l, _ = self._sizes(m)
-        row = k @ grid.affine[:3]
-        row[3] -= k @ views.sources[m]
-        return row, zones_of(grid, views.sources[m], k, l)
-
-    def _close_voxels(self, views: Views, grid: Grid, m: int) -> tuple[tuple[slice, ...], NDArray[np.bool_]] | None:
-        return close_voxels(views, m, grid, *self._sizes(m))
-
-    def _transmittance(self, views: Views, grid: Grid, m: int, mu: Volume, part: Grid) -> NDArray[np.float32]:
-        frame, l, d = self._sizes(m)
-        near, _ = depths_of(grid, views.sources[m], frame[2], l)
-        return mean_transmittance(mu, grid, part, views, m, frame, d / 2 * (1 / l + 1 / near))
+    def _weights_of_area(self, m: int, u: Array, v: Array) -> Array:
+        """What a mm^2 of module m's crystal counts along lines through the hole's middle to (u, v), mm, point-inverted."""
+        l, area = float(self.system.collimator_length[m]), math.pi / 4 * float(self.effective_diameter[m]) ** 2
+        return self.pixel_weights(m, u, v, (1.0, 1.0), l, Opening(0.0, 0.0, area))  # type: ignore[return-value]
 
     def rays(self, views: Views, m: int, grid: Grid) -> int:
         """Rays of each pixel of view m."""
@@ -481,13 +445,9 @@ class Emission(Model):
         """A warning where there are too few rays for the tolerance."""
         if self._is_by_depth:  # has none
             return None
-        worst, module = 0.0, 0
-        for m in range(len(views)):
-            edges = shadow_edges(views, m, grid)
-            n = self._pixel_points(views, m, grid)
-            error = expected_error(edges, n, self.hole_points(views, m, grid))
-            if error > worst:
-                worst, module = error, m
+        points = [(self._pixel_points(views, m, grid), self.hole_points(views, m, grid)) for m in range(len(views))]
+        errors = [expected_error(shadow_edges(views, m, grid), *points[m]) for m in range(len(views))]
+        worst, module = max(errors), int(np.argmax(errors))
         if worst <= self.tolerance:
             return None
         n, voxel = self._pixel_points(views, module, grid), " x ".join(f"{size:.3g}" for size in grid.spacing)

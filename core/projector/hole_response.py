@@ -19,20 +19,22 @@ import functools
 import itertools
 import math
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..geometry.grid import Grid
+from ..geometry.system import PinholeSystem
 from ..geometry.views import Views
 from ..physics.crystal import share_inside
-from .depth_response import DepthResponse
+from ..volumes.volume import Volume
+from .depth_response import DepthResponse, DepthResponses, VoxelBox
 from .models import view_rays
+from .transmittance import mean_transmittance
 
 Array = NDArray[np.float64]
-Weigh = Callable[[Array, Array], Array]
+Weigh = Callable[[int, Array, Array], Array]
 
 # Widths on the crystal by which planes of depth may differ, and by which the image of a part of a voxel may be smeared since
 # it is seen aslant, in units of the geometric mean of the two largest of the widths of pixel, voxel and the hole's shadow.
@@ -44,81 +46,160 @@ _LARGE_VOXELS = 0.6
 _MOST_RATIO, _ZONE_RATIO = 2.5, 1.4
 
 
-def hole_response(
-    views: Views,
-    m: int,
-    grid: Grid,
-    frame: Array,
-    l: float,
-    d: float,
-    side: float,
-    weigh: Weigh,
-    far: float,
-    near: float,
-) -> DepthResponse:
-    """The response of view m to a hole of diameter d, of voxels in a zone of depth from `far` to `near`, mm.
+class WholeHoles(DepthResponses):
+    """What views count of a volume through the whole holes of their modules.
 
-    `frame` has the module's u, v, k, `l` is the collimator's length, and pixels count only within the crystal's `side`.
-    ``weigh(along_u, along_v)`` is what a mm^2 of the crystal counts per (decay / (s mm^3) mm) along lines through the hole's
-    middle to these places on the crystal, mm, point-inverted.
+    Parameters
+    ----------
+    views, grid, system
+        The views, the volume's grid and the modules.
+    diameters
+        Of the holes, (M,), mm.
+    sides
+        Of the square on each crystal in which pixels count, (M,), mm.
+    weigh
+        ``weigh(m, u, v)`` is what a mm^2 of the crystal counts per (decay / (s mm^3) mm) along lines through the middle of
+        module m's hole to these places on the crystal, mm, point-inverted.
+    mu
+        What attenuates, if anything.
+    is_strict
+        Whether grids that reach too close to a pinhole are refused.
     """
-    u, v, k = frame
-    pinhole, rays = views.sources[m], view_rays(views, m)
-    scale = l / float((views.detector_centers[m] - pinhole) @ k)
-    # The pixels' places on the crystal, mm along v and u, point-inverted: those of the first, and from pixel to pixel.
-    first = scale * (rays.corner - pinhole)
-    firsts = float(first @ v), float(first @ u)
-    pitches = scale * float(rays.row_step @ v), scale * float(rays.column_step @ u)
-    to_camera = frame @ grid.affine[:3]
-    to_camera[:, 3] -= frame @ pinhole
-    pixels = [firsts[i] + pitches[i] * np.arange(views.shape[i]) for i in range(2)]
-    # Of the farthest voxel's image the widths, mm: of the hole's shadow and of the voxel's, where that is narrowest.
-    across = np.linalg.svd(to_camera[:2, :3], compute_uv=False)
-    widths = d * (1 + l / far), l / far * across[-1]
-    steps = tuple(_cells_of_pixel(abs(pitch), *widths) for pitch in pitches)
-    _, middle, largest = sorted((*widths, min(map(abs, pitches))))
-    sharpness = math.sqrt(middle * largest)
-    deep = np.abs(to_camera[2, :3])
-    inverses = 1 / (far + deep.sum() / 2), 1 / max(near - deep.sum() / 2, near / 2)  # of whole voxels
-    n_planes = 2 + int((inverses[1] - inverses[0]) * l * (d + across[0]) / (_PLANE_APART * sharpness))
-    inverses = np.linspace(*inverses, n_planes)
-    slope = max(abs(place) for at in pixels for place in at[[0, -1]]) / l + d / 2 / near
-    most = _PART_SMEAR * sharpness * (1 if widths[0] == largest else _LARGE_VOXELS)
-    counts = _parts_along(slope * l / near * deep, most)
-    parts = (np.indices(counts).reshape(3, -1).T + 0.5) / counts - 0.5
-    edges = to_camera[:, :3] / counts
-    shadows = [np.multiply(edges[axis], np.sign(pitch)) for axis, pitch in zip((1, 0), pitches, strict=True)]
-    # A photon's direction, on which its counts depend, lies between that of the voxel and that of the pixel as seen from
-    # the hole's middle, l / (l + h) of the way: so the factors of either are powers that are 1 together.
-    share = l / (l + 2 / (1 / near + 1 / far))
-    bend = 1.5 * share * (1 - share)
-    kernel = _kernel(d, l * inverses, np.stack(shadows), np.abs(pitches), steps, bend / l**2)
-    # In all, a voxel counts (1 + t^2)^(-3/2) / h^2, t being its slope. The mean of this over the hole, and to second order
-    # that over the voxel, differ from what the powers make of it, by this share times (1 + t^2)^-2.
-    holes = (np.arange(16)[:, None] + 0.5) / 16 * (d / 2) ** 2  # squared distances from its middle, of equal areas
-    shadow = holes * (1 / l + inverses) ** 2
-    made = np.average((1 + shadow) ** (-1.5 * share), 0, 1 + bend * shadow)
-    of_u, of_v, of_k = np.square(edges).sum(axis=1) / 12
-    of_voxel = 3 * (of_k - (1 - share) / 2 * (of_u + of_v)) * inverses**2
-    second = ((1 + holes * inverses**2) ** -1.5).mean(axis=0) / made - 1 + of_voxel
-    kernel *= (1 + second - second.mean())[:, None, None]
-    margin = kernel.shape[1] // 2, kernel.shape[2] // 2
-    matrix = np.empty((3, 4))
-    for row, axis, i in ((1, 1, 0), (0, 0, 1)):  # rows follow v, columns u
-        per_slope = steps[i] * l / pitches[i]
-        matrix[row] = per_slope * to_camera[axis] + (margin[i] - steps[i] * firsts[i] / pitches[i]) * to_camera[2]
-    matrix[2] = to_camera[2]
-    n_cells = [steps[i] * (views.shape[i] - 1 - (-kernel.shape[i + 1] - i) // steps[i]) for i in range(2)]
-    along = [firsts[i] + pitches[i] / steps[i] * (np.arange(n_cells[i]) - margin[i]) for i in range(2)]
-    of_direction, of_pixel = _weights(weigh, along, l) ** (1 - share), _weights(weigh, pixels, l) ** share
-    on_v, on_u = (share_inside(at, abs(pitch), side) for at, pitch in zip(pixels, pitches, strict=True))
-    of_pixel = of_pixel * (on_v[:, None] * on_u)
-    spacing = (inverses[-1] - inverses[0]) / (n_planes - 1)
-    secant = 1 + (along[0][:, None] ** 2 + along[1] ** 2) / l**2
-    before = grid.voxel_volume / len(parts) * l**2 * of_direction * (1 + second.mean() / secant**2)
-    before, kernel = before.astype(np.float32), kernel.astype(np.float32)
-    first_plane, of_inverse = float(inverses[0]), float(1 / spacing)
-    return DepthResponse(matrix, parts, near, far, first_plane, of_inverse, before, kernel, steps, of_pixel)
+
+    def __init__(
+        self,
+        views: Views,
+        grid: Grid,
+        system: PinholeSystem,
+        diameters: Array,
+        sides: Array,
+        weigh: Weigh,
+        mu: Volume | None,
+        is_strict: bool,
+    ) -> None:
+        super().__init__(len(views), views.shape, grid, mu)
+        self._views, self._system, self._diameters = views, system, diameters
+        self._sides, self._weigh, self._is_strict = sides, weigh, is_strict
+
+    def _module(self, m: int) -> tuple[Array, Array, float, float]:
+        """Of module m the pinhole, mm, the frame u, v, k, the collimator's length and the hole's diameter, mm."""
+        l, d = float(self._system.collimator_length[m]), float(self._diameters[m])
+        return self._views.sources[m], self._system.frames()[m], l, d
+
+    def depths(self, m: int) -> Array:
+        """As of `DepthResponses`."""
+        pinhole, (_, _, k), *_ = self._module(m)
+        row: Array = k @ self.grid.affine[:3]
+        row[3] -= k @ pinhole
+        return row
+
+    def _limits(self, m: int) -> tuple[float, float]:
+        """Depths of the farthest voxel and of the nearest one that is not too close to the pinhole, a little wider, mm."""
+        pinhole, (_, _, k), l, _ = self._module(m)
+        depths = (self.grid.corners() - pinhole) @ k
+        far = max(1.01 * float(depths.max()), l / 10)
+        near, nearest = l / (_MOST_RATIO * (1 + l / far) - 1), 0.99 * float(depths.min())
+        if nearest < near and self._is_strict:
+            raise InputError(
+                "emission: hole 'depth' is for volumes at some distance from the pinholes, but the grid's depths before one "
+                f"are from {depths.min():.3g} to {depths.max():.3g} mm: take a smaller grid, or hole 'auto' or 'rays'"
+            )
+        return far, max(nearest, near)
+
+    def zones(self, m: int) -> list[tuple[float, float]]:
+        """As of `DepthResponses`; in each the hole's shadow grows so little that one response serves."""
+        *_, l, _ = self._module(m)
+        smallest, largest = (1 + l / depth for depth in self._limits(m))
+        n = max(1, round(math.log(largest / smallest) / math.log(_ZONE_RATIO) + 0.4))
+        return list(itertools.pairwise((l / (np.geomspace(smallest, largest, n + 1) - 1)).tolist()))
+
+    def close(self, m: int) -> VoxelBox | None:
+        """As of `DepthResponses`."""
+        (_, near), (pinhole, frame, l, d) = self._limits(m), self._module(m)
+        # A pyramid before the pinhole, wider by the hole: its corners at the pinhole's plane and at `near`.
+        signs = np.array(list(itertools.product((-1, 1), repeat=2)))
+        views, (n_v, n_u) = self._views, self.pixels
+        rays = views.detector_centers[m] - pinhole + signs @ [views.u_steps[m] * n_u / 2, views.v_steps[m] * n_v / 2]
+        hole = d * (1 + near / l) * signs @ frame[:2]
+        corners = pinhole + np.concatenate([hole, hole + near * rays / (rays @ frame[2])[:, None]])
+        index = corners @ self.grid.index_from_world[:3, :3].T + self.grid.index_from_world[:3, 3]
+        low = np.clip(np.floor(index.min(axis=0)), 0, self.grid.shape).astype(int)
+        high = np.clip(np.ceil(index.max(axis=0)) + 1, low, self.grid.shape).astype(int)
+        row, places = self.depths(m), np.indices((high - low).tolist()) + low[:, None, None, None]
+        depths = np.tensordot(row[:3], places, 1) + row[3]
+        close = (depths > 0) & (depths <= near)
+        return (tuple(map(slice, low.tolist(), high.tolist())), close) if close.any() else None
+
+    def transmittance(self, m: int, mu: Volume, part: Grid) -> NDArray[np.float32]:
+        """As of `DepthResponses`."""
+        _, frame, l, d = self._module(m)
+        margin = d / 2 * (1 / l + 1 / self._limits(m)[1])
+        return mean_transmittance(mu, self.grid, part, self._views, m, frame, margin)
+
+    def _weights(self, m: int, places: list[Array]) -> Array:
+        """What a mm^3 counts, times its squared depth by l^2, along lines to `places` (rows, columns) on the crystal, mm."""
+        v, u = places[0][:, None], places[1][None, :]
+        return self._weigh(m, u, v) * np.sqrt(1 + (u**2 + v**2) / self._module(m)[2] ** 2)
+
+    def make(self, m: int, far: float, near: float) -> DepthResponse:
+        """As of `DepthResponses`."""
+        views, grid, (pinhole, frame, l, d) = self._views, self.grid, self._module(m)
+        u, v, k = frame
+        rays = view_rays(views, m)
+        scale = l / float((views.detector_centers[m] - pinhole) @ k)
+        # The pixels' places on the crystal, mm along v and u, point-inverted: those of the first, and from pixel to pixel.
+        first = scale * (rays.corner - pinhole)
+        firsts = float(first @ v), float(first @ u)
+        pitches = scale * float(rays.row_step @ v), scale * float(rays.column_step @ u)
+        to_camera = frame @ grid.affine[:3]
+        to_camera[:, 3] -= frame @ pinhole
+        pixels = [firsts[i] + pitches[i] * np.arange(views.shape[i]) for i in range(2)]
+        # Of the farthest voxel's image the widths, mm: of the hole's shadow and of the voxel's, where that is narrowest.
+        across = np.linalg.svd(to_camera[:2, :3], compute_uv=False)
+        widths = d * (1 + l / far), l / far * across[-1]
+        steps = _cells_of_pixel(abs(pitches[0]), *widths), _cells_of_pixel(abs(pitches[1]), *widths)
+        _, middle, largest = sorted((*widths, min(map(abs, pitches))))
+        sharpness = math.sqrt(middle * largest)
+        deep = np.abs(to_camera[2, :3])
+        inverses = 1 / (far + deep.sum() / 2), 1 / max(near - deep.sum() / 2, near / 2)  # of whole voxels
+        n_planes = 2 + int((inverses[1] - inverses[0]) * l * (d + across[0]) / (_PLANE_APART * sharpness))
+        inverses = np.linspace(*inverses, n_planes)
+        slope = max(abs(place) for at in pixels for place in at[[0, -1]]) / l + d / 2 / near
+        most = _PART_SMEAR * sharpness * (1 if widths[0] == largest else _LARGE_VOXELS)
+        counts = _parts_along(slope * l / near * deep, most)
+        parts = (np.indices(tuple(counts)).reshape(3, -1).T + 0.5) / counts - 0.5
+        edges = to_camera[:, :3] / counts
+        shadows = [np.multiply(edges[axis], np.sign(pitch)) for axis, pitch in zip((1, 0), pitches, strict=True)]
+        # A photon's direction, on which its counts depend, lies between that of the voxel and that of the pixel as seen from
+        # the hole's middle, l / (l + h) of the way: so the factors of either are powers that are 1 together.
+        share = l / (l + 2 / (1 / near + 1 / far))
+        bend = 1.5 * share * (1 - share)
+        kernel = _kernel(d, l * inverses, np.stack(shadows), np.abs(pitches), steps, bend / l**2)
+        # In all, a voxel counts (1 + t^2)^(-3/2) / h^2, t being its slope. The mean of this over the hole, and to second
+        # order that over the voxel, differ from what the powers make of it, by this share times (1 + t^2)^-2.
+        holes = (np.arange(16)[:, None] + 0.5) / 16 * (d / 2) ** 2  # squared distances from its middle, of equal areas
+        shadow = holes * (1 / l + inverses) ** 2
+        made = np.average((1 + shadow) ** (-1.5 * share), 0, 1 + bend * shadow)
+        of_u, of_v, of_k = np.square(edges).sum(axis=1) / 12
+        of_voxel = 3 * (of_k - (1 - share) / 2 * (of_u + of_v)) * inverses**2
+        second = ((1 + holes * inverses**2) ** -1.5).mean(axis=0) / made - 1 + of_voxel
+        kernel *= (1 + second - second.mean())[:, None, None]
+        margin = kernel.shape[1] // 2, kernel.shape[2] // 2
+        matrix = np.empty((3, 4))
+        for row, axis, i in ((1, 1, 0), (0, 0, 1)):  # rows follow v, columns u
+            per_slope = steps[i] * l / pitches[i]
+            matrix[row] = per_slope * to_camera[axis] + (margin[i] - steps[i] * firsts[i] / pitches[i]) * to_camera[2]
+        matrix[2] = to_camera[2]
+        n_cells = [steps[i] * (views.shape[i] - 1 - (-kernel.shape[i + 1] - i) // steps[i]) for i in range(2)]
+        along = [firsts[i] + pitches[i] / steps[i] * (np.arange(n_cells[i]) - margin[i]) for i in range(2)]
+        of_direction, of_pixel = self._weights(m, along) ** (1 - share), self._weights(m, pixels) ** share
+        of_pixel *= np.outer(*(share_inside(pixels[i], abs(pitches[i]), self._sides[m]) for i in range(2)))
+        spacing = (inverses[-1] - inverses[0]) / (n_planes - 1)
+        secant = 1 + (along[0][:, None] ** 2 + along[1] ** 2) / l**2
+        before = grid.voxel_volume / len(parts) * l**2 * of_direction * (1 + second.mean() / secant**2)
+        before, kernel = before.astype(np.float32), kernel.astype(np.float32)
+        first_plane, of_inverse = float(inverses[0]), float(1 / spacing)
+        return DepthResponse(matrix, parts, near, far, first_plane, of_inverse, before, kernel, steps, of_pixel)
 
 
 def _cells_of_pixel(pitch: float, shadow: float, voxel: float) -> int:
@@ -135,61 +216,6 @@ def _parts_along(smears: Array, most: float) -> NDArray[np.int64]:
     while np.linalg.norm(smears / counts) > most:
         counts[np.argmax(smears / counts)] += 1
     return counts
-
-
-def _weights(weigh: Weigh, places: list[NDArray[Any]], l: float) -> Array:
-    """What a mm^3 counts, times its squared depth by l^2, along lines to `places` (rows, columns) on the crystal."""
-    v, u = places[0][:, None], places[1][None, :]
-    return weigh(u, v) * np.sqrt(1 + (u**2 + v**2) / l**2)
-
-
-def require_depths(grid: Grid, pinhole: Array, k: Array, l: float) -> None:
-    """Raise `InputError` where voxels lie so close to the pinhole that they are left out."""
-    depths = (grid.corners() - pinhole) @ k
-    if 0.99 * float(depths.min()) < depths_of(grid, pinhole, k, l)[0]:
-        raise InputError(
-            f"emission: hole 'depth' is for volumes at some distance from the pinholes, but the grid's depths before one "
-            f"are from {depths.min():.3g} to {depths.max():.3g} mm: take a smaller grid, or hole 'auto' or 'rays'"
-        )
-
-
-def depths_of(grid: Grid, pinhole: Array, k: Array, l: float) -> tuple[float, float]:
-    """Depths of the nearest voxel that is not too close to the pinhole and of the farthest one, a little wider, mm."""
-    depths = (grid.corners() - pinhole) @ k
-    far = max(1.01 * float(depths.max()), l / 10)
-    return max(0.99 * float(depths.min()), l / (_MOST_RATIO * (1 + l / far) - 1)), far
-
-
-def zones_of(grid: Grid, pinhole: Array, k: Array, l: float) -> list[tuple[float, float]]:
-    """Zones of depth, each from far to near, mm, in which the hole's shadow grows so little that one response serves."""
-    shadows = 1 + l / np.array(depths_of(grid, pinhole, k, l))
-    n = max(1, round(math.log(shadows[0] / shadows[1]) / math.log(_ZONE_RATIO) + 0.4))
-    return list(itertools.pairwise((l / (np.geomspace(*shadows[::-1], n + 1) - 1)).tolist()))
-
-
-def close_voxels(
-    views: Views, m: int, grid: Grid, frame: Array, l: float, d: float
-) -> tuple[tuple[slice, ...], NDArray[np.bool_]] | None:
-    """Voxels that `hole_response` leaves out and view m may see: a box of the grid, and which in it; None if none are."""
-    pinhole, (u, v, k) = views.sources[m], frame
-    near, _ = depths_of(grid, pinhole, k, l)
-    # A pyramid before the pinhole, wider by the hole: its corners at the pinhole's plane and at `near`.
-    rays = (
-        views.detector_centers[m]
-        - pinhole
-        + np.array([[i, j] for i in (-1, 1) for j in (-1, 1)])
-        @ (np.stack([views.u_steps[m] * views.shape[1], views.v_steps[m] * views.shape[0]]) / 2)
-    )
-    hole = d * (1 + near / l) * np.array([i * u + j * v for i in (-1, 1) for j in (-1, 1)])
-    corners = pinhole + np.concatenate([hole, hole + near * rays / (rays @ k)[:, None]])
-    index = corners @ grid.index_from_world[:3, :3].T + grid.index_from_world[:3, 3]
-    low = np.clip(np.floor(index.min(axis=0)), 0, grid.shape).astype(int).tolist()
-    high = np.clip(np.ceil(index.max(axis=0)) + 1, low, grid.shape).astype(int).tolist()
-    box = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
-    places = np.stack(np.meshgrid(*(np.arange(a, b) for a, b in zip(low, high, strict=True)), indexing="ij"), axis=-1)
-    depths = places @ (k @ grid.affine[:3, :3]) + k @ (grid.affine[:3, 3] - pinhole)
-    close = (depths > 0) & (depths <= near)
-    return (box, close) if close.any() else None
 
 
 def _kernel(d: float, slopes: Array, edges: Array, pitches: Array, steps: tuple[int, ...], bend: float) -> Array:

@@ -48,9 +48,7 @@ class Lattices:
         """Corners (8, 3), world mm, of the part of the grid that is traced."""
         if self.volume is None:
             return self.grid.corners()
-        affine = self.grid.affine.copy()
-        affine[:3, 3] += affine[:3, :3] @ np.array(self.origin)
-        return Grid(self.volume.shape, affine).corners()
+        return self.grid.box(self.origin, self.volume.shape).corners()
 
 
 def filled_lattices(

@@ -378,9 +378,8 @@ class Projector(LinearOperator):
             found = None if self._depths is None else self._depths.close(m)
             if found is not None:
                 box, close = found
-                affine, which = self.grid.affine.copy(), np.array([m])
-                affine[:3, 3] += affine[:3, :3] @ [each.start for each in box]
-                grid, model = Grid(close.shape, affine), self.model.of_views(which).by_rays()
+                grid, which = self.grid.box([each.start for each in box], close.shape), np.array([m])
+                model = self.model.of_views(which).by_rays()
                 with recorded_warnings():
                     parts.append((m, box, close, Projector(grid, self.views[which], model, self._asked, self.threads)))
         return parts

@@ -120,6 +120,4 @@ def _indices(value: ArrayLike, name: str) -> NDArray[np.int64]:
 
 def _moved(volume: Volume, array: NDArray[np.float32], start: NDArray[np.int64]) -> Volume:
     """`array` as a volume whose first voxel has the index `start` in `volume`."""
-    affine = volume.grid.affine.copy()
-    affine[:3, 3] += affine[:3, :3] @ start
-    return Volume(array, Grid(array.shape, affine), volume.quantity)  # type: ignore[arg-type]
+    return Volume(array, volume.grid.box(start, array.shape), volume.quantity)

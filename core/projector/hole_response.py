@@ -42,6 +42,8 @@ Weigh = Callable[[int, Array, Array], Array]
 _PLANE_APART, _PART_SMEAR = 0.15, 0.17
 # Where the voxel's own width is the largest, parts and cells are finer by this factor.
 _LARGE_VOXELS = 0.6
+# Larger voxels, mm, are cut into parts of this size at most: kernels as wide as their shadows would take longer.
+_LARGEST = 6.0
 # Largest ratio of the largest and the smallest shadow of the hole in a grid, and about so much in a zone.
 _MOST_RATIO, _ZONE_RATIO = 2.5, 1.4
 
@@ -162,11 +164,13 @@ class WholeHoles(DepthResponses):
         sharpness = math.sqrt(middle * largest)
         deep = np.abs(to_camera[2, :3])
         inverses = 1 / (far + deep.sum() / 2), 1 / max(near - deep.sum() / 2, near / 2)  # of whole voxels
-        n_planes = 2 + int((inverses[1] - inverses[0]) * l * (d + across[0]) / (_PLANE_APART * sharpness))
+        n_planes = 2 + int(
+            (inverses[1] - inverses[0]) * l * (d + min(across[0], _LARGEST)) / (_PLANE_APART * sharpness)
+        )
         inverses = np.linspace(*inverses, n_planes)
         slope = max(abs(place) for at in pixels for place in at[[0, -1]]) / l + d / 2 / near
         most = _PART_SMEAR * sharpness * (1 if widths[0] == largest else _LARGE_VOXELS)
-        counts = _parts_along(slope * l / near * deep, most)
+        counts = np.maximum(_parts_along(slope * l / near * deep, most), np.ceil(grid.spacing / _LARGEST).astype(int))
         parts = (np.indices(tuple(counts)).reshape(3, -1).T + 0.5) / counts - 0.5
         edges = to_camera[:, :3] / counts
         shadows = [np.multiply(edges[axis], np.sign(pitch)) for axis, pitch in zip((1, 0), pitches, strict=True)]
@@ -206,7 +210,7 @@ def _cells_of_pixel(pitch: float, shadow: float, voxel: float) -> int:
     """Cells along a pixel's side."""
     small, middle, largest = sorted((pitch, shadow, voxel))
     sharpness = math.sqrt(middle * largest)
-    size = sharpness * (0.04 + 0.3 * min(small / sharpness, 0.2)) * (1 if shadow == largest else _LARGE_VOXELS)
+    size = sharpness * (0.04 + 0.3 * min(small / sharpness, 0.35)) * (1 if shadow == largest else _LARGE_VOXELS)
     return max(2, round(pitch / size + 0.2))
 
 

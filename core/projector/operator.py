@@ -362,7 +362,8 @@ class Projector(LinearOperator):
     def _depth_arguments(self, x: ArrayOrTensor) -> tuple[ArrayOrTensor, Any, int]:
         """What `DepthResponses` takes: the array, the functions and the threads."""
         double = self._backend.always_float64 or is_double(x)
-        functions = backends.load("cpu" if self._backend.name == "cpu" else "reference_depth")
+        has_kernels = self._backend.name != "numpy" and backends.choose("auto").name == "cpu"
+        functions = backends.load("cpu" if has_kernels else "reference_depth")
         return np.ascontiguousarray(to_numpy(x, np.float64 if double else np.float32)), functions, self.threads
 
     @functools.cached_property

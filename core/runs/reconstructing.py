@@ -217,8 +217,8 @@ def _by_depth(recipe: Recipe) -> bool:
         why = "the run's edge is 'path'"
     elif recipe["model.depth_layers"] > 1:
         why = "the run has depth_layers"
-    elif backend != "cpu":  # others refuse it, or take minutes for an iteration
-        why = f"the backend is {backend}, not cpu"
+    elif backend in ("cuda", "numpy"):  # the one refuses it, the other takes minutes for an iteration
+        why = f"the backend is {backend}"
     if why is not None:
         _warn(f"the hole's blur is that of rays through {_POINTS} points, not of the whole hole by depth: {why}")
     return why is None

@@ -141,7 +141,7 @@ def test_a_beating_heart_is_a_run_for_each_state(workbook, tmp_path, capsys, mon
     assert [state.array.max() for state in states] == [1, 1.5] and states[0].grid == states[1].grid
 
     files = [str(tmp_path / f"beat-{k}.npz") for k in (1, 2)]
-    project = ["project", str(workbook), *NUMPY, "--modules", "30", "--emission", "--center"]
+    project = ["project", str(workbook), *NUMPY, "--modules", "30", "--emission", "--hole", "point", "--center"]
     more = ["--noise", "5", "--mosaic", str(tmp_path / "m.png")]
     assert main([*project, "--states", *files, *more, "-o", str(tmp_path / "run.npz")]) == 0
     for k, file in enumerate(files):

@@ -33,26 +33,26 @@ def cells_to_voxels(volume: Array, cells: Array, of: DepthResponse, passes: Arra
 
 def cells_to_pixels(cells: Array, of: DepthResponse) -> Array:
     """The image (n_v, n_u) of a view's cells."""
-    image, weighted = np.zeros(of.after.shape), cells * of.before
-    for where, tap in _taps(of):
-        image += np.einsum("pij,p->ij", weighted[where], tap)
-    return image * of.after
+    spectrum = np.fft.rfft2(cells * of.before) * np.fft.rfft2(of.kernel, of.shape[1:]).conj()
+    return _inverse(spectrum.sum(axis=0), of)[_pixels(of)] * of.after
 
 
 def pixels_to_cells(image: Array, of: DepthResponse) -> Array:
     """The adjoint of `cells_to_pixels`."""
-    cells, weighted = np.zeros(of.shape), image * of.after
-    for where, tap in _taps(of):
-        cells[where] += weighted * tap[:, None, None]
-    return cells * of.before
+    fine = np.zeros(of.shape[1:])
+    fine[_pixels(of)] = image * of.after
+    return _inverse(np.fft.rfft2(fine) * np.fft.rfft2(of.kernel, of.shape[1:]), of) * of.before
 
 
-def _taps(of: DepthResponse) -> Iterator[tuple[tuple[slice, ...], Array]]:
-    """For every tap of the kernels: the cells that it takes, as many as pixels, and its weights of the planes."""
-    for a, b in np.ndindex(of.kernel.shape[1:]):
-        first = zip((a, b), of.steps, of.after.shape, strict=True)
-        rows, columns = (slice(start, start + step * (n - 1) + 1, step) for start, step, n in first)
-        yield (slice(None), rows, columns), of.kernel[:, a, b]
+def _pixels(of: DepthResponse) -> tuple[slice, ...]:
+    """Of the cells of a plane those from which on pixels sum."""
+    return tuple(slice(0, step * (n - 1) + 1, step) for step, n in zip(of.steps, of.after.shape, strict=True))
+
+
+def _inverse(spectrum: Array, of: DepthResponse) -> Array:
+    """What has this spectrum, with zeros in place of rounding: nothing becomes negative by it."""
+    found = np.fft.irfft2(spectrum, of.shape[1:])
+    return np.where(np.abs(found) > 1e-14 * np.abs(found).max(), found, 0)
 
 
 def _shares(of: DepthResponse, shape: tuple[int, ...], x: int) -> Iterator[tuple[tuple[Array, ...], Array]]:

@@ -21,6 +21,7 @@ from ..core.runs.exr import exr_bytes
 from ..core.runs.mosaic import Sheet, as_seen, labels, png, sheet, smaller
 from ..core.runs.run import ProjectionRun
 from . import ids, jobs
+from .reports import Need
 
 _KEY = "mphdrr_projection"  # custom property: marks the images that a new run replaces
 _ARRAYS = ("sources", "detector_centers", "u_steps", "v_steps")
@@ -312,6 +313,9 @@ def show(image: bpy.types.Image, context: bpy.types.Context) -> bool:
                 _fit(context, window, area)
                 shown = True
     return shown
+
+
+PROJECTED: Need = (lambda context: ids.MOSAIC in bpy.data.images, "No projections yet: render them first")
 
 
 def show_below(image: bpy.types.Image, context: bpy.types.Context) -> bool:

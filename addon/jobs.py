@@ -208,6 +208,7 @@ class JobOperator:
     if TYPE_CHECKING:  # what every bpy.types.Operator has
         bl_idname: str
         bl_label: str
+        properties: Any
 
         def report(self, type: set[str], message: str) -> None: ...
         def as_keywords(self, *, ignore: tuple[str, ...] = ()) -> dict[str, Any]: ...
@@ -215,6 +216,10 @@ class JobOperator:
     def job(self, context: bpy.types.Context) -> Job:
         """The job, from the operator's and the scene's settings; raises InputError."""
         raise NotImplementedError
+
+    def given_or(self, panel: bpy.types.PropertyGroup) -> Callable[[str], Any]:
+        """What gives a setting by its name: that of the operator where it is given, else the panel's."""
+        return lambda name: getattr(self if self.properties.is_property_set(name) else panel, name)
 
     def ask(self, context: bpy.types.Context) -> set[str] | None:
         """Open a dialog or a file browser, whose button starts the job; None where there is nothing to ask."""

@@ -3,7 +3,7 @@
 import bpy
 
 from ..addon import ids, preferences
-from ..addon.reports import polled, run_reported
+from ..addon.reports import needs, run_reported
 
 
 class MPHDRR_OT_clean_cache(bpy.types.Operator):
@@ -13,9 +13,7 @@ class MPHDRR_OT_clean_cache(bpy.types.Operator):
     bl_label = "Clean Cache"
     bl_options = {"INTERNAL"}
 
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return polled(cls, preferences.cache_size() > 0, "The cache is empty")
+    poll = needs((lambda context: preferences.cache_size() > 0, "The cache is empty"))
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         return run_reported(self, preferences.clean_cache)

@@ -3,7 +3,7 @@
 import bpy
 
 from ..addon import ids, jobs, phantoms
-from ..addon.reports import run_reported
+from ..addon.reports import needs, run_reported
 
 
 class _EditPhantom(jobs.JobOperator):
@@ -11,7 +11,7 @@ class _EditPhantom(jobs.JobOperator):
 
     bake = False
 
-    poll = classmethod(phantoms.poll_phantom)
+    poll = needs(phantoms.ACTIVE)
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
         return phantoms.updating(context.object, self.bake)
@@ -40,7 +40,7 @@ class MPHDRR_OT_show_phantom_outline(bpy.types.Operator):
     bl_label = "Outline"
     bl_options = {"REGISTER", "UNDO"}
 
-    poll = classmethod(phantoms.poll_phantom)
+    poll = needs(phantoms.ACTIVE)
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         return run_reported(self, lambda: phantoms.toggle_outline(context.object))

@@ -5,7 +5,7 @@ from bpy.props import FloatProperty, StringProperty
 
 from ..addon import ids, jobs, recovery, slices, storage, volume_import, volumes
 from ..addon.decimals import typed
-from ..addon.reports import polled, run_reported
+from ..addon.reports import needs, run_reported
 
 
 class MPHDRR_OT_add_slices(bpy.types.Operator):
@@ -15,7 +15,7 @@ class MPHDRR_OT_add_slices(bpy.types.Operator):
     bl_label = "Add Slices"
     bl_options = {"REGISTER", "UNDO"}
 
-    poll = classmethod(volumes.poll_volume)
+    poll = needs(volumes.ACTIVE)
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         return run_reported(self, lambda: f"Added {len(slices.add_slices(context.object))} slices")
@@ -28,11 +28,15 @@ class MPHDRR_OT_remove_slices(bpy.types.Operator):
     bl_label = "Remove Slices"
     bl_options = {"REGISTER", "UNDO"}
 
-    poll = classmethod(volumes.poll_volume)
+    poll = needs(volumes.ACTIVE)
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         slices.remove_slices(context.object)
         return {"FINISHED"}
+
+
+def _is_ct(context: bpy.types.Context) -> bool:
+    return volumes.is_volume(context.object) and volumes.quantity_of(context.object) == "hu"
 
 
 class MPHDRR_OT_ct_to_attenuation(jobs.JobOperator, bpy.types.Operator):
@@ -46,10 +50,7 @@ class MPHDRR_OT_ct_to_attenuation(jobs.JobOperator, bpy.types.Operator):
         name="Energy (keV)", description="Tc-99m: 140.5; a CT of 120 kV: about 70", default=140.5, min=10.0, max=1000.0
     )
 
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        is_ct = volumes.is_volume(context.object) and volumes.quantity_of(context.object) == "hu"
-        return polled(cls, is_ct, "No CT is active: select a volume of CT numbers (hu)")
+    poll = needs((_is_ct, "No CT is active: select a volume of CT numbers (hu)"))
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
         return volume_import.converting(context.object, typed(self.energy))
@@ -81,9 +82,7 @@ class MPHDRR_OT_remake_volumes(jobs.JobOperator, bpy.types.Operator):
     bl_idname = ids.REMAKE_VOLUMES
     bl_label = "Make Missing Volumes Again"
 
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return polled(cls, bool(recovery.missing(context.scene)[0]), "No phantom or map misses its file of voxels")
+    poll = needs((lambda context: recovery.missing(context.scene)[0], "No phantom or map misses its file of voxels"))
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
         return recovery.remaking(context.scene)

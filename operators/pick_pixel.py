@@ -5,10 +5,10 @@ import numpy as np
 from bpy.props import FloatProperty, IntProperty
 from bpy_extras import view3d_utils
 
-from ..addon import epipolar, epipolar_drawing, ids, tiles
+from ..addon import epipolar, epipolar_drawing, ids, images, tiles
 from ..addon.decimals import typed
 from ..addon.eyedropper import Eyedropper, region_under
-from ..addon.reports import polled, run_reported
+from ..addon.reports import needs, run_reported
 from ..core.errors import InputError
 
 
@@ -37,9 +37,7 @@ class MPHDRR_OT_pick_pixel(Eyedropper, bpy.types.Operator):
         options={"SKIP_SAVE"},
     )  # fmt: skip
 
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return polled(cls, ids.MOSAIC in bpy.data.images, "No projections yet: render them first")
+    poll = needs(images.PROJECTED)
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         try:
@@ -80,9 +78,7 @@ class MPHDRR_OT_clear_pixel(bpy.types.Operator):
     bl_label = "Clear Picked Pixel"
     bl_options = {"REGISTER", "UNDO"}
 
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return polled(cls, bool(context.scene.mphdrr_epipolar.views), "No pixel is picked")
+    poll = needs((lambda context: context.scene.mphdrr_epipolar.views, "No pixel is picked"))
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         epipolar.clear(context.scene)

@@ -7,6 +7,7 @@ import bpy
 from bpy.app.translations import pgettext_iface as iface
 
 from ..addon import following, ids, jobs, scanner, selection
+from ..addon.layouts import labelled
 from ..addon.properties import LABELS
 from .geometry import ScannerPanel, draw_facts, draw_text
 
@@ -112,9 +113,7 @@ def _draw_numbers(
     layout: bpy.types.UILayout, numbers: bpy.types.PropertyGroup, mixed: Sequence[str]
 ) -> bpy.types.UILayout:
     """Draw d, Ld, Td, R and l; "mixed" stands beside those that differ between modules."""
-    column = layout.column(align=True)
-    column.use_property_split = True
-    column.use_property_decorate = False
+    column = labelled(layout.column(align=True))
     for name, label in LABELS.items():
         if name != "collimator_length":
             column.prop(numbers, name, text=_label(label, name in mixed))

@@ -11,6 +11,12 @@ def labelled(layout: bpy.types.UILayout) -> bpy.types.UILayout:
     return layout
 
 
+def invoking(layout: bpy.types.UILayout) -> bpy.types.UILayout:
+    """The layout, whose buttons from now on ask the user first where their operators do."""
+    layout.operator_context = "INVOKE_DEFAULT"
+    return layout
+
+
 def draw_settings(
     layout: bpy.types.UILayout, settings: bpy.types.PropertyGroup, names: Iterable[tuple[str, bool]]
 ) -> None:

@@ -40,6 +40,16 @@ def needs(*every: Need) -> Any:
     return classmethod(poll)
 
 
+class Reported:
+    """Mix into an operator that does `act`, and reports the line that this returns, or what it raises."""
+
+    bl_options = {"REGISTER", "UNDO"}
+
+    def execute(self: Any, context: bpy.types.Context) -> set[str]:
+        """Act and report."""
+        return run_reported(self, lambda: self.act(context))
+
+
 def run_reported(operator: bpy.types.Operator, action: Callable[[], str]) -> set[str]:
     """Run an operator's work; report its warnings, and the line that it returns or an `InputError` as {'ERROR'}."""
     try:

@@ -5,7 +5,7 @@ from collections.abc import Iterable
 import bpy
 
 from . import following, images, scanner
-from .reports import Need, needs, run_reported
+from .reports import Need, Reported, needs
 
 SCANNER: Need = (
     lambda context: scanner.active_scanner(context.scene) is not None,
@@ -105,16 +105,14 @@ def select_active(scene: bpy.types.Scene) -> None:
         layer.objects.active = camera
 
 
-class OnScanner:
+class OnScanner(Reported):
     """Mix into an operator that works on the scanner of the panels."""
-
-    bl_options = {"REGISTER", "UNDO"}
 
     poll = needs(SCANNER)
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
-        """Do the work and report."""
-        return run_reported(self, lambda: self.change(context, scanner.required_scanner(context.scene)))
+    def act(self, context: bpy.types.Context) -> str:
+        """Do the work on the scanner."""
+        return self.change(context, scanner.required_scanner(context.scene))
 
     def change(self, context: bpy.types.Context, collection: bpy.types.Collection) -> str:
         """Do the work and return the line to report; raises InputError."""

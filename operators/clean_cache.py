@@ -3,10 +3,10 @@
 import bpy
 
 from ..addon import ids, preferences
-from ..addon.reports import needs, run_reported
+from ..addon.reports import Reported, needs
 
 
-class MPHDRR_OT_clean_cache(bpy.types.Operator):
+class MPHDRR_OT_clean_cache(Reported, bpy.types.Operator):
     """Delete compiled code; it is made again when it is needed"""
 
     bl_idname = ids.CLEAN_CACHE
@@ -15,5 +15,5 @@ class MPHDRR_OT_clean_cache(bpy.types.Operator):
 
     poll = needs((lambda context: preferences.cache_size() > 0, "The cache is empty"))
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
-        return run_reported(self, preferences.clean_cache)
+    def act(self, context: bpy.types.Context) -> str:
+        return preferences.clean_cache()

@@ -6,18 +6,17 @@ from bpy_extras.io_utils import ExportHelper
 
 from ..addon import choices, event_sets, ids, jobs
 from ..addon.event_properties import COUNT, FOLDER, MODEL, NEXT, OPENED, RECIPE
-from ..addon.reports import run_reported
+from ..addon.reports import Reported
 from ..core.events.templates import TEMPLATES
 
 
-class MPHDRR_OT_new_event_recipe(ExportHelper, bpy.types.Operator):
+class MPHDRR_OT_new_event_recipe(Reported, ExportHelper, bpy.types.Operator):
     """Write a recipe for events with comments in it, to be edited and tried. Its scanner is the scene's workbook, or the
     example's where there is none
     """
 
     bl_idname = ids.NEW_EVENT_RECIPE
     bl_label = "New Event Recipe"
-    bl_options = {"REGISTER", "UNDO"}
 
     filename_ext = ".toml"
     filter_glob: StringProperty(default="*.toml", options={"HIDDEN"})
@@ -26,8 +25,8 @@ class MPHDRR_OT_new_event_recipe(ExportHelper, bpy.types.Operator):
         items=choices.items({}, ((name, name.capitalize(), text) for name, text in TEMPLATES.items())),
     )  # fmt: skip
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
-        return run_reported(self, lambda: event_sets.write_recipe(context.scene, self.filepath, self.like))
+    def act(self, context: bpy.types.Context) -> str:
+        return event_sets.write_recipe(context.scene, self.filepath, self.like)
 
 
 class MPHDRR_OT_try_event(jobs.JobOperator, bpy.types.Operator):

@@ -11,7 +11,7 @@ from bpy_extras.io_utils import ImportHelper
 from ..addon import choices, ids, images, jobs, rendering, runs, scanner, storage, tiles
 from ..addon.decimals import typed
 from ..addon.projection_properties import OPENING_ANGLE, ProjectionSettings, settings_recipe, use_preset
-from ..addon.reports import needs, run_reported
+from ..addon.reports import Reported, needs
 from ..core.errors import InputError
 from ..core.runs.presets import PRESETS
 
@@ -72,26 +72,22 @@ class MPHDRR_OT_use_preset(bpy.types.Operator):
         return {"FINISHED"}
 
 
-class MPHDRR_OT_load_recipe(ImportHelper, bpy.types.Operator):
+class MPHDRR_OT_load_recipe(Reported, ImportHelper, bpy.types.Operator):
     """Set the panel as a recipe (.toml) or a run (.h5, .npz, .pt) says: model, detector, noise, modules and, where the
     scene has objects of their names, volumes. By default the recipe of the last run
     """
 
     bl_idname = ids.LOAD_RECIPE
     bl_label = "Load Recipe"
-    bl_options = {"REGISTER", "UNDO"}
 
     filter_glob: StringProperty(default="*.toml;*.h5;*.hdf5;*.npz;*.pt", options={"HIDDEN"})
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
-        def load() -> str:
-            filepath = self.filepath or context.scene.mphdrr_projections.run_file
-            if not filepath:
-                raise InputError("no file given: set filepath to a recipe (.toml) or a run (.h5, .npz, .pt)")
-            rendering.load_recipe(context.scene, Path(storage.absolute(filepath)))
-            return f"Set the panel as {bpy.path.basename(filepath)} says"
-
-        return run_reported(self, load)
+    def act(self, context: bpy.types.Context) -> str:
+        filepath = self.filepath or context.scene.mphdrr_projections.run_file
+        if not filepath:
+            raise InputError("no file given: set filepath to a recipe (.toml) or a run (.h5, .npz, .pt)")
+        rendering.load_recipe(context.scene, Path(storage.absolute(filepath)))
+        return f"Set the panel as {bpy.path.basename(filepath)} says"
 
 
 class ShowPicture:

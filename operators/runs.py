@@ -6,7 +6,7 @@ import bpy
 from bpy.props import EnumProperty, IntProperty
 
 from ..addon import ids, images, jobs, rendering, runs
-from ..addon.reports import Need, needs, run_reported
+from ..addon.reports import Need, Reported, needs
 from ..core.errors import InputError
 from ..core.progress import Progress
 from ..core.runs.comparing import difference, difference_sheet
@@ -41,12 +41,11 @@ class MPHDRR_OT_show_run(jobs.JobOperator, bpy.types.Operator):
         return rendering.showing_job(context.scene, self.index)
 
 
-class MPHDRR_OT_remove_run(bpy.types.Operator):
+class MPHDRR_OT_remove_run(Reported, bpy.types.Operator):
     """Remove a run from the list, and its file from the disk if it is in this .blend's own folder"""
 
     bl_idname = ids.REMOVE_RUN
     bl_label = "Remove Run"
-    bl_options = {"REGISTER", "UNDO"}
 
     poll = needs(_LISTED)
 
@@ -59,12 +58,9 @@ class MPHDRR_OT_remove_run(bpy.types.Operator):
             message="Neither Undo nor the .blend as it was saved will find its file again.",
         )  # fmt: skip
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
-        def remove() -> str:
-            _required_run(context.scene, self.index)
-            return rendering.remove_run(context.scene, self.index)
-
-        return run_reported(self, remove)
+    def act(self, context: bpy.types.Context) -> str:
+        _required_run(context.scene, self.index)
+        return rendering.remove_run(context.scene, self.index)
 
 
 def _other_runs(self: Any, context: bpy.types.Context | None) -> list[tuple[str, str, str]]:

@@ -4,7 +4,7 @@ import bpy
 from bpy.app.translations import pgettext_iface as iface
 
 from ..addon import epipolar, ids
-from ..addon.layouts import labelled
+from ..addon.layouts import invoking, labelled
 from .geometry import Sidebar, draw_facts, draw_text
 
 
@@ -21,8 +21,7 @@ class _Epipolar:
     def draw(self, context: bpy.types.Context) -> None:
         layout = labelled(self.layout)  # type: ignore[attr-defined]
         settings = context.scene.mphdrr_epipolar
-        row = layout.row(align=True)
-        row.operator_context = "INVOKE_DEFAULT"
+        row = invoking(layout.row(align=True))
         row.operator(ids.PICK_PIXEL, icon="EYEDROPPER")
         row.operator(ids.CLEAR_PIXEL, text="", icon="X")
         run = epipolar.run_views(context.scene)

@@ -4,7 +4,7 @@ import bpy
 from bpy.app.translations import pgettext_iface as iface
 
 from ..addon import ids, jobs, rendering, runs, scanner, volumes
-from ..addon.layouts import draw_settings, labelled
+from ..addon.layouts import draw_settings, invoking, labelled
 from ..addon.projection_properties import drawn, makes_counts
 from .geometry import Sidebar, draw_hint, draw_text
 from .runs import draw_changes
@@ -32,9 +32,8 @@ class MPHDRR_PT_projections(Sidebar, bpy.types.Panel):
             modules.prop(settings, "first")
             modules.prop(settings, "last")
         draw_settings(column, settings, drawn(settings, "compute"))
-        row = layout.row()
+        row = invoking(layout.row())
         row.scale_y = 1.4
-        row.operator_context = "INVOKE_DEFAULT"
         has_scanner = scanner.active_scanner(context.scene) is not None
         has_volume = bool(volumes.volume_objects(context.scene))
         row.enabled = has_scanner and has_volume
@@ -87,8 +86,7 @@ class MPHDRR_PT_export(Sidebar, bpy.types.Panel):
     bl_order = ids.ORDER_EXPORT
 
     def draw(self, context: bpy.types.Context) -> None:
-        layout = self.layout
-        layout.operator_context = "INVOKE_DEFAULT"
+        layout = invoking(self.layout)
         run_file = context.scene.mphdrr_projections.run_file
         row = layout.row()
         row.enabled = bool(run_file)

@@ -4,7 +4,7 @@ import bpy
 from bpy.app.translations import pgettext_iface as iface
 
 from ..addon import ids, jobs, plots, runs
-from ..addon.layouts import draw_settings, labelled
+from ..addon.layouts import draw_settings, invoking, labelled
 from ..addon.reconstruction_properties import drawn
 from .geometry import Sidebar, draw_hint, draw_text
 
@@ -27,9 +27,8 @@ class MPHDRR_PT_reconstruction(Sidebar, bpy.types.Panel):
             jobs.draw_job(layout)
             layout.label(text=iface("Of {run}").format(run=run.name), translate=False, icon="RENDER_STILL")
         draw_settings(layout.column(), settings, (each for each in drawn(settings) if each[0] in _MAIN))
-        row = layout.row()
+        row = invoking(layout.row())
         row.scale_y = 1.4
-        row.operator_context = "INVOKE_DEFAULT"
         row.operator(ids.RECONSTRUCT, text="Reconstruct", icon="OUTLINER_OB_VOLUME")
         known = settings.known
         if known and settings.volume is not None:
@@ -72,7 +71,6 @@ class MPHDRR_PT_backprojection(Sidebar, bpy.types.Panel):
     bl_options = {"DEFAULT_CLOSED"}
 
     def draw(self, context: bpy.types.Context) -> None:
-        layout = labelled(self.layout)
+        layout = invoking(labelled(self.layout))
         layout.prop(context.scene.mphdrr_reconstruction, "how")
-        layout.operator_context = "INVOKE_DEFAULT"
         layout.operator(ids.BACKPROJECT, text="Back-Project", icon="OUTLINER_DATA_VOLUME")

@@ -19,7 +19,7 @@ from ..core.memory import readable_size
 from ..core.runs.recipe import Recipe, fitting_recipe
 from ..core.runs.run import ProjectionRun
 from ..core.runs.settings import SETTINGS, Setting
-from . import cameras, following, ids, phantoms, scanner, storage, volumes
+from . import cameras, following, ids, phantoms, scanner, storage, volumes, windows
 from .decimals import typed
 from .module_values import FROM_ROI, numbers_of
 from .projection_properties import OPENING_ANGLE, settings_recipe
@@ -193,14 +193,11 @@ def _look() -> None:
     """Compare the shown runs with their scenes, and have the panels drawn where that has changed."""
     if bpy.app.background:
         return
-    windows = bpy.context.window_manager.windows
-    found = {window.scene.name: changes(window.scene) for window in windows}
+    found = {window.scene.name: changes(window.scene) for window in bpy.context.window_manager.windows}
     if any(_looked.get(name) != lines for name, lines in found.items()):
         _looked.update(found)
-        for area in (area for window in windows for area in window.screen.areas):
-            for region in area.regions:
-                if (area.type == "VIEW_3D" and region.type == "UI") or area.type == "IMAGE_EDITOR":
-                    region.tag_redraw()
+        windows.redraw_sidebars()
+        windows.redraw("IMAGE_EDITOR")
 
 
 def _volume_state(item: bpy.types.Object) -> dict[str, Any]:

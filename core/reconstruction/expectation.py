@@ -1,12 +1,11 @@
 """Maximum likelihood by expectation maximisation: MLEM and OSEM."""
 
-import warnings
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..errors import InputWarning
+from ..errors import warn
 from ..memory import require
 from ..progress import Progress
 from ..projector import Projector
@@ -160,8 +159,7 @@ def _em(loop: Loop, A: Projector, data: CountData, subsets: Any, prior: Prior | 
 
     result = loop.run(step, {"subsets": n, **data.record(total, prior)}, objective)
     if too_late > _TOO_LATE:
-        text = f"prior: too strong for one step late in {too_late:.0%} of the voxels: take less weight, or bsrem"
-        warnings.warn(text, InputWarning, stacklevel=3)
+        warn(f"prior: too strong for one step late in {too_late:.0%} of the voxels: take less weight, or bsrem")
     return result
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.geometry.views import Views
-from ..core.progress import Progress
+from ..core.progress import Progress, tell
 from ..core.runs.display import Display
 from ..core.runs.exr import exr_bytes
 from ..core.runs.mosaic import Sheet, as_seen, labels, png, sheet, smaller
@@ -223,8 +223,7 @@ def _in_threads(
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         for file in pool.map(make, pictures):
             files.append(file)
-            if progress is not None:
-                progress(done + len(files), total)
+            tell(progress, done + len(files), total)
     return files
 
 

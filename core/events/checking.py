@@ -9,7 +9,7 @@ from pathlib import Path
 
 from ..errors import InputError
 from ..files import ensure_folder
-from ..progress import Progress
+from ..progress import Progress, tell
 from .event_files import header, verify
 from .folders import EVENTS, INDEX, INPUT_LIST, INPUTS, RECIPE, SetFolder, is_leftover
 from .planning import plan
@@ -93,8 +93,7 @@ def check(folder: str | os.PathLike[str], progress: Progress | None = None) -> l
         for done, fault in enumerate(pool.map(faults_of, numbers), 1):
             if fault is not None:
                 faults.append(fault)
-            if progress is not None:
-                progress(done, len(numbers))
+            tell(progress, done, len(numbers))
     return [*faults, *_foreign(target)]
 
 

@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike
 
 from ..errors import warn
 from ..memory import require
-from ..progress import Progress
+from ..progress import Progress, tell
 from ..projector import Projector
 from ..projector.subsets import access_order, balanced_subsets
 from .counts import LEAST, CountData
@@ -147,8 +147,7 @@ def _em(loop: Loop, A: Projector, data: CountData, subsets: Any, prior: Prior | 
                 divisor = np.maximum(late, least)
             factor = np.divide(factor, divisor, out=np.ones_like(x), where=seen[s] > LEAST)
             x = np.multiply(x, factor, out=factor)
-            if progress is not None:
-                progress(k + 1, n)
+            tell(progress, k + 1, n)
         return x, objective(x, waiting(progress, n, n))
 
     def objective(x: Array, asked: Progress | None) -> float:

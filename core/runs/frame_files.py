@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..memory import require
-from ..progress import Progress
+from ..progress import Progress, tell
 from ..recording import recorded_warnings
 from ..validation import whole_shape
 from ..volumes.formats import metaimage
@@ -137,8 +137,7 @@ def read_frames(
         if first != last:
             size = f"{last[0]} x {last[1]} pixels, {paths[0]} of {first[0]} x {first[1]}"
             raise InputError(f"{one}: it holds frames of {size}; expected one size")
-        if progress is not None:
-            progress(number, len(paths))
+        tell(progress, number, len(paths))
     counts = found[0] if len(found) == 1 else np.concatenate(found).view(Counts)
     counts.about = np.concatenate([one.about for one in found])
     counts.kind = ", ".join(sorted({one.kind for one in found} - {""}))

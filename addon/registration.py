@@ -212,14 +212,8 @@ def register(command: Callable[..., int] | None = None) -> None:
 def unregister() -> None:
     """Take back what `register` did."""
     atexit.unregister(unregister)
-    jobs.stop()
-    preview.stop()
-    live_scanner.stop()
-    live_phantoms.stop()
-    runs.stop()
-    plots.stop()
-    recoloring.stop()
-    event_notes.stop()
+    for module in (jobs, preview, live_scanner, live_phantoms, runs, plots, recoloring, event_notes):
+        module.stop()
     _registered.close()
 
 

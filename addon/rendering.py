@@ -131,8 +131,7 @@ def exporting(scene: bpy.types.Scene, filepath: str) -> jobs.Job:
         raise InputError("no file given: set filepath to a name ending in .h5, .npz or .pt")
     path = storage.absolute(filepath)
     if found := runs.changes(scene):
-        text = f"the run is not of the scene as it is now ({'; '.join(found)}): {path.name} holds what was rendered"
-        warn(text)
+        warn(f"the run is not of the scene as it is now ({'; '.join(found)}): {path.name} holds what was rendered")
 
     def work(progress: Progress) -> None:
         stages_of(progress)("reading the run file")

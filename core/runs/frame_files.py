@@ -17,7 +17,7 @@ from ..errors import InputError
 from ..memory import require
 from ..progress import Progress, tell
 from ..recording import recorded_warnings
-from ..validation import whole_shape
+from ..validation import one_of, whole_shape
 from ..volumes.formats import metaimage
 from ..volumes.formats.contents import first_line, reading
 from ..volumes.formats.dicom import is_dicom
@@ -204,8 +204,7 @@ def _raw(path: Path, layout: Layout) -> NDArray[Any]:
             "shape (--raw-shape FRAMES ROWS COLUMNS)" if layout.shape is None else "type (--raw-type, uint16 or so)"
         )
         raise InputError(f"raw numbers need their {missing}")
-    if layout.type not in RAW_TYPES:
-        raise InputError(f"raw type {layout.type!r}: expected one of {', '.join(RAW_TYPES)}")
+    one_of(layout.type, RAW_TYPES, "raw type")
     kind = np.dtype(layout.type).newbyteorder(">" if layout.big_endian else "<")
     return _numbers(path, kind, whole_shape(layout.shape, "raw shape (--raw-shape)", 3))
 

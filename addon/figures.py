@@ -225,13 +225,8 @@ def _rays(system: PinholeSystem) -> bpy.types.Curve:
         spline.points.add(1)
         spline.points[0].co = (*center, 1.0)
         spline.points[1].co = (0.0, 0.0, 0.0, 1.0)
-    material = bpy.data.materials.new(ids.STUDIO)
-    compat.enable_nodes(material)
-    nodes, links = material.node_tree.nodes, material.node_tree.links
-    nodes.clear()
-    shine, output = nodes.new("ShaderNodeEmission"), nodes.new("ShaderNodeOutputMaterial")
+    material, shine = compat.surface_material(ids.STUDIO, "ShaderNodeEmission")
     shine.inputs["Color"].default_value = _RAY_COLOR
-    links.new(shine.outputs[0], output.inputs["Surface"])
     curve.materials.append(material)
     return curve
 

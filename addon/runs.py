@@ -13,7 +13,7 @@ from typing import Any
 import bpy
 import numpy as np
 
-from ..core.errors import InputError
+from ..core.errors import InputError, refusing
 from ..core.geometry.system import LENGTHS, PinholeSystem
 from ..core.memory import readable_size
 from ..core.runs.recipe import Recipe, fitting_recipe
@@ -156,10 +156,8 @@ def remove_file(item: bpy.types.PropertyGroup) -> bool:
     needed = [run.file for scene in bpy.data.scenes for run in scene.mphdrr_projections.runs].count(item.file)
     if not storage.is_own(path) or needed > 1:
         return not path.exists()
-    try:
+    with refusing(path, "cannot be removed"):
         path.unlink(missing_ok=True)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be removed ({error.strerror or error})") from error
     return True
 
 

@@ -68,9 +68,14 @@ _BALL = np.stack(  # points (N, 3) of a sphere of radius 1
 
 
 def figure_job(
-    context: bpy.types.Context, name: str, paths: Sequence[Path], size: tuple[int, int] | None = None,
-    modules: str | None = None, labels: bool = True, samples: int = SAMPLES,
-) -> jobs.Job:  # fmt: skip
+    context: bpy.types.Context,
+    name: str,
+    paths: Sequence[Path],
+    size: tuple[int, int] | None = None,
+    modules: str | None = None,
+    labels: bool = True,
+    samples: int = SAMPLES,
+) -> jobs.Job:
     """The job that writes a figure of the context's scene to files (.png, .svg), `size` pixels wide and high.
 
     `modules` are all by default; of figures of one module, the active one. Raises InputError where the scene has not what
@@ -119,9 +124,13 @@ def figure_job(
 
 
 def rendering(
-    page: Page, subject: Subject, shown: Studio, item: bpy.types.Object | None = None, labels: bool = True,
+    page: Page,
+    subject: Subject,
+    shown: Studio,
+    item: bpy.types.Object | None = None,
+    labels: bool = True,
     samples: int = SAMPLES,
-) -> Generator[None, None, None]:  # fmt: skip
+) -> Generator[None, None, None]:
     """Render a subject's scanner, and the volume of an object, onto a page; yields while Blender's own job renders."""
     assert subject.scanner is not None
     system = subject.chosen(subject.scanner)

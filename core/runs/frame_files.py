@@ -314,10 +314,10 @@ def _interfile(path: Path, layout: Layout) -> Counts:
     keys = (f"{name} (sec)" for name in ("time per projection", "image duration", "study duration"))
     times = next(([float(text) for text in header[key]] for key in keys if any(header.get(key, ()))), [])
     windows = int(number("number of energy windows", 1))
-    return _counts(
-        _numbers(data, type_, (count, rows, columns), skip), f"{windows} energy windows" if windows > 1 else "", time=times,
-        pixel=[float(said(f"scaling factor (mm/pixel) [{i}]", "nan")) for i in (1, 2)], window=range(1, windows + 1),
-    )  # fmt: skip
+    pixel = [float(said(f"scaling factor (mm/pixel) [{i}]", "nan")) for i in (1, 2)]
+    kind = f"{windows} energy windows" if windows > 1 else ""
+    frames = _numbers(data, type_, (count, rows, columns), skip)
+    return _counts(frames, kind, time=times, pixel=pixel, window=range(1, windows + 1))
 
 
 def _interfile_header(path: Path) -> dict[str, list[str]]:

@@ -197,9 +197,7 @@ def model_of(run: ProjectionRun, recipe: Recipe) -> Recipe:
         hole = "auto" if is_free and is_whole and _by_depth(recipe) else "rays"
     if hole == "rays" and points is None:
         points = _POINTS if is_whole else made
-    changes: dict[str, Any] = {
-        **dict.fromkeys(SAMPLING), "model.hole": hole, "model.aperture_points": points,
-    }  # fmt: skip
+    changes: dict[str, Any] = dict.fromkeys(SAMPLING) | {"model.hole": hole, "model.aperture_points": points}
     if hole == "rays":
         # The tolerance is for images of single voxels; neighbours make up for each other's errors.
         changes |= {"model.pixel_points": recipe["reconstruction.pixel_points"], "model.tolerance": 1e9}

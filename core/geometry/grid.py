@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -76,3 +77,8 @@ class Grid:
 
     def __hash__(self) -> int:
         return hash((self.shape, self.affine.tobytes()))
+
+
+def part_of(grid: Grid, start: ArrayLike, shape: Any) -> Grid:
+    """The grid of the voxels of a `grid` from the index `start` on, (n_x, n_y, n_z) of them; it may reach beyond."""
+    return Grid(shape, affine_matrix(grid.affine[:3, :3], grid.affine[:3, 3] + grid.affine[:3, :3] @ np.array(start)))

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..arrays import ArrayOrTensor, cropped
 from ..errors import InputError
-from ..geometry.grid import Grid
+from ..geometry.grid import Grid, part_of
 from .rays import Array, Attenuation, Ends, IndexFans, IndexRays, Rays, index_fans, index_rays
 
 Index = tuple[int, int, int]
@@ -46,11 +46,8 @@ class Lattices:
 
     def corners(self) -> Array:
         """Corners (8, 3), world mm, of the part of the grid that is traced."""
-        if self.volume is None:
-            return self.grid.corners()
-        affine = self.grid.affine.copy()
-        affine[:3, 3] += affine[:3, :3] @ np.array(self.origin)
-        return Grid(self.volume.shape, affine).corners()
+        grid = self.grid if self.volume is None else part_of(self.grid, self.origin, self.volume.shape)
+        return grid.corners()
 
 
 def filled_lattices(

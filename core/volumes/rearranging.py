@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InputError
-from ..geometry.grid import Grid
+from ..geometry.grid import Grid, part_of
 from ..memory import require
 from ..validation import freeze, instance, one_for_all, real_array, real_numbers
 from .volume import Volume, outside_value
@@ -120,6 +120,4 @@ def _indices(value: ArrayLike, name: str) -> NDArray[np.int64]:
 
 def _moved(volume: Volume, array: NDArray[np.float32], start: NDArray[np.int64]) -> Volume:
     """`array` as a volume whose first voxel has the index `start` in `volume`."""
-    affine = volume.grid.affine.copy()
-    affine[:3, 3] += affine[:3, :3] @ start
-    return Volume(array, Grid(array.shape, affine), volume.quantity)  # type: ignore[arg-type]
+    return Volume(array, part_of(volume.grid, start, array.shape), volume.quantity)

@@ -38,9 +38,7 @@ def backprojecting(context: bpy.types.Context, recipe: Recipe, how: str) -> jobs
         return store_volume(volume, folder, None, provenance)
 
     def finish(stored: StoredVolume) -> str:
-        scene = jobs.found_again(bpy.data.scenes, uid)
-        if scene is None:
-            raise InputError("the scene that the back-projection is for is gone")
+        scene = jobs.scene_again(uid, "the back-projection is")
         item = volumes.add_stored(stored, f"{name} {label}", scene.collection)
         volumes.make_active(bpy.context, item)
         slices.add_slices(item)  # it is somewhere everywhere: as smoke, a cloud

@@ -77,22 +77,17 @@ def part_material(part: str) -> bpy.types.Material:
     material = bpy.data.materials.get(name)
     if material is not None:
         return material
-    material = bpy.data.materials.new(name)
-    compat.enable_nodes(material)
+    material, shader = compat.surface_material(name, "ShaderNodeBsdfPrincipled")
     # In Solid view:
     material.diffuse_color, material.metallic, material.roughness = look.color, 0.3 * look.metallic, look.roughness
     if look.color[3] < 1.0:
         material.surface_render_method = "BLENDED"
-    nodes, links = material.node_tree.nodes, material.node_tree.links
-    nodes.clear()  # Blender 4.5 begins with a volume's nodes where a volume is active
-    shader, output = nodes.new("ShaderNodeBsdfPrincipled"), nodes.new("ShaderNodeOutputMaterial")
-    output.location = (300, 0)
-    links.new(shader.outputs[0], output.inputs["Surface"])
     shader.inputs["Base Color"].default_value = (*look.color[:3], 1.0)
     shader.inputs["Metallic"].default_value = look.metallic
     shader.inputs["Roughness"].default_value = look.roughness
     shader.inputs["Alpha"].default_value = look.color[3]
     if part == "ROI":  # transparent but for its rim
+        nodes, links = material.node_tree.nodes, material.node_tree.links
         weight, scale = nodes.new("ShaderNodeLayerWeight"), nodes.new("ShaderNodeMath")
         weight.location, scale.location = (-520, 0), (-260, 0)
         weight.inputs["Blend"].default_value = 0.25

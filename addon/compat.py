@@ -7,7 +7,20 @@ import bpy
 VDB_CENTER_SHIFT = 0.0 if bpy.app.version >= (5, 0, 0) else -0.5
 
 
-def enable_nodes(material: bpy.types.Material) -> None:
-    """Give a new material its node tree; since 5.0 every material has one."""
-    if bpy.app.version < (5, 0, 0):
+def blank_material(name: str) -> bpy.types.Material:
+    """A new material with an empty node tree."""
+    material = bpy.data.materials.new(name)
+    if bpy.app.version < (5, 0, 0):  # since then every material has a node tree
         material.use_nodes = True
+    material.node_tree.nodes.clear()  # 4.5 begins with a volume's nodes where a volume is active
+    return material
+
+
+def surface_material(name: str, kind: str) -> tuple[bpy.types.Material, bpy.types.Node]:
+    """A new material whose surface is a shader of that kind, and the shader."""
+    material = blank_material(name)
+    tree = material.node_tree
+    shader, output = tree.nodes.new(kind), tree.nodes.new("ShaderNodeOutputMaterial")
+    output.location = (300.0, 0.0)
+    tree.links.new(shader.outputs[0], output.inputs["Surface"])
+    return material, shader

@@ -46,7 +46,7 @@ def importing(context: bpy.types.Context, paths: list[Path], said: Mapping[str, 
 
     def finish(result: tuple[ProjectionRun, images.Pictures]) -> jobs.Finishing:
         run, made = result
-        scene = rendering.scene_again(scene_uid)
+        scene = jobs.scene_again(scene_uid, "the projections are")
         owner = jobs.found_again(bpy.data.collections, scanner_uid)
         state = runs.state_of(system, run.recipe, None, None) | {"measured": caption(run)}
         images.show((yield from rendering.storing(scene, run, path, state, owner, made)), bpy.context)

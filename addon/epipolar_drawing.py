@@ -8,7 +8,7 @@ import numpy as np
 from gpu_extras.batch import batch_for_shader
 from numpy.typing import NDArray
 
-from . import epipolar, ids, images, planes, tiles
+from . import epipolar, ids, images, planes, tiles, windows
 
 Floats = NDArray[np.float64]
 
@@ -93,10 +93,7 @@ def draw_in_scene() -> None:
 
 def redraw(*_: Any) -> None:
     """Have the editors drawn again: the pixel or the marker was changed, perhaps by a script."""
-    for window in bpy.context.window_manager.windows:
-        for area in window.screen.areas:
-            if area.type in ("VIEW_3D", "IMAGE_EDITOR"):
-                area.tag_redraw()
+    windows.redraw("VIEW_3D", "IMAGE_EDITOR")
 
 
 def plane_pixel(

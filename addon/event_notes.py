@@ -16,6 +16,7 @@ from ..core.events.folders import EVENTS, INDEX, RECIPE, SetFolder
 from ..core.memory import readable_size
 from ..core.recording import recorded_warnings
 from . import storage
+from .windows import redraw_sidebars
 
 _INTERVAL = 0.1  # s between two looks at a thread that reads
 _LOOK = 2.0  # s between two looks at a file's date
@@ -139,9 +140,5 @@ def _watch() -> float | None:
     for path in done:
         del _readers[path]
     if done:
-        for window in bpy.context.window_manager.windows:
-            for area in window.screen.areas:
-                for region in area.regions:
-                    if area.type == "VIEW_3D" and region.type == "UI":
-                        region.tag_redraw()
+        redraw_sidebars()
     return _INTERVAL if _readers else None

@@ -79,7 +79,7 @@ def trying(context: bpy.types.Context, filepath: str, number: int, folder: str =
 
     def finish(made: tuple[_Phantom, str]) -> str:
         phantom, said = made
-        scene = _scene_again(uid)
+        scene = jobs.scene_again(uid, "the event is")
         settings = scene.mphdrr_events
         item = _put(scene, phantom, target)
         settings.phantom, settings.tried, settings.number = item, said, number + 1
@@ -171,7 +171,7 @@ def opening(context: bpy.types.Context, folder: str, number: int, model: str = "
         run, mosaic = opened.run, None
         if run is not None and opened.pictures is not None:
             mosaic = yield from images.storing(run, opened.pictures)
-        scene = _scene_again(uid)
+        scene = jobs.scene_again(uid, "the event is")
         settings = scene.mphdrr_events
         collection = scanner.active_scanner(scene)
         if run is not None and collection is None:
@@ -299,13 +299,6 @@ def _show(item: bpy.types.Object, other: bpy.types.Object | None) -> None:
     if item.name in known:
         item.hide_set(False)
         volumes.make_active(bpy.context, item)
-
-
-def _scene_again(uid: int) -> bpy.types.Scene:
-    scene = jobs.found_again(bpy.data.scenes, uid)
-    if scene is None:
-        raise InputError("the scene that the event is for is gone")
-    return scene
 
 
 def _said(planned: events.PlannedEvent) -> str:

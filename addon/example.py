@@ -41,7 +41,7 @@ def example_job(context: bpy.types.Context) -> jobs.Job:
 
     def finish(result: Any) -> jobs.Finishing:
         stored, run, made = result
-        scene = rendering.scene_again(scene_uid)
+        scene = jobs.scene_again(scene_uid, "the projections are")
         mosaic = yield from images.storing(run, made)
         collection = scanner.build_scanner(scene, system)
         yield None

@@ -68,9 +68,14 @@ _BALL = np.stack(  # points (N, 3) of a sphere of radius 1
 
 
 def figure_job(
-    context: bpy.types.Context, name: str, paths: Sequence[Path], size: tuple[int, int] | None = None,
-    modules: str | None = None, labels: bool = True, samples: int = SAMPLES,
-) -> jobs.Job:  # fmt: skip
+    context: bpy.types.Context,
+    name: str,
+    paths: Sequence[Path],
+    size: tuple[int, int] | None = None,
+    modules: str | None = None,
+    labels: bool = True,
+    samples: int = SAMPLES,
+) -> jobs.Job:
     """The job that writes a figure of the context's scene to files (.png, .svg), `size` pixels wide and high.
 
     `modules` are all by default; of figures of one module, the active one. Raises InputError where the scene has not what
@@ -119,9 +124,13 @@ def figure_job(
 
 
 def rendering(
-    page: Page, subject: Subject, shown: Studio, item: bpy.types.Object | None = None, labels: bool = True,
+    page: Page,
+    subject: Subject,
+    shown: Studio,
+    item: bpy.types.Object | None = None,
+    labels: bool = True,
     samples: int = SAMPLES,
-) -> Generator[None, None, None]:  # fmt: skip
+) -> Generator[None, None, None]:
     """Render a subject's scanner, and the volume of an object, onto a page; yields while Blender's own job renders."""
     assert subject.scanner is not None
     system = subject.chosen(subject.scanner)
@@ -225,13 +234,8 @@ def _rays(system: PinholeSystem) -> bpy.types.Curve:
         spline.points.add(1)
         spline.points[0].co = (*center, 1.0)
         spline.points[1].co = (0.0, 0.0, 0.0, 1.0)
-    material = bpy.data.materials.new(ids.STUDIO)
-    compat.enable_nodes(material)
-    nodes, links = material.node_tree.nodes, material.node_tree.links
-    nodes.clear()
-    shine, output = nodes.new("ShaderNodeEmission"), nodes.new("ShaderNodeOutputMaterial")
+    material, shine = compat.surface_material(ids.STUDIO, "ShaderNodeEmission")
     shine.inputs["Color"].default_value = _RAY_COLOR
-    links.new(shine.outputs[0], output.inputs["Surface"])
     curve.materials.append(material)
     return curve
 

@@ -21,7 +21,7 @@ from ..core.geometry.views import Views
 from ..core.memory import require
 from ..core.perspective.perspective_grid import PerspectiveGrid
 from ..core.perspective.resampling import from_perspective, to_perspective
-from ..core.progress import Progress, stages_of
+from ..core.progress import Progress, stages_of, tell
 from ..core.runs.mosaic import as_seen, png
 from ..core.runs.run_recipe import recipe_views
 from ..core.volumes.volume import Volume, outside_value
@@ -73,8 +73,7 @@ def showing(context: bpy.types.Context, planes: int, uniform: str) -> jobs.Job:
         packing, files = stages("packing"), list[bytes]()
         for layer in np.moveaxis(array, 2, 0):
             files.append(png(colored(as_seen(layer.T), quantity, low, high), _PNG_LEVEL))
-            if packing is not None:
-                packing(len(files), planes)
+            tell(packing, len(files), planes)
         return g, files
 
     def finish(made: tuple[PerspectiveGrid, list[bytes]]) -> str:

@@ -15,12 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.geometry.views import Views
-from ..core.progress import Progress
+from ..core.progress import Progress, tell
 from ..core.runs.display import Display
 from ..core.runs.exr import exr_bytes
 from ..core.runs.mosaic import Sheet, as_seen, labels, png, sheet, smaller
 from ..core.runs.run import ProjectionRun
 from . import ids, jobs
+from .reports import Need
+from .windows import areas
 
 _KEY = "mphdrr_projection"  # custom property: marks the images that a new run replaces
 _ARRAYS = ("sources", "detector_centers", "u_steps", "v_steps")
@@ -221,8 +223,7 @@ def _in_threads(
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         for file in pool.map(make, pictures):
             files.append(file)
-            if progress is not None:
-                progress(done + len(files), total)
+            tell(progress, done + len(files), total)
     return files
 
 
@@ -240,10 +241,7 @@ def _describe(
 
 def store_difference(drawn: Sheet, numbers: list[int], unit: str, text: str) -> bpy.types.Image:
     """Make the image of a difference of two runs, until other projections are shown; `text` says its numbers."""
-    file = png(drawn.picture, _PNG_LEVEL)
-    old = bpy.data.images.get(ids.DIFFERENCE)
-    image = _new_picture(ids.DIFFERENCE, file) if old is None else _fill(old, file)
-    image.use_fake_user, image[_KEY] = True, True
+    image = _store(ids.DIFFERENCE, png(drawn.picture, _PNG_LEVEL))
     _describe(image, drawn, numbers, [], unit, None)
     image[_TEXT] = text
     return image
@@ -251,13 +249,18 @@ def store_difference(drawn: Sheet, numbers: list[int], unit: str, text: str) -> 
 
 def store_reconstruction(file: bytes) -> bpy.types.Image:
     """Make the image of a reconstruction, a PNG of it, until other projections are shown."""
-    old = bpy.data.images.get(ids.RECONSTRUCTION)
-    image = _new_picture(ids.RECONSTRUCTION, file) if old is None else _fill(old, file)
+    image = _store(ids.RECONSTRUCTION, file)
+    for area in areas("IMAGE_EDITOR"):
+        if area.spaces.active.image == image:
+            area.tag_redraw()
+    return image
+
+
+def _store(name: str, file: bytes) -> bpy.types.Image:
+    """One of our images of that name, showing a PNG; saved while nothing shows it."""
+    old = bpy.data.images.get(name)
+    image = _new_picture(name, file) if old is None else _fill(old, file)
     image.use_fake_user, image[_KEY] = True, True
-    for window in bpy.context.window_manager.windows:
-        for area in window.screen.areas:
-            if area.type == "IMAGE_EDITOR" and area.spaces.active.image == image:
-                area.tag_redraw()
     return image
 
 
@@ -295,10 +298,9 @@ def projection_array(image: bpy.types.Image) -> NDArray[np.float32]:
 
 def redraw_mosaic() -> None:
     """Have the Image Editors that show the mosaic drawn again: another module is active."""
-    for window in bpy.context.window_manager.windows:
-        for area in window.screen.areas:
-            if area.type == "IMAGE_EDITOR" and tiles(area.spaces.active.image) is not None:
-                area.tag_redraw()
+    for area in areas("IMAGE_EDITOR"):
+        if tiles(area.spaces.active.image) is not None:
+            area.tag_redraw()
 
 
 def show(image: bpy.types.Image, context: bpy.types.Context) -> bool:
@@ -312,6 +314,9 @@ def show(image: bpy.types.Image, context: bpy.types.Context) -> bool:
                 _fit(context, window, area)
                 shown = True
     return shown
+
+
+PROJECTED: Need = (lambda context: ids.MOSAIC in bpy.data.images, "No projections yet: render them first")
 
 
 def show_below(image: bpy.types.Image, context: bpy.types.Context) -> bool:

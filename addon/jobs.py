@@ -25,6 +25,7 @@ from ..core.progress import Cancelled, Progress, StagedProgress
 from ..core.recording import recorded_warnings
 from . import ids
 from .reports import warnings_reported
+from .windows import redraw_sidebars
 
 _INTERVAL = 0.1  # s between two looks at the thread, and between two drawings of how far it is
 _STEP = 0.02  # s that finishing may take of the main thread before the window has its turn, which is as long
@@ -82,6 +83,14 @@ def run(job: Job, progress: Progress = lambda done, total: None) -> str:
 def _finishing(job: Job, result: Any) -> Finishing:
     finished = job.finish(result)
     return (yield from finished) if isinstance(finished, Generator) else finished
+
+
+def scene_again(uid: int, what: str) -> bpy.types.Scene:
+    """The scene that a job was started for, by its `session_uid`; `InputError`, for `what` it was, where it is gone."""
+    scene = found_again(bpy.data.scenes, uid)
+    if scene is None:
+        raise InputError(f"the scene that {what} for is gone")
+    return scene
 
 
 def found_again(datablocks: Any, uid: int) -> Any:
@@ -208,6 +217,7 @@ class JobOperator:
     if TYPE_CHECKING:  # what every bpy.types.Operator has
         bl_idname: str
         bl_label: str
+        properties: Any
 
         def report(self, type: set[str], message: str) -> None: ...
         def as_keywords(self, *, ignore: tuple[str, ...] = ()) -> dict[str, Any]: ...
@@ -215,6 +225,10 @@ class JobOperator:
     def job(self, context: bpy.types.Context) -> Job:
         """The job, from the operator's and the scene's settings; raises InputError."""
         raise NotImplementedError
+
+    def given_or(self, panel: bpy.types.PropertyGroup) -> Callable[[str], Any]:
+        """What gives a setting by its name: that of the operator where it is given, else the panel's."""
+        return lambda name: getattr(self if self.properties.is_property_set(name) else panel, name)
 
     def ask(self, context: bpy.types.Context) -> set[str] | None:
         """Open a dialog or a file browser, whose button starts the job; None where there is nothing to ask."""
@@ -450,11 +464,8 @@ def _argument(value: Any) -> Any:
 
 
 def _redraw(context: bpy.types.Context) -> None:
-    """Have sidebars and status bars drawn, but not the scene: ten times a second, that would slow the work down."""
+    """Have sidebars and status bars drawn: ten times a second."""
     for window in context.window_manager.windows:
         with bpy.context.temp_override(window=window):
             window.workspace.status_text_set(None)  # there is no other way to have the status bar drawn
-        for area in window.screen.areas:
-            for region in area.regions:
-                if area.type == "VIEW_3D" and region.type == "UI":
-                    region.tag_redraw()
+    redraw_sidebars()

@@ -9,7 +9,6 @@ from mathutils import Vector
 
 from . import compat, volume_materials
 from .cameras import remove_objects
-from .compat import enable_nodes
 from .volume_materials import Cut, change
 
 _KEY = "mphdrr_surface"  # custom property of a surface's object
@@ -110,14 +109,8 @@ def _cutting(name: str) -> bpy.types.NodeTree:
 
 def _material(name: str, quantity: str) -> bpy.types.Material:
     """A dull surface in the brighter colours of a quantity."""
-    material = bpy.data.materials.new(name)
-    enable_nodes(material)
+    material, shader = compat.surface_material(name, "ShaderNodeBsdfPrincipled")
     color = (*volume_materials.ramp(quantity)[-2][1], 1.0)
     material.diffuse_color = color
-    nodes = material.node_tree.nodes
-    nodes.clear()  # Blender 4.5 begins with a volume's nodes where a volume is active
-    shader, output = nodes.new("ShaderNodeBsdfPrincipled"), nodes.new("ShaderNodeOutputMaterial")
-    output.location = (300.0, 0.0)
-    material.node_tree.links.new(shader.outputs[0], output.inputs["Surface"])
     shader.inputs["Base Color"].default_value, shader.inputs["Roughness"].default_value = color, 0.6
     return material

@@ -7,7 +7,7 @@ import numpy as np
 from mathutils import Matrix
 from numpy.typing import NDArray
 
-from ..core.errors import InputError
+from ..core.errors import InputError, naming
 from ..core.geometry.grid import Grid
 from ..core.memory import require
 from ..core.progress import Progress
@@ -98,11 +98,9 @@ def meshes_of(items: Sequence[bpy.types.Object], depsgraph: bpy.types.Depsgraph)
         pose = world_matrix(item)
         if np.linalg.det(pose[:3, :3]) < 0:  # a mirrored object shows the other side of its faces
             faces = faces[:, ::-1]
-        try:
+        with naming(repr(item.name)):
             meshes.append(Mesh(points.astype(np.float64) @ pose[:3, :3].T + pose[:3, 3], faces.astype(np.int64)))
             require_closed(meshes[-1])
-        except InputError as error:
-            raise InputError(f"{item.name!r}: {error}") from None
     return meshes
 
 

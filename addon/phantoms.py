@@ -25,7 +25,7 @@ from ..core.volumes.meshes.mesh import Mesh
 from . import jobs, meshes, storage, volumes
 from .cameras import remove_objects, set_world_matrix, world_matrix
 from .phantom_properties import FILE, PhantomSettings
-from .reports import polled
+from .reports import Need
 from .stored_volumes import StoredVolume, moved, store_volume
 from .vdb import provenance_of
 
@@ -106,10 +106,10 @@ def settings_of(item: bpy.types.Object | None) -> Any:
     return None if properties.kind in ("VOLUME", "") else getattr(properties, properties.kind.lower())
 
 
-def poll_phantom(operator: type[bpy.types.Operator], context: bpy.types.Context) -> bool:
-    """`poll` of operators that need an active phantom."""
-    is_phantom = settings_of(context.object) is not None
-    return polled(operator, is_phantom, "No phantom is active: select one that was added with its settings")
+ACTIVE: Need = (
+    lambda context: settings_of(context.object) is not None,
+    "No phantom is active: select one that was added with its settings",
+)
 
 
 def adding(

@@ -15,6 +15,7 @@ from ..core import cache
 from ..core.memory import readable_size
 from ..core.projector import backends, parallel
 from . import ids
+from .layouts import invoking
 
 PACKAGE = __package__.rpartition(".")[0]  # "mphdrr", or "bl_ext.<repo>.mphdrr" when installed as an extension
 
@@ -36,8 +37,7 @@ class MPHDRR_Preferences(bpy.types.AddonPreferences):
     def draw(self, context: bpy.types.Context) -> None:
         """Called by Blender."""
         layout = self.layout
-        row = layout.row()
-        row.operator_context = "INVOKE_DEFAULT"
+        row = invoking(layout.row())
         row.operator(ids.LOAD_EXAMPLE, icon="PLAY")
         if website():
             row.operator("wm.url_open", text="Website and Documentation", icon="URL").url = website()

@@ -26,7 +26,7 @@ from ..core.runs.recipe import Recipe
 from ..core.runs.run import ProjectionRun
 from ..core.runs.run_recipe import recipe_model, recipe_views, run_recipe
 from ..core.volumes.volume import Volume
-from . import jobs, phantoms, planes, preview_drawing, rendering, runs, scanner, selection, volumes
+from . import jobs, phantoms, planes, preview_drawing, rendering, runs, scanner, selection, volumes, windows
 from .module_values import module_numbers, off_aim, system_of
 from .stored_volumes import moved
 from .vdb import read_vdb
@@ -197,7 +197,7 @@ class Session:
             if self.worker.is_alive():
                 if not self.late and time.monotonic() > self.started + _PATIENCE:
                     self.late = "Being made again after a change" if self.quick else "Being made with all pixels"
-                    _redraw()
+                    windows.redraw("VIEW_3D")
                 return _INTERVAL
             self._take(self.worker)
         if self.has_changed:
@@ -239,11 +239,11 @@ class Session:
             self._fail("not enough memory: choose fewer voxels or pixels")
         else:
             self._fail(f"the preview failed: {type(error).__name__}: {error}")
-        _redraw()
+        windows.redraw("VIEW_3D")
 
     def _fail(self, problem: str) -> None:
         self.shown, self.problem, self.asked, self.full_at = None, problem, None, None
-        _redraw()
+        windows.redraw("VIEW_3D")
 
     @property
     def lines(self) -> tuple[str, ...]:
@@ -289,7 +289,7 @@ def stop(*_: Any) -> None:
         bpy.app.timers.unregister(_look)
     if _drawing is not None:
         _drawing()
-        _redraw()
+        windows.redraw("VIEW_3D")
     _session = _drawing = None
 
 
@@ -309,11 +309,3 @@ def _look() -> float | None:
     if jobs.is_running() or bpy.app.is_job_running("RENDER"):
         return 10 * _INTERVAL
     return _session.look(bpy.context)
-
-
-def _redraw() -> None:
-    """Have the 3D views drawn."""
-    for window in bpy.context.window_manager.windows:
-        for area in window.screen.areas:
-            if area.type == "VIEW_3D":
-                area.tag_redraw()

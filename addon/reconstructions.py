@@ -89,9 +89,7 @@ def reconstructing(context: bpy.types.Context, recipe: Recipe) -> jobs.Job:
         return shown_of(found.volume.array, found.objective.tolist(), scores, found.settings["flatters"])
 
     def finish(result: _Shown) -> str:
-        scene = jobs.found_again(bpy.data.scenes, uid)
-        if scene is None:
-            raise InputError("the scene that the reconstruction is for is gone")
+        jobs.scene_again(uid, "the reconstruction is")  # or an error
         item = shelf.show(result)
         volumes.make_active(bpy.context, item)
         images.show_below(bpy.data.images[ids.RECONSTRUCTION], bpy.context)

@@ -43,6 +43,7 @@ from . import (
     updates,
     volumes,
 )
+from .layouts import invoking
 
 
 def _classes(module: ModuleType) -> list[Any]:
@@ -87,9 +88,9 @@ ENTRIES = {
 
 def _draw_entries(entries: dict[str, str]) -> Callable[..., None]:
     def draw(menu: bpy.types.Menu, context: bpy.types.Context) -> None:
-        menu.layout.operator_context = "INVOKE_DEFAULT"
+        layout = invoking(menu.layout)
         for operator, text in entries.items():
-            menu.layout.operator(operator, text=text)
+            layout.operator(operator, text=text)
 
     return draw
 
@@ -108,8 +109,7 @@ def _draw_submenu(name: str, text: str, icon: str) -> Callable[..., None]:
 
 def _draw_splash(menu: bpy.types.Menu, context: bpy.types.Context) -> None:
     """An extension cannot bring an application template: Blender looks for these in its own folders only."""
-    menu.layout.operator_context = "INVOKE_DEFAULT"
-    menu.layout.operator(ids.LOAD_EXAMPLE, text="mphDRR Example", icon="PLAY")
+    invoking(menu.layout).operator(ids.LOAD_EXAMPLE, text="mphDRR Example", icon="PLAY")
     menu.layout.separator()
 
 
@@ -212,14 +212,8 @@ def register(command: Callable[..., int] | None = None) -> None:
 def unregister() -> None:
     """Take back what `register` did."""
     atexit.unregister(unregister)
-    jobs.stop()
-    preview.stop()
-    live_scanner.stop()
-    live_phantoms.stop()
-    runs.stop()
-    plots.stop()
-    recoloring.stop()
-    event_notes.stop()
+    for module in (jobs, preview, live_scanner, live_phantoms, runs, plots, recoloring, event_notes):
+        module.stop()
     _registered.close()
 
 

@@ -67,7 +67,7 @@ def render_job(context: bpy.types.Context, recipe: Recipe, volume: str = "", mu:
 
     def finish(result: tuple[ProjectionRun, images.Pictures]) -> jobs.Finishing:
         run, made = result
-        scene = scene_again(scene_uid)
+        scene = jobs.scene_again(scene_uid, "the projections are")
         owner = jobs.found_again(bpy.data.collections, scanner_uid)  # which need not be the panel's any more
         images.show((yield from storing(scene, run, path, state, owner, made)), bpy.context)
         where = path if bpy.data.filepath else f"{path} until the .blend is saved"
@@ -75,14 +75,6 @@ def render_job(context: bpy.types.Context, recipe: Recipe, volume: str = "", mu:
         return f"Projected {recipe['volume.object']!r} into {len(run.views)} modules in {seconds:.1f} s: {where}"
 
     return jobs.Job("Projecting", work, finish, lambda: path.unlink(missing_ok=True))
-
-
-def scene_again(uid: int) -> bpy.types.Scene:
-    """The scene that a job was started for, by its `session_uid`; `InputError` where it is gone."""
-    scene = jobs.found_again(bpy.data.scenes, uid)
-    if scene is None:
-        raise InputError("the scene that the projections are for is gone")
-    return scene
 
 
 def sources(
@@ -139,8 +131,7 @@ def exporting(scene: bpy.types.Scene, filepath: str) -> jobs.Job:
         raise InputError("no file given: set filepath to a name ending in .h5, .npz or .pt")
     path = storage.absolute(filepath)
     if found := runs.changes(scene):
-        text = f"the run is not of the scene as it is now ({'; '.join(found)}): {path.name} holds what was rendered"
-        warn(text)
+        warn(f"the run is not of the scene as it is now ({'; '.join(found)}): {path.name} holds what was rendered")
 
     def work(progress: Progress) -> None:
         stages_of(progress)("reading the run file")
@@ -236,7 +227,7 @@ def showing_job(scene: bpy.types.Scene, index: int) -> jobs.Job:
 
     def finish(result: tuple[ProjectionRun, images.Pictures]) -> jobs.Finishing:
         run, made = result
-        scene = scene_again(uid)
+        scene = jobs.scene_again(uid, "the projections are")
         files = [item.file for item in scene.mphdrr_projections.runs]
         if file not in files:  # it was removed meanwhile
             raise InputError(f"the run {name!r} is gone")

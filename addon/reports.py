@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import Any
 
 import bpy
 
@@ -9,6 +10,9 @@ from ..core.errors import InputError
 from ..core.recording import recorded_warnings
 
 _MOST = 5  # nobody reads more lines than that
+
+Need = tuple[Callable[[bpy.types.Context], Any], str]
+"""What an operator needs of the context, and the tooltip's words where that is not so."""
 
 
 @contextmanager
@@ -24,11 +28,26 @@ def warnings_reported(operator: bpy.types.Operator) -> Iterator[None]:
                 operator.report({"WARNING"}, f"... and {len(caught) - _MOST} more warnings of this kind")
 
 
-def polled(operator: type[bpy.types.Operator], is_met: bool, need: str) -> bool:
-    """An operator's answer to `poll`: whether its `need` is met, which the tooltip shows where it is not."""
-    if not is_met:
-        operator.poll_message_set(need)
-    return is_met
+def needs(*every: Need) -> Any:
+    """The `poll` of an operator: whether every need is met; the tooltip shows the first that is not."""
+
+    def poll(operator: type[bpy.types.Operator], context: bpy.types.Context) -> bool:
+        unmet = next((text for is_met, text in every if not is_met(context)), None)
+        if unmet is not None:
+            operator.poll_message_set(unmet)
+        return unmet is None
+
+    return classmethod(poll)
+
+
+class Reported:
+    """Mix into an operator that does `act`, and reports the line that this returns, or what it raises."""
+
+    bl_options = {"REGISTER", "UNDO"}
+
+    def execute(self: Any, context: bpy.types.Context) -> set[str]:
+        """Act and report."""
+        return run_reported(self, lambda: self.act(context))
 
 
 def run_reported(operator: bpy.types.Operator, action: Callable[[], str]) -> set[str]:

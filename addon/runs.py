@@ -13,13 +13,13 @@ from typing import Any
 import bpy
 import numpy as np
 
-from ..core.errors import InputError
+from ..core.errors import InputError, refusing
 from ..core.geometry.system import LENGTHS, PinholeSystem
 from ..core.memory import readable_size
 from ..core.runs.recipe import Recipe, fitting_recipe
 from ..core.runs.run import ProjectionRun
 from ..core.runs.settings import SETTINGS, Setting
-from . import cameras, following, ids, phantoms, scanner, storage, volumes
+from . import cameras, following, ids, phantoms, scanner, storage, volumes, windows
 from .decimals import typed
 from .module_values import FROM_ROI, numbers_of
 from .projection_properties import OPENING_ANGLE, settings_recipe
@@ -156,10 +156,8 @@ def remove_file(item: bpy.types.PropertyGroup) -> bool:
     needed = [run.file for scene in bpy.data.scenes for run in scene.mphdrr_projections.runs].count(item.file)
     if not storage.is_own(path) or needed > 1:
         return not path.exists()
-    try:
+    with refusing(path, "cannot be removed"):
         path.unlink(missing_ok=True)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be removed ({error.strerror or error})") from error
     return True
 
 
@@ -193,14 +191,11 @@ def _look() -> None:
     """Compare the shown runs with their scenes, and have the panels drawn where that has changed."""
     if bpy.app.background:
         return
-    windows = bpy.context.window_manager.windows
-    found = {window.scene.name: changes(window.scene) for window in windows}
+    found = {window.scene.name: changes(window.scene) for window in bpy.context.window_manager.windows}
     if any(_looked.get(name) != lines for name, lines in found.items()):
         _looked.update(found)
-        for area in (area for window in windows for area in window.screen.areas):
-            for region in area.regions:
-                if (area.type == "VIEW_3D" and region.type == "UI") or area.type == "IMAGE_EDITOR":
-                    region.tag_redraw()
+        windows.redraw_sidebars()
+        windows.redraw("IMAGE_EDITOR")
 
 
 def _volume_state(item: bpy.types.Object) -> dict[str, Any]:

@@ -1,12 +1,16 @@
 """Which modules an operator or a panel works on: the active one and the selected ones."""
 
 from collections.abc import Iterable
-from typing import Any
 
 import bpy
 
 from . import following, images, scanner
-from .reports import polled, run_reported
+from .reports import Need, Reported, needs
+
+SCANNER: Need = (
+    lambda context: scanner.active_scanner(context.scene) is not None,
+    "No scanner in the scene: import a geometry first",
+)
 
 
 def active_module(context: bpy.types.Context) -> bpy.types.Object | None:
@@ -101,24 +105,14 @@ def select_active(scene: bpy.types.Scene) -> None:
         layer.objects.active = camera
 
 
-class NeedsScanner:
-    """Mix into an operator that needs a scanner."""
-
-    @classmethod
-    def poll(cls: Any, context: bpy.types.Context) -> bool:
-        """There is a scanner."""
-        has_scanner = scanner.active_scanner(context.scene) is not None
-        return polled(cls, has_scanner, "No scanner in the scene: import a geometry first")
-
-
-class OnScanner(NeedsScanner):
+class OnScanner(Reported):
     """Mix into an operator that works on the scanner of the panels."""
 
-    bl_options = {"REGISTER", "UNDO"}
+    poll = needs(SCANNER)
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
-        """Do the work and report."""
-        return run_reported(self, lambda: self.change(context, scanner.required_scanner(context.scene)))
+    def act(self, context: bpy.types.Context) -> str:
+        """Do the work on the scanner."""
+        return self.change(context, scanner.required_scanner(context.scene))
 
     def change(self, context: bpy.types.Context, collection: bpy.types.Collection) -> str:
         """Do the work and return the line to report; raises InputError."""
@@ -128,8 +122,4 @@ class OnScanner(NeedsScanner):
 class OnModules(OnScanner):
     """Mix into an operator that works on the active or selected modules."""
 
-    @classmethod
-    def poll(cls: Any, context: bpy.types.Context) -> bool:
-        """There is a scanner, and a module of it is active or selected."""
-        need = "No module is selected: select a module's camera"
-        return super().poll(context) and polled(cls, bool(selected_modules(context)), need)
+    poll = needs(SCANNER, (selected_modules, "No module is selected: select a module's camera"))

@@ -6,7 +6,7 @@ import numpy as np
 from gpu_extras.batch import batch_for_shader
 from numpy.typing import NDArray
 
-from . import cameras, following, scanner, selection
+from . import cameras, following, scanner, selection, windows
 
 # By the setting: the lines' colour, and which of the points of `lines` they join.
 _DRAWN = {
@@ -59,7 +59,4 @@ def draw() -> None:
 
 def redraw(*_: object) -> None:
     """Have the 3D views drawn again: the setting was changed, perhaps by a script."""
-    for window in bpy.context.window_manager.windows:
-        for area in window.screen.areas:
-            if area.type == "VIEW_3D":
-                area.tag_redraw()
+    windows.redraw("VIEW_3D")

@@ -18,7 +18,7 @@ from ..core.errors import InputError
 from ..core.volumes.volume import Volume
 from . import looks, vdb, volume_materials, volumes
 from .cameras import remove_objects
-from .compat import enable_nodes
+from .compat import blank_material
 
 _PLANES = ("Sagittal", "Coronal", "Axial")  # across world x, y, z
 _KEY = "mphdrr_slice"  # custom property: the axis of the grid that a plane is across
@@ -232,10 +232,8 @@ def _plane(item: bpy.types.Object, volume: Volume, axis: int, name: str) -> bpy.
 
 def _material(name: str, image: bpy.types.Image) -> bpy.types.Material:
     """A picture that shines by itself, seen from both sides, in colours that no light changes."""
-    material = bpy.data.materials.new(name)
-    enable_nodes(material)
+    material = blank_material(name)
     tree = material.node_tree
-    tree.nodes.clear()
     texture = tree.nodes.new("ShaderNodeTexImage")
     texture.name, texture.image, texture.interpolation, texture.extension = "Slice", image, "Closest", "EXTEND"
     emission, nothing = tree.nodes.new("ShaderNodeEmission"), tree.nodes.new("ShaderNodeBsdfTransparent")

@@ -14,7 +14,7 @@ from typing import Any
 
 import bpy
 
-from ..core.errors import InputError, warn
+from ..core.errors import InputError, refusing, warn
 from ..core.files import ensure_folder, replacing
 from ..core.memory import readable_size
 from . import ids
@@ -118,10 +118,8 @@ def remove_unused() -> str:
     unused = unused_volumes()
     text = f"Removed {summary(unused)}" if unused else "No file of voxels or runs is unused"
     for path in unused:
-        try:
+        with refusing(path, "cannot be removed"):
             path.unlink(missing_ok=True)
-        except OSError as error:
-            raise InputError(f"{path}: cannot be removed ({error.strerror or error})") from error
     return text
 
 

@@ -22,6 +22,7 @@ from ..core.geometry.grid import Grid
 from ..core.memory import require
 from ..core.validation import freeze, positive
 from ..core.version import VERSION
+from ..core.volumes.formats.contents import reading
 from ..core.volumes.volume import AIR_HU, UNITS, Volume
 
 SMOKE = "smoke for display"  # a grid that only Blender's solid viewport uses
@@ -87,16 +88,9 @@ def read_vdb(path: str | Path, quantity: str | None = None, grid: str | None = N
     unit = positive(unit, "unit of the file's lengths", "mm")
     if missing := _missing_bytes(path):
         raise InputError(f"{path}: is cut off, {missing} bytes are missing at its end")
-    try:
+    with reading(path, "an OpenVDB volume"):
         name = _chosen(_described(path), quantity, grid)
         return _volume_of(openvdb().read(str(path), name), quantity, unit)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
-    except MemoryError:
-        raise
-    except Exception as error:  # whatever OpenVDB raises on a damaged file
-        reason = (str(error) or type(error).__name__).splitlines()[0]
-        raise InputError(f"{path}: cannot be read as an OpenVDB volume ({reason})") from error
 
 
 def provenance_of(path: Path) -> dict[str, Any]:

@@ -11,7 +11,7 @@ import bpy
 import numpy as np
 
 from ..core.volumes.volume import UNITS
-from .compat import enable_nodes
+from .compat import blank_material
 
 # Positions and linear RGB, evenly brighter.
 _PURPLES = (
@@ -65,10 +65,8 @@ def usual_range(quantity: str, low: float, high: float) -> tuple[float, float]:
 
 def new_material(name: str, quantity: str, size: float) -> bpy.types.Material:
     """A material that glows and is opaque where the grid `quantity` is high (`set_range`); for a volume of `size` mm."""
-    material = bpy.data.materials.new(name)
-    enable_nodes(material)
+    material = blank_material(name)
     tree = material.node_tree
-    tree.nodes.clear()
 
     def node(kind: str, column: int, row: float = 0.0, **settings: object) -> bpy.types.Node:
         new = tree.nodes.new(kind)

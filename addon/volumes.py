@@ -20,7 +20,7 @@ from ..core.memory import readable_size
 from ..core.volumes.volume import Volume
 from . import compat, ids, storage, volume_materials
 from .cameras import world_matrix
-from .reports import polled
+from .reports import Need
 from .stored_volumes import StoredVolume, moved, store_volume, write_states
 from .vdb import SMOKE, read_vdb
 
@@ -175,9 +175,7 @@ def quantity_of(item: bpy.types.Object) -> str:
     return str(item.mphdrr_volume.quantity)
 
 
-def poll_volume(operator: type[bpy.types.Operator], context: bpy.types.Context) -> bool:
-    """`poll` of operators that need an active volume."""
-    return polled(operator, is_volume(context.object), "No volume is active: select one first")
+ACTIVE: Need = (lambda context: is_volume(context.object), "No volume is active: select one first")
 
 
 def volume_objects(scene: bpy.types.Scene) -> list[bpy.types.Object]:

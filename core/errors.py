@@ -19,6 +19,15 @@ def warn(text: str, stacklevel: int = 3) -> None:
 
 
 @contextmanager
+def refusing(place: object, what: str) -> Iterator[None]:
+    """Make what the system refuses an input error: of which `place`, such as a file, and that it "cannot be written"."""
+    try:
+        yield
+    except OSError as error:
+        raise InputError(f"{place}: {what} ({error.strerror or error})") from error
+
+
+@contextmanager
 def naming(name: object) -> Iterator[None]:
     """Put a name, such as a file's, before the messages of input errors."""
     try:

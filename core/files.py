@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from .errors import InputError
+from .errors import InputError, refusing
 
 
 @contextmanager
@@ -55,10 +55,8 @@ def refuse_folder(path: Path) -> None:
     """Raise `InputError` if `path` is a folder or cannot be the name of a file."""
     if "\0" in str(path):
         raise InputError(f"{str(path)!r}: not a file name (it holds a NUL)")
-    try:
+    with refusing(repr(str(path)), "not a file name"):  # such as one that is too long
         is_folder = path.is_dir()
-    except OSError as error:  # too long
-        raise InputError(f"{str(path)!r}: not a file name ({error.strerror or error})") from error
     if is_folder:
         raise InputError(f"{path}: is a folder; expected the name of a file to write")
 
@@ -67,10 +65,8 @@ def ensure_folder(path: str | os.PathLike[str]) -> Path:
     """Make the folder `path` and its parents unless they exist; `InputError` if it cannot be made or written to."""
     folder = Path(path).absolute()
     probe = folder / f".{uuid.uuid4().hex[:8]}"
-    try:
+    with refusing(folder, "cannot be written"):
         folder.mkdir(parents=True, exist_ok=True)
         probe.touch()
         probe.unlink()
-    except OSError as error:
-        raise InputError(f"{folder}: cannot be written ({error.strerror or error})") from error
     return folder

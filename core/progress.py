@@ -38,6 +38,12 @@ def stages_of(progress: Progress | None) -> Stages:
     return progress.stages if isinstance(progress, StagedProgress) else lambda words: progress
 
 
+def tell(progress: Progress | None, done: int, total: int) -> None:
+    """Call a progress callback, if there is one."""
+    if progress is not None:
+        progress(done, total)
+
+
 def part_of(progress: Progress | None, number: int, count: int) -> Progress | None:
     """The progress of part `number`, from 0, of `count` equal parts."""
     return None if progress is None else lambda done, total: progress(number * total + done, count * total)
@@ -47,5 +53,4 @@ def in_threads(work: Callable[[Part], None], parts: Sequence[Part], progress: Pr
     """Call ``work(part)`` for all parts, in a thread for each processor core; an exception of `progress` stops the rest."""
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         for done, _ in enumerate(pool.map(work, parts), 1):
-            if progress is not None:
-                progress(done, len(parts))  # leaving the loop cancels the parts that have not begun
+            tell(progress, done, len(parts))  # leaving the loop cancels the parts that have not begun

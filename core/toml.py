@@ -12,13 +12,17 @@ from .errors import InputError
 
 def read_toml(path: str | os.PathLike[str]) -> dict[str, Any]:
     """What a TOML file holds; `InputError` if it cannot be read or is not TOML."""
+    return parse_toml(toml_text(path), str(path))
+
+
+def toml_text(path: str | os.PathLike[str]) -> str:
+    """The text of a TOML file, every line's end as it is; `InputError` if it cannot be read."""
     try:
-        text = Path(path).read_text(encoding="utf-8-sig")
+        return Path(path).read_bytes().decode("utf-8-sig")
     except UnicodeDecodeError:
         raise InputError(f"{path}: expected TOML, a text in UTF-8") from None
     except (OSError, ValueError) as error:  # an impossible path is a ValueError
         raise InputError(f"{path}: {getattr(error, 'strerror', None) or error}") from None
-    return parse_toml(text, str(path))
 
 
 def parse_toml(text: str, name: str) -> dict[str, Any]:

@@ -6,6 +6,7 @@ import bpy
 from bpy.props import BoolProperty, FloatProperty, FloatVectorProperty, StringProperty
 
 from ..addon import ids, jobs, phantoms, storage
+from ..addon.layouts import labelled
 from ..addon.phantom_properties import FILE, PhantomSettings, identifier, sampling, settings_class
 from ..core.errors import InputError
 from ..core.geometry.frames import euler_pose
@@ -27,9 +28,7 @@ class AddPhantom(jobs.JobOperator):
     psi: FloatProperty(name="Psi", description="Turn about the phantom's own axis, done first", subtype="ANGLE")
 
     def draw(self: Any, context: bpy.types.Context) -> None:
-        layout = self.layout
-        layout.use_property_split = True
-        layout.use_property_decorate = False
+        layout = labelled(self.layout)
         self.draw_settings(layout)
         row = layout.row()
         row.enabled = self.quantity == "activity"

@@ -3,19 +3,17 @@
 import bpy
 
 from ..addon import ids, preferences
-from ..addon.reports import polled, run_reported
+from ..addon.reports import Reported, needs
 
 
-class MPHDRR_OT_clean_cache(bpy.types.Operator):
+class MPHDRR_OT_clean_cache(Reported, bpy.types.Operator):
     """Delete compiled code; it is made again when it is needed"""
 
     bl_idname = ids.CLEAN_CACHE
     bl_label = "Clean Cache"
     bl_options = {"INTERNAL"}
 
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return polled(cls, preferences.cache_size() > 0, "The cache is empty")
+    poll = needs((lambda context: preferences.cache_size() > 0, "The cache is empty"))
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
-        return run_reported(self, preferences.clean_cache)
+    def act(self, context: bpy.types.Context) -> str:
+        return preferences.clean_cache()

@@ -7,6 +7,7 @@ import bpy
 from bpy.app.translations import pgettext_iface as iface
 
 from ..addon.column_maps import ColumnMapProperties, ColumnMapQuantity
+from ..addon.layouts import labelled
 from ..core.workbook.quantities import DERIVED, QUANTITIES
 
 WIDTH = 1000  # of the dialog, pixels
@@ -34,9 +35,7 @@ def draw(layout: bpy.types.UILayout, form: ColumnMapProperties) -> None:
 def _tables(layout: bpy.types.UILayout, form: ColumnMapProperties) -> None:
     grid = layout.grid_flow(row_major=True, columns=min(3, len(form.tables)), even_columns=True)
     for i, table in enumerate(form.tables):
-        box = grid.box()
-        box.use_property_split = True
-        box.use_property_decorate = False
+        box = labelled(grid.box())
         one = i > 0 and table.rows == "ONE_FOR_ALL"
         box.label(text=iface("Table {number}" if i else "Table {number}: pinholes").format(number=i + 1))
         column = box.column(align=True)

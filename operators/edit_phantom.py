@@ -3,7 +3,7 @@
 import bpy
 
 from ..addon import ids, jobs, phantoms
-from ..addon.reports import run_reported
+from ..addon.reports import Reported, needs
 
 
 class _EditPhantom(jobs.JobOperator):
@@ -11,7 +11,7 @@ class _EditPhantom(jobs.JobOperator):
 
     bake = False
 
-    poll = classmethod(phantoms.poll_phantom)
+    poll = needs(phantoms.ACTIVE)
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
         return phantoms.updating(context.object, self.bake)
@@ -33,14 +33,13 @@ class MPHDRR_OT_apply_phantom_pose(_EditPhantom, bpy.types.Operator):
     bake = True
 
 
-class MPHDRR_OT_show_phantom_outline(bpy.types.Operator):
+class MPHDRR_OT_show_phantom_outline(Reported, bpy.types.Operator):
     """Show or hide the surfaces of the active phantom's shapes as wires that go with it"""
 
     bl_idname = ids.SHOW_PHANTOM_OUTLINE
     bl_label = "Outline"
-    bl_options = {"REGISTER", "UNDO"}
 
-    poll = classmethod(phantoms.poll_phantom)
+    poll = needs(phantoms.ACTIVE)
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
-        return run_reported(self, lambda: phantoms.toggle_outline(context.object))
+    def act(self, context: bpy.types.Context) -> str:
+        return phantoms.toggle_outline(context.object)

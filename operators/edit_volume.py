@@ -5,20 +5,19 @@ from bpy.props import FloatProperty, StringProperty
 
 from ..addon import ids, jobs, recovery, slices, storage, volume_import, volumes
 from ..addon.decimals import typed
-from ..addon.reports import polled, run_reported
+from ..addon.reports import Reported, needs
 
 
-class MPHDRR_OT_add_slices(bpy.types.Operator):
+class MPHDRR_OT_add_slices(Reported, bpy.types.Operator):
     """Show an axial, a coronal and a sagittal slice of the active volume as planes that go with it"""
 
     bl_idname = ids.ADD_SLICES
     bl_label = "Add Slices"
-    bl_options = {"REGISTER", "UNDO"}
 
-    poll = classmethod(volumes.poll_volume)
+    poll = needs(volumes.ACTIVE)
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
-        return run_reported(self, lambda: f"Added {len(slices.add_slices(context.object))} slices")
+    def act(self, context: bpy.types.Context) -> str:
+        return f"Added {len(slices.add_slices(context.object))} slices"
 
 
 class MPHDRR_OT_remove_slices(bpy.types.Operator):
@@ -28,11 +27,15 @@ class MPHDRR_OT_remove_slices(bpy.types.Operator):
     bl_label = "Remove Slices"
     bl_options = {"REGISTER", "UNDO"}
 
-    poll = classmethod(volumes.poll_volume)
+    poll = needs(volumes.ACTIVE)
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         slices.remove_slices(context.object)
         return {"FINISHED"}
+
+
+def _is_ct(context: bpy.types.Context) -> bool:
+    return volumes.is_volume(context.object) and volumes.quantity_of(context.object) == "hu"
 
 
 class MPHDRR_OT_ct_to_attenuation(jobs.JobOperator, bpy.types.Operator):
@@ -46,16 +49,13 @@ class MPHDRR_OT_ct_to_attenuation(jobs.JobOperator, bpy.types.Operator):
         name="Energy (keV)", description="Tc-99m: 140.5; a CT of 120 kV: about 70", default=140.5, min=10.0, max=1000.0
     )
 
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        is_ct = volumes.is_volume(context.object) and volumes.quantity_of(context.object) == "hu"
-        return polled(cls, is_ct, "No CT is active: select a volume of CT numbers (hu)")
+    poll = needs((_is_ct, "No CT is active: select a volume of CT numbers (hu)"))
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
         return volume_import.converting(context.object, typed(self.energy))
 
 
-class MPHDRR_OT_clean_volume_files(bpy.types.Operator):
+class MPHDRR_OT_clean_volume_files(Reported, bpy.types.Operator):
     """Remove the files of voxels and runs in this .blend's folder that no volume and no list of runs needs any more"""
 
     bl_idname = ids.CLEAN_VOLUME_FILES
@@ -71,8 +71,8 @@ class MPHDRR_OT_clean_volume_files(bpy.types.Operator):
             message="Neither Undo nor other .blend files that use this folder will find them again.",
         )  # fmt: skip
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
-        return run_reported(self, storage.remove_unused)
+    def act(self, context: bpy.types.Context) -> str:
+        return storage.remove_unused()
 
 
 class MPHDRR_OT_remake_volumes(jobs.JobOperator, bpy.types.Operator):
@@ -81,20 +81,17 @@ class MPHDRR_OT_remake_volumes(jobs.JobOperator, bpy.types.Operator):
     bl_idname = ids.REMAKE_VOLUMES
     bl_label = "Make Missing Volumes Again"
 
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return polled(cls, bool(recovery.missing(context.scene)[0]), "No phantom or map misses its file of voxels")
+    poll = needs((lambda context: recovery.missing(context.scene)[0], "No phantom or map misses its file of voxels"))
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
         return recovery.remaking(context.scene)
 
 
-class MPHDRR_OT_find_volume_files(bpy.types.Operator):
+class MPHDRR_OT_find_volume_files(Reported, bpy.types.Operator):
     """Look for the missing files of voxels, by their names, in a folder and all below it"""
 
     bl_idname = ids.FIND_VOLUME_FILES
     bl_label = "Find Missing Volume Files"
-    bl_options = {"REGISTER", "UNDO"}
 
     directory: StringProperty(name="Folder", description="Where to look", subtype="DIR_PATH", options={"SKIP_SAVE"})
 
@@ -102,5 +99,5 @@ class MPHDRR_OT_find_volume_files(bpy.types.Operator):
         context.window_manager.fileselect_add(self)
         return {"RUNNING_MODAL"}
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
-        return run_reported(self, lambda: storage.relocate(self.directory))
+    def act(self, context: bpy.types.Context) -> str:
+        return storage.relocate(self.directory)

@@ -1,30 +1,22 @@
 """Event sets: a recipe written and tried on the phantom in the scene, a set made as a job, an event opened in the scene."""
 
-from typing import Any
-
 import bpy
 from bpy.props import EnumProperty, StringProperty
 from bpy_extras.io_utils import ExportHelper
 
 from ..addon import choices, event_sets, ids, jobs
 from ..addon.event_properties import COUNT, FOLDER, MODEL, NEXT, OPENED, RECIPE
-from ..addon.reports import run_reported
+from ..addon.reports import Reported
 from ..core.events.templates import TEMPLATES
 
 
-def _setting(operator: Any, context: bpy.types.Context, name: str) -> Any:
-    """A setting given to the operator, else the panel's."""
-    return getattr(operator if operator.properties.is_property_set(name) else context.scene.mphdrr_events, name)
-
-
-class MPHDRR_OT_new_event_recipe(ExportHelper, bpy.types.Operator):
+class MPHDRR_OT_new_event_recipe(Reported, ExportHelper, bpy.types.Operator):
     """Write a recipe for events with comments in it, to be edited and tried. Its scanner is the scene's workbook, or the
     example's where there is none
     """
 
     bl_idname = ids.NEW_EVENT_RECIPE
     bl_label = "New Event Recipe"
-    bl_options = {"REGISTER", "UNDO"}
 
     filename_ext = ".toml"
     filter_glob: StringProperty(default="*.toml", options={"HIDDEN"})
@@ -33,8 +25,8 @@ class MPHDRR_OT_new_event_recipe(ExportHelper, bpy.types.Operator):
         items=choices.items({}, ((name, name.capitalize(), text) for name, text in TEMPLATES.items())),
     )  # fmt: skip
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
-        return run_reported(self, lambda: event_sets.write_recipe(context.scene, self.filepath, self.like))
+    def act(self, context: bpy.types.Context) -> str:
+        return event_sets.write_recipe(context.scene, self.filepath, self.like)
 
 
 class MPHDRR_OT_try_event(jobs.JobOperator, bpy.types.Operator):
@@ -50,7 +42,9 @@ class MPHDRR_OT_try_event(jobs.JobOperator, bpy.types.Operator):
     folder: FOLDER  # type: ignore[valid-type]
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        return event_sets.trying(context, *(_setting(self, context, name) for name in ("recipe", "number", "folder")))
+        return event_sets.trying(
+            context, *map(self.given_or(context.scene.mphdrr_events), ("recipe", "number", "folder"))
+        )
 
 
 class MPHDRR_OT_make_event_set(jobs.JobOperator, bpy.types.Operator):
@@ -66,7 +60,7 @@ class MPHDRR_OT_make_event_set(jobs.JobOperator, bpy.types.Operator):
     count: COUNT  # type: ignore[valid-type]
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        return event_sets.making(*(_setting(self, context, name) for name in ("recipe", "folder", "count")))
+        return event_sets.making(*map(self.given_or(context.scene.mphdrr_events), ("recipe", "folder", "count")))
 
 
 class MPHDRR_OT_open_event(jobs.JobOperator, bpy.types.Operator):
@@ -82,4 +76,6 @@ class MPHDRR_OT_open_event(jobs.JobOperator, bpy.types.Operator):
     model: MODEL  # type: ignore[valid-type]
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        return event_sets.opening(context, *(_setting(self, context, name) for name in ("folder", "opened", "model")))
+        return event_sets.opening(
+            context, *map(self.given_or(context.scene.mphdrr_events), ("folder", "opened", "model"))
+        )

@@ -7,6 +7,7 @@ from bpy.props import BoolProperty, EnumProperty, StringProperty
 
 from ..addon import ids, jobs, scanner, scanner_files, selection, storage
 from ..addon.decimals import typed
+from ..addon.reports import needs
 from ..addon.scanner_files import WORKBOOK_SUFFIXES
 from ..core.errors import InputError
 from ..core.exchange import FORMAT_NUMBERS, FORMATS
@@ -14,11 +15,13 @@ from ..core.exchange import FORMAT_NUMBERS, FORMATS
 _FORMATS = tuple((f.name, f.name, f.title, FORMAT_NUMBERS[f.name]) for f in FORMATS.values())
 
 
-class MPHDRR_OT_export_geometry(selection.NeedsScanner, jobs.ExportJob, bpy.types.Operator):
+class MPHDRR_OT_export_geometry(jobs.ExportJob, bpy.types.Operator):
     """Write the scanner as it stands in the scene to a workbook, into a copy of the one it came from"""
 
     bl_idname = ids.EXPORT_GEOMETRY
     bl_label = "Export Pinhole Geometry"
+
+    poll = needs(selection.SCANNER)
 
     filename_ext = ".xlsx"
     filepath: StringProperty(name="File", description="Workbook to write", subtype="FILE_PATH", options={"SKIP_SAVE"})
@@ -52,7 +55,7 @@ class MPHDRR_OT_export_geometry(selection.NeedsScanner, jobs.ExportJob, bpy.type
         return scanner_files.exporting_scanner(collection, path, self.use_template)
 
 
-class MPHDRR_OT_export_for_program(selection.NeedsScanner, jobs.ExportJob, bpy.types.Operator):
+class MPHDRR_OT_export_for_program(jobs.ExportJob, bpy.types.Operator):
     """Write the scanner as it stands in the scene for another program: cameras for reconstruction codes, solids to print,
     Monte Carlo simulations. Images are those of the Projections panel
     """
@@ -60,6 +63,8 @@ class MPHDRR_OT_export_for_program(selection.NeedsScanner, jobs.ExportJob, bpy.t
     bl_idname = ids.EXPORT_FOR_PROGRAM
     bl_label = "Export Geometry for a Program"
     bl_options = set()
+
+    poll = needs(selection.SCANNER)
 
     filename_ext = ""
     filepath: StringProperty(

@@ -4,6 +4,7 @@ import bpy
 from bpy.props import StringProperty
 
 from ..addon import ids, jobs, storage, volumes
+from ..addon.reports import needs
 from ..addon.volume_export import WRITTEN_ENDINGS, exporting
 from ..core.errors import InputError
 
@@ -19,7 +20,7 @@ class MPHDRR_OT_export_volume(jobs.JobOperator, bpy.types.Operator):
     filepath: StringProperty(name="File", description="File to write", subtype="FILE_PATH", options={"SKIP_SAVE"})
     filter_glob: StringProperty(default=";".join(f"*{e}" for e in WRITTEN_ENDINGS), options={"HIDDEN"})
 
-    poll = classmethod(volumes.poll_volume)
+    poll = needs(volumes.ACTIVE)
 
     def ask(self, context: bpy.types.Context) -> set[str] | None:
         if self.filepath:

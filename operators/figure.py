@@ -6,9 +6,14 @@ import bpy
 from bpy.props import BoolProperty, EnumProperty, IntProperty, StringProperty
 
 from ..addon import figures, ids, jobs, scanner, storage, volumes
-from ..addon.reports import polled
+from ..addon.reports import Need, needs
 from ..core.errors import InputError
 from ..core.figures.page import LARGEST, SUFFIXES
+
+_SHOWN: Need = (
+    lambda context: scanner.active_scanner(context.scene) or volumes.volume_objects(context.scene),
+    "Nothing to show: import a workbook or add a phantom first",
+)
 
 
 class MPHDRR_OT_export_figure(jobs.JobOperator, bpy.types.Operator):
@@ -36,10 +41,7 @@ class MPHDRR_OT_export_figure(jobs.JobOperator, bpy.types.Operator):
         default=figures.SAMPLES, min=1, soft_max=256,
     )  # fmt: skip
 
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        shows = scanner.active_scanner(context.scene) is not None or bool(volumes.volume_objects(context.scene))
-        return polled(cls, shows, "Nothing to show: import a workbook or add a phantom first")
+    poll = needs(_SHOWN)
 
     def ask(self, context: bpy.types.Context) -> set[str] | None:
         if self.filepath:

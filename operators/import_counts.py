@@ -14,6 +14,7 @@ from bpy.props import (
 
 from ..addon import choices, counts_import, ids, jobs, storage
 from ..addon.decimals import typed
+from ..addon.layouts import labelled
 from ..core.runs.frame_files import COUNTS_FORMATS, RAW_TYPES
 from ..core.runs.orientations import ORIENTATIONS
 
@@ -73,9 +74,7 @@ class MPHDRR_OT_import_counts(jobs.JobOperator, bpy.types.Operator):
     raw_big_endian: BoolProperty(name="Big-Endian", description="The most significant byte of a number comes first")
 
     def draw(self, context: bpy.types.Context) -> None:
-        layout = self.layout
-        layout.use_property_split = True
-        layout.use_property_decorate = False
+        layout = labelled(self.layout)
         for name in ("frames", "orientation", "time"):
             layout.prop(self, name)
         column = layout.column(heading="If Needed")

@@ -7,6 +7,7 @@ import bpy
 from bpy.props import BoolProperty, FloatProperty, IntVectorProperty, StringProperty
 
 from ..addon import column_maps, ids, scanner, studio
+from ..addon.layouts import labelled
 from ..addon.reports import run_reported, warnings_reported
 from ..addon.scanner_files import WORKBOOK_SUFFIXES
 from ..core.errors import InputError
@@ -125,8 +126,7 @@ class MPHDRR_OT_import_geometry(bpy.types.Operator):
             return
         if context.space_data.type == "FILE_BROWSER":  # not in the panel of the last operation
             layout.operator(ids.BROWSE_EXAMPLE, icon="FILE_FOLDER")
-        layout.use_property_split = True
-        layout.use_property_decorate = False
+        labelled(layout)
         for name in ("name", "plate_thickness", "wall_thickness", "image_size", "columns", "choose_columns"):
             layout.prop(self, name)
 

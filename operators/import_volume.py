@@ -11,6 +11,7 @@ from bpy.props import BoolProperty, CollectionProperty, EnumProperty, FloatPrope
 
 from ..addon import choices, ids, jobs, storage
 from ..addon.decimals import typed
+from ..addon.layouts import labelled
 from ..addon.volume_import import READ_ENDINGS, importing, name_of
 from ..core.errors import InputError
 from ..core.volumes.volume import UNITS
@@ -58,9 +59,7 @@ class ReadVolumes(jobs.JobOperator):
     own_names: tuple[str, ...] = ("name",)  # the operator's own properties, in the order of drawing
 
     def draw(self: Any, context: bpy.types.Context) -> None:
-        layout = self.layout
-        layout.use_property_split = True
-        layout.use_property_decorate = False
+        layout = labelled(self.layout)
         for name in (*self.own_names, "quantity", "center", "attenuation"):
             layout.prop(self, name)
         row = layout.row()

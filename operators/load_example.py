@@ -4,7 +4,7 @@ import bpy
 
 from ..addon import example, ids, jobs
 from ..addon.cli.demo import EXAMPLE
-from ..addon.reports import polled
+from ..addon.reports import needs
 
 
 class MPHDRR_OT_load_example(jobs.JobOperator, bpy.types.Operator):
@@ -13,9 +13,7 @@ class MPHDRR_OT_load_example(jobs.JobOperator, bpy.types.Operator):
     bl_idname = ids.LOAD_EXAMPLE
     bl_label = "Load Example"
 
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return polled(cls, not jobs.is_running(), "Another job is running: wait for it or cancel it")
+    poll = needs((lambda context: not jobs.is_running(), "Another job is running: wait for it or cancel it"))
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
         return example.example_job(context)
@@ -28,10 +26,7 @@ class MPHDRR_OT_browse_example(bpy.types.Operator):
     bl_label = "Example Workbook"
     bl_options = {"INTERNAL"}
 
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        is_browser = context.space_data is not None and context.space_data.type == "FILE_BROWSER"
-        return polled(cls, is_browser, "Only in a file browser")
+    poll = needs((lambda context: getattr(context.space_data, "type", "") == "FILE_BROWSER", "Only in a file browser"))
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         params = context.space_data.params

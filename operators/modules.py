@@ -7,6 +7,7 @@ from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty
 
 from ..addon import following, ids, jobs, maps, module_edits, scanner, selection
 from ..addon.decimals import typed
+from ..addon.reports import needs
 from ..addon.scanner_parts import modules_text
 
 
@@ -191,13 +192,15 @@ class MPHDRR_OT_check_geometry(selection.OnScanner, bpy.types.Operator):
         return f"{len(found)} findings at {len(concerned)} modules: see the Design panel"
 
 
-class MPHDRR_OT_add_map(selection.NeedsScanner, jobs.JobOperator, bpy.types.Operator):
+class MPHDRR_OT_add_map(jobs.JobOperator, bpy.types.Operator):
     """Calculate what the scanner, with ideal modules, does in every voxel around the isocentre, and show it as a volume,
     in place of the scanner's last map of this quantity
     """
 
     bl_idname = ids.ADD_MAP
     bl_label = "Add Map"
+
+    poll = needs(selection.SCANNER)
 
     quantity: EnumProperty(name="Quantity", description="What is mapped", items=maps.QUANTITIES)
     voxels: IntProperty(

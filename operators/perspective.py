@@ -1,30 +1,16 @@
 """The active volume as the active module sees it: a frustum of pictures, or back on its own voxels."""
 
-from typing import Any
-
 import bpy
 
 from ..addon import frustums, ids, jobs, selection, volumes
 from ..addon.perspective_properties import PerspectiveSettings
-from ..addon.reports import polled
+from ..addon.reports import needs
 
 
 class _InPerspective(PerspectiveSettings, jobs.JobOperator):
     """Mix into an operator that takes the active volume into the coordinates of the active module."""
 
-    @classmethod
-    def poll(cls: Any, context: bpy.types.Context) -> bool:
-        """There are both."""
-        if not polled(
-            cls, selection.active_module(context) is not None, "No module is active: import a geometry first"
-        ):
-            return False
-        return volumes.poll_volume(cls, context)
-
-    def setting(self, context: bpy.types.Context, name: str) -> Any:
-        """A setting given to the operator, else the panel's."""
-        is_given = self.properties.is_property_set(name)  # type: ignore[attr-defined]
-        return getattr(self if is_given else context.scene.mphdrr_perspective, name)
+    poll = needs((selection.active_module, "No module is active: import a geometry first"), volumes.ACTIVE)
 
 
 class MPHDRR_OT_show_in_perspective(_InPerspective, bpy.types.Operator):
@@ -37,7 +23,7 @@ class MPHDRR_OT_show_in_perspective(_InPerspective, bpy.types.Operator):
     bl_label = "Show in Perspective"
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        return frustums.showing(context, self.setting(context, "planes"), self.setting(context, "uniform"))
+        return frustums.showing(context, *map(self.given_or(context.scene.mphdrr_perspective), ("planes", "uniform")))
 
 
 class MPHDRR_OT_resample_in_perspective(_InPerspective, bpy.types.Operator):
@@ -49,7 +35,7 @@ class MPHDRR_OT_resample_in_perspective(_InPerspective, bpy.types.Operator):
     bl_label = "Volume Through Module"
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        return frustums.resampling(context, self.setting(context, "cells"), self.setting(context, "uniform"))
+        return frustums.resampling(context, *map(self.given_or(context.scene.mphdrr_perspective), ("cells", "uniform")))
 
 
 class MPHDRR_OT_clear_perspective(bpy.types.Operator):
@@ -59,9 +45,7 @@ class MPHDRR_OT_clear_perspective(bpy.types.Operator):
     bl_label = "Clear Perspective"
     bl_options = {"REGISTER", "UNDO"}
 
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return polled(cls, bool(frustums.frustums(context.scene)), "No volume is shown in perspective")
+    poll = needs((lambda context: frustums.frustums(context.scene), "No volume is shown in perspective"))
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         count = frustums.remove(context.scene)

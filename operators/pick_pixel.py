@@ -5,21 +5,20 @@ import numpy as np
 from bpy.props import FloatProperty, IntProperty
 from bpy_extras import view3d_utils
 
-from ..addon import epipolar, epipolar_drawing, ids, tiles
+from ..addon import epipolar, epipolar_drawing, ids, images, tiles
 from ..addon.decimals import typed
 from ..addon.eyedropper import Eyedropper, region_under
-from ..addon.reports import polled, run_reported
+from ..addon.reports import Reported, needs
 from ..core.errors import InputError
 
 
-class MPHDRR_OT_pick_pixel(Eyedropper, bpy.types.Operator):
+class MPHDRR_OT_pick_pixel(Eyedropper, Reported, bpy.types.Operator):
     """Click on a pixel of a projection, in the Image Editor or on a plane in the scene: its ray is drawn there, and on the
     other modules' projections its epipolar lines. Esc or a right click leaves all as it was
     """
 
     bl_idname = ids.PICK_PIXEL
     bl_label = "Pick Pixel"
-    bl_options = {"REGISTER", "UNDO"}
 
     module: IntProperty(name="Module", description="Number of the module", default=1, options={"SKIP_SAVE"})
     column: FloatProperty(
@@ -37,9 +36,7 @@ class MPHDRR_OT_pick_pixel(Eyedropper, bpy.types.Operator):
         options={"SKIP_SAVE"},
     )  # fmt: skip
 
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return polled(cls, ids.MOSAIC in bpy.data.images, "No projections yet: render them first")
+    poll = needs(images.PROJECTED)
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         try:
@@ -49,14 +46,11 @@ class MPHDRR_OT_pick_pixel(Eyedropper, bpy.types.Operator):
             return {"CANCELLED"}
         return super().invoke(context, event)
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
-        def pick() -> str:
-            pixel = (typed(each) for each in (self.column, self.row, self.k))
-            found = epipolar.pick(context.scene, self.module, *pixel)
-            column, row = found.pixel
-            return f"Module {self.module}, column {column:g}, row {row:g}: {found.seen_by} modules see the marker"
-
-        return run_reported(self, pick)
+    def act(self, context: bpy.types.Context) -> str:
+        pixel = (typed(each) for each in (self.column, self.row, self.k))
+        found = epipolar.pick(context.scene, self.module, *pixel)
+        column, row = found.pixel
+        return f"Module {self.module}, column {column:g}, row {row:g}: {found.seen_by} modules see the marker"
 
     def says(self, context: bpy.types.Context, event: bpy.types.Event) -> str:
         found = _under(context, event)
@@ -80,9 +74,7 @@ class MPHDRR_OT_clear_pixel(bpy.types.Operator):
     bl_label = "Clear Picked Pixel"
     bl_options = {"REGISTER", "UNDO"}
 
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return polled(cls, bool(context.scene.mphdrr_epipolar.views), "No pixel is picked")
+    poll = needs((lambda context: context.scene.mphdrr_epipolar.views, "No pixel is picked"))
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         epipolar.clear(context.scene)

@@ -5,8 +5,12 @@ from bpy.props import EnumProperty
 
 from ..addon import choices, ids, images, tiles
 from ..addon.eyedropper import Eyedropper, region_under
-from ..addon.reports import polled
+from ..addon.reports import needs
 from ..core.errors import InputError
+
+
+def _has_image_editor(context: bpy.types.Context) -> bool:
+    return bool(context.window) and any(area.type == "IMAGE_EDITOR" for area in context.window.screen.areas)
 
 
 class MPHDRR_OT_pick_window(Eyedropper, bpy.types.Operator):
@@ -25,13 +29,10 @@ class MPHDRR_OT_pick_window(Eyedropper, bpy.types.Operator):
         default="HIGH", options={"SKIP_SAVE"},
     )  # fmt: skip
 
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        shown = bool(context.window) and any(area.type == "IMAGE_EDITOR" for area in context.window.screen.areas)
-        has_run = images.tiles(bpy.data.images.get(ids.MOSAIC)) is not None
-        return polled(cls, has_run, "No projections yet: render them first") and polled(
-            cls, shown, "No Image Editor is open: press Show Mosaic"
-        )
+    poll = needs(
+        (lambda context: images.tiles(bpy.data.images.get(ids.MOSAIC)), images.PROJECTED[1]),
+        (_has_image_editor, "No Image Editor is open: press Show Mosaic"),
+    )
 
     def takes(self, context: bpy.types.Context, event: bpy.types.Event) -> bool:
         found = _under(context, event)

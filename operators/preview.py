@@ -2,8 +2,8 @@
 
 import bpy
 
-from ..addon import ids, jobs, preview, scanner, volumes
-from ..addon.reports import polled
+from ..addon import ids, jobs, preview, selection, volumes
+from ..addon.reports import needs
 
 
 class MPHDRR_OT_live_preview(bpy.types.Operator):
@@ -12,17 +12,16 @@ class MPHDRR_OT_live_preview(bpy.types.Operator):
     bl_idname = ids.LIVE_PREVIEW
     bl_label = "Live Preview"
 
+    _can_start = needs(
+        (lambda context: not bpy.app.background, "Needs a window"),
+        selection.SCANNER,
+        (lambda context: volumes.volume_objects(context.scene), "No volume in the scene: add a phantom first"),
+        (lambda context: not jobs.is_running(), "A job is running: wait for it or cancel it"),
+    )
+
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        scene = context.scene
-        return preview.session() is not None or (
-            polled(cls, not bpy.app.background, "Needs a window")
-            and polled(
-                cls, scanner.active_scanner(scene) is not None, "No scanner in the scene: import a geometry first"
-            )
-            and polled(cls, bool(volumes.volume_objects(scene)), "No volume in the scene: add a phantom first")
-            and polled(cls, not jobs.is_running(), "A job is running: wait for it or cancel it")
-        )
+        return preview.session() is not None or cls._can_start(context)
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         if preview.session() is None:

@@ -11,7 +11,7 @@ from bpy_extras.io_utils import ImportHelper
 from ..addon import choices, ids, images, jobs, rendering, runs, scanner, storage, tiles
 from ..addon.decimals import typed
 from ..addon.projection_properties import OPENING_ANGLE, ProjectionSettings, settings_recipe, use_preset
-from ..addon.reports import polled, run_reported
+from ..addon.reports import Reported, needs
 from ..core.errors import InputError
 from ..core.runs.presets import PRESETS
 
@@ -49,7 +49,7 @@ class MPHDRR_OT_render_projections(ProjectionSettings, jobs.JobOperator, bpy.typ
         coefficient = name.replace("_material", "_mu")
         if not self.properties.is_property_set(name) and self.properties.is_property_set(coefficient):
             return "NUMBER"
-        return getattr(self if self.properties.is_property_set(name) else scene.mphdrr_projections, name)
+        return self.given_or(scene.mphdrr_projections)(name)
 
 
 class MPHDRR_OT_use_preset(bpy.types.Operator):
@@ -72,43 +72,48 @@ class MPHDRR_OT_use_preset(bpy.types.Operator):
         return {"FINISHED"}
 
 
-class MPHDRR_OT_load_recipe(ImportHelper, bpy.types.Operator):
+class MPHDRR_OT_load_recipe(Reported, ImportHelper, bpy.types.Operator):
     """Set the panel as a recipe (.toml) or a run (.h5, .npz, .pt) says: model, detector, noise, modules and, where the
     scene has objects of their names, volumes. By default the recipe of the last run
     """
 
     bl_idname = ids.LOAD_RECIPE
     bl_label = "Load Recipe"
-    bl_options = {"REGISTER", "UNDO"}
 
     filter_glob: StringProperty(default="*.toml;*.h5;*.hdf5;*.npz;*.pt", options={"HIDDEN"})
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
-        def load() -> str:
-            filepath = self.filepath or context.scene.mphdrr_projections.run_file
-            if not filepath:
-                raise InputError("no file given: set filepath to a recipe (.toml) or a run (.h5, .npz, .pt)")
-            rendering.load_recipe(context.scene, Path(storage.absolute(filepath)))
-            return f"Set the panel as {bpy.path.basename(filepath)} says"
-
-        return run_reported(self, load)
+    def act(self, context: bpy.types.Context) -> str:
+        filepath = self.filepath or context.scene.mphdrr_projections.run_file
+        if not filepath:
+            raise InputError("no file given: set filepath to a recipe (.toml) or a run (.h5, .npz, .pt)")
+        rendering.load_recipe(context.scene, Path(storage.absolute(filepath)))
+        return f"Set the panel as {bpy.path.basename(filepath)} says"
 
 
-class MPHDRR_OT_show_projections(bpy.types.Operator):
+class ShowPicture:
+    """Mix into an operator that shows one of the pictures that are made here."""
+
+    picture = ids.MOSAIC
+
+    def execute(self: Any, context: bpy.types.Context) -> set[str]:
+        if not images.show_below(bpy.data.images[self.picture], context):
+            self.report({"ERROR"}, "no window with a 3D view to open an Image Editor in")
+            return {"CANCELLED"}
+        return {"FINISHED"}
+
+
+class MPHDRR_OT_show_projections(ShowPicture, bpy.types.Operator):
     """Show the mosaic of the last run in an Image Editor, opened below the 3D view if there is none"""
 
     bl_idname = ids.SHOW_PROJECTIONS
     bl_label = "Show Projections"
 
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return polled(cls, ids.MOSAIC in bpy.data.images, "No projections yet: render them first")
+    poll = needs(images.PROJECTED)
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
-        if not images.show_below(bpy.data.images[ids.MOSAIC], context):
-            self.report({"ERROR"}, "no window with a 3D view to open an Image Editor in")
-            return {"CANCELLED"}
-        return {"FINISHED"}
+
+def _shows_mosaic(context: bpy.types.Context) -> bool:
+    space = context.space_data
+    return space is not None and space.type == "IMAGE_EDITOR" and images.tiles(space.image) is not None
 
 
 class MPHDRR_OT_pick_module(bpy.types.Operator):
@@ -118,11 +123,7 @@ class MPHDRR_OT_pick_module(bpy.types.Operator):
     bl_label = "Pick Module"
     bl_options = {"UNDO", "INTERNAL"}
 
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        space = context.space_data
-        is_shown = space is not None and space.type == "IMAGE_EDITOR" and images.tiles(space.image) is not None
-        return polled(cls, is_shown, "Only in an Image Editor that shows the mosaic")
+    poll = needs((_shows_mosaic, "Only in an Image Editor that shows the mosaic"))
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         try:

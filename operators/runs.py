@@ -6,7 +6,7 @@ import bpy
 from bpy.props import EnumProperty, IntProperty
 
 from ..addon import ids, images, jobs, rendering, runs
-from ..addon.reports import polled, run_reported
+from ..addon.reports import Need, Reported, needs
 from ..core.errors import InputError
 from ..core.progress import Progress
 from ..core.runs.comparing import difference, difference_sheet
@@ -22,21 +22,17 @@ def _required_run(scene: bpy.types.Scene, index: int) -> bpy.types.PropertyGroup
     return found[index]
 
 
-class _OfRuns:
-    """Mix into an operator that needs a run in the list."""
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        is_met = bool(context.scene.mphdrr_projections.runs)
-        return polled(cls, is_met, "No runs yet: render the projections first")  # type: ignore[arg-type]
+_LISTED: Need = (lambda context: context.scene.mphdrr_projections.runs, "No runs yet: render the projections first")
 
 
-class MPHDRR_OT_show_run(_OfRuns, jobs.JobOperator, bpy.types.Operator):
+class MPHDRR_OT_show_run(jobs.JobOperator, bpy.types.Operator):
     """Show a run of the list: its images, the mosaic and the planes in the scene. Modules and volumes stay as they are"""
 
     bl_idname = ids.SHOW_RUN
     bl_label = "Show Run"
     bl_options = {"REGISTER", "UNDO", "INTERNAL"}  # a click in the list
+
+    poll = needs(_LISTED)
 
     index: IntProperty(name="Index", description="Place of the run in the list, from 0", min=0, options={"SKIP_SAVE"})
 
@@ -45,12 +41,13 @@ class MPHDRR_OT_show_run(_OfRuns, jobs.JobOperator, bpy.types.Operator):
         return rendering.showing_job(context.scene, self.index)
 
 
-class MPHDRR_OT_remove_run(_OfRuns, bpy.types.Operator):
+class MPHDRR_OT_remove_run(Reported, bpy.types.Operator):
     """Remove a run from the list, and its file from the disk if it is in this .blend's own folder"""
 
     bl_idname = ids.REMOVE_RUN
     bl_label = "Remove Run"
-    bl_options = {"REGISTER", "UNDO"}
+
+    poll = needs(_LISTED)
 
     index: IntProperty(name="Index", description="Place of the run in the list, from 0", min=0, options={"SKIP_SAVE"})
 
@@ -61,12 +58,9 @@ class MPHDRR_OT_remove_run(_OfRuns, bpy.types.Operator):
             message="Neither Undo nor the .blend as it was saved will find its file again.",
         )  # fmt: skip
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
-        def remove() -> str:
-            _required_run(context.scene, self.index)
-            return rendering.remove_run(context.scene, self.index)
-
-        return run_reported(self, remove)
+    def act(self, context: bpy.types.Context) -> str:
+        _required_run(context.scene, self.index)
+        return rendering.remove_run(context.scene, self.index)
 
 
 def _other_runs(self: Any, context: bpy.types.Context | None) -> list[tuple[str, str, str]]:
@@ -77,13 +71,15 @@ def _other_runs(self: Any, context: bpy.types.Context | None) -> list[tuple[str,
     return _others
 
 
-class MPHDRR_OT_compare_runs(_OfRuns, jobs.JobOperator, bpy.types.Operator):
+class MPHDRR_OT_compare_runs(jobs.JobOperator, bpy.types.Operator):
     """Draw the shown run minus another one, of the same modules, pixels and unit, as a mosaic: white where they are equal,
     red where the shown one has more, blue where it has less
     """
 
     bl_idname = ids.COMPARE_RUNS
     bl_label = "Compare Runs"
+
+    poll = needs(_LISTED)
 
     other: EnumProperty(name="Other", description="What is subtracted", items=_other_runs, options={"SKIP_SAVE"})
 

@@ -5,7 +5,7 @@ from bpy.props import EnumProperty, FloatProperty, IntProperty, StringProperty
 
 from ..addon import choices, ids, jobs, meshes, volumes
 from ..addon.decimals import typed
-from ..addon.reports import polled
+from ..addon.reports import needs
 
 
 class MPHDRR_OT_voxelize_objects(jobs.JobOperator, bpy.types.Operator):
@@ -31,9 +31,7 @@ class MPHDRR_OT_voxelize_objects(jobs.JobOperator, bpy.types.Operator):
     )
     name: StringProperty(name="Name", description="The volume's name; empty: the mesh's")
 
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return polled(cls, bool(_chosen(context)), "Select closed mesh objects first")
+    poll = needs((lambda context: _chosen(context), "Select closed mesh objects first"))
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
         return meshes.voxelizing(
@@ -53,7 +51,7 @@ class MPHDRR_OT_mesh_from_volume(jobs.JobOperator, bpy.types.Operator):
         description="The surface's value, in the unit that the panel shows; 0: halfway from outside to the largest",
     )
 
-    poll = classmethod(volumes.poll_volume)
+    poll = needs(volumes.ACTIVE)
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
         return meshes.extracting(context.object, typed(self.level) or None)

@@ -4,6 +4,7 @@ import bpy
 from bpy.app.translations import pgettext_iface as iface
 
 from ..addon import ids
+from ..addon.layouts import invoking
 from ..addon.phantom_properties import menu_entries
 
 
@@ -11,8 +12,7 @@ class MPHDRR_MT_add(bpy.types.Menu):
     bl_label = "mphDRR"
 
     def draw(self, context: bpy.types.Context) -> None:
-        layout = self.layout
-        layout.operator_context = "INVOKE_DEFAULT"
+        layout = invoking(self.layout)
         for kind, label, beats in menu_entries():
             layout.operator(ids.ADD_PHANTOM + kind, text=label, icon="OUTLINER_DATA_VOLUME")
             if beats:

@@ -7,6 +7,7 @@ import bpy
 from bpy.app.translations import pgettext_iface as iface
 
 from ..addon import following, ids, jobs, scanner, selection
+from ..addon.layouts import invoking, labelled
 from ..addon.properties import LABELS
 from .geometry import ScannerPanel, draw_facts, draw_text
 
@@ -37,8 +38,7 @@ class MPHDRR_PT_design(ScannerPanel, bpy.types.Panel):
             layout.label(text="Select a module's camera", icon="INFO")
         else:
             _draw_module(layout, camera)
-        row = layout.row(align=True)
-        row.operator_context = "INVOKE_DEFAULT"
+        row = invoking(layout.row(align=True))
         row.operator(ids.DUPLICATE_MODULES, text="Duplicate", icon="DUPLICATE")
         row.operator(ids.REMOVE_MODULES, text="Remove", icon="TRASH")
         row = layout.row(align=True)
@@ -78,12 +78,10 @@ class MPHDRR_PT_scanner_design(ScannerPanel, bpy.types.Panel):
             if len(findings) > _MOST_FINDINGS:
                 more = iface("... and {count} more").format(count=len(findings) - _MOST_FINDINGS)
                 layout.label(text=more, icon="BLANK1")
-        column = layout.column(align=True)
-        column.operator_context = "INVOKE_DEFAULT"
+        column = invoking(layout.column(align=True))
         column.operator_menu_enum(ids.ADD_MAP, "quantity", text="Add Map", icon="OUTLINER_DATA_VOLUME")
         jobs.draw_job(column)
-        column = layout.column(align=True)
-        column.operator_context = "INVOKE_DEFAULT"
+        column = invoking(layout.column(align=True))
         column.operator(ids.EXPORT_GEOMETRY, text="Export Workbook", icon="EXPORT")
         column.operator(ids.EXPORT_FOR_PROGRAM, text="Export for a Program", icon="EXPORT")
         column.separator()
@@ -112,9 +110,7 @@ def _draw_numbers(
     layout: bpy.types.UILayout, numbers: bpy.types.PropertyGroup, mixed: Sequence[str]
 ) -> bpy.types.UILayout:
     """Draw d, Ld, Td, R and l; "mixed" stands beside those that differ between modules."""
-    column = layout.column(align=True)
-    column.use_property_split = True
-    column.use_property_decorate = False
+    column = labelled(layout.column(align=True))
     for name, label in LABELS.items():
         if name != "collimator_length":
             column.prop(numbers, name, text=_label(label, name in mixed))

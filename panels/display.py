@@ -4,6 +4,7 @@ import bpy
 from bpy.app.translations import pgettext_iface as iface
 
 from ..addon import ids, images, selection, tiles
+from ..addon.layouts import labelled
 from .geometry import Sidebar
 
 
@@ -17,9 +18,7 @@ class _Display:
         return ids.MOSAIC in bpy.data.images
 
     def draw(self, context: bpy.types.Context) -> None:
-        layout = self.layout  # type: ignore[attr-defined]
-        layout.use_property_split = True
-        layout.use_property_decorate = False
+        layout = labelled(self.layout)  # type: ignore[attr-defined]
         settings = context.scene.mphdrr_display
         layout.prop(settings, "colors")
         layout.prop(settings, "scale")

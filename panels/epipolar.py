@@ -4,6 +4,7 @@ import bpy
 from bpy.app.translations import pgettext_iface as iface
 
 from ..addon import epipolar, ids
+from ..addon.layouts import invoking, labelled
 from .geometry import Sidebar, draw_facts, draw_text
 
 
@@ -18,12 +19,9 @@ class _Epipolar:
         return ids.MOSAIC in bpy.data.images
 
     def draw(self, context: bpy.types.Context) -> None:
-        layout = self.layout  # type: ignore[attr-defined]
-        layout.use_property_split = True
-        layout.use_property_decorate = False
+        layout = labelled(self.layout)  # type: ignore[attr-defined]
         settings = context.scene.mphdrr_epipolar
-        row = layout.row(align=True)
-        row.operator_context = "INVOKE_DEFAULT"
+        row = invoking(layout.row(align=True))
         row.operator(ids.PICK_PIXEL, icon="EYEDROPPER")
         row.operator(ids.CLEAR_PIXEL, text="", icon="X")
         run = epipolar.run_views(context.scene)

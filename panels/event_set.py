@@ -3,6 +3,7 @@
 import bpy
 
 from ..addon import event_notes, ids, jobs
+from ..addon.layouts import invoking, labelled
 from .geometry import Sidebar, draw_hint, draw_text
 
 
@@ -12,10 +13,7 @@ class MPHDRR_PT_event_set(Sidebar, bpy.types.Panel):
     bl_options = {"DEFAULT_CLOSED"}
 
     def draw(self, context: bpy.types.Context) -> None:
-        layout = self.layout
-        layout.operator_context = "INVOKE_DEFAULT"
-        layout.use_property_split = True
-        layout.use_property_decorate = False
+        layout = invoking(labelled(self.layout))
         settings = context.scene.mphdrr_events
         jobs.draw_job(layout)
         column = layout.column(align=True)

@@ -8,6 +8,7 @@ import numpy as np
 from bpy.app.translations import pgettext_iface as iface
 
 from ..addon import following, ids, jobs, scanner, selection
+from ..addon.layouts import invoking
 
 _LINE = 32  # letters that fit into the sidebar at its usual width
 
@@ -61,8 +62,7 @@ class MPHDRR_PT_geometry(Sidebar, bpy.types.Panel):
     bl_order = ids.ORDER_GEOMETRY
 
     def draw(self, context: bpy.types.Context) -> None:
-        layout = self.layout
-        layout.operator_context = "INVOKE_DEFAULT"
+        layout = invoking(self.layout)
         collection = scanner.active_scanner(context.scene)
         if collection is None and not jobs.is_running():
             row = layout.row()

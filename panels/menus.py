@@ -8,14 +8,14 @@ import bpy
 from bpy.app.translations import pgettext_iface as iface
 
 from ..addon import ids, selection
+from ..addon.layouts import invoking
 
 
 class MPHDRR_MT_commands(bpy.types.Menu):
     bl_label = "mphDRR"
 
     def draw(self, context: bpy.types.Context) -> None:
-        layout = self.layout
-        layout.operator_context = "INVOKE_DEFAULT"
+        layout = invoking(self.layout)
         layout.menu("MPHDRR_MT_modules", icon="OUTLINER_OB_CAMERA")
         layout.menu("MPHDRR_MT_volumes", icon="OUTLINER_DATA_VOLUME")
         layout.menu("MPHDRR_MT_projections", icon="RENDER_STILL")
@@ -27,8 +27,7 @@ class MPHDRR_MT_modules(bpy.types.Menu):
     bl_label = "Modules and Collimators"
 
     def draw(self, context: bpy.types.Context) -> None:
-        layout = self.layout
-        layout.operator_context = "INVOKE_DEFAULT"
+        layout = invoking(self.layout)
         layout.operator(ids.IMPORT_GEOMETRY, icon="IMPORT")
         layout.operator(ids.EXPORT_GEOMETRY, icon="EXPORT")
         layout.operator(ids.EXPORT_FOR_PROGRAM)
@@ -60,8 +59,7 @@ class MPHDRR_MT_volumes(bpy.types.Menu):
     bl_label = "Phantoms and Volumes"
 
     def draw(self, context: bpy.types.Context) -> None:
-        layout = self.layout
-        layout.operator_context = "INVOKE_DEFAULT"
+        layout = invoking(self.layout)
         layout.menu("MPHDRR_MT_add", text="Add Phantom or Volume", icon="ADD")
         layout.separator()
         layout.operator(ids.UPDATE_PHANTOM, icon="FILE_REFRESH")
@@ -88,8 +86,7 @@ class MPHDRR_MT_projections(bpy.types.Menu):
     bl_label = "Projections"
 
     def draw(self, context: bpy.types.Context) -> None:
-        layout = self.layout
-        layout.operator_context = "INVOKE_DEFAULT"
+        layout = invoking(self.layout)
         layout.operator(ids.RENDER_PROJECTIONS, icon="RENDER_STILL")
         layout.operator(ids.IMPORT_COUNTS, icon="IMPORT")
         layout.operator(ids.LIVE_PREVIEW, icon="VIEW_CAMERA")

@@ -4,6 +4,7 @@ import bpy
 from bpy.app.translations import pgettext_iface as iface
 
 from ..addon import frustums, ids, jobs, selection, volumes
+from ..addon.layouts import invoking, labelled
 from .geometry import Sidebar, draw_hint, draw_text
 
 
@@ -13,10 +14,7 @@ class MPHDRR_PT_perspective(Sidebar, bpy.types.Panel):
     bl_options = {"DEFAULT_CLOSED"}
 
     def draw(self, context: bpy.types.Context) -> None:
-        layout = self.layout
-        layout.operator_context = "INVOKE_DEFAULT"
-        layout.use_property_split = True
-        layout.use_property_decorate = False
+        layout = invoking(labelled(self.layout))
         settings, camera = context.scene.mphdrr_perspective, selection.active_module(context)
         if camera is None:
             draw_hint(layout, "Import a geometry first.")

@@ -6,6 +6,7 @@ import bpy
 from bpy.app.translations import pgettext_iface as iface
 
 from ..addon import ids, phantom_properties, phantoms, recovery, slices, storage, volumes
+from ..addon.layouts import invoking, labelled
 from .geometry import Sidebar, draw_facts, draw_hint, draw_text
 
 
@@ -14,10 +15,7 @@ class MPHDRR_PT_phantom(Sidebar, bpy.types.Panel):
     bl_order = ids.ORDER_PHANTOM
 
     def draw(self, context: bpy.types.Context) -> None:
-        layout = self.layout
-        layout.operator_context = "INVOKE_DEFAULT"
-        layout.use_property_split = True
-        layout.use_property_decorate = False
+        layout = invoking(labelled(self.layout))
         adding = layout.column()
         column = adding.column(align=True)
         column.menu("MPHDRR_MT_add", text="Add Phantom", icon="OUTLINER_DATA_VOLUME")

@@ -1,11 +1,10 @@
 """Sidebar, third and last step: the projections, and the dataset that they give."""
 
-from collections.abc import Container
-
 import bpy
 from bpy.app.translations import pgettext_iface as iface
 
 from ..addon import ids, jobs, rendering, runs, scanner, volumes
+from ..addon.layouts import draw_settings, invoking, labelled
 from ..addon.projection_properties import drawn, makes_counts
 from .geometry import Sidebar, draw_hint, draw_text
 from .runs import draw_changes
@@ -19,26 +18,22 @@ class MPHDRR_PT_projections(Sidebar, bpy.types.Panel):
     bl_order = ids.ORDER_PROJECTIONS
 
     def draw(self, context: bpy.types.Context) -> None:
-        layout = self.layout
-        layout.use_property_split = True
-        layout.use_property_decorate = False
+        layout = labelled(self.layout)
         settings = context.scene.mphdrr_projections
         jobs.draw_job(layout)  # at the top, where it is seen on small screens too
         column = layout.column()
         column.prop(settings, "volume", placeholder="Active volume")
         column.prop(settings, "model")
-        model = [name for name, _ in drawn(settings, "model") if name != "model"]
-        _draw(column, settings, "model", [name for name in model if name in _MAIN])
-        _draw(column, settings, "detector")
+        draw_settings(column, settings, (each for each in drawn(settings, "model") if each[0] in _MAIN))
+        draw_settings(column, settings, drawn(settings, "detector"))
         modules = column.column(align=True)
         modules.prop(settings, "all_modules")
         if not settings.all_modules:
             modules.prop(settings, "first")
             modules.prop(settings, "last")
-        _draw(column, settings, "compute")
-        row = layout.row()
+        draw_settings(column, settings, drawn(settings, "compute"))
+        row = invoking(layout.row())
         row.scale_y = 1.4
-        row.operator_context = "INVOKE_DEFAULT"
         has_scanner = scanner.active_scanner(context.scene) is not None
         has_volume = bool(volumes.volume_objects(context.scene))
         row.enabled = has_scanner and has_volume
@@ -55,17 +50,6 @@ class MPHDRR_PT_projections(Sidebar, bpy.types.Panel):
             draw_changes(layout, context.scene)
 
 
-def _draw(
-    layout: bpy.types.UILayout, settings: bpy.types.PropertyGroup, table: str, only: Container[str] | None = None
-) -> None:
-    """The settings of a table that the chosen model has; those without an effect are greyed out."""
-    for name, is_active in drawn(settings, table):
-        if only is None or name in only:
-            row = layout.row()
-            row.active = is_active
-            row.prop(settings, name)
-
-
 class MPHDRR_PT_physics(Sidebar, bpy.types.Panel):
     bl_label = "Physics"
     bl_parent_id = "MPHDRR_PT_projections"
@@ -79,9 +63,7 @@ class MPHDRR_PT_physics(Sidebar, bpy.types.Panel):
         self.layout.operator_menu_enum(ids.USE_PRESET, "preset", text="", icon="PRESET")
 
     def draw(self, context: bpy.types.Context) -> None:
-        layout = self.layout
-        layout.use_property_split = True
-        layout.use_property_decorate = False
+        layout = labelled(self.layout)
         settings = context.scene.mphdrr_projections
         column = layout.column(align=True)
         if settings.model == "EMISSION":
@@ -89,7 +71,8 @@ class MPHDRR_PT_physics(Sidebar, bpy.types.Panel):
             collection = scanner.active_scanner(context.scene)
             if collection is not None:
                 column.prop(collection.mphdrr_scanner, "opening_angle")
-        _draw(column, settings, "model", [n for n, _ in drawn(settings, "model") if n not in (*_MAIN, "model")])
+        others = (each for each in drawn(settings, "model") if each[0] not in (*_MAIN, "model"))
+        draw_settings(column, settings, others)
         row = layout.row(heading="Poisson Noise")
         row.active = makes_counts(settings)
         row.prop(settings, "noise", text="")
@@ -103,8 +86,7 @@ class MPHDRR_PT_export(Sidebar, bpy.types.Panel):
     bl_order = ids.ORDER_EXPORT
 
     def draw(self, context: bpy.types.Context) -> None:
-        layout = self.layout
-        layout.operator_context = "INVOKE_DEFAULT"
+        layout = invoking(self.layout)
         run_file = context.scene.mphdrr_projections.run_file
         row = layout.row()
         row.enabled = bool(run_file)

@@ -4,6 +4,7 @@ import bpy
 from bpy.app.translations import pgettext_iface as iface
 
 from ..addon import ids, jobs, plots, runs
+from ..addon.layouts import draw_settings, invoking, labelled
 from ..addon.reconstruction_properties import drawn
 from .geometry import Sidebar, draw_hint, draw_text
 
@@ -17,9 +18,7 @@ class MPHDRR_PT_reconstruction(Sidebar, bpy.types.Panel):
     bl_order = ids.ORDER_RECONSTRUCTION
 
     def draw(self, context: bpy.types.Context) -> None:
-        layout = self.layout
-        layout.use_property_split = True
-        layout.use_property_decorate = False
+        layout = labelled(self.layout)
         settings = context.scene.mphdrr_reconstruction
         run = runs.shown(context.scene)
         if run is None:
@@ -27,11 +26,9 @@ class MPHDRR_PT_reconstruction(Sidebar, bpy.types.Panel):
         else:
             jobs.draw_job(layout)
             layout.label(text=iface("Of {run}").format(run=run.name), translate=False, icon="RENDER_STILL")
-        column = layout.column()
-        _draw(column, settings, True)
-        row = layout.row()
+        draw_settings(layout.column(), settings, (each for each in drawn(settings) if each[0] in _MAIN))
+        row = invoking(layout.row())
         row.scale_y = 1.4
-        row.operator_context = "INVOKE_DEFAULT"
         row.operator(ids.RECONSTRUCT, text="Reconstruct", icon="OUTLINER_OB_VOLUME")
         known = settings.known
         if known and settings.volume is not None:
@@ -57,24 +54,15 @@ def _draw_result(layout: bpy.types.UILayout, settings: bpy.types.PropertyGroup, 
     box.operator(ids.SHOW_RECONSTRUCTION, text="Show Slices", icon="IMAGE_DATA")
 
 
-def _draw(layout: bpy.types.UILayout, settings: bpy.types.PropertyGroup, main: bool) -> None:
-    for name, is_active in drawn(settings):
-        if (name in _MAIN) == main:
-            row = layout.row()
-            row.active = is_active
-            row.prop(settings, name)
-
-
 class MPHDRR_PT_reconstruction_model(Sidebar, bpy.types.Panel):
     bl_label = "Model and Prior"
     bl_parent_id = "MPHDRR_PT_reconstruction"
     bl_options = {"DEFAULT_CLOSED"}
 
     def draw(self, context: bpy.types.Context) -> None:
-        layout = self.layout
-        layout.use_property_split = True
-        layout.use_property_decorate = False
-        _draw(layout.column(), context.scene.mphdrr_reconstruction, False)
+        settings = context.scene.mphdrr_reconstruction
+        others = (each for each in drawn(settings) if each[0] not in _MAIN)
+        draw_settings(labelled(self.layout).column(), settings, others)
 
 
 class MPHDRR_PT_backprojection(Sidebar, bpy.types.Panel):
@@ -83,9 +71,6 @@ class MPHDRR_PT_backprojection(Sidebar, bpy.types.Panel):
     bl_options = {"DEFAULT_CLOSED"}
 
     def draw(self, context: bpy.types.Context) -> None:
-        layout = self.layout
-        layout.use_property_split = True
-        layout.use_property_decorate = False
+        layout = invoking(labelled(self.layout))
         layout.prop(context.scene.mphdrr_reconstruction, "how")
-        layout.operator_context = "INVOKE_DEFAULT"
         layout.operator(ids.BACKPROJECT, text="Back-Project", icon="OUTLINER_DATA_VOLUME")

@@ -4,6 +4,7 @@ import bpy
 from bpy.app.translations import pgettext_iface as iface
 
 from ..addon import ids, images, jobs, runs
+from ..addon.layouts import invoking
 from .geometry import Sidebar, draw_text
 
 
@@ -45,8 +46,7 @@ class _Runs:
         row = layout.row()
         row.enabled = not jobs.is_running()
         row.template_list("MPHDRR_UL_runs", "", settings, "runs", settings, "active_run", rows=2, maxrows=6)
-        buttons = row.column(align=True)
-        buttons.operator_context = "INVOKE_DEFAULT"
+        buttons = invoking(row.column(align=True))
         buttons.operator(ids.REMOVE_RUN, text="", icon="REMOVE").index = settings.active_run
         column = layout.column(align=True)
         column.active = False
@@ -54,8 +54,7 @@ class _Runs:
             column.label(text=part)
         if len(settings.runs) > 1:
             column.label(text=iface("All runs: {size}").format(size=runs.size_text(settings.runs)))
-            row = layout.row()
-            row.operator_context = "INVOKE_DEFAULT"
+            row = invoking(layout.row())
             row.enabled = not jobs.is_running()
             row.operator_menu_enum(ids.COMPARE_RUNS, "other", text="Compare With", icon="SELECT_DIFFERENCE")
             if text := images.difference_text():
@@ -83,8 +82,7 @@ def draw_changes(layout: bpy.types.UILayout, scene: bpy.types.Scene) -> None:
         draw_text(column, line, icon="DOT")
     if runs.measured_text(scene):
         return
-    row = box.row()
+    row = invoking(box.row())
     row.alert, row.enabled = False, not jobs.is_running()
-    row.operator_context = "INVOKE_DEFAULT"
     again = row.operator(ids.RENDER_PROJECTIONS, text="Render Again", icon="FILE_REFRESH")
     again.volume = runs.volume_to_render(scene)

@@ -66,8 +66,7 @@ def _run(arguments: argparse.Namespace) -> None:
         write_run(run, out / "run.h5")
         write_sheet(run, out / "mosaic.png")
     if scene is None:
-        text = f"no scene and no pictures of it, which need Blender: {INSTALL_BLENDER}"
-        warn(text)
+        warn(f"no scene and no pictures of it, which need Blender: {INSTALL_BLENDER}")
     else:
         _make_scene(scene, run, out)
     print(f"{out}: {', '.join(sorted(p.name for p in out.iterdir() if p.suffix in ('.blend', '.h5', '.png')))}")

@@ -44,9 +44,7 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
 
 
 def _run(arguments: argparse.Namespace) -> None:
-    path = output_path(arguments.output)
-    if path.suffix.lower() != ".blend":
-        raise InputError(f"{path}: expected a name ending in .blend")
+    path = output_path(arguments.output, (".blend",))
     system = chosen_modules(read_workbook(arguments), arguments.modules)
     volume = read_volume(arguments.volume) if arguments.volume else None
     mu = read_volume_of(arguments.mu, "mu") if arguments.mu else None

@@ -7,9 +7,9 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
-from ..errors import InputError
+from ..errors import InputError, refusing
 from ..files import ensure_folder
-from ..progress import Progress
+from ..progress import Progress, tell
 from .event_files import header, verify
 from .folders import EVENTS, INDEX, INPUT_LIST, INPUTS, RECIPE, SetFolder, is_leftover
 from .planning import plan
@@ -93,8 +93,7 @@ def check(folder: str | os.PathLike[str], progress: Progress | None = None) -> l
         for done, fault in enumerate(pool.map(faults_of, numbers), 1):
             if fault is not None:
                 faults.append(fault)
-            if progress is not None:
-                progress(done, len(numbers))
+            tell(progress, done, len(numbers))
     return [*faults, *_foreign(target)]
 
 
@@ -211,10 +210,8 @@ def _remove(path: Path, target: SetFolder) -> None:
     if path.is_dir() and not path.is_symlink():
         _move(path, target)
         return
-    try:
+    with refusing(path, "cannot be removed"):
         path.unlink(missing_ok=True)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be removed ({error.strerror or error})") from error
 
 
 def _move(path: Path, target: SetFolder) -> None:
@@ -224,7 +221,5 @@ def _move(path: Path, target: SetFolder) -> None:
     while new.exists():
         number += 1
         new = beside / f"{path.stem}-{number}{path.suffix}"
-    try:
+    with refusing(path, f"cannot be moved to {new}"):
         path.rename(new)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be moved to {new} ({error.strerror or error})") from error

@@ -18,11 +18,12 @@ _OWN = ("name", "odds", "split", "pose")
 _OF_FILE = ("file", "mu_file", "center", "energy")
 
 
-def table(values: Mapping[str, Any], name: str) -> dict[str, Any]:
-    """A table of the recipe, empty where it is not there."""
+def table(values: Mapping[str, Any], name: str, *known: str) -> dict[str, Any]:
+    """A table of the recipe, empty where it is not there; `InputError` for a key that is not one of those `known`."""
     found = values.get(name, {})
     if not isinstance(found, dict):
         raise InputError(f"{name}: expected a table [{name}]")
+    unknown(found, known or found, f"{name}.")
     return found
 
 
@@ -151,8 +152,7 @@ def _of_file(values: dict[str, Any], kind: Kind | None, quantity: str) -> dict[s
 
 def _placed(values: dict[str, Any]) -> dict[str, Any]:
     """The entries of [phantoms.pose]."""
-    pose = table(values, "pose")
-    unknown(pose, ("position", "euler_degrees", "turn"), "pose.")
+    pose = table(values, "pose", "position", "euler_degrees", "turn")
     found: dict[str, Any] = {}
     for key in ("position", "euler_degrees"):
         if key not in pose:

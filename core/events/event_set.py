@@ -29,6 +29,8 @@ from .making import EventMaker, radon_views
 from .planning import PlannedEvent, plan
 from .recipe import EventRecipe
 
+Floats = NDArray[np.float64]
+
 COUNTED = ("counts", "photons")
 """Units of images that have Poisson noise."""
 
@@ -55,6 +57,16 @@ class _Source:
     def rows(self) -> dict[int, dict[str, Any]]:
         """The index by event."""
         return {row["event"]: row for row in self.folder.rows()}
+
+
+def _numbers(name: str, text: str) -> Any:
+    """A property of `Event`: an array of its file, with its docstring."""
+
+    def read(event: Event) -> Floats:
+        with event._open() as file:
+            return np.asarray(file[name][()], np.float64)
+
+    return property(read, doc=text)
 
 
 class Event:
@@ -112,30 +124,13 @@ class Event:
         """How it was drawn, with its phantom."""
         return plan(self._source.recipe, self.number)
 
-    @property
-    def pose(self) -> NDArray[np.float64]:
-        """World-from-phantom pose (4, 4), mm: rotation and translation."""
-        return self._small("pose")
-
-    @property
-    def placement(self) -> NDArray[np.float64]:
-        """The pose with mirroring and the factor of size, (4, 4), mm."""
-        return self._small("placement")
-
-    @property
-    def position(self) -> NDArray[np.float64]:
-        """Of the phantom, (3,), mm."""
-        return self._small("position")
-
-    @property
-    def euler_degrees(self) -> NDArray[np.float64]:
-        """phi, theta, psi of the phantom, (3,), degrees."""
-        return self._small("euler_degrees")
-
-    @property
-    def module_gain(self) -> NDArray[np.float64]:
-        """Factors (M,) of the modules' sensitivities, which the images of counts hold."""
-        return self._small("module_gain")
+    pose: Floats = _numbers("pose", "World-from-phantom pose (4, 4), mm: rotation and translation.")
+    placement: Floats = _numbers("placement", "The pose with mirroring and the factor of size, (4, 4), mm.")
+    position: Floats = _numbers("position", "Of the phantom, (3,), mm.")
+    euler_degrees: Floats = _numbers("euler_degrees", "phi, theta, psi of the phantom, (3,), degrees.")
+    module_gain: Floats = _numbers(
+        "module_gain", "Factors (M,) of the modules' sensitivities, in the images of counts."
+    )
 
     @property
     def truth(self) -> Volume:
@@ -260,10 +255,6 @@ class Event:
         except OSError:
             header(self.path)  # says what is wrong, where it knows
             raise InputError(f"{self.path}: cannot be read as HDF5; mphdrr events check says more") from None
-
-    def _small(self, name: str) -> NDArray[np.float64]:
-        with self._open() as file:
-            return np.asarray(file[name][()], np.float64)
 
     def _dataset(self, file: Any, group: str, name: str) -> Any:
         if name not in names_of(file, group):

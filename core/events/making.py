@@ -15,7 +15,7 @@ from ..geometry.system import PinholeSystem, chosen_modules
 from ..geometry.views import Views
 from ..memory import readable_size, require
 from ..physics.isotopes import photon_energy
-from ..progress import Progress
+from ..progress import Progress, tell
 from ..projector import Emission, Projector, intensity
 from ..recording import recorded_warnings
 from ..runs.projecting import warn_of_energy, warn_of_images
@@ -92,11 +92,9 @@ class EventMaker:
         def step() -> None:
             nonlocal done
             done += 1
-            if progress is not None:
-                progress(done, steps)
+            tell(progress, done, steps)
 
-        if progress is not None:
-            progress(0, steps)
+        tell(progress, 0, steps)
         with naming(f"event {number}"):
             with recorded_warnings() as warnings:
                 truth = self.truth(planned)

@@ -15,7 +15,7 @@ import numpy as np
 from ..errors import InputError, naming
 from ..geometry.grid import Grid
 from ..runs.recipe import Recipe
-from ..toml import parse_toml
+from ..toml import parse_toml, toml_text
 from ..validation import lengths, one_of, real_array, whole_number, whole_shape
 from .draws import check_number, check_odds, options
 from .entries import PhantomEntry, phantom_entry, plain_name, seed_of, share, table, unknown
@@ -147,8 +147,7 @@ class EventRecipe:
     @cached_property
     def image_store(self) -> str:
         """How images are stored: one of `IMAGE_STORES`."""
-        storage = table(self.values, "storage")
-        unknown(storage, ("images",), "storage.")
+        storage = table(self.values, "storage", "images")
         store: str = storage.get("images", "float32")
         one_of(store, IMAGE_STORES, "storage.images")
         return store
@@ -195,8 +194,7 @@ class EventRecipe:
         """The parallel projections; None for none."""
         if "radon" not in self.values:
             return None
-        radon = table(self.values, "radon")
-        unknown(radon, ("angles", "over_degrees", "rows", "columns", "pitch"), "radon.")
+        radon = table(self.values, "radon", "angles", "over_degrees", "rows", "columns", "pitch")
         counts = radon.get("angles")
         counts = counts if isinstance(counts, list) else [counts]
         counts = tuple(whole_number(count, "radon.angles") for count in counts)
@@ -215,8 +213,7 @@ class EventRecipe:
     @cached_property
     def augmentation(self) -> Augmentation:
         """What is changed besides the phantom's settings and pose."""
-        values = table(self.values, "augmentation")
-        unknown(values, ("mirror", "size", "activity", "module_gain"), "augmentation.")
+        values = table(self.values, "augmentation", "mirror", "size", "activity", "module_gain")
         for name in ("size", "activity"):
             check_number(values.get(name, 1.0), f"augmentation.{name}")
         if "activity" in values and self.quantity != "activity":
@@ -230,8 +227,7 @@ class EventRecipe:
     @cached_property
     def levels(self) -> tuple[float, ...]:
         """Shares of the acquisition time at which noise is to be drawn."""
-        noise = table(self.values, "noise")
-        unknown(noise, ("levels",), "noise.")
+        noise = table(self.values, "noise", "levels")
         levels = real_array(noise.get("levels", [1.0]), "noise.levels", (None,))
         if not len(levels) or np.any(levels <= 0):
             raise InputError("noise.levels: expected shares of the acquisition time above 0, such as [1.0, 0.25]")
@@ -275,9 +271,7 @@ class EventRecipe:
 
     @cached_property
     def _truth(self) -> dict[str, Any]:
-        truth = table(self.values, "truth")
-        unknown(truth, ("voxels", "spacing", "center", "quantity", "store", "below"), "truth.")
-        return truth
+        return table(self.values, "truth", "voxels", "spacing", "center", "quantity", "store", "below")
 
     def _model(self, entries: dict[str, Any]) -> Recipe:
         attenuation, energy = entries.pop("attenuation", None), entries.pop("attenuation_energy", None)
@@ -324,10 +318,4 @@ class EventRecipe:
 def read_recipe(path: str | os.PathLike[str]) -> EventRecipe:
     """The recipe of an event set in a TOML file; paths in it are relative to its folder. `InputError` names the entry."""
     path = Path(path)
-    try:
-        text = path.read_bytes().decode("utf-8-sig")
-    except UnicodeDecodeError:
-        raise InputError(f"{path}: expected TOML, a text in UTF-8") from None
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: {getattr(error, 'strerror', None) or error}") from None
-    return EventRecipe(text, str(path), path.absolute().parent)
+    return EventRecipe(toml_text(path), str(path), path.absolute().parent)

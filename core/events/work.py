@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..errors import InputError, warn
-from ..progress import Progress
+from ..progress import Progress, tell
 from ..validation import whole_number
 from .dask_work import in_cluster
 from .event_set import EventSet
@@ -175,6 +175,5 @@ def make(
     """
     count = whole_number(count, "count")
     for made in making(recipe, folder, count, first, workers):
-        if progress is not None:
-            progress(made.done, made.total)
+        tell(progress, made.done, made.total)
     return EventSet(folder)

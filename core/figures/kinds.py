@@ -7,7 +7,7 @@ into the studio (`addon.figures`).
 from collections.abc import Callable
 from typing import NamedTuple
 
-from ..errors import InputError
+from ..validation import one_of
 from . import mosaics, sums, virtual_c_arm
 from .page import Page
 from .subject import Subject
@@ -72,6 +72,5 @@ KINDS = {
 
 def figure_kind(name: str) -> FigureKind:
     """The kind of that name; `InputError` where there is none."""
-    if name not in KINDS:
-        raise InputError(f"figure {name!r}: expected one of {', '.join(KINDS)}")
+    one_of(name, KINDS, "figure")
     return KINDS[name]

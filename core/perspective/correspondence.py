@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InputError
 from ..memory import require
-from ..progress import Progress
+from ..progress import Progress, tell
 from ..validation import instance, real_array, whole_number
 from .perspective_grid import PerspectiveGrid
 from .view_rays import Floats, Indices, pixels_of, points_at_depths, rays_by_depth, view_indices
@@ -125,8 +125,7 @@ def find_correspondences(
     curves, counts = np.full((len(flat), grid.n_k), np.nan), np.zeros((len(flat), grid.n_k), np.intp)
     for i, pixel in enumerate(flat):
         curves[i], counts[i] = _scores(images, grid, pixel, chosen, half_width)
-        if progress is not None:
-            progress(i + 1, len(flat))
+        tell(progress, i + 1, len(flat))
     depths, scores = _highest(curves, grid)
     starts, per_depth = rays_by_depth(grid.views, grid.m, flat)
     points = starts + depths[:, None] * per_depth

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..progress import Progress
+from ..progress import Progress, tell
 from ..projector.parallel import in_order, thread_count
 
 try:
@@ -103,8 +103,7 @@ def give(
 def see_through(parts: Iterator[None], size: int, total: int, progress: Progress | None) -> None:
     """Have all parts, of `size` each, done, and say how far they are."""
     for done, _ in enumerate(parts, 1):
-        if progress is not None:
-            progress(min(done * size, total), total)
+        tell(progress, min(done * size, total), total)
 
 
 def shifted(matrices: NDArray[np.float64], first: int) -> NDArray[np.float64]:

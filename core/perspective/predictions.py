@@ -7,7 +7,7 @@ import numpy as np
 from ..arrays import ArrayOrTensor, cast_like, checked, is_tensor, namespace, promote, zeros
 from ..errors import InputError
 from ..geometry.views import Views
-from ..progress import Progress
+from ..progress import Progress, tell
 from ..validation import instance, shape_text, whole_number
 from .perspective_grid import PerspectiveGrid, depths_in_views
 from .places import take
@@ -113,8 +113,7 @@ def predict_views(
         else:  # all of it is behind the source
             images.append(zeros((*array.shape[:-3], *views.shape), array))
             covered.append(np.zeros(views.shape, bool))
-        if progress is not None:
-            progress(n + 1, len(views))
+        tell(progress, n + 1, len(views))
     if is_tensor(array):
         import torch
 

@@ -11,7 +11,7 @@ from ..arrays import ArrayOrTensor, checked, to_caller, to_numpy
 from ..errors import InputError, warn
 from ..geometry.grid import Grid
 from ..memory import require
-from ..progress import Progress, part_of
+from ..progress import Progress, part_of, tell
 from ..projector import backends
 from ..projector.operator import LinearOperator
 from ..projector.parallel import in_order, run_all, sum_of, thread_count
@@ -287,8 +287,7 @@ class _AlongRays(_Pair):
 
         for first in range(0, n, _PLANES_AT_ONCE * workers):
             run_all(lambda worker, first=first: work(worker, first), range(workers), workers)  # type: ignore[misc]
-            if progress is not None:
-                progress(min(first + _PLANES_AT_ONCE * workers, n), n)
+            tell(progress, min(first + _PLANES_AT_ONCE * workers, n), n)
         return np.asarray(sum_of(volumes, workers))
 
     @staticmethod

@@ -14,7 +14,7 @@ import math
 from dataclasses import dataclass
 
 from ..errors import InputError
-from ..validation import positive
+from ..validation import one_of, positive
 from .materials import CZT_MU as CZT_MU  # coefficients that version 0.1.0 had here
 from .materials import LEAD_MU as LEAD_MU
 from .materials import NAI_MU as NAI_MU
@@ -79,8 +79,7 @@ ISOTOPES = {
 
 def isotope(name: str) -> Isotope:
     """The isotope of a name such as "Tc-99m"; `InputError` lists the names."""
-    if name not in ISOTOPES:
-        raise InputError(f"isotope {name!r}: expected one of {', '.join(ISOTOPES)}")
+    one_of(name, ISOTOPES, "isotope")
     return ISOTOPES[name]
 
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError
+from ..errors import InputError, naming
 from ..geometry.collimator import edge_slope
 from ..geometry.system import PinholeSystem
 from ..validation import positive
@@ -133,11 +133,9 @@ def _known(material: str) -> Material:
 
 
 def _at_lines(material: str, lines: Sequence[tuple[float, float]], name: str) -> NDArray[np.float64]:
-    try:
+    with naming(name):
         _known(material)  # refuses an unknown material even without lines
         coefficients = [attenuation(material, energy) for energy, _ in lines]
-    except InputError as error:
-        raise InputError(f"{name}: {error}") from None
     if not lines:
         raise InputError(
             f"{name} {material!r}: at which energy? expected an isotope with photons in its window, or a number, 1/mm"

@@ -70,15 +70,15 @@ class DepthResponse:
         column, row, depth = matrix @ corners.T
         if depth.min() <= self.nearest / 2:  # seen from among the voxels, they may be anywhere
             return replace(self, matrix=matrix), (slice(None), slice(None))
-        pixels = []
-        for at, taps, step, n in zip((row, column), self.kernel.shape[1:], self.steps, self.after.shape, strict=True):
+        pixels, cells = [], []
+        for at, taps, step, n, size in zip(
+            (row, column), self.kernel.shape[1:], self.steps, self.after.shape, self.before.shape, strict=True
+        ):
             low, high = float((at / depth).min()) - 2, float((at / depth).max()) + 2
             start = min(max(math.floor((low - taps) / step) + 1, 0), n - 1)
-            pixels.append(slice(start, max(start, min(math.floor(high / step), n - 1)) + 1))
-        cells = [
-            slice(step * pixel.start, step * pixel.stop + n - step * size)
-            for pixel, step, n, size in zip(pixels, self.steps, self.before.shape, self.after.shape, strict=True)
-        ]
+            stop = max(start, min(math.floor(high / step), n - 1)) + 1
+            pixels.append(slice(start, stop))
+            cells.append(slice(step * start, step * stop + size - step * n))
         planes = (1 / depth - self.first_plane) * self.planes_per_inverse
         nearer = min(max(math.ceil(planes.max()), 1), len(self.kernel) - 1)
         farther = min(max(math.floor(planes.min()), 0), nearer - 1)

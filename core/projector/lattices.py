@@ -46,9 +46,8 @@ class Lattices:
 
     def corners(self) -> Array:
         """Corners (8, 3), world mm, of the part of the grid that is traced."""
-        if self.volume is None:
-            return self.grid.corners()
-        return self.grid.box(self.origin, self.volume.shape).corners()
+        grid = self.grid if self.volume is None else self.grid.box(self.origin, self.volume.shape)
+        return grid.corners()
 
 
 def filled_lattices(

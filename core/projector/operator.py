@@ -17,7 +17,7 @@ from ..errors import InputError, warn
 from ..geometry.grid import Grid
 from ..geometry.views import Views
 from ..memory import require
-from ..progress import Progress, part_of
+from ..progress import Progress, part_of, tell
 from ..recording import recorded_warnings
 from ..volumes.images import Images
 from ..volumes.volume import Volume
@@ -292,11 +292,11 @@ class Projector(LinearOperator):
         what = f"projecting {_times(self.shape_in)} voxels into {n_views} images of {n_v} x {n_u} pixels"
         require(itemsize * (n_views * n_v * n_u + self.grid.n_voxels) + self._extra_bytes(itemsize), what)
         images = None
-        _report(progress, 0, n_views)
+        tell(progress, 0, n_views)
         for m, image in enumerate(self._images(x, mu)):
             images = zeros(self.shape_out, image) if images is None else images
             images[m] = image
-            _report(progress, m + 1, n_views)
+            tell(progress, m + 1, n_views)
         if images is None:
             images = np.zeros(self.shape_out, np.float64 if self._float64 else np.float32)
         return to_caller(images, x)
@@ -457,27 +457,22 @@ class AdjointProjector(LinearOperator):
         require(needed, f"the adjoint into {_times(A.grid.shape)} voxels")
         A._require_rays()
         n = len(A.views)
-        _report(progress, 0, n)
+        tell(progress, 0, n)
         images = A._responded(images)
         if A._depths is not None:
-            arguments = *A._depth_arguments(images), lambda done: _report(progress, done, n), A._mu_volume(mu)
+            arguments = *A._depth_arguments(images), lambda done: tell(progress, done, n), A._mu_volume(mu)
             volume = A._depths.backproject(*arguments)
             for m, box, close, of_part in A._close_parts:
                 volume[box] += np.where(close, of_part.T._run(to_numpy(given[m : m + 1], None), mu=mu), 0)
         elif not A.model.weights_voxels:
-            volume = execution.backproject(images, A._bundles, A._mu(mu), lambda done: _report(progress, done, n))
+            volume = execution.backproject(images, A._bundles, A._mu(mu), lambda done: tell(progress, done, n))
         else:  # each view's volume is weighted before it is added to the total
             volume = zeros(A.grid.shape, images)
             for m in range(n):
                 of_view = execution.backproject(images[m : m + 1], A._bundles_of(m))
                 volume += of_view * A._voxel_weights(m, of_view)
-                _report(progress, m + 1, n)
+                tell(progress, m + 1, n)
         return to_caller(A._finished(volume, x), x)
-
-
-def _report(progress: Progress | None, done: int, total: int) -> None:
-    if progress is not None:
-        progress(done, total)
 
 
 def _describe(grid: Grid) -> str:

@@ -11,7 +11,7 @@ from torch.nn.functional import avg_pool2d
 from ..errors import InputError
 from ..geometry.grid import Grid
 from ..geometry.rotations import pose_matrix, se3_exp
-from ..progress import Progress
+from ..progress import Progress, tell
 from ..volumes.volume import Volume
 from .poses import pinhole_images
 
@@ -146,8 +146,7 @@ def register_pose(
             optimizer.step()
             schedule.step()
             similarities.append(float(score.detach()))
-            if progress is not None:
-                progress(len(similarities), total)
+            tell(progress, len(similarities), total)
     with torch.no_grad():
         return PoseEstimate(middle @ se3_exp(scale * motion) @ from_middle, tuple(similarities))
 

@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..memory import require
-from ..progress import Progress
+from ..progress import Progress, tell
 from ..projector import Projector
 from ..projector.subsets import access_order
 from .counts import LEAST, CountData
@@ -169,8 +169,7 @@ def bsrem(
             if reached >= before - rounding or halvings == _MOST_HALVINGS:
                 break
         loop.state["halvings"] = np.array(float(halvings))
-        if progress is not None:
-            progress(2 * n, 2 * n)
+        tell(progress, 2 * n, 2 * n)
         return found, reached
 
     return loop.run(step, {"subsets": n, "relaxation": relaxation, **data.record(total, prior)}, objective)

@@ -1,14 +1,13 @@
 """Maximum likelihood by expectation maximisation: MLEM and OSEM."""
 
-import warnings
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..errors import InputWarning
+from ..errors import warn
 from ..memory import require
-from ..progress import Progress
+from ..progress import Progress, tell
 from ..projector import Projector
 from ..projector.subsets import access_order, balanced_subsets
 from .counts import LEAST, CountData
@@ -148,8 +147,7 @@ def _em(loop: Loop, A: Projector, data: CountData, subsets: Any, prior: Prior | 
                 divisor = np.maximum(late, least)
             factor = np.divide(factor, divisor, out=np.ones_like(x), where=seen[s] > LEAST)
             x = np.multiply(x, factor, out=factor)
-            if progress is not None:
-                progress(k + 1, n)
+            tell(progress, k + 1, n)
         return x, objective(x, waiting(progress, n, n))
 
     def objective(x: Array, asked: Progress | None) -> float:
@@ -160,8 +158,7 @@ def _em(loop: Loop, A: Projector, data: CountData, subsets: Any, prior: Prior | 
 
     result = loop.run(step, {"subsets": n, **data.record(total, prior)}, objective)
     if too_late > _TOO_LATE:
-        text = f"prior: too strong for one step late in {too_late:.0%} of the voxels: take less weight, or bsrem"
-        warnings.warn(text, InputWarning, stacklevel=3)
+        warn(f"prior: too strong for one step late in {too_late:.0%} of the voxels: take less weight, or bsrem")
     return result
 
 

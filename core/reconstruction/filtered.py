@@ -12,7 +12,7 @@ from ..geometry.grid import Grid
 from ..geometry.views import Views
 from ..memory import require
 from ..perspective.places import take
-from ..progress import Progress
+from ..progress import Progress, tell
 from ..projector.parallel import run_all, thread_count
 from ..validation import instance, real_array
 from .loop import plain
@@ -98,8 +98,7 @@ def filtered_backprojection(
     room = np.zeros((at_once, n_v + 2, matrix.shape[1] + 2, 1), np.float32)
     inside = room[:, 1:-1, 1:-1, 0]
     planes = np.arange(grid.shape[2], dtype=np.float64)
-    if progress is not None:
-        progress(0, n)
+    tell(progress, 0, n)
     for first in range(0, n, at_once):
         end = min(first + at_once, n)
 
@@ -109,8 +108,7 @@ def filtered_backprojection(
         run_all(filter_view, range(first, end), thread_count(None))
         taken = room[: end - first], of_place[first:end]
         take(volume, planes, *taken, flat=True, by_depth=True, nearest=_BEHIND)
-        if progress is not None:
-            progress(end, n)
+        tell(progress, end, n)
     return volume
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InputError, warn
-from ..progress import Progress
+from ..progress import Progress, tell
 from ..projector import Projector
 from ..validation import instance, positive, real_array
 from .loop import Loop, Start, plain, waiting
@@ -96,7 +96,7 @@ def sirt(
         if nonnegative:
             x = np.maximum(x, np.float32(0))
         residual = problem.images - problem.forward(x, waiting(progress, 1, 2))
-        said(progress)
+        tell(progress, 2, 2)
         return x, 0.5 * float(np.sum(per_pixel * np.square(residual, dtype=float)))
 
     return loop.run(step, {"relaxation": relaxation, "nonnegative": nonnegative, **problem.record()})
@@ -172,7 +172,7 @@ def cgls(
             if leans and after > _DONE**2 * first_squares:
                 loop.state["first"] = np.zeros_like(first)  # it is said once
                 warn(_LEANS.format(number + 1), 2)
-        said(progress)
+        tell(progress, 2, 2)
         return x, 0.5 * float(_squares(residual))
 
     return loop.run(step, problem.record())
@@ -217,12 +217,6 @@ def inverse(sums: Array) -> Array:
     """1 by sums of weights; 0 where there are none, or next to none beside the others."""
     least = 1e-6 * sums.max(initial=0.0)
     return np.divide(1, sums, out=np.zeros_like(sums), where=sums > least)
-
-
-def said(progress: Progress | None) -> None:
-    """The end of a step of two."""
-    if progress is not None:
-        progress(2, 2)
 
 
 def least_squares_loop(name: str, A: Any, iterations: int, *arguments: Any, nonnegative: bool) -> Loop:

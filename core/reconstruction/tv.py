@@ -5,10 +5,10 @@ from numpy.typing import ArrayLike
 
 from ..geometry.grid import Grid
 from ..memory import require
-from ..progress import Progress
+from ..progress import Progress, tell
 from ..projector import Projector
 from ..validation import positive
-from .least_squares import Problem, inverse, least_squares_loop, said
+from .least_squares import Problem, inverse, least_squares_loop
 from .loop import Start, waiting
 from .result import Array, Callback, Reconstruction
 from .stopping import StoppingRule
@@ -89,7 +89,7 @@ def tv(
         now = problem.forward(new, waiting(progress, 1, 2))
         ahead, beyond = 2 * now - seen, 2 * new - x
         loop.state = {"seen": now, "ahead": ahead, "beyond": beyond, "misfit": misfit, "slopes": slopes}
-        said(progress)
+        tell(progress, 2, 2)
         squares = float(np.sum(np.square(now - problem.images, dtype=float)))
         return new, 0.5 * squares + weight * total_variation(new, A.grid, pairs)
 

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InputError
+from ..validation import one_of
 
 # 17 evenly spaced colours of each map, between which is interpolated: matplotlib's, less than 2.5 % away (CC0).
 _COLORS = {
@@ -45,8 +46,7 @@ class Display:
     def __post_init__(self) -> None:
         if self.colors not in _COLORS:
             raise InputError(f"colors {self.colors!r}: expected one of {', '.join(COLORS)}")
-        if self.scale not in SCALES:
-            raise InputError(f"scale {self.scale!r}: expected one of {', '.join(SCALES)}")
+        one_of(self.scale, SCALES, "scale")
         for name, value in (("low", self.low), ("high", self.high)):
             if value is not None and not np.isfinite(value):
                 raise InputError(f"{name} = {value}: expected a finite number")

@@ -115,12 +115,16 @@ def _run_of(arrays: dict[str, NDArray[Any]], attributes: dict[str, Any]) -> Proj
     return ProjectionRun(
         arrays["projections"],
         PinholeSystem(arrays["geometry/center"], **lengths, numbers=arrays["geometry/number"]),
-        Views(**rays, shape=(n_v, n_u)), volume, unit=str(attributes["projections_unit"]),
-        settings=json.loads(attributes["settings"]), seed=None if seed == "none" else int(seed),
-        workbook=str(attributes["workbook"]), workbook_sha256=str(attributes["workbook_sha256"]),
+        Views(**rays, shape=(n_v, n_u)),
+        volume,
+        unit=str(attributes["projections_unit"]),
+        settings=json.loads(attributes["settings"]),
+        seed=None if seed == "none" else int(seed),
+        workbook=str(attributes["workbook"]),
+        workbook_sha256=str(attributes["workbook_sha256"]),
         versions=json.loads(attributes["versions"]),
         background=arrays.get(_BACKGROUND, 0.0),  # type: ignore[arg-type]  # checked there
-    )  # fmt: skip
+    )
 
 
 def _write_hdf5(arrays: dict[str, NDArray[Any]], attributes: dict[str, Any], path: Path) -> None:

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..memory import require
-from ..progress import Progress
+from ..progress import Progress, tell
 from ..recording import recorded_warnings
-from ..validation import whole_shape
+from ..validation import one_of, whole_shape
 from ..volumes.formats import metaimage
 from ..volumes.formats.contents import first_line, reading
 from ..volumes.formats.dicom import is_dicom
@@ -137,8 +137,7 @@ def read_frames(
         if first != last:
             size = f"{last[0]} x {last[1]} pixels, {paths[0]} of {first[0]} x {first[1]}"
             raise InputError(f"{one}: it holds frames of {size}; expected one size")
-        if progress is not None:
-            progress(number, len(paths))
+        tell(progress, number, len(paths))
     counts = found[0] if len(found) == 1 else np.concatenate(found).view(Counts)
     counts.about = np.concatenate([one.about for one in found])
     counts.kind = ", ".join(sorted({one.kind for one in found} - {""}))
@@ -205,8 +204,7 @@ def _raw(path: Path, layout: Layout) -> NDArray[Any]:
             "shape (--raw-shape FRAMES ROWS COLUMNS)" if layout.shape is None else "type (--raw-type, uint16 or so)"
         )
         raise InputError(f"raw numbers need their {missing}")
-    if layout.type not in RAW_TYPES:
-        raise InputError(f"raw type {layout.type!r}: expected one of {', '.join(RAW_TYPES)}")
+    one_of(layout.type, RAW_TYPES, "raw type")
     kind = np.dtype(layout.type).newbyteorder(">" if layout.big_endian else "<")
     return _numbers(path, kind, whole_shape(layout.shape, "raw shape (--raw-shape)", 3))
 
@@ -316,10 +314,10 @@ def _interfile(path: Path, layout: Layout) -> Counts:
     keys = (f"{name} (sec)" for name in ("time per projection", "image duration", "study duration"))
     times = next(([float(text) for text in header[key]] for key in keys if any(header.get(key, ()))), [])
     windows = int(number("number of energy windows", 1))
-    return _counts(
-        _numbers(data, type_, (count, rows, columns), skip), f"{windows} energy windows" if windows > 1 else "", time=times,
-        pixel=[float(said(f"scaling factor (mm/pixel) [{i}]", "nan")) for i in (1, 2)], window=range(1, windows + 1),
-    )  # fmt: skip
+    pixel = [float(said(f"scaling factor (mm/pixel) [{i}]", "nan")) for i in (1, 2)]
+    kind = f"{windows} energy windows" if windows > 1 else ""
+    frames = _numbers(data, type_, (count, rows, columns), skip)
+    return _counts(frames, kind, time=times, pixel=pixel, window=range(1, windows + 1))
 
 
 def _interfile_header(path: Path) -> dict[str, list[str]]:

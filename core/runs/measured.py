@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..errors import InputError, warn
+from ..errors import InputError, naming, warn
 from ..geometry.system import Detector, PinholeSystem
 from ..memory import require
 from ..progress import Stages
@@ -135,15 +135,13 @@ def recipe_counts(recipe: Recipe, system: PinholeSystem, stages: Stages = lambda
     frames, orientation = recipe["counts.frames"], recipe["counts.orientation"]
     if recipe["counts.frames_file"] is not None:
         frames = _read_numbers(Path(recipe["counts.frames_file"]))
-    try:
+    with naming(found.name):
         run = counts_run(
             found, system, frames, orientation[0] if orientation and len(orientation) == 1 else orientation,
             recipe.given.get("model.time"), expected=recipe["counts.expected"],
             detector=recipe.given.get("detector.plane", "real"), magnification=recipe["detector.magnification"],
             pitch=recipe["detector.pitch"], recipe=recipe, settings={"counts": found.name},
         )  # fmt: skip
-    except InputError as error:
-        raise InputError(f"{found.name}: {error}") from None
     _require_size(recipe, run, found.name)
     return run
 

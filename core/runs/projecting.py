@@ -11,7 +11,7 @@ from ..geometry.system import Detector, PinholeSystem
 from ..geometry.views import Views
 from ..memory import require
 from ..physics.noise import sample_counts
-from ..progress import Progress
+from ..progress import Progress, tell
 from ..projector import Emission, Model, Projector, Transmission, intensity
 from ..validation import positive
 from ..volumes.volume import Volume
@@ -74,8 +74,7 @@ def project_run(
     images = np.empty((len(views), n_v, n_u), np.float32)
     for m, image in enumerate(projector.iter_views(volume)):
         images[m] = image + projector.background[m] if photons is None else intensity(image, photons)
-        if progress is not None:
-            progress(m + 1, len(views))
+        tell(progress, m + 1, len(views))
     if noise_seed is not None:
         images = sample_counts(images, noise_seed).astype(np.float32)
     record = {

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ..errors import InputError
+from ..errors import InputError, naming
 from ..files import replacing
 from ..phantoms.kinds import KINDS
 from ..phantoms.settings import setting_names
@@ -117,10 +117,8 @@ def read_recipe(path: str | os.PathLike[str]) -> Recipe:
     """The recipe in a TOML file, whose paths are relative to its folder; `InputError` names file and key."""
     folder = Path(path).parent
     tables = read_toml(path)
-    try:
+    with naming(path):
         return _with_paths(recipe_of_tables(tables), lambda name: os.path.normpath(folder / name))
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
 
 
 def write_recipe(recipe: Recipe, path: str | os.PathLike[str]) -> None:

@@ -92,7 +92,7 @@ def reconstruct_run(
     modelled = model_of(run, recipe)
     flatters = flattering(run, grid, modelled)
     for text in flatters:
-        _warn(text)
+        warn(text, 2)
     if recipe["reconstruction.ignore_attenuation"]:
         mu = None
     A = projector_of_run(run, grid, mu, modelled, recipe["compute.backend"], recipe["compute.threads"], stages)
@@ -197,9 +197,7 @@ def model_of(run: ProjectionRun, recipe: Recipe) -> Recipe:
         hole = "auto" if is_free and is_whole and _by_depth(recipe) else "rays"
     if hole == "rays" and points is None:
         points = _POINTS if is_whole else made
-    changes: dict[str, Any] = {
-        **dict.fromkeys(SAMPLING), "model.hole": hole, "model.aperture_points": points,
-    }  # fmt: skip
+    changes: dict[str, Any] = dict.fromkeys(SAMPLING) | {"model.hole": hole, "model.aperture_points": points}
     if hole == "rays":
         # The tolerance is for images of single voxels; neighbours make up for each other's errors.
         changes |= {"model.pixel_points": recipe["reconstruction.pixel_points"], "model.tolerance": 1e9}
@@ -220,7 +218,7 @@ def _by_depth(recipe: Recipe) -> bool:
     elif backend in ("cuda", "numpy"):  # the one refuses it, the other takes minutes for an iteration
         why = f"the backend is {backend}"
     if why is not None:
-        _warn(f"the hole's blur is that of rays through {_POINTS} points, not of the whole hole by depth: {why}")
+        warn(f"the hole's blur is that of rays through {_POINTS} points, not of the whole hole by depth: {why}", 4)
     return why is None
 
 
@@ -243,7 +241,7 @@ def flattering(run: ProjectionRun, grid: Grid, model: Recipe | None = None) -> l
     """
     if run.volume is None:  # measured
         return []
-    said, made, points = [], run.recipe if "recipe" in run.settings else Recipe(), "model.aperture_points"
+    said, made = [], run.recipe if "recipe" in run.settings else Recipe()
     fine, coarse = float(run.volume.grid.spacing.max()), float(grid.spacing.min())
     if 2 * fine > 1.001 * coarse:
         said.append(
@@ -257,7 +255,3 @@ def flattering(run: ProjectionRun, grid: Grid, model: Recipe | None = None) -> l
             "flatter, unless the run has more points"
         )
     return said
-
-
-def _warn(text: str) -> None:
-    warn(text, 4)

@@ -15,7 +15,7 @@ from typing import Any
 from ...errors import InputError
 from ...files import ensure_folder, replacing
 from ...memory import readable_size
-from ...progress import Progress
+from ...progress import Progress, tell
 from ..folders import is_leftover
 from ..noise_choice import chosen_seed
 from .layout import Chosen, Layout, Part, Row
@@ -74,8 +74,7 @@ class Plan:
         def written() -> None:
             nonlocal done
             done += 1
-            if progress is not None:
-                progress(done, len(self.rows))
+            tell(progress, done, len(self.rows))
 
         for part in self.missing:
             self.layout.write(part, self.rows, self.folder, written)

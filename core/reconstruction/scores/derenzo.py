@@ -10,7 +10,7 @@ from ...errors import InputError
 from ...geometry.frames import checked_affine
 from ...phantoms.derenzo import DerenzoRods
 from ...phantoms.phantom import QUANTITIES, Phantom
-from ...progress import Progress
+from ...progress import Progress, tell
 from ...validation import freeze, instance
 from ...volumes.resampling import values_at
 from ...volumes.volume import Volume, require_quantity
@@ -160,8 +160,7 @@ def derenzo_score(
     sectors = []
     for done, (rods, sector) in enumerate(numbered, 1):
         sectors.append(_Sector(volume, phantom, world_from_phantom, rods, sector).score())
-        if progress is not None:
-            progress(done, len(numbered))
+        tell(progress, done, len(numbered))
     return DerenzoScore(tuple(sectors))
 
 

@@ -5,7 +5,6 @@ Those of DICOM and ITK point left, back (posterior) and to the head: LPS.
 """
 
 import math
-import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -15,7 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...errors import InputError, InputWarning, naming
+from ... import errors
+from ...errors import InputError, naming
 from ...geometry.grid import Grid
 from ...memory import require
 from ...progress import Cancelled
@@ -69,7 +69,7 @@ def refuse_several_files(field: str, where: str) -> None:
 
 def warn(path: Path, text: str) -> None:
     """Give an `InputWarning` about a file."""
-    warnings.warn(f"{path}: {text}", InputWarning, stacklevel=3)
+    errors.warn(f"{path}: {text}")
 
 
 def warn_of_assumed(path: Path, assumed: Sequence[str]) -> None:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from ...errors import InputError, warn
 from ...geometry.frames import affine_matrix
-from ...progress import Progress
+from ...progress import Progress, tell
 from .contents import RAS_FROM_LPS, Contents, first_line, reading, require_voxels
 
 _SAME_ORIENTATION = 1e-4  # direction cosines are written with 6 digits
@@ -93,8 +93,7 @@ def read(path: Path, series: str | None = None, progress: Progress | None = None
         array = np.empty((columns, rows, len(slices)), np.float32)
         for k, (one, pixels) in enumerate(_pixels(slices)):
             array[:, :, k] = (pixels.astype(np.float64) * one.slope + one.intercept).T * factor
-            if progress is not None:
-                progress(k + 1, len(slices))
+            tell(progress, k + 1, len(slices))
     axes = np.column_stack([*(first.orientation * np.array(first.spacing[::-1])[:, None]), step])
     return Contents(array, RAS_FROM_LPS @ affine_matrix(axes, first.position), quantity)
 

@@ -1,0 +1,27 @@
+"""How panels and dialogs show settings."""
+
+from collections.abc import Iterable
+
+import bpy
+
+
+def labelled(layout: bpy.types.UILayout) -> bpy.types.UILayout:
+    """The layout, from now on with settings' names in a column of their own, and without the dots that animate them."""
+    layout.use_property_split, layout.use_property_decorate = True, False
+    return layout
+
+
+def invoking(layout: bpy.types.UILayout) -> bpy.types.UILayout:
+    """The layout, whose buttons from now on ask the user first where their operators do."""
+    layout.operator_context = "INVOKE_DEFAULT"
+    return layout
+
+
+def draw_settings(
+    layout: bpy.types.UILayout, settings: bpy.types.PropertyGroup, names: Iterable[tuple[str, bool]]
+) -> None:
+    """Draw settings, each with whether it has an effect; those without are greyed out."""
+    for name, is_active in names:
+        row = layout.row()
+        row.active = is_active
+        row.prop(settings, name)

@@ -213,7 +213,8 @@ _DECLARED = (
     Setting("model.window", float, None, "Energies that are counted, from and to", "10 % around the isotope's strongest "
             "line", unit="keV", least=0, slider=1000, sizes=(2,), needs=(_COUNTS, "model.isotope"),
             label="Window (keV)"),
-    Setting("model.hole", str, "auto", "What the hole does to the image", label="Hole", option="--hole", words={
+    Setting("model.hole", str, "auto", "What photons pass: the whole hole (auto; depth, never by rays), points "
+            "of it (rays), or its middle alone (point)", label="Hole", option="--hole", words={
         "auto": ("Automatic", "The blur of the whole hole, by depth; by rays where that cannot be"),
         "depth": ("By Depth", "The blur of the whole hole, depth by depth, without rays"),
         "rays": ("Rays", "The blur of rays through points of the hole"),

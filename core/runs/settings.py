@@ -222,7 +222,7 @@ _DECLARED = (
     }, needs=(_COUNTS,)),
     Setting("model.aperture_points", int, None, "Points of the hole that rays pass; 1: its middle, no blur, 7 and more: the "
             "blur of a hole of this size", "as many as the hole's tolerance asks for", least=1, slider=64,
-            needs=(_COUNTS, "model.hole=rays"), label="Hole Points"),
+            needs=(_COUNTS, "model.hole=rays", "no model.aperture_tolerance"), label="Hole Points"),
     Setting("model.aperture_tolerance", float, None, "In place of a number of points, as many as bring a voxel's image "
             "this close to that of the whole hole", "0.1, where rays are used", above=0, slider=1,
             needs=(_COUNTS, "model.hole=rays"), label="Hole Tolerance"),

@@ -18,7 +18,7 @@ from ..core.geometry.system import LENGTHS, PinholeSystem
 from ..core.memory import readable_size
 from ..core.runs.recipe import Recipe, fitting_recipe
 from ..core.runs.run import ProjectionRun
-from ..core.runs.settings import SETTINGS, Setting
+from ..core.runs.settings import SAMPLING, SETTINGS, Setting
 from . import cameras, following, ids, phantoms, scanner, storage, volumes, windows
 from .decimals import typed
 from .module_values import FROM_ROI, numbers_of
@@ -229,7 +229,7 @@ def _differences(scene: bpy.types.Scene, old: Mapping[str, Any], own: bpy.types.
     chosen = panel.volume or _found(scene, old["volume"])
     yield from _of_volume(scene, "", old["volume"], chosen)
     yield from _of_volume(scene, "attenuation ", old["mu"], panel.mu if settings["model.kind"] == "emission" else None)
-    yield from _of_settings(old["settings"], settings)
+    yield from _of_settings(_settings(fitting_recipe(old["settings"])), settings)  # with an earlier version's hole
 
 
 def _of_modules(collection: bpy.types.Collection | None, old: Mapping[str, Any]) -> Iterator[str]:
@@ -324,9 +324,11 @@ def _of_volume(
 
 
 def _of_settings(old: Mapping[str, Any], now: Mapping[str, Any]) -> Iterator[str]:
-    other_model = old["model.kind"] != now["model.kind"]
+    other_model, other_hole = (old.get(key) != now.get(key) for key in ("model.kind", "model.hole"))
     for key, default in _DEFAULTS.items():
         if other_model and key.startswith(("model.", "noise.")) and key != "model.kind":
+            continue
+        if other_hole and key in SAMPLING:
             continue
         one, two = old.get(key, default), now.get(key, default)
         if not _same(one, two):

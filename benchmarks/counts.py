@@ -23,10 +23,11 @@ import mphdrr.core as mph
 WORKBOOK = Path(__file__).parents[1] / "examples" / "dc-spect-80.xlsx"
 CASES = ((64, 2.0, 64), (128, 1.0, 128))  # voxels along an axis, mm, pixels along a side
 MODELS: dict[str, dict[str, Any]] = {
-    "automatic": {},
-    "1 ray": {"pixel_points": 1},
-    "7 points of the hole, automatic": {"aperture_points": 7},
-    "7 points of the hole, 1 ray each": {"aperture_points": 7, "pixel_points": 1},
+    "whole hole, by depth": {},
+    "its middle, automatic": {"hole": "point"},
+    "its middle, 1 ray": {"hole": "point", "pixel_points": 1},
+    "7 points of it, automatic": {"aperture_points": 7},
+    "7 points of it, 1 ray each": {"aperture_points": 7, "pixel_points": 1},
 }
 PLACES = 12
 ENOUGH = 5.0  # s
@@ -68,7 +69,7 @@ def main() -> None:
         volume = mph.DerenzoPhantom(radius=40, rod_diameters=(8, 6, 5, 4, 3, 2), height=40).voxelize(grid)
         for name, options in MODELS.items():
             model = mph.Emission(system, **options)
-            rays = [model.rays(views, m, grid) for m in range(len(system))]
+            rays = [model.rays(views, m, grid) if options else 0 for m in range(len(system))]
             counted = f"{min(rays)} to {max(rays)}" if max(rays) > min(rays) else str(rays[0])
             error = worst_error(system, size, views, model)
             A = mph.Projector(grid, views, model)

@@ -3,8 +3,8 @@
     python benchmarks/events.py [--quick] [--events 50] [--voxels 256] [--pixels 256] [--output FOLDER]
 
 The event: a Derenzo phantom of random pose, its true volume, all views of the real workbook, parallel projections at 96 and
-256 angles, written. Made with line integrals, and with emission through seven points of the hole and three of each pixel; by
-one worker that has all cores, and by one worker per core. The pipeline: numpy, DiffDRR 0.6.1 and torch, a few views and
+256 angles, written. Made with line integrals, and with emission through the whole hole; by one worker that has all cores,
+and by one worker per core. The pipeline: numpy, DiffDRR 0.6.1 and torch, a few views and
 angles of one event, scaled to all. Writes the section "Event sets" of `benchmarks.md`.
 """
 
@@ -35,7 +35,7 @@ ANGLES = (96, 256)
 RADIUS, RODS, HEIGHT = 40.0, (8.0, 6.0, 5.0, 4.0, 3.0, 2.0), 40.0  # mm, as in docs/reconstruction.md
 MODELS = {
     "line integrals": 'kind = "transmission"',
-    "emission": 'kind = "emission"\ntime = 600\naperture_points = 7\npixel_points = 3',
+    "emission": 'kind = "emission"\ntime = 600',
 }
 RECIPE = """version = 1
 seed = 1
@@ -204,7 +204,7 @@ Written by `make bench-events`, {date.today()}; do not edit. {report.processor()
 An event: a Derenzo phantom (radius {RADIUS:g} mm, rods of {", ".join(f"{d:g}" for d in RODS)} mm, {HEIGHT:g} mm high) turned
 at random and moved by up to 25 mm along each axis; its volume of {voxels}^3 voxels of {SIDE / voxels:g} mm, 80 views of
 {pixels} x {pixels} pixels, parallel projections at {" and ".join(map(str, ANGLES))} angles; compressed without loss, on the
-disk. Emission is through 7 points of the hole and 3 of each pixel. Times are of the whole work, with the start of the
+disk. Emission is through the whole hole, by depth. Times are of the whole work, with the start of the
 workers, by the number of events; what 1000 take is scaled from them. A larger phantom compresses to more.""",
         report._table(head, lines),
     ]

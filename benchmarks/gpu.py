@@ -167,7 +167,7 @@ def ours(case: Case) -> Iterator[Contender]:
         "cuda, arrays on the CPU", n, lambda: torch.from_numpy(A(host)), lambda: torch.from_numpy(A.T(host_images))
     )
     mu = mph.Volume(np.full(case.grid.shape, 0.015, np.float32), case.grid, "mu")
-    model = mph.Emission(case.system, mu=mu, pixel_points=1, tolerance=1e9)
+    model = mph.Emission(case.system, mu=mu, hole="point", pixel_points=1, tolerance=1e9)
     C = mph.Projector(case.grid, case.views, model, backend="cuda")
     yield Contender("cuda, emission with mu", n, lambda: C(case.volume), lambda: C.T(case.images), False)
 

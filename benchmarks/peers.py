@@ -91,7 +91,8 @@ class Ours(Peer):
 
     def emission(self, case: Case) -> Call:
         mu = mph.Volume(case.volume("mu"), case.grid, "mu")
-        model = mph.Emission(case.system, mu, pixel_points=1, tolerance=1e9)  # one ray a pixel, as all contenders
+        # One ray a pixel, through the middle of the hole, as all contenders.
+        model = mph.Emission(case.system, mu, hole="point", pixel_points=1, tolerance=1e9)
         A, x = self._projector(case, model), case.volume("noise")
         return lambda: A(x)
 

@@ -34,8 +34,8 @@ CAMERA: dict[str, Any] = {
 }
 TRUE_POINTS = {"aperture_points": 91, "pixel_points": 3}
 MODELS: dict[str, dict[str, Any]] = {
-    "whole-hole": {"hole": "depth"},
-    "no-recovery": {"blur": 0.0, "pixel_points": 5},
+    "whole-hole": {},
+    "no-recovery": {"blur": 0.0, "hole": "point", "pixel_points": 5},
     "seven-rays": {"aperture_points": 7, "pixel_points": 1},
 }
 ITERATIONS, SUBSETS, DRAWS = 80, 16, 5
@@ -101,7 +101,7 @@ def cylinder(folder: Path, diameter: float = 200.0, height: float = 60.0, iterat
     coarse, _ = water(50, 4.0)
     found = {}
     for name, of_model in (("corrected", mu), ("uncorrected", None)):
-        A = mph.Projector(coarse, views, mph.Emission(SYSTEM, of_model, intrinsic_fwhm=1.0, hole="depth", **CAMERA))
+        A = mph.Projector(coarse, views, mph.Emission(SYSTEM, of_model, intrinsic_fwhm=1.0, **CAMERA))
         x = mph.osem(A, data, iterations, SUBSETS).volume.array
         distance = np.linalg.norm((np.indices(coarse.shape).T * 4.0 + coarse.affine[:3, 3]).T, axis=0)
         found[name] = float(x[distance < 20].mean() / 100)
@@ -161,15 +161,15 @@ def main() -> None:
         if study in MODELS:
             reconstruct(folder, study, data, 64, n, **MODELS[study])
         elif study == "blur-3":
-            reconstruct(folder, study, data, 64, n, blur=3.0, hole="depth")
+            reconstruct(folder, study, data, 64, n, blur=3.0)
         elif study == "fine":
-            reconstruct(folder, study, data, 128, n, hole="depth")
+            reconstruct(folder, study, data, 128, n)
         elif study == "noise":
             for draw in range(DRAWS):
                 if (folder / f"noise-{draw}.json").exists():
                     continue
                 drawn = np.random.default_rng(draw).poisson(data)
-                reconstruct(folder, f"noise-{draw}", drawn, 64, n, hole="depth")
+                reconstruct(folder, f"noise-{draw}", drawn, 64, n)
         elif study == "cylinder":
             cylinder(folder)
         elif study != "data":

@@ -99,7 +99,7 @@ def back_projections(system: mph.PinholeSystem) -> Image.Image:
     truth = PHANTOMS["Derenzo"].voxelize(mph.Grid.centered((168, 168, 84), 0.5))
     page = Image.new("RGB", (4 * (size + MARGIN) + MARGIN, 2 * (size + TEXT + MARGIN) + MARGIN), (24, 26, 29))
     write = ImageDraw.Draw(page)
-    ideal, real = mph.Emission(system, pixel_points=1, tolerance=1e9), mph.Emission(system, hole="depth")
+    ideal, real = mph.Emission(system, hole="point", pixel_points=1, tolerance=1e9), mph.Emission(system)
     for row, (name, model) in enumerate({"ideal holes": ideal, "the scanner's holes": real}.items()):
         counts = mph.Projector(truth.grid, views, model)(truth)
         settings = {"recipe": {"model": {"kind": "emission"}}}

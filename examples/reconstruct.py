@@ -37,21 +37,20 @@ def main() -> None:
     views = system.views(shape=(arguments.pixels, arguments.pixels), detector="real")
     phantom = mph.DerenzoPhantom(40, (8, 6, 5, 4, 3, 2), 40, activity=100)
     physics = {
-        "time": 600, "isotope": "Tc-99m", "aperture_mu": "tungsten", "crystal_mu": "NaI", "intrinsic_fwhm": 1.0,
-        "tolerance": 1e9,
+        "time": 600, "isotope": "Tc-99m", "aperture_mu": "tungsten", "crystal_mu": "NaI", "intrinsic_fwhm": 1.0
     }  # fmt: skip
 
     # The data: from fine voxels, many rays and with noise.
     side = 102.4  # mm
     fine = mph.Grid.centered(arguments.fine, side / arguments.fine)
     truth = phantom.voxelize(fine)
-    scan = mph.Emission(system, aperture_points=19, pixel_points=4, **physics)
+    scan = mph.Emission(system, aperture_points=19, pixel_points=4, tolerance=1e9, **physics)
     counts = mph.sample_counts(mph.Projector(fine, views, scan)(truth), seed=1)
     print(f"{counts.sum():.4g} counts in {len(views)} images, {time.perf_counter() - began:.1f} s")
 
     # The model: coarser voxels, and the blur of the whole hole, depth by depth.
     grid = mph.Grid.centered(arguments.voxels, side / arguments.voxels)
-    A = mph.Projector(grid, views, mph.Emission(system, hole="depth", **physics))
+    A = mph.Projector(grid, views, mph.Emission(system, **physics))
 
     def say(iteration: int, values: object) -> None:
         print(f"iteration {iteration} of {arguments.iterations}, {time.perf_counter() - began:.1f} s")

@@ -29,7 +29,7 @@ seed = 1
 system = {{ file = '{WORKBOOK}' }}
 detector = {{ plane = "real", rows = 12, columns = 12 }}
 truth = {{ voxels = 16, spacing = 8.0 }}
-models.emission = {{ kind = "emission", isotope = "Tc-99m", time = 600, hole = "depth" }}
+models.emission = {{ kind = "emission", isotope = "Tc-99m", time = 600 }}
 noise = {{ levels = [1.0, 0.5] }}
 splits = {{ train = 0.75, validation = 0.25 }}
 
@@ -72,7 +72,7 @@ def train(events: EventSet, arguments: argparse.Namespace) -> None:
 
     # Back to the volume: the exact adjoint of a simple model of the scanner, by its sensitivity.
     first = events[0]
-    simple = mph.Emission(first.system, pixel_points=1, tolerance=1e9)
+    simple = mph.Emission(first.system, hole="point", pixel_points=1, tolerance=1e9)
     A = mph.Projector(first.truth.grid, first.views, simple)
     sensitivity = A.T(torch.ones((len(first.views), *first.views.shape)))
     sensitivity = sensitivity.clamp(min=0.01 * float(sensitivity.max()))

@@ -9,7 +9,7 @@ from ..addon.projection_properties import drawn, makes_counts
 from .geometry import Sidebar, draw_hint, draw_text
 from .runs import draw_changes
 
-_MAIN = ("time", "photons", "pixel_points")
+_MAIN = ("time", "photons", "hole", "aperture_points", "pixel_points")
 """Settings of models that the panel itself shows; the others stand under Physics."""
 
 

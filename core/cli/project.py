@@ -23,8 +23,8 @@ from .recipe_options import add_entries, add_option, add_setting, typed_entries
 _LISTED = (
     *("system.columns", "system.modules", "volume.file", "volume.states", "volume.center", "phantom.file"),
     *("counts.files", "counts.frames", "counts.frames_file", "counts.orientation", "counts.expected"),
-    *("attenuation.file", "model.time", "model.isotope", "detector.plane", "detector.magnification", "noise.seed"),
-    *("compute.backend", "compute.threads"),
+    *("attenuation.file", "model.time", "model.isotope", "model.hole", "detector.plane", "detector.magnification"),
+    *("noise.seed", "compute.backend", "compute.threads"),
 )
 """Settings whose options the help lists; the others it leaves to --set and the recipe."""
 

@@ -34,7 +34,7 @@ class Recipe:
     given: Mapping[str, Any] = dataclasses.field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        checked = _with_hole({key: _checked(self.given, key) for key in self.given})
+        checked = _with_hole({key: _checked(self.given, key) for key in self.given}, self.given)
         object.__setattr__(self, "given", checked)
         for key in checked:
             for need in _unmet(checked, key):
@@ -77,7 +77,7 @@ class Recipe:
 
 def fitting_recipe(values: Mapping[str, Any], kept: Collection[str] = ()) -> Recipe:
     """The recipe of those values, None aside, that have an effect; `InputError` where one of `kept` has none."""
-    values = _with_hole({key: value for key, value in values.items() if value is not None})
+    values = _with_hole({key: value for key, value in values.items() if value is not None}, kept)
 
     def is_stale(key: str) -> bool:
         is_known = key in SETTINGS or key.partition(".")[2] in _phantom_fields(values)
@@ -152,10 +152,12 @@ def write_recipe(recipe: Recipe, path: str | os.PathLike[str]) -> None:
         temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
-def _with_hole(values: dict[str, Any]) -> dict[str, Any]:
-    """The values, with hole "rays" where there are numbers of rays and nothing is said of the hole."""
-    is_said = "model.hole" in values or values.get("model.kind") != "emission"
-    return values if is_said or not any(key in values for key in SAMPLING) else {**values, "model.hole": "rays"}
+def _with_hole(values: dict[str, Any], kept: Collection[str]) -> dict[str, Any]:
+    """The values, with hole "rays" for numbers of rays beside hole "auto", if they are `kept`, or beside none."""
+    given = {key for key in SAMPLING if values.get(key, SETTINGS[key].default) != SETTINGS[key].default}
+    numbers = given if "model.hole" not in values else given.intersection(kept)
+    is_free = values.get("model.kind") == "emission" and values.get("model.hole", "auto") == "auto"
+    return {**values, "model.hole": "rays"} if is_free and numbers else values
 
 
 def is_met(values: Mapping[str, Any], need: str) -> bool:

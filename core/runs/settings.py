@@ -213,7 +213,8 @@ _DECLARED = (
     Setting("model.window", float, None, "Energies that are counted, from and to", "10 % around the isotope's strongest "
             "line", unit="keV", least=0, slider=1000, sizes=(2,), needs=(_COUNTS, "model.isotope"),
             label="Window (keV)"),
-    Setting("model.hole", str, "auto", "What the hole does to the image", label="Hole", option="--hole", words={
+    Setting("model.hole", str, "auto", "What photons pass: the whole hole (auto; depth, never by rays), points "
+            "of it (rays), or its middle alone (point)", label="Hole", option="--hole", words={
         "auto": ("Automatic", "The blur of the whole hole, by depth; by rays where that cannot be"),
         "depth": ("By Depth", "The blur of the whole hole, depth by depth, without rays"),
         "rays": ("Rays", "The blur of rays through points of the hole"),
@@ -221,7 +222,7 @@ _DECLARED = (
     }, needs=(_COUNTS,)),
     Setting("model.aperture_points", int, None, "Points of the hole that rays pass; 1: its middle, no blur, 7 and more: the "
             "blur of a hole of this size", "as many as the hole's tolerance asks for", least=1, slider=64,
-            needs=(_COUNTS, "model.hole=rays"), label="Hole Points"),
+            needs=(_COUNTS, "model.hole=rays", "no model.aperture_tolerance"), label="Hole Points"),
     Setting("model.aperture_tolerance", float, None, "In place of a number of points, as many as bring a voxel's image "
             "this close to that of the whole hole", "0.1, where rays are used", above=0, slider=1,
             needs=(_COUNTS, "model.hole=rays"), label="Hole Tolerance"),

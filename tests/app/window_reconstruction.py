@@ -54,7 +54,7 @@ def render() -> None:
     """Counts, few and quickly."""
     settings = bpy.context.scene.mphdrr_projections
     settings.model, settings.time, settings.width, settings.height = "EMISSION", 600.0, 24, 24
-    settings.pixel_points, settings.tolerance, settings.first, settings.last = 1, 1e6, 1, 16
+    settings.first, settings.last = 1, 16
     call(bpy.ops.mphdrr.render_projections)
 
 

@@ -148,13 +148,12 @@ def render():
     settings = bpy.context.scene.mphdrr_projections
     settings.model, settings.time = "EMISSION", 60.0
     settings.width = settings.height = 128
-    settings.pixel_points = 5
     press(bpy.ops.mphdrr.render_projections)
     yield 1
     yield idle
     counts = totals()
     yield from scroll(6)
-    return [f"{counts[55] / counts[54]:.1f} times", "SPECT Counts", "60", "128", "5"]
+    return [f"{counts[55] / counts[54]:.1f} times", "SPECT Counts", "60", "128"]
 
 
 @step

@@ -47,6 +47,7 @@ kind = "transmission"
 [models.counts]
 kind = "emission"
 time = 100
+hole = "point"
 pixel_points = 1
 tolerance = 1e6
 [augmentation]

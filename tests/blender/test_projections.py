@@ -26,9 +26,9 @@ from mphdrr.core.projector import Emission, InverseSquareSum, Projector, intensi
 from mphdrr.core.runs.files import read_run
 from mphdrr.core.runs.mosaic import as_seen
 from mphdrr.core.runs.recipe import write_recipe
-from mphdrr.core.runs.settings import SETTINGS
+from mphdrr.core.runs.settings import SAMPLING, SETTINGS
 from mphdrr.core.volumes.volume import Volume
-from mphdrr.panels.projections import MPHDRR_PT_physics
+from mphdrr.panels.projections import MPHDRR_PT_physics, MPHDRR_PT_projections
 
 
 @pytest.fixture
@@ -82,9 +82,9 @@ def body(scanned) -> Volume:
 PHYSICS = {
     "isotope": "Tc-99m", "aperture_points": 3, "aperture_mu": 3.6, "opening_angle": np.float32(1.4), "edge": "PATH",
     "crystal_mu": 0.404, "depth_layers": 2, "intrinsic_fwhm": 3.0, "within_cone": True, "within_walls": True,
-    "within_crystal": True, "time": 600.0, "pixel_points": 2,
+    "within_crystal": True, "time": 600.0, "pixel_points": 2, "hole": "RAYS",
 }  # fmt: skip
-IN_PYTHON = PHYSICS | {"edge": "path", "opening_angle": 1.4}
+IN_PYTHON = PHYSICS | {"edge": "path", "opening_angle": 1.4, "hole": "rays"}
 
 
 def test_physics_of_the_panel_is_that_of_core(scanned, scene, body):
@@ -149,8 +149,57 @@ def test_physics_panel_shows_settings_that_exist(scanned, scene, model):
     shown = {name: owner for (owner, name), _ in layout.prop.call_args_list}
     assert all(name in owner.bl_rna.properties for name, owner in shown.items())
     assert {"noise", "seed"} <= shown.keys()
-    of_counts = {"mu", *PHYSICS} - {"time", "pixel_points"}
+    of_counts = {"mu", *PHYSICS} - {"time", "hole", "aperture_points", "pixel_points"}  # these are in the panel above
     assert (of_counts <= shown.keys()) == (model == "EMISSION")
+
+
+@pytest.mark.parametrize(
+    ("model", "hole", "numbers"),
+    [
+        ("EMISSION", "AUTO", set()),
+        ("EMISSION", "DEPTH", set()),
+        ("EMISSION", "RAYS", {"aperture_points", "aperture_tolerance", "pixel_points", "tolerance"}),
+        ("EMISSION", "POINT", {"pixel_points", "tolerance"}),
+        ("TRANSMISSION", "AUTO", {"pixel_points", "tolerance"}),
+        ("INVERSE_SQUARE", "AUTO", set()),
+    ],
+)
+def test_numbers_of_rays_are_shown_where_rays_are_used(scanned, scene, model, hole, numbers):
+    settings = scene.mphdrr_projections
+    settings.model, settings.hole = model, hole
+    shown = {}
+    for panel in (MPHDRR_PT_projections, MPHDRR_PT_physics):
+        layout = MagicMock()
+        layout.row.return_value = layout.column.return_value = layout
+        panel.draw(SimpleNamespace(layout=layout), bpy.context)
+        shown[panel] = {call.args[1] for call in layout.prop.call_args_list}
+    sampling = {key.partition(".")[2] for key in SAMPLING}
+    assert sampling & set().union(*shown.values()) == numbers
+    assert ("hole" in shown[MPHDRR_PT_projections]) == (model == "EMISSION"), "the choice itself is easily found"
+
+
+@pytest.mark.parametrize(
+    ("hole", "numbers", "expected"),
+    [
+        ("AUTO", {}, ("auto", None, None)),
+        ("AUTO", {"aperture_points": 3, "pixel_points": 1}, ("rays", 3, 1)),  # as in recipes and in Python
+        ("RAYS", {"pixel_points": 1}, ("rays", None, 1)),
+        ("POINT", {"pixel_points": 1}, ("point", None, 1)),
+    ],
+)
+def test_numbers_of_rays_that_a_script_gives_mean_rays(scanned, scene, hole, numbers, expected):
+    scene.mphdrr_projections.hole = hole
+    assert bpy.ops.mphdrr.render_projections(width=4, height=4, last=2, model="EMISSION", **numbers) == {"FINISHED"}
+    recipe = read_run(storage.absolute(scene.mphdrr_projections.run_file)).recipe
+    assert tuple(recipe[f"model.{name}"] for name in ("hole", "aperture_points", "pixel_points")) == expected
+
+
+def test_numbers_that_the_panel_does_not_show_are_not_used(scanned, scene):
+    settings = scene.mphdrr_projections
+    settings.model, settings.aperture_points, settings.pixel_points, settings.tolerance = "EMISSION", 7, 3, 0.5
+    assert bpy.ops.mphdrr.render_projections(width=4, height=4, last=2) == {"FINISHED"}
+    recipe = read_run(storage.absolute(settings.run_file)).recipe
+    assert recipe["model.hole"] == "auto" and not recipe.given.keys() & set(SAMPLING)
 
 
 @pytest.mark.parametrize(

@@ -27,7 +27,6 @@ def render(scene, ring_system):
     bpy.ops.mphdrr.add_derenzo(voxels=32, rod_diameters=(10, 8, 0, 0, 0, 0), location=(5, -3, 2), phi=0.2)
     settings = scene.mphdrr_projections
     settings.width, settings.height, settings.model, settings.time = 12, 10, "EMISSION", 600.0
-    settings.pixel_points, settings.tolerance = 2, 9.0
 
     def now(**changes):
         for name, value in changes.items():

@@ -334,9 +334,13 @@ def test_two_runs_of_blender_4_5_open_in_every_version(scene, tmp_path):
     scene = bpy.context.scene
     before, after = scene.mphdrr_projections.runs
     assert (before.name, after.name) == ("Before", "Derenzo, emission") and runs.shown(scene) == after
-    assert runs.changes(scene, before) == ["Module 03 moved", "phantom Derenzo turned"] and runs.changes(scene) == []
+    hole = ["hole Rays, now Automatic"]  # its middle, the default of that version
+    assert runs.changes(scene, before) == ["Module 03 moved", "phantom Derenzo turned", *hole]
+    assert runs.changes(scene) == hole
+    settings = scene.mphdrr_projections
+    settings.hole, settings.aperture_points = "RAYS", 1
     expected = array_of(after)
     assert np.array_equal(images.projection_array(bpy.data.images["mphDRR 66"]), expected[2])
     assert bpy.ops.mphdrr.render_projections() == {"FINISHED"}
-    np.testing.assert_allclose(array_of(scene.mphdrr_projections.runs[-1]), expected, rtol=1e-6)
-    assert runs.changes(scene, scene.mphdrr_projections.runs[1]) == []
+    np.testing.assert_allclose(array_of(settings.runs[-1]), expected, rtol=1e-6)
+    assert runs.changes(scene, settings.runs[1]) == []

@@ -46,7 +46,8 @@ def test_an_event_is_what_the_projector_makes_of_its_phantom(small):
         truth = phantom(**own).voxelize(recipe.grid, event.pose)
         np.testing.assert_allclose(event.truth.array, truth.array, rtol=1e-6, atol=1e-6)
         np.testing.assert_allclose(event.images("lines"), mph.Projector(truth.grid, views)(truth), rtol=1e-5, atol=1e-4)
-        counts = mph.Projector(truth.grid, views, mph.Emission(system, time=100, pixel_points=1, tolerance=1e6))(truth)
+        model = mph.Emission(system, time=100, hole="point", pixel_points=1, tolerance=1e6)
+        counts = mph.Projector(truth.grid, views, model)(truth)
         np.testing.assert_allclose(event.images("emission"), counts + 0.25, rtol=1e-5)
         for n in (6, 8):
             parallel = mph.parallel_views(np.pi * np.arange(n) / n, (16, 16), 6.0)

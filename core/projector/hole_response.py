@@ -80,13 +80,13 @@ class WholeHoles(DepthResponses):
         is_strict: bool,
     ) -> None:
         super().__init__(len(views), views.shape, grid, mu)
-        self._views, self._system, self._diameters = views, system, diameters
+        self._views, self._system, self._diameters, self._frames = views, system, diameters, system.frames()
         self._sides, self._weigh, self._is_strict = sides, weigh, is_strict
 
     def _module(self, m: int) -> tuple[Array, Array, float, float]:
         """Of module m the pinhole, mm, the frame u, v, k, the collimator's length and the hole's diameter, mm."""
         l, d = float(self._system.collimator_length[m]), float(self._diameters[m])
-        return self._views.sources[m], self._system.frames()[m], l, d
+        return self._views.sources[m], self._frames[m], l, d
 
     def depths(self, m: int) -> Array:
         """As of `DepthResponses`."""

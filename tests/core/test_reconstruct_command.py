@@ -113,7 +113,8 @@ def test_each_method_does_its_own_number_of_iterations_unless_it_is_told(name, s
         )
     mph.write_run(run, tmp_path / "run.npz")
     how = {"reconstruction.method": name, "reconstruction.voxels": 8, "reconstruction.spacing": 12.0,
-           **({"reconstruction.weight": 0.1} if name == "tv" else {})}  # fmt: skip
+           **({"reconstruction.weight": 0.1} if name == "tv" else {}),
+           **({"reconstruction.hole": "rays"} if METHODS[name].of_counts else {})}  # fmt: skip
     done = mph.reconstruct_run(run, mph.Recipe(how)).iterations
     assert done == own == {"osem": 10, "mlem": 50, "bsrem": 30, "sirt": 100, "cgls": 10, "tv": 200}[name]
     assert mph.reconstruct_run(run, mph.Recipe(how | {"reconstruction.iterations": 2})).iterations == 2

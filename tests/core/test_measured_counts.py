@@ -271,7 +271,7 @@ def test_what_is_no_count_is_named_with_its_place(system, value, said):
     if value == 2.5:
         assert mph.counts_run(counts, system, **GOOD, expected=True).projections[3, 1, 5] == 2.5
     for wrong in (counts[0], counts.astype(complex), counts.astype(str), counts[:0]):
-        with pytest.raises(mph.InputError, match="expected (real )?numbers"):
+        with pytest.raises(mph.InputError, match=r"expected (real )?numbers"):
             mph.counts_run(wrong, system, **GOOD)
 
 

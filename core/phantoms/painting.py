@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from ..geometry.grid import Grid
 from ..memory import require
-from ..progress import Progress
+from ..progress import Progress, tell
 from .shapes import Shape
 
 Points = NDArray[np.float64]
@@ -178,8 +178,7 @@ def paint_voxels(
             box = image[tuple(map(slice, stroke.start, stroke.stop))]
             for _ in (stroke.paint_points if stroke.is_small else stroke.paint_cells)(box, pool):
                 done += 1
-                if progress is not None:
-                    progress(done, total)
+                tell(progress, done, total)
     # Where layers were sampled at different points, one may replace a little more than there was.
     values = [layer.value for layer in layers]
     if min(values, default=0.0) >= 0:

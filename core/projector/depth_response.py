@@ -38,8 +38,16 @@ class DepthResponse:
 
     matrix: Array
     """(3, 4): of a voxel's indices (x, y, z, 1), to (column h, row h, h)."""
-    parts: Array
-    """(n, 3): from a voxel's middle to those of its parts, as indices; each part is shared out by itself."""
+    pieces: Array
+    """(n, 3): from a voxel's middle to those of its pieces, as indices; each is shared out by itself,"""
+    line: Array
+    """(3,): from end to end, as indices, of the line that a piece is by its depth."""
+    of_point: float
+    """Columns or rows of cells that a line covers up to which it is taken as a point,"""
+    of_pair: float
+    """and as two that share their cells. A longer one is taken as two points"""
+    parts_per_cell: float
+    """and so many more for each cell that it covers, in whole numbers."""
     nearest: float
     """Depth, mm, up to which voxels count nothing,"""
     farthest: float

@@ -5,6 +5,7 @@ image of a voxel is made in two steps that are each a sparse matrix, whose trans
 counts go to 3 x 3 cells of a fine image, around where the line through the hole's middle meets it, with the weights of a
 quadratic B-spline, and to the two planes of depth that it lies between. Then each pixel sums the cells around it with the
 plane's kernel: the disc, the voxel's shadow and the pixel's area, all convolved, less what the B-spline has blurred already.
+A voxel that is seen aslant is smeared by its depth: it is two points or more in that direction.
 No voxel is so small that rays miss it.
 
 References
@@ -36,12 +37,15 @@ from .transmittance import mean_transmittance
 Array = NDArray[np.float64]
 Weigh = Callable[[int, Array, Array], Array]
 
-# Widths on the crystal by which planes of depth may differ, and by which the image of a part of a voxel may be smeared since
-# it is seen aslant, in units of the geometric mean of the two largest of the widths of pixel, voxel and the hole's shadow.
-# With these and the cells of a pixel, images of single voxels are right to 0.2 % on average, and to 1 % always.
-_PLANE_APART, _PART_SMEAR = 0.15, 0.17
+# In units of the geometric mean of the two largest of the widths of pixel, voxel and the hole's shadow on the crystal:
+# widths by which planes of depth may differ; by which a voxel that is seen aslant is smeared if it is taken as a point, and
+# for each point more; and by which its edges may be smeared unlike the whole. With these and the cells of a pixel, images of
+# single voxels are right to 0.3 % on average, and to 1 % always.
+_PLANE_APART, _POINT_SMEAR, _PART_SMEAR, _SKEW = 0.19, 0.17, 0.6, 0.16
 # Where the voxel's own width is the largest, parts and cells are finer by this factor.
 _LARGE_VOXELS = 0.6
+# Cells by which two points that share them may be smeared; by more, some of the cells' shares would be negative.
+_PAIR_SMEAR = 0.366 * math.sqrt(12)
 # Larger voxels, mm, are cut into parts of this size at most: kernels as wide as their shadows would take longer.
 _LARGEST = 6.0
 # Largest ratio of the largest and the smallest shadow of the hole in a grid, and about so much in a zone.
@@ -162,18 +166,25 @@ class WholeHoles(DepthResponses):
         steps = _cells_of_pixel(abs(pitches[0]), *widths), _cells_of_pixel(abs(pitches[1]), *widths)
         _, middle, largest = sorted((*widths, min(map(abs, pitches))))
         sharpness = math.sqrt(middle * largest)
-        deep = np.abs(to_camera[2, :3])
-        inverses = 1 / (far + deep.sum() / 2), 1 / max(near - deep.sum() / 2, near / 2)  # of whole voxels
+        half = np.abs(to_camera[2, :3]).sum() / 2
+        inverses = 1 / (far + half), 1 / max(near - half, near / 2)  # of whole voxels
         n_planes = 2 + int(
             (inverses[1] - inverses[0]) * l * (d + min(across[0], _LARGEST)) / (_PLANE_APART * sharpness)
         )
         inverses = np.linspace(*inverses, n_planes)
+        # A voxel's places of one depth lie around a line: a box along it, and beside it what remains of the edges. Where
+        # they are deep and across at once, this is true of small pieces only, or where the hole's shadow is wide.
         slope = max(abs(place) for at in pixels for place in at[[0, -1]]) / l + d / 2 / near
-        most = _PART_SMEAR * sharpness * (1 if widths[0] == largest else _LARGE_VOXELS)
-        counts = np.maximum(_parts_along(slope * l / near * deep, most), np.ceil(grid.spacing / _LARGEST).astype(int))
-        parts = (np.indices(tuple(counts)).reshape(3, -1).T + 0.5) / counts - 0.5
+        skew = _SKEW * sharpness * near / l / max(slope, np.linalg.norm(_line(to_camera[:, :3])[:2]))
+        largest_piece = min(max(skew, (skew / 2 * (d * (near / l + 1)) ** 2) ** (1 / 3)), _LARGEST)
+        counts = np.ceil(grid.spacing / largest_piece).astype(int)
+        pieces = (np.indices(tuple(counts)).reshape(3, -1).T + 0.5) / counts - 0.5
         edges = to_camera[:, :3] / counts
-        shadows = [np.multiply(edges[axis], np.sign(pitch)) for axis, pitch in zip((1, 0), pitches, strict=True)]
+        along = edges[2] / counts / np.linalg.norm(edges[2])
+        shadows = (edges - np.outer(_line(edges), edges[2]))[1::-1] * np.sign(pitches)[:, None]
+        cell = max(abs(pitches[i]) / steps[i] for i in range(2)) / sharpness
+        cell /= 1 if widths[0] == largest else _LARGE_VOXELS
+        limits = _POINT_SMEAR / cell, _PAIR_SMEAR, cell / _PART_SMEAR
         # A photon's direction, on which its counts depend, lies between that of the voxel and that of the pixel as seen from
         # the hole's middle, l / (l + h) of the way: so the factors of either are powers that are 1 together.
         share = l / (l + 2 / (1 / near + 1 / far))
@@ -184,8 +195,7 @@ class WholeHoles(DepthResponses):
         holes = (np.arange(16)[:, None] + 0.5) / 16 * (d / 2) ** 2  # squared distances from its middle, of equal areas
         shadow = holes * (1 / l + inverses) ** 2
         made = np.average((1 + shadow) ** (-1.5 * share), 0, 1 + bend * shadow)
-        of_u, of_v, of_k = np.square(edges).sum(axis=1) / 12
-        of_voxel = 3 * (of_k - (1 - share) / 2 * (of_u + of_v)) * inverses**2
+        of_voxel = -(1 - share) / 8 * np.square(shadows).sum() * inverses**2
         second = ((1 + holes * inverses**2) ** -1.5).mean(axis=0) / made - 1 + of_voxel
         kernel *= (1 + second - second.mean())[:, None, None]
         margin = kernel.shape[1] // 2, kernel.shape[2] // 2
@@ -195,31 +205,29 @@ class WholeHoles(DepthResponses):
             matrix[row] = per_slope * to_camera[axis] + (margin[i] - steps[i] * firsts[i] / pitches[i]) * to_camera[2]
         matrix[2] = to_camera[2]
         n_cells = [steps[i] * (views.shape[i] - 1 - (-kernel.shape[i + 1] - i) // steps[i]) for i in range(2)]
-        along = [firsts[i] + pitches[i] / steps[i] * (np.arange(n_cells[i]) - margin[i]) for i in range(2)]
-        of_direction, of_pixel = self._weights(m, along) ** (1 - share), self._weights(m, pixels) ** share
+        places = [firsts[i] + pitches[i] / steps[i] * (np.arange(n_cells[i]) - margin[i]) for i in range(2)]
+        of_direction, of_pixel = self._weights(m, places) ** (1 - share), self._weights(m, pixels) ** share
         of_pixel *= np.outer(*(share_inside(pixels[i], abs(pitches[i]), self._sides[m]) for i in range(2)))
         spacing = (inverses[-1] - inverses[0]) / (n_planes - 1)
-        secant = 1 + (along[0][:, None] ** 2 + along[1] ** 2) / l**2
-        before = grid.voxel_volume / len(parts) * l**2 * of_direction * (1 + second.mean() / secant**2)
+        secant = 1 + (places[0][:, None] ** 2 + places[1] ** 2) / l**2
+        before = grid.voxel_volume / len(pieces) * l**2 * of_direction * (1 + second.mean() / secant**2)
         before, kernel = before.astype(np.float32), kernel.astype(np.float32)
-        first_plane, of_inverse = float(inverses[0]), float(1 / spacing)
-        return DepthResponse(matrix, parts, near, far, first_plane, of_inverse, before, kernel, steps, of_pixel)
+        zone = near, far, float(inverses[0]), float(1 / spacing)
+        return DepthResponse(matrix, pieces, along, *limits, *zone, before, kernel, steps, of_pixel)
+
+
+def _line(edges: Array) -> Array:
+    """Along u, v and k, per mm of depth, the line on which a voxel lies by its depth; its `edges` (3, 3) are columns, mm."""
+    line: Array = edges @ edges[2] / (edges[2] @ edges[2])
+    return line
 
 
 def _cells_of_pixel(pitch: float, shadow: float, voxel: float) -> int:
     """Cells along a pixel's side."""
     small, middle, largest = sorted((pitch, shadow, voxel))
     sharpness = math.sqrt(middle * largest)
-    size = sharpness * (0.04 + 0.3 * min(small / sharpness, 0.35)) * (1 if shadow == largest else _LARGE_VOXELS)
+    size = sharpness * (0.046 + 0.34 * min(small / sharpness, 0.35)) * (1 if shadow == largest else _LARGE_VOXELS)
     return max(2, round(pitch / size + 0.2))
-
-
-def _parts_along(smears: Array, most: float) -> NDArray[np.int64]:
-    """Parts of a voxel along its edges, which smear its image by `smears` (3,), mm: by at most `most` remain in all."""
-    counts = np.ones(3, np.int64)
-    while np.linalg.norm(smears / counts) > most:
-        counts[np.argmax(smears / counts)] += 1
-    return counts
 
 
 def _kernel(d: float, slopes: Array, edges: Array, pitches: Array, steps: tuple[int, ...], bend: float) -> Array:
@@ -230,6 +238,8 @@ def _kernel(d: float, slopes: Array, edges: Array, pitches: Array, steps: tuple[
     It may not be negative anywhere, or expected counts would be.
     """
     size = pitches / steps
+    apart = slopes[1] - slopes[0]
+    slopes = np.concatenate([slopes[:1] - apart, slopes, slopes[-1:] + apart])
     extent = d * (1 + slopes.max()) / 2 + pitches / 2 + np.abs(edges).sum(axis=1) * slopes.max() / 2
     half = [math.ceil(reach) + 1 for reach in extent / size]
     n = [2 ** math.ceil(math.log2(2 * h + 8)) for h in half]
@@ -243,6 +253,8 @@ def _kernel(d: float, slopes: Array, edges: Array, pitches: Array, steps: tuple[
             exact *= np.sinc(slope * (edge[0] * f_v + edge[1] * f_u))
         image = np.fft.irfft2(exact, n)
         taps[...] = np.roll(image, half, (0, 1))[: 2 * half[0] + 1, : 2 * half[1] + 1]
+    # Between planes there are straight lines: on the mean over depths they are right, not at the planes.
+    kernel = kernel[1:-1] - (kernel[2:] - 2 * kernel[1:-1] + kernel[:-2]) / 12
     away = [(size[i] * np.arange(-half[i], half[i] + 1)) ** 2 for i in range(2)]
     kernel *= 1 + bend * np.add.outer(*away)
     kernel[kernel < 1e-4 * kernel.max(axis=(1, 2), keepdims=True)] = 0

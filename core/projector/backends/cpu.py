@@ -25,7 +25,7 @@ Array = NDArray[Any]  # of float32 or float64
 LEVEL_VARIABLE = "MPHDRR_CPU_LEVEL"
 """Environment variable that names a lower level of processor, `levels`, than this one's."""
 
-_CONTRACT = 6
+_CONTRACT = 7
 _NAMES = {"win32": "siddon.dll", "darwin": "libsiddon.dylib"}
 _MOST_VOXELS = 2**31 - 1  # their indices are of 32 bits
 _PRODUCT = 2  # in kernels.h
@@ -65,9 +65,10 @@ class _Job(Structure):
 class _DepthJob(Structure):
     _fields_ = [
         ("is_double", c_int64), ("volume", _Lattice), ("first", c_int64), ("last", c_int64), ("matrix", c_double * 12),
-        ("shift", c_double * 3), ("nearest", c_double), ("farthest", c_double), ("first_plane", c_double),
+        ("shift", c_double * 3), ("line", c_double * 3), ("of_point", c_double), ("of_pair", c_double),
+        ("parts_per_cell", c_double), ("nearest", c_double), ("farthest", c_double), ("first_plane", c_double),
         ("planes_per_inverse", c_double), ("passes", c_void_p), ("cells", c_void_p), ("planes", c_int64),
-        ("rows", c_int64), ("columns", c_int64), ("kernel", c_void_p),
+        ("rows", c_int64), ("columns", c_int64), ("kernel", c_void_p), ("bounds", c_void_p),
         ("taps", c_int64 * 2), ("step", c_int64 * 2), ("image", c_void_p), ("row", c_int64), ("pixels", c_int64 * 2),
     ]  # fmt: skip
 
@@ -301,7 +302,7 @@ def cells_to_pixels(cells: Array, of: DepthResponse) -> Array:
     """The image (n_v, n_u) of a view's cells."""
     image = np.zeros(of.after.shape, cells.dtype)
     sorted_cells = _sorted_cells(of, cells.dtype)
-    sorted_cells[...] = _by_place(cells * of.before, of)
+    np.multiply(_by_place(cells, of), _by_place(of.before, of), out=sorted_cells, casting="same_kind")
     _run_pixels(_library.cells_to_pixels, of, sorted_cells, image)
     image *= of.after
     return image
@@ -314,11 +315,9 @@ def pixels_to_cells(image: Array, of: DepthResponse) -> Array:
     padded = np.zeros((n_v, before + -(-together // _READ_ON) * _READ_ON), image.dtype)
     padded[:, before : before + n_u] = image * of.after
     sorted_cells = _sorted_cells(of, image.dtype)
-    sorted_cells[...] = 0
     _run_pixels(_library.pixels_to_cells, of, sorted_cells, padded[:, before:])
     cells = np.empty(of.shape, image.dtype)
-    _by_place(cells, of)[...] = sorted_cells
-    cells *= of.before
+    np.multiply(sorted_cells, _by_place(of.before, of), out=_by_place(cells, of), casting="same_kind")
     return cells
 
 
@@ -341,11 +340,13 @@ def _run_voxels(
     if passes is not None and (passes.shape != volume.shape or passes.dtype != cells.dtype):
         raise ValueError(f"expected passes of the volume's shape and type, got {passes.shape}, {passes.dtype}")
     first, last, _ = slab.indices(len(volume))
-    for shift in of.parts @ of.matrix[:, :3].T:
+    for shift in of.pieces @ of.matrix[:, :3].T:
         job = _DepthJob(
             is_double=cells.dtype == np.float64, volume=_lattice(volume, cells, kernel is _library.cells_to_voxels),
             first=first, last=last, matrix=tuple(of.matrix.ravel().tolist()), shift=tuple(shift.tolist()),
-            nearest=of.nearest, farthest=of.farthest, first_plane=of.first_plane, planes_per_inverse=of.planes_per_inverse,
+            line=tuple((of.matrix[:, :3] @ of.line).tolist()), of_point=of.of_point, of_pair=of.of_pair,
+            parts_per_cell=of.parts_per_cell, nearest=of.nearest, farthest=of.farthest, first_plane=of.first_plane,
+            planes_per_inverse=of.planes_per_inverse,
             cells=cells.ctypes.data, planes=of.shape[0], rows=of.shape[1], columns=of.shape[2],
             passes=None if passes is None else passes.ctypes.data, step=of.steps,
         )  # fmt: skip
@@ -355,10 +356,12 @@ def _run_voxels(
 def _run_pixels(kernel: Any, of: DepthResponse, sorted_cells: Array, image: Array) -> None:
     """Run a kernel between the sorted cells and the pixels of one view."""
     taps = np.pad(of.kernel, ((0, 0), (of.steps[0],) * 2, (0, 0))).astype(image.dtype, copy=False)
+    has = taps != 0
+    bounds = np.stack([has.argmax(-1), taps.shape[2] - has[..., ::-1].argmax(-1)], -1) * has.any(-1, keepdims=True)
     job = _DepthJob(
         is_double=image.dtype == np.float64,
         cells=sorted_cells.ctypes.data, planes=of.shape[0], rows=of.shape[1], columns=of.shape[2],
-        kernel=taps.ctypes.data, taps=of.kernel.shape[1:], step=of.steps,
+        kernel=taps.ctypes.data, bounds=bounds.ctypes.data, taps=of.kernel.shape[1:], step=of.steps,
         image=image.ctypes.data, row=image.strides[0] // image.itemsize, pixels=of.after.shape,
     )  # fmt: skip
     kernel(level, job)

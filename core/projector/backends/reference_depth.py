@@ -1,5 +1,7 @@
 """A hole's image depth by depth, written to be read: the reference, in numpy. The functions are those of `cpu`."""
 
+import itertools
+import math
 from collections.abc import Iterator
 from typing import Any
 
@@ -61,20 +63,36 @@ def _shares(of: DepthResponse, shape: tuple[int, ...], x: int) -> Iterator[tuple
     y, z = np.meshgrid(np.arange(shape[1]), np.arange(shape[2]), indexing="ij")
     voxels = np.einsum("ij,jyz->iyz", of.matrix, np.stack([np.full(y.shape, x), y, z, np.ones(y.shape)]))
     in_zone = (voxels[2] > of.nearest) & (voxels[2] <= of.farthest)
-    for shift in of.parts @ of.matrix[:, :3].T:
-        column, row, depth = voxels + shift[:, None, None]
-        inverse = 1 / np.where(in_zone, depth, np.inf)
-        column, row = column * inverse, row * inverse
-        inside = (inverse > 0) & (column >= 1) & (column <= columns - 3) & (row >= 1) & (row <= rows - 2)
-        column, row = np.where(inside, column, 1.0), np.where(inside, row, 1.0)
-        weight = inside * inverse**2
-        plane = np.clip((inverse - of.first_plane) * of.planes_per_inverse, 0, planes - 1)
-        farther = np.minimum(plane.astype(int), planes - 2)
-        middle_row, middle_column = (np.floor(place + 0.5).astype(int) for place in (row, column))
-        for a, by_row in enumerate(_spline(row - middle_row), -1):
-            for b, by_column in enumerate(_spline(column - middle_column), -1):
-                for k, by_plane in enumerate((1 - (plane - farther), plane - farther)):
-                    yield (farther + k, middle_row + a, middle_column + b), weight * by_row * by_column * by_plane
+    line = of.matrix[:, :3] @ of.line
+    for shift in of.pieces @ of.matrix[:, :3].T:
+        middles = voxels + shift[:, None, None]
+        middles[2, ~in_zone] = np.inf
+        wide, high = (line[:2, None, None] - middles[:2] / middles[2] * line[2]) / middles[2]
+        smear = np.maximum(np.abs(wide), np.abs(high))
+        is_one = smear <= of.of_pair
+        parts = np.where(is_one, 1, 2 + np.floor(smear * of.parts_per_cell))
+        apart = np.where(is_one & (smear > of.of_point), 1 / math.sqrt(12), 0)
+        # With the mean of 1 / depth^2 on the line.
+        share = np.where(is_one, 1 + (line[2] / middles[2] / 2) ** 2, 1 / parts)
+        for number in range(int(parts.max())):
+            off = np.where(is_one, 0, (number - (parts - 1) / 2) / np.sqrt(np.maximum(parts**2 - 1, 1)))
+            column, row, depth = middles + line[:, None, None] * off
+            column, row, inverse = column / depth, row / depth, 1 / depth
+            inside = in_zone & (number < parts)
+            inside &= (column >= 1) & (column <= columns - 3) & (row >= 1) & (row <= rows - 2)
+            column, row = np.where(inside, column, 1.0), np.where(inside, row, 1.0)
+            weight = inside * share * inverse**2 / 2
+            plane = np.clip((inverse - of.first_plane) * of.planes_per_inverse, 0, planes - 1)
+            farther = np.minimum(plane.astype(int), planes - 2)
+            first_row, first_column = (np.floor(place + 0.5).astype(int) - 1 for place in (row, column))
+            by_row, by_column = (
+                [_spline(place - first - 1 + end * apart * smeared) for end in (-1, 1)]
+                for place, first, smeared in ((row, first_row, high), (column, first_column, wide))
+            )
+            by_plane = 1 - (plane - farther), plane - farther
+            for a, b, k in itertools.product(range(3), range(3), range(2)):
+                share_of_cell = by_row[0][a] * by_column[0][b] + by_row[1][a] * by_column[1][b]
+                yield (farther + k, first_row + a, first_column + b), weight * share_of_cell * by_plane[k]
 
 
 def _spline(offset: Array) -> tuple[Array, Array, Array]:

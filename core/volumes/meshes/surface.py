@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ...errors import InputError
 from ...memory import require
-from ...progress import Progress
+from ...progress import Progress, tell
 from ...validation import instance, real_array
 from ..volume import Volume, outside_value
 from .mesh import Mesh
@@ -48,8 +48,7 @@ def volume_to_mesh(volume: Volume, level: float | None = None, progress: Progres
             keys.append(new_keys)
             shares.append(new_shares)
         planes = [planes[1], _plane(array, i + 1, outside)]
-        if progress is not None:
-            progress(i + 1, int(shape[0]) - 1)
+        tell(progress, i + 1, int(shape[0]) - 1)
     key = np.concatenate(keys)
     require(200.0 * key.size, f"a mesh of {len(key)} triangles")
     edges, first, faces = np.unique(key, return_index=True, return_inverse=True)

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from ...errors import InputError
 from ...geometry.grid import Grid
 from ...memory import require
-from ...progress import Progress, part_of
+from ...progress import Progress, part_of, tell
 from ...validation import freeze, instance, one_for_all
 from ..volume import Volume
 from .mesh import Mesh, as_mesh, require_closed
@@ -109,8 +109,7 @@ def mesh_coverage(mesh: Mesh, grid: Grid, progress: Progress | None = None) -> N
             by_rays, overlap = _along_rays(pieces, (n, n_y, n_z), (step, area / step))
             covered[overlap] = by_rays[overlap]
         box[first:last] = np.where(covered < _ROUNDING, 0, np.where(covered > 1 - _ROUNDING, 1, covered))
-        if progress is not None:
-            progress(last, n_x)
+        tell(progress, last, n_x)
     return coverage
 
 

@@ -9,33 +9,59 @@
 
 // Where some voxels of a row, neighbours along z, lie in the fine image. In memory: they are taken one by one.
 typedef struct {
+    F parts;          // how many
+    F is_pair;        // 1/2: each is two points that share their cells; 0: one point
     I cell;           // the first of 3 x 3 cells in the farther of two planes, a number in `cells`
-    F along;          // columns from the middle one of the three
-    F across[3];      // shares of their rows: a quadratic B-spline
+    F along[2];       // columns of the points from the middle one of the three
+    F across[2][3];   // shares of their rows: a quadratic B-spline
     F nearer;         // share of the nearer plane
     F weight;         // 1 / depth^2; 0 outside the image
 } Places;
 
-INLINE void find_places(const DepthJob *job, const double row_start[3], F z, Places *p) {
-    F at[3];
+enum { MOST_PARTS = 1 << 12 }; // only close before the pinhole's plane would there be more
+
+INLINE void place_point(Places *p, int point, F along, F offset) {
+    const F before = (F)0.5 - offset, after = (F)0.5 + offset;
+    p->along[point] = along;
+    p->across[point][0] = before * before * (F)0.5;
+    p->across[point][1] = (F)0.75 - offset * offset;
+    p->across[point][2] = after * after * (F)0.5;
+}
+
+// One part of each voxel, a `number`.
+INLINE void find_places(const DepthJob *job, const double row_start[3], F z, int number, Places *p) {
+    F at[3], line[3];
     EACH_AXIS(a) at[a] = (F)(REAL)row_start[a] + z * (F)(REAL)job->matrix[a][2];
+    EACH_AXIS(a) line[a] = (F)(REAL)job->line[a];
     const I in_zone = (at[2] > (F)(REAL)job->nearest) & (at[2] <= (F)(REAL)job->farthest);
     EACH_AXIS(a) at[a] += (F)(REAL)job->shift[a];
-    const F inverse = 1 / (in_zone ? at[2] : (F)1);
-    const F u = at[0] * inverse, v = at[1] * inverse;
-    const I inside = in_zone & (u >= (F)1) & (u <= (F)(job->columns - 3)) & (v >= (F)1) & (v <= (F)(job->rows - 2));
-    const I column = AS(I, inside ? u + (F)0.5 : (F)1), row = AS(I, inside ? v + (F)0.5 : (F)1);
+    F inverse = 1 / (in_zone ? at[2] : (F)1), u = at[0] * inverse, v = at[1] * inverse;
+    const F wide = (line[0] - u * line[2]) * inverse, high = (line[1] - v * line[2]) * inverse;
+    const F smear = MAX(ABS(wide), ABS(high)), more = MIN(smear * (F)(REAL)job->parts_per_cell, (F)MOST_PARTS);
+    const I is_one = smear <= (F)(REAL)job->of_pair;
+    p->is_pair = (is_one & (smear > (F)(REAL)job->of_point)) ? (F)0.5 : (F)0;
+    p->parts = is_one ? (F)1 : 2 + AS(F, AS(I, in_zone ? more : (F)0));
+    F deep = line[2] * inverse, weight = 1 + deep * deep * (F)0.25; // the mean of 1 / depth^2 on the line
+    if (ANY(!is_one)) {
+        const F n = p->parts, off = ((F)(REAL)number - (n - 1) * (F)0.5) / __builtin_elementwise_sqrt(MAX(n * n - 1, (F)1));
+        EACH_AXIS(a) at[a] += is_one ? (F)0 : off * line[a];
+        inverse = 1 / (in_zone ? at[2] : (F)1), u = at[0] * inverse, v = at[1] * inverse;
+        weight = is_one ? weight : 1 / n;
+    }
+    const I inside = in_zone & (p->parts > (F)(REAL)number) & (u >= (F)1) & (u <= (F)(job->columns - 3)) & (v >= (F)1) &
+                     (v <= (F)(job->rows - 2));
+    u = inside ? u : (F)1, v = inside ? v : (F)1;
+    const I column = AS(I, u + (F)0.5), row = AS(I, v + (F)0.5);
     const F last = (F)(REAL)(job->planes - 1);
     const F plane = MIN(MAX((inverse - (F)(REAL)job->first_plane) * (F)(REAL)job->planes_per_inverse, (F)0), last);
     const I farther = AS(I, MIN(plane, last - 1));
     p->cell = (farther * (I)job->rows + row - 1) * (I)job->columns + column - 1;
-    p->along = inside ? u - AS(F, column) : (F)0;
-    const F offset = inside ? v - AS(F, row) : (F)0, before = (F)0.5 - offset, after = (F)0.5 + offset;
-    p->across[0] = before * before * (F)0.5;
-    p->across[1] = (F)0.75 - offset * offset;
-    p->across[2] = after * after * (F)0.5;
+    u -= AS(F, column), v -= AS(F, row);
+    const F apart = p->is_pair * (F)0.57735026918962576; // twice the half of a box's standard deviation
+    place_point(p, 0, u - apart * wide, v - apart * high);
+    if (ANY(p->is_pair != (F)0)) place_point(p, 1, u + apart * wide, v + apart * high);
     p->nearer = plane - AS(F, farther);
-    p->weight = inside ? inverse * inverse : (F)0;
+    p->weight = inside ? weight * inverse * inverse : (F)0;
 }
 
 typedef REAL Cells __attribute__((ext_vector_type(4), aligned(sizeof(REAL)))); // neighbours in a row
@@ -69,32 +95,37 @@ INLINE void between(const DepthJob *job, const int gathers) {
             const F f = gathers ? (F)0 : some(voxels + z, lanes);
             if (!gathers && !ANY(f != (F)0)) continue;
             Places p;
-            find_places(job, start, (F)(REAL)z + lane, &p);
-            if (!ANY(p.weight != (F)0)) continue;
-            if (passes) p.weight *= some(passes + z, lanes);
-            const F value = gathers ? p.weight : p.weight * f;
-            // Each voxel's numbers by their addresses: an element of a vector in a register is dear.
-            const REAL *values = (const REAL *)&value, *nearer = (const REAL *)&p.nearer;
-            const REAL *along = (const REAL *)&p.along, *across = (const REAL *)p.across;
-            const __typeof__(p.cell[0]) *first = (const void *)&p.cell;
-            for (int i = 0; i < lanes; i++) {
-                if (values[i] == 0) continue;
-                const Cells row = shares(along[i]) * values[i];
-                REAL *cells = (REAL *)job->cells + first[i];
-                REAL of[2] = {1 - nearer[i], nearer[i]}, sum = 0;
-                UNROLLED for (int k = 0; k < 2; k++, cells += of_plane) {
-                    const Cells given = row * of[k];
-                    Cells taken = 0;
-                    UNROLLED for (int a = 0; a < 3; a++) {
-                        Cells *at = (Cells *)(cells + a * job->columns);
-                        const REAL share = across[a * LANES + i];
-                        if (gathers) taken += share * *at;
-                        else *at += share * given;
+            int number = 0;
+            do {
+                find_places(job, start, (F)(REAL)z + lane, number, &p);
+                if (!ANY(p.weight != (F)0)) continue;
+                if (passes) p.weight *= some(passes + z, lanes);
+                F value = gathers ? p.weight : p.weight * f;
+                value = p.is_pair != (F)0 ? value * p.is_pair : value;
+                // Each voxel's numbers by their addresses: an element of a vector in a register is dear.
+                const REAL *values = (const REAL *)&value, *nearer = (const REAL *)&p.nearer, *is_pair = (const REAL *)&p.is_pair;
+                const REAL *along = (const REAL *)&p.along, *across = (const REAL *)p.across;
+                const __typeof__(p.cell[0]) *first = (const void *)&p.cell;
+                for (int i = 0; i < lanes; i++) {
+                    if (values[i] == 0) continue;
+                    Cells rows[3], taken[2] = {0}, given = shares(along[i]) * values[i];
+                    UNROLLED for (int a = 0; a < 3; a++) rows[a] = across[a * LANES + i] * given;
+                    if (is_pair[i] != 0) {
+                        given = shares(along[LANES + i]) * values[i];
+                        UNROLLED for (int a = 0; a < 3; a++) rows[a] += across[(3 + a) * LANES + i] * given;
                     }
-                    if (gathers) taken *= given, sum += (taken.x + taken.y) + taken.z;
+                    REAL *cells = (REAL *)job->cells + first[i];
+                    UNROLLED for (int k = 0; k < 2; k++, cells += of_plane) {
+                        const REAL of = k ? nearer[i] : 1 - nearer[i];
+                        UNROLLED for (int a = 0; a < 3; a++) {
+                            Cells *at = (Cells *)(cells + a * job->columns);
+                            if (gathers) taken[k] += rows[a] * *at;
+                            else *at += rows[a] * of;
+                        }
+                    }
+                    if (gathers) taken[0] += nearer[i] * (taken[1] - taken[0]), voxels[z + i] += (taken[0].x + taken[0].y) + taken[0].z;
                 }
-                if (gathers) voxels[z + i] += sum;
-            }
+            } while (ANY(p.parts > (F)(REAL)++number));
         }
     }
 }
@@ -111,34 +142,38 @@ typedef REAL Run __attribute__((ext_vector_type(LANES), aligned(sizeof(REAL))));
 // sums += numbers, and those beside them, times taps of as many rows; the rows' taps lie `apart`.
 INLINE void add_tapped(F sums[TALL][WIDE], const int wide, const REAL *numbers, const REAL *taps, int64_t apart) {
     REAL tap[TALL];
-    int any = 0;
-    UNROLLED for (int r = 0; r < TALL; r++) tap[r] = taps[r * apart], any |= tap[r] != 0;
-    if (!any) return; // the corners around a disc
+    UNROLLED for (int r = 0; r < TALL; r++) tap[r] = taps[r * apart];
     UNROLLED for (int w = 0; w < wide; w++) {
         const F some = *(const Run *)(numbers + w * LANES);
         UNROLLED for (int r = 0; r < TALL; r++) sums[r][w] += tap[r] * some;
     }
 }
 
-// target += the first `n` of a row of sums.
-INLINE void add_sums(REAL *target, const F sums[WIDE], int64_t n) {
-    const REAL *sum = (const REAL *)sums;
-    for (int64_t i = 0; i < n; i++) target[i] += sum[i];
-}
-
 // A row of cells has those with the same place in their pixel side by side, `together` of them.
 typedef struct {
     const DepthJob *job;
-    const REAL *kernel;  // the taps of a plane
-    REAL *cells;         // of the plane
+    const REAL *kernel;        // the taps of a plane
+    const int64_t (*bounds)[2]; // of its rows
+    REAL *cells;               // of the plane
     int64_t together;
 } Plane;
 
 INLINE Plane plane_of(const DepthJob *job, int64_t number) {
+    const int64_t row = number * (job->taps[0] + 2 * job->step[0]) + job->step[0];
     return (Plane){
-        job, (const REAL *)job->kernel + (number * (job->taps[0] + 2 * job->step[0]) + job->step[0]) * job->taps[1],
+        job, (const REAL *)job->kernel + row * job->taps[1], (const int64_t (*)[2])job->bounds + row,
         (REAL *)job->cells + number * job->rows * job->columns, job->columns / job->step[1],
     };
+}
+
+// The taps at `place` in a pixel that are not 0 in rows of the kernel, `apart`: from *first on, to before *last.
+INLINE void find_taps(const Plane *of, int64_t row, int64_t apart, int64_t place, int64_t *first, int64_t *last) {
+    const int64_t step = of->job->step[1];
+    *first = of->job->taps[1], *last = 0;
+    UNROLLED for (int r = 0; r < TALL; r++) {
+        *first = MIN(*first, of->bounds[row + r * apart][0]), *last = MAX(*last, of->bounds[row + r * apart][1]);
+    }
+    *first = place + MAX(*first - place + step - 1, (int64_t)0) / step * step;
 }
 
 // Pixels from (i, j) on: each is a sum over the cells from its first on.
@@ -148,12 +183,16 @@ INLINE void sum_cells(const Plane *of, int64_t i, int64_t j, const int wide) {
     const int64_t rows = MIN(taps[0] + (TALL - 1) * step[0], job->rows - first);
     F sums[TALL][WIDE] = {0};
     for (int64_t a = 0; a < rows; a++) for (int64_t place = 0; place < step[1]; place++) {
-        const REAL *cells = of->cells + (first + a) * job->columns + place * of->together + j;
+        int64_t b, last;
+        find_taps(of, a, -step[0], place, &b, &last);
+        const REAL *cells = of->cells + (first + a) * job->columns + place * of->together + j + b / step[1];
         const REAL *const row = of->kernel + a * taps[1];
-        for (int64_t b = place; b < taps[1]; b += step[1], cells++) add_tapped(sums, wide, cells, row + b, -step[0] * taps[1]);
+        for (; b < last; b += step[1], cells++) add_tapped(sums, wide, cells, row + b, -step[0] * taps[1]);
     }
     for (int64_t r = 0; r < MIN((int64_t)TALL, job->pixels[0] - i); r++) {
-        add_sums((REAL *)job->image + (i + r) * job->row + j, sums[r], MIN(wide * (int64_t)LANES, job->pixels[1] - j));
+        REAL *const pixels = (REAL *)job->image + (i + r) * job->row + j;
+        const int64_t n = MIN(wide * (int64_t)LANES, job->pixels[1] - j);
+        for (int64_t p = 0; p < n; p++) pixels[p] += ((const REAL *)sums[r])[p];
     }
 }
 
@@ -164,13 +203,16 @@ INLINE void sum_pixels(const Plane *of, int64_t r, int64_t place, int64_t j, con
     const int64_t first = r < taps[0] ? 0 : (r - taps[0]) / step[0] + 1, last = MIN(job->pixels[0] - 1, r / step[0] + TALL - 1);
     F sums[TALL][WIDE] = {0};
     for (int64_t i = first; i <= last; i++) {
-        const REAL *pixels = (const REAL *)job->image + i * job->row + j;
+        int64_t b, end;
+        find_taps(of, r - i * step[0], step[0], place, &b, &end);
+        const REAL *pixels = (const REAL *)job->image + i * job->row + j - b / step[1];
         const REAL *const row = of->kernel + (r - i * step[0]) * taps[1];
-        for (int64_t b = place; b < taps[1]; b += step[1], pixels--) add_tapped(sums, wide, pixels, row + b, step[0] * taps[1]);
+        for (; b < end; b += step[1], pixels--) add_tapped(sums, wide, pixels, row + b, step[0] * taps[1]);
     }
     for (int64_t t = 0; t < TALL && r + t * step[0] < job->rows; t++) {
         REAL *const cells = of->cells + (r + t * step[0]) * job->columns + place * of->together + j;
-        add_sums(cells, sums[t], MIN(wide * (int64_t)LANES, of->together - j));
+        const int64_t n = MIN(wide * (int64_t)LANES, of->together - j);
+        for (int64_t i = 0; i < n; i++) cells[i] = ((const REAL *)sums[t])[i];
     }
 }
 

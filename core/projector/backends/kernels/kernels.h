@@ -13,7 +13,7 @@
 #pragma once
 #include <stdint.h>
 
-#define CONTRACT 6 // counted up with every change of this file: cpu.py takes no other
+#define CONTRACT 7 // counted up with every change of this file: cpu.py takes no other
 
 // Voxels (n[0], n[1], n[2]) in C order, of a job's kind of number.
 typedef struct {
@@ -55,10 +55,11 @@ typedef struct {
 } Job;
 
 // Emission whose hole blurs by depth: voxels are shared out among the cells of a fine image, in planes of depth; pixels are
-// weighted sums of cells. A voxel counts where matrix[2] (x, y, z, 1) is above `nearest` and at most `farthest`. It, or a part of it,
-// lies at column c, row r and depth h where matrix (x, y, z, 1) + shift = (c h, r h, h), and counts value / h^2, but nothing outside
-// the fine image. Its plane is a number from 0 to planes - 1,
-// (1 / h - first_plane) planes_per_inverse.
+// weighted sums of cells. A voxel counts where matrix[2] (x, y, z, 1) is above `nearest` and at most `farthest`. A place in it lies at
+// column c, row r and depth h where matrix (x, y, z, 1) + shift + t line = (c h, r h, h), t being from -1/2 to 1/2 evenly, and counts
+// value / h^2, but nothing outside the fine image. Its plane is a number from 0 to planes - 1, (1 / h - first_plane)
+// planes_per_inverse. Where the line covers s columns or rows, it is taken as one point if s <= of_point, as two that share
+// their cells if s <= of_pair, else as 2 + floor(s parts_per_cell); more than one have its variance.
 //
 // Between cells and pixels, a row's cells lie sorted by their place in a pixel: column c is number (c mod step[1]) (columns / step[1])
 // + c / step[1]. Up to 15 numbers after the last cell are read and not used.
@@ -66,7 +67,8 @@ typedef struct {
     int64_t is_double;
     Lattice volume;
     int64_t first, last; // those voxels, of the first axis, that this job is for
-    double matrix[3][4], shift[3];
+    double matrix[3][4], shift[3], line[3];
+    double of_point, of_pair, parts_per_cell;
     double nearest, farthest;
     double first_plane, planes_per_inverse;
     const void *passes;            // share of each voxel's photons that attenuation leaves, of the volume's shape; or null
@@ -74,6 +76,7 @@ typedef struct {
     int64_t planes, rows, columns; // at least 2 planes
     const void *kernel;            // (planes, taps[0] + 2 step[0], taps[1]): what a pixel counts of the cells from its first on; step[0] rows
                                    // of 0 come before and after
+    const void *bounds;            // (planes, taps[0] + 2 step[0], 2), of int64_t: each row's first tap that is not 0, and the one after the last; or 0, 0
     int64_t taps[2];
     int64_t step[2];               // cells from a pixel's first to its neighbour's, along rows and columns
     void *image;                   // (pixels[0], pixels[1]); pixels_to_cells also reads (taps[1] - 1) / step[1] zeros before each row, and

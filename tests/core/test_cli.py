@@ -114,7 +114,7 @@ def test_every_part_of_the_emission_model_is_an_option(workbook, tmp_path):
     model = mph.Emission(
         run.system, isotope="Tl-201", window=(60, 80), time=300, aperture_points=3, aperture_mu="lead",
         opening_angle=np.deg2rad(80), edge="path", within_cone=True, within_walls=True, within_crystal=True,
-        crystal_mu=0.3, depth_layers=2, intrinsic_fwhm=3,
+        crystal_mu=0.3, depth_layers=2, intrinsic_fwhm=3, hole="rays",  # as points of the hole are asked for
     )  # fmt: skip
     expected = mph.Projector(run.volume.grid, run.views, model)(run.volume)
     assert expected.any()

@@ -138,8 +138,8 @@ def laid_out(layout: Layout) -> Workbook:
                 table[f"{column[name]}{row}"] = float(value)
         table[f"{user}{row}"] = f'=IF({z}{row}>0,"up","down")&ROUND({x}{row}/{y}{row},2)'
     if layout.inputs:
-        table[f"{note}{last + 5}"] = float(system.centers[0, 2])
-        table[f"{z}{first}"] = f"=${note}${last + 5}*1"
+        table[f"{note}{last + 20}"] = float(system.centers[0, 2])
+        table[f"{z}{first}"] = f"=${note}${last + 20}*1"
         main[f"{dim['Td']}{first}"] = f"=2*{float(system.detector_thickness[0]) / 2!r}"
     _summaries(book, table.title, x, y, z, first, last)
     return book

@@ -65,7 +65,7 @@ class _Job(Structure):
 class _DepthJob(Structure):
     _fields_ = [
         ("is_double", c_int64), ("volume", _Lattice), ("first", c_int64), ("last", c_int64), ("matrix", c_double * 12),
-        ("shift", c_double * 3), ("line", c_double * 3), ("of_point", c_double), ("of_pair", c_double),
+        ("line", c_double * 3), ("shifts", c_void_p), ("pieces", c_int64), ("of_point", c_double), ("of_pair", c_double),
         ("parts_per_cell", c_double), ("nearest", c_double), ("farthest", c_double), ("first_plane", c_double),
         ("planes_per_inverse", c_double), ("passes", c_void_p), ("cells", c_void_p), ("planes", c_int64),
         ("rows", c_int64), ("columns", c_int64), ("kernel", c_void_p), ("bounds", c_void_p),
@@ -340,17 +340,16 @@ def _run_voxels(
     if passes is not None and (passes.shape != volume.shape or passes.dtype != cells.dtype):
         raise ValueError(f"expected passes of the volume's shape and type, got {passes.shape}, {passes.dtype}")
     first, last, _ = slab.indices(len(volume))
-    for shift in of.pieces @ of.matrix[:, :3].T:
-        job = _DepthJob(
-            is_double=cells.dtype == np.float64, volume=_lattice(volume, cells, kernel is _library.cells_to_voxels),
-            first=first, last=last, matrix=tuple(of.matrix.ravel().tolist()), shift=tuple(shift.tolist()),
-            line=tuple((of.matrix[:, :3] @ of.line).tolist()), of_point=of.of_point, of_pair=of.of_pair,
-            parts_per_cell=of.parts_per_cell, nearest=of.nearest, farthest=of.farthest, first_plane=of.first_plane,
-            planes_per_inverse=of.planes_per_inverse,
-            cells=cells.ctypes.data, planes=of.shape[0], rows=of.shape[1], columns=of.shape[2],
-            passes=None if passes is None else passes.ctypes.data, step=of.steps,
-        )  # fmt: skip
-        kernel(level, job)
+    shifts, line = np.ascontiguousarray(of.pieces @ of.matrix[:, :3].T), of.matrix[:, :3] @ of.line
+    job = _DepthJob(
+        is_double=cells.dtype == np.float64, volume=_lattice(volume, cells, kernel is _library.cells_to_voxels),
+        first=first, last=last, matrix=tuple(of.matrix.ravel().tolist()), line=tuple(line.tolist()),
+        shifts=shifts.ctypes.data, pieces=len(shifts), of_point=of.of_point, of_pair=of.of_pair,
+        parts_per_cell=of.parts_per_cell, nearest=of.nearest, farthest=of.farthest, first_plane=of.first_plane,
+        planes_per_inverse=of.planes_per_inverse, passes=None if passes is None else passes.ctypes.data,
+        cells=cells.ctypes.data, planes=of.shape[0], rows=of.shape[1], columns=of.shape[2], step=of.steps,
+    )  # fmt: skip
+    kernel(level, job)
 
 
 def _run_pixels(kernel: Any, of: DepthResponse, sorted_cells: Array, image: Array) -> None:

@@ -28,13 +28,15 @@ INLINE void place_point(Places *p, int point, F along, F offset) {
     p->across[point][2] = after * after * (F)0.5;
 }
 
-// One part of each voxel, a `number`.
-INLINE void find_places(const DepthJob *job, const double row_start[3], F z, int number, Places *p) {
+// Of each voxel's piece, from its middle by `shift`, one part, a `number`.
+INLINE void find_places(
+    const DepthJob *job, const double row_start[3], F z, const double shift[3], int number, Places *p
+) {
     F at[3], line[3];
     EACH_AXIS(a) at[a] = (F)(REAL)row_start[a] + z * (F)(REAL)job->matrix[a][2];
     EACH_AXIS(a) line[a] = (F)(REAL)job->line[a];
     const I in_zone = (at[2] > (F)(REAL)job->nearest) & (at[2] <= (F)(REAL)job->farthest);
-    EACH_AXIS(a) at[a] += (F)(REAL)job->shift[a];
+    EACH_AXIS(a) at[a] += (F)(REAL)shift[a];
     F inverse = 1 / (in_zone ? at[2] : (F)1), u = at[0] * inverse, v = at[1] * inverse;
     const F wide = (line[0] - u * line[2]) * inverse, high = (line[1] - v * line[2]) * inverse;
     const F smear = MAX(ABS(wide), ABS(high)), more = MIN(smear * (F)(REAL)job->parts_per_cell, (F)MOST_PARTS);
@@ -95,9 +97,8 @@ INLINE void between(const DepthJob *job, const int gathers) {
             const F f = gathers ? (F)0 : some(voxels + z, lanes);
             if (!gathers && !ANY(f != (F)0)) continue;
             Places p;
-            int number = 0;
-            do {
-                find_places(job, start, (F)(REAL)z + lane, number, &p);
+            for (int64_t piece = 0; piece < job->pieces; piece++) for (int number = 0; !number || ANY(p.parts > (F)(REAL)number); number++) {
+                find_places(job, start, (F)(REAL)z + lane, job->shifts[piece], number, &p);
                 if (!ANY(p.weight != (F)0)) continue;
                 if (passes) p.weight *= some(passes + z, lanes);
                 F value = gathers ? p.weight : p.weight * f;
@@ -125,7 +126,7 @@ INLINE void between(const DepthJob *job, const int gathers) {
                     }
                     if (gathers) taken[0] += nearer[i] * (taken[1] - taken[0]), voxels[z + i] += (taken[0].x + taken[0].y) + taken[0].z;
                 }
-            } while (ANY(p.parts > (F)(REAL)++number));
+            }
         }
     }
 }

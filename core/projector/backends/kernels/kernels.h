@@ -56,7 +56,7 @@ typedef struct {
 
 // Emission whose hole blurs by depth: voxels are shared out among the cells of a fine image, in planes of depth; pixels are
 // weighted sums of cells. A voxel counts where matrix[2] (x, y, z, 1) is above `nearest` and at most `farthest`. A place in it lies at
-// column c, row r and depth h where matrix (x, y, z, 1) + shift + t line = (c h, r h, h), t being from -1/2 to 1/2 evenly, and counts
+// column c, row r and depth h where matrix (x, y, z, 1) + shifts[i] + t line = (c h, r h, h), t being from -1/2 to 1/2 evenly, and counts
 // value / h^2, but nothing outside the fine image. Its plane is a number from 0 to planes - 1, (1 / h - first_plane)
 // planes_per_inverse. Where the line covers s columns or rows, it is taken as one point if s <= of_point, as two that share
 // their cells if s <= of_pair, else as 2 + floor(s parts_per_cell); more than one have its variance.
@@ -67,7 +67,9 @@ typedef struct {
     int64_t is_double;
     Lattice volume;
     int64_t first, last; // those voxels, of the first axis, that this job is for
-    double matrix[3][4], shift[3], line[3];
+    double matrix[3][4], line[3];
+    const double (*shifts)[3];     // of `pieces` equal pieces of a voxel from its middle
+    int64_t pieces;
     double of_point, of_pair, parts_per_cell;
     double nearest, farthest;
     double first_plane, planes_per_inverse;

@@ -486,7 +486,7 @@ def _panel(settings) -> dict:
     return {k: tuple(v) if isinstance(v, bpy.types.bpy_prop_array) else v for k, v in values.items()}
 
 
-@pytest.mark.parametrize("saved", ["run", "toml"])
+@pytest.mark.parametrize("saved", [pytest.param("run", marks=pytest.mark.long), "toml"])
 def test_the_recipe_of_a_run_sets_the_panel_as_it_was(scanned, scene, body, tmp_path, saved):
     settings = scene.mphdrr_projections
     settings.model, settings.noise, settings.seed, settings.mu = "EMISSION", True, 5, bpy.data.objects["Body"]

@@ -87,6 +87,7 @@ def test_panel_settings_count_and_scripts_override_them(render, scene):
         bpy.ops.mphdrr.reconstruct(prior="QUADRATIC")
 
 
+@pytest.mark.long
 def test_without_a_number_each_method_does_its_own(render, scene):
     panel = scene.mphdrr_reconstruction
     panel.voxels, panel.spacing = 6, 16.0

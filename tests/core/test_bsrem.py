@@ -144,7 +144,7 @@ def even(scanner):
 
 
 @pytest.mark.parametrize("prior", [mph.Quadratic, mph.RelativeDifference, mph.TotalVariation])
-@pytest.mark.parametrize("neighbors", [6, 26])
+@pytest.mark.parametrize("neighbors", [pytest.param(6, marks=pytest.mark.long), 26])
 @pytest.mark.parametrize("weight", [2.0, 50.0])
 def test_a_uniform_volume_in_its_mask_stays_so_up_to_its_edge(even, prior, neighbors, weight):
     A, mask, counts = even
@@ -212,6 +212,7 @@ def test_what_cannot_be_is_refused(small, method, given, words):
         mph.bsrem(small.A, small.counts, 1, relaxation=-1)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("prior", PRIORS, ids=lambda prior: type(prior).__name__)
 def test_the_rule_that_the_page_names_leaves_no_voxel_far_from_the_maximum(small, prior):
     """While 1e-6 of the objective may be a few percent of a voxel."""

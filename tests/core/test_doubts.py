@@ -180,7 +180,7 @@ SCENES = {
 
 
 @pytest.mark.parametrize("scene", SCENES)
-@pytest.mark.parametrize("which", [slice(None, None, 3), slice(5, 25)])
+@pytest.mark.parametrize("which", [slice(None, None, 3), pytest.param(slice(5, 25), marks=pytest.mark.long)])
 def test_counts_of_modules_in_reversed_order_are_named_and_others_are_not(scanner, scene, which, rng):
     """With attenuation, blur, scatter and modules of unequal gain that the reconstruction knows nothing of."""
     system, grid = scanner[which], mph.Grid.centered(24, 6.0)

@@ -201,7 +201,7 @@ def small_disk(tmp_path):
     subprocess.run(["umount", str(disk)], check=True)
 
 
-@pytest.mark.parametrize("workers", ["1", "2"])
+@pytest.mark.parametrize("workers", [pytest.param("1", marks=pytest.mark.long), "2"])
 def test_a_full_disk_ends_with_one_line_and_a_set_that_resumes(tmp_path, small_disk, undisturbed, capsys, workers):
     small_recipe(tmp_path)
     command = ["events", "make", str(small_disk / "set"), "--recipe", str(tmp_path / "small.toml"), "--quiet"]

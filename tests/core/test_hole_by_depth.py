@@ -68,7 +68,7 @@ def exact_image(system, pixels, edges, at, work):
     return image[wide:-wide, wide:-wide] * d**2 / 16 * abs(np.linalg.det(edges)) / n
 
 
-def errors_of_voxels(rng, size, pixels, hole, near=False, voxels=1, depth=80, work=6e6):
+def errors_of_voxels(rng, size, pixels, hole, near=False, voxels=1, depth=80, work=2e6):
     """Share of counts misplaced, and of the total, of single voxels anywhere in a grid that is seen aslant or straight.
 
     The grid is 50 mm wide, or `depth` voxels. With `near`, it is as close to the pinhole as "depth" takes it.
@@ -105,7 +105,7 @@ def errors_of_voxels(rng, size, pixels, hole, near=False, voxels=1, depth=80, wo
 
 # Of a voxel, mm; pixels along the crystal's side; of the hole, mm.
 SIZES = [(0.2, 32, 12.0), (0.4, 256, 2.3), (0.8, 128, 6.0), (3.4, 32, 0.6), (4.4, 64, 2.3), (6.0, 128, 0.3)]
-NEAR = [(0.3, 32, 11.0), (0.5, 64, 5.0), (2.1, 128, 0.9)]
+NEAR = [(0.3, 32, 11.0), (0.5, 64, 5.0), (2.1, 64, 0.9)]
 
 
 def assert_right(errors):
@@ -116,7 +116,7 @@ def assert_right(errors):
 
 def test_voxels_of_any_size_have_the_whole_holes_image_as_near_to_the_pinhole_as_it_goes(rng):
     far = [error for sizes in SIZES for error in errors_of_voxels(rng, *sizes)]
-    assert_right(far + [error for sizes in NEAR for error in errors_of_voxels(rng, *sizes, near=True, work=2e7)])
+    assert_right(far + [error for sizes in NEAR for error in errors_of_voxels(rng, *sizes, near=True)])
 
 
 @pytest.mark.long
@@ -340,7 +340,10 @@ def worst_share_off(mu, grid, region, rng, n):
     return max(errors)
 
 
-@pytest.mark.parametrize(("coefficient", "size", "voxel"), [(0.028, 2.0, 3.0), (0.06, 1.0, 4.0), (0.06, 2.0, 2.0)])
+@pytest.mark.parametrize(
+    ("coefficient", "size", "voxel"),
+    [(0.028, 2.0, 3.0), pytest.param(0.06, 1.0, 4.0, marks=pytest.mark.long), (0.06, 2.0, 2.0)],
+)
 def test_attenuation_of_a_thin_shell_beside_air_is_within_one_per_cent(coefficient, size, voxel, rng):
     spheres = [mph.Sphere(radius=radius, mu=value) for radius, value in ((40, coefficient), (36, 0))]
     shapes = [mph.Cylinder(radius=70, height=140, mu=0.0154), *spheres]

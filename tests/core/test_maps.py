@@ -42,10 +42,10 @@ def test_sensitivity_map_is_what_the_adjoint_gives(workbook):
     """Counts of a unit of activity in each voxel, summed over pixels that cover the crystals."""
     system = mph.read_system(workbook)
     grid = mph.Grid.centered((6, 7, 5), 12.0, (4.0, -6.0, 3.0))
-    views = system.views(shape=(256, 256), detector="real")
+    views = system.views(shape=(128, 128), detector="real")
     settings = {"crystal_mu": 0.25, "photons_per_decay": 0.89, **EDGE}
     projector = mph.Projector(grid, views, mph.Emission(system, **settings))
-    backprojected = projector.T(np.ones((len(system), 256, 256), np.float32)) / grid.voxel_volume
+    backprojected = projector.T(np.ones((len(system), 128, 128), np.float32)) / grid.voxel_volume
     found = mph.sensitivity_map(system, grid, **settings).array
     whole = mph.modules_map(system, grid).array == len(system)
     assert whole.mean() > 0.9

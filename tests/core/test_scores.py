@@ -104,9 +104,9 @@ def falsely_resolved(kind: str, volumes: int, grid: mph.Grid, seed: int) -> tupl
     return np.array(found), np.array(small)
 
 
-@pytest.mark.parametrize("kind", NOISE)
+@pytest.mark.parametrize("kind", list(NOISE)[::2])
 def test_noise_resolves_at_most_one_sector_in_twenty(kind):
-    """Eight kinds of 25 volumes: 200. The bound for one kind leaves room for their own chance."""
+    """25 volumes of a kind; the long lane has 200 of each. The bound for one kind leaves room for their own chance."""
     found, small = falsely_resolved(kind, 25, mph.Grid.centered((31, 31, 9), 2.0), 3)
     assert found.mean() <= 0.05 and found[small].mean() <= 0.05
 

@@ -83,7 +83,7 @@ test-kernels: env-dev
 	$(BIN)/python -m pytest tests/kernels
 	@for level in $$($(BIN)/python -c "from mphdrr.core.projector.backends import cpu; print(*cpu.levels())"); do \
 		echo "accuracy of $$level"; MPHDRR_CPU_LEVEL=$$level $(BIN)/python -m pytest -k cpu tests/core/test_projector.py \
-		tests/core/test_emission.py tests/core/test_emission_gradients.py tests/core/test_geometry_gradients.py || exit 1; done
+		tests/core/test_emission.py tests/core/test_emission_gradients.py tests/core/test_geometry_gradients.py tests/core/test_hole_by_depth.py || exit 1; done
 
 test-gate: env-gate
 	$(BIN)/python -m pytest tests/core/test_monte_carlo.py

@@ -61,6 +61,13 @@ def test_workers_and_shards_make_the_same_bytes(tmp_path, undisturbed):
     assert tree(tmp_path / "shards") == undisturbed
 
 
+def is_worker(process: psutil.Process) -> bool:
+    try:
+        return "spawn_main" in " ".join(process.cmdline())
+    except psutil.NoSuchProcess:  # it has just ended
+        return False
+
+
 @pytest.mark.long
 def test_dask_makes_the_same_bytes_though_a_worker_dies(tmp_path, undisturbed):
     pytest.importorskip("distributed")
@@ -69,7 +76,7 @@ def test_dask_makes_the_same_bytes_though_a_worker_dies(tmp_path, undisturbed):
     killed = 0
     while work.poll() is None:
         children = psutil.Process(work.pid).children(recursive=True)
-        workers = [child for child in children if not killed and "spawn_main" in " ".join(child.cmdline())]
+        workers = [] if killed else [child for child in children if is_worker(child)]
         if workers and list(tmp_path.glob("set/events/*.h5")):
             workers[0].kill()
             killed += 1
@@ -118,10 +125,14 @@ def test_cancelled_work_goes_on(tmp_path, undisturbed):
     assert tree(tmp_path / "set") == undisturbed
 
 
+def events_in(folder):
+    return list(folder.glob("set/events/[0-9]*"))
+
+
 @pytest.mark.long
 @pytest.mark.parametrize(("moments", "workers"), [(20, "1"), (5, "2")])
 def test_killed_work_goes_on_bit_for_bit(tmp_path, undisturbed, moments, workers):
-    """Killed at random moments of its whole time, and resumed once."""
+    """Killed at random moments of its start, and after random numbers of events, and resumed once."""
     chance = random.Random(4)
     small_recipe(tmp_path)
     started = time.monotonic()
@@ -133,15 +144,16 @@ def test_killed_work_goes_on_bit_for_bit(tmp_path, undisturbed, moments, workers
         small_recipe(folder)
         work = begin(folder, "--workers", workers)
         children: list[psutil.Process] = []
-        end = time.monotonic() + whole * chance.uniform(0.2, 1.0)
-        while time.monotonic() < end and work.poll() is None:
-            time.sleep(0.005)
+        after = moment % COUNT
+        end = time.monotonic() + (chance.uniform(0.2, 1.0) * whole if after == 0 else 60)
+        while time.monotonic() < end and work.poll() is None and len(events_in(folder)) < (after or COUNT):
+            time.sleep(0.002)
             children = psutil.Process(work.pid).children(recursive=True) or children
         work.send_signal(signal.SIGKILL)
         work.wait()
         psutil.wait_procs(children, timeout=20)
         assert not any(child.is_running() for child in children)  # none is left behind
-        left.add(len(list(folder.glob("set/events/[0-9]*"))))
+        left.add(len(events_in(folder)))
         assert (
             main(["events", "make", str(folder / "set"), "--recipe", str(folder / "small.toml"), "-n", str(COUNT)]) == 0
         )

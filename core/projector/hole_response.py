@@ -167,11 +167,9 @@ class WholeHoles(DepthResponses):
         _, middle, largest = sorted((*widths, min(map(abs, pitches))))
         sharpness = math.sqrt(middle * largest)
         half = np.abs(to_camera[2, :3]).sum() / 2
-        inverses = 1 / (far + half), 1 / max(near - half, near / 2)  # of whole voxels
-        n_planes = 2 + int(
-            (inverses[1] - inverses[0]) * l * (d + min(across[0], _LARGEST)) / (_PLANE_APART * sharpness)
-        )
-        inverses = np.linspace(*inverses, n_planes)
+        farthest, nearest = 1 / (far + half), 1 / max(near - half, near / 2)  # of whole voxels, 1 / mm
+        n_planes = 2 + int((nearest - farthest) * l * (d + min(across[0], _LARGEST)) / (_PLANE_APART * sharpness))
+        inverses = np.linspace(farthest, nearest, n_planes)
         # A voxel's places of one depth lie around a line: a box along it, and beside it what remains of the edges. Where
         # they are deep and across at once, this is true of small pieces only, or where the hole's shadow is wide.
         slope = max(abs(place) for at in pixels for place in at[[0, -1]]) / l + d / 2 / near
@@ -205,14 +203,15 @@ class WholeHoles(DepthResponses):
             matrix[row] = per_slope * to_camera[axis] + (margin[i] - steps[i] * firsts[i] / pitches[i]) * to_camera[2]
         matrix[2] = to_camera[2]
         n_cells = [steps[i] * (views.shape[i] - 1 - (-kernel.shape[i + 1] - i) // steps[i]) for i in range(2)]
-        places = [firsts[i] + pitches[i] / steps[i] * (np.arange(n_cells[i]) - margin[i]) for i in range(2)]
+        places: list[Array] = [
+            firsts[i] + pitches[i] / steps[i] * (np.arange(n_cells[i]) - margin[i]) for i in range(2)
+        ]
         of_direction, of_pixel = self._weights(m, places) ** (1 - share), self._weights(m, pixels) ** share
         of_pixel *= np.outer(*(share_inside(pixels[i], abs(pitches[i]), self._sides[m]) for i in range(2)))
-        spacing = (inverses[-1] - inverses[0]) / (n_planes - 1)
         secant = 1 + (places[0][:, None] ** 2 + places[1] ** 2) / l**2
         before = grid.voxel_volume / len(pieces) * l**2 * of_direction * (1 + second.mean() / secant**2)
         before, kernel = before.astype(np.float32), kernel.astype(np.float32)
-        zone = near, far, float(inverses[0]), float(1 / spacing)
+        zone = near, far, farthest, (n_planes - 1) / (nearest - farthest)
         return DepthResponse(matrix, pieces, along, *limits, *zone, before, kernel, steps, of_pixel)
 
 

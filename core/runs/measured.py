@@ -257,7 +257,7 @@ def _warn_of_others(found: Counts, used: list[int], words: list[str], run: Proje
         said = "exposures" if len(times) > 1 else "an exposure"
         warn(f"{found.name}: the file says {said} of {_and(times)} s; taken as {time:g} s, as given")
     if len(windows := np.unique(found.about[used, 3])) > 1 and np.isfinite(windows).all():
-        said = f"{found.name}: frames of the energy windows {_and(windows)} are used"
+        said = f"{found.name}: frames of the energy windows {_and(windows.tolist())} are used"
         warn(f"{said}; say none (--frames) for those that are not meant")
     steps = np.linalg.norm([run.views.u_steps, run.views.v_steps], axis=2) / run.settings["magnification"]
     for k, along_u, along_v in zip(used, *steps, strict=True):

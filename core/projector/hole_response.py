@@ -159,7 +159,7 @@ class WholeHoles(DepthResponses):
         pitches = scale * float(rays.row_step @ v), scale * float(rays.column_step @ u)
         to_camera = frame @ grid.affine[:3]
         to_camera[:, 3] -= frame @ pinhole
-        pixels = [firsts[i] + pitches[i] * np.arange(views.shape[i]) for i in range(2)]
+        pixels: list[Array] = [firsts[i] + pitches[i] * np.arange(views.shape[i]) for i in range(2)]
         # Of the farthest voxel's image the widths, mm: of the hole's shadow and of the voxel's, where that is narrowest.
         across = np.linalg.svd(to_camera[:2, :3], compute_uv=False)
         widths = d * (1 + l / far), l / far * across[-1]

@@ -159,7 +159,7 @@ class WholeHoles(DepthResponses):
         pitches = scale * float(rays.row_step @ v), scale * float(rays.column_step @ u)
         to_camera = frame @ grid.affine[:3]
         to_camera[:, 3] -= frame @ pinhole
-        pixels: list[Array] = [firsts[i] + pitches[i] * np.arange(views.shape[i]) for i in range(2)]
+        pixels: list[Array] = [firsts[i] + pitches[i] * np.arange(views.shape[i], dtype=float) for i in range(2)]
         # Of the farthest voxel's image the widths, mm: of the hole's shadow and of the voxel's, where that is narrowest.
         across = np.linalg.svd(to_camera[:2, :3], compute_uv=False)
         widths = d * (1 + l / far), l / far * across[-1]
@@ -204,7 +204,7 @@ class WholeHoles(DepthResponses):
         matrix[2] = to_camera[2]
         n_cells = [steps[i] * (views.shape[i] - 1 - (-kernel.shape[i + 1] - i) // steps[i]) for i in range(2)]
         places: list[Array] = [
-            firsts[i] + pitches[i] / steps[i] * (np.arange(n_cells[i]) - margin[i]) for i in range(2)
+            firsts[i] + pitches[i] / steps[i] * (np.arange(n_cells[i], dtype=float) - margin[i]) for i in range(2)
         ]
         of_direction, of_pixel = self._weights(m, places) ** (1 - share), self._weights(m, pixels) ** share
         of_pixel *= np.outer(*(share_inside(pixels[i], abs(pitches[i]), self._sides[m]) for i in range(2)))

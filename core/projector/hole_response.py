@@ -41,7 +41,7 @@ Weigh = Callable[[int, Array, Array], Array]
 # widths by which planes of depth may differ; by which a voxel that is seen aslant is smeared if it is taken as a point, and
 # for each point more; and by which its edges may be smeared unlike the whole. With these and the cells of a pixel, images of
 # single voxels are right to 0.3 % on average, and to 1 % always.
-_PLANE_APART, _POINT_SMEAR, _PART_SMEAR, _SKEW = 0.19, 0.17, 0.6, 0.16
+_PLANE_APART, _POINT_SMEAR, _PART_SMEAR, _SKEW = 0.2, 0.17, 0.6, 0.16
 # Where the voxel's own width is the largest, parts and cells are finer by this factor.
 _LARGE_VOXELS = 0.6
 # Cells by which two points that share them may be smeared; by more, some of the cells' shares would be negative.

@@ -111,6 +111,7 @@ class DepthResponses(ABC):
     def __init__(self, n: int, pixels: tuple[int, int], grid: Grid, mu: Volume | None) -> None:
         self.n, self.pixels, self.grid, self.mu = n, pixels, grid, mu
         self._made: dict[tuple[int, float], DepthResponse] = {}
+        self._zones: dict[int, list[tuple[float, float]]] = {}
         self._passing: dict[int, tuple[Index, Array]] = {}
         self._room = _KEPT
 
@@ -185,8 +186,10 @@ class DepthResponses(ABC):
     def _of_part(self, m: int, origin: Index, shape: Index) -> list[tuple[DepthResponse, tuple[slice, slice]]]:
         """View m's responses to a part of the volume, of the zones that it reaches into, and the pixels that may see it."""
         row = self.depths(m)
+        if m not in self._zones:
+            self._zones[m] = self.zones(m)
         depths = [row @ (*np.add(origin, corner), 1) for corner in itertools.product(*((0, n - 1) for n in shape))]
-        reached = [(far, near) for far, near in self.zones(m) if max(depths) > near and min(depths) <= far]
+        reached = [(far, near) for far, near in self._zones[m] if max(depths) > near and min(depths) <= far]
         return [self._response(m, far, near).of_part(origin, shape) for far, near in reached]
 
     def _response(self, m: int, far: float, near: float) -> DepthResponse:

@@ -180,7 +180,8 @@ class WholeHoles(DepthResponses):
         edges = to_camera[:, :3] / counts
         along = edges[2] / counts / np.linalg.norm(edges[2])
         shadows = (edges - np.outer(_line(edges), edges[2]))[1::-1] * np.sign(pitches)[:, None]
-        cell = max(abs(pitches[i]) / steps[i] for i in range(2)) / sharpness
+        sizes = np.divide(pitches, steps)  # of the cells, mm along v and u
+        cell = np.abs(sizes).max() / sharpness
         cell /= 1 if widths[0] == largest else _LARGE_VOXELS
         limits = _POINT_SMEAR / cell, _PAIR_SMEAR, cell / _PART_SMEAR
         # A photon's direction, on which its counts depend, lies between that of the voxel and that of the pixel as seen from
@@ -197,14 +198,12 @@ class WholeHoles(DepthResponses):
         second = ((1 + holes * inverses**2) ** -1.5).mean(axis=0) / made - 1 + of_voxel
         kernel *= (1 + second - second.mean())[:, None, None]
         margin = kernel.shape[1] // 2, kernel.shape[2] // 2
-        matrix = np.empty((3, 4))
-        for row, axis, i in ((1, 1, 0), (0, 0, 1)):  # rows follow v, columns u
-            per_slope = steps[i] * l / pitches[i]
-            matrix[row] = per_slope * to_camera[axis] + (margin[i] - steps[i] * firsts[i] / pitches[i]) * to_camera[2]
-        matrix[2] = to_camera[2]
+        matrix = to_camera.copy()
+        for row, i in ((0, 1), (1, 0)):  # columns follow u, rows v
+            matrix[row] = l / sizes[i] * to_camera[row] + (margin[i] - firsts[i] / sizes[i]) * to_camera[2]
         n_cells = [steps[i] * (views.shape[i] - 1 - (-kernel.shape[i + 1] - i) // steps[i]) for i in range(2)]
         places: list[Array] = [
-            firsts[i] + pitches[i] / steps[i] * (np.arange(n_cells[i], dtype=float) - margin[i]) for i in range(2)
+            firsts[i] + sizes[i] * (np.arange(n_cells[i], dtype=float) - margin[i]) for i in range(2)
         ]
         of_direction, of_pixel = self._weights(m, places) ** (1 - share), self._weights(m, pixels) ** share
         of_pixel *= np.outer(*(share_inside(pixels[i], abs(pitches[i]), self._sides[m]) for i in range(2)))

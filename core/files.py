@@ -1,13 +1,25 @@
 """Writing files such that the old or the new one is always there, whole."""
 
+import itertools
 import os
+import platform
+import re
 import shutil
+import time
 import uuid
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from .errors import InputError, refusing
+
+_TEMPORARY = re.compile(r"\.(?:[0-9a-f]{8}|([0-9a-f]{4})([0-9a-f]{8})[0-9a-f]{4})-(.+)")
+"""Names of files that are being written: by which host and process, so that what a killed one has left is known."""
+_LEFT_AFTER = 3600  # seconds: what other hosts have not touched since is not written any more
+_ATTEMPTS = 3
+_HOST = zlib.crc32(platform.node().encode()) & 0xFFFF
+_count = itertools.count()
 
 
 @contextmanager
@@ -22,7 +34,8 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
     target = Path(os.path.realpath(path))
     if not target.parent.is_dir():
         raise InputError(f"{target.parent}: no such folder; make it first or choose another")
-    temporary = target.with_name(f".{uuid.uuid4().hex[:8]}-{target.name}")
+    number = next(_count) & 0xFFFF
+    temporary = target.with_name(f".{_HOST:04x}{os.getpid():08x}{number:04x}-{target.name}")
     try:
         # Tried, because os.access knows neither read-only disks nor Windows' permissions.
         with open(temporary, "xb"):
@@ -39,6 +52,54 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
         raise InputError(f"{target}: cannot be written ({error.strerror or error})") from error
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def write_bytes(path: str | os.PathLike[str], data: bytes | memoryview) -> None:
+    """Write a file whole or not at all, also beside others that write it, or remove what they think was left."""
+    for attempt in range(1, _ATTEMPTS + 1):
+        try:
+            with replacing(path) as temporary:
+                temporary.write_bytes(data)
+            return
+        except InputError as error:
+            # Its temporary file was removed, or on Windows another is just replacing it.
+            if attempt == _ATTEMPTS or not isinstance(error.__cause__, FileNotFoundError | PermissionError):
+                raise
+
+
+def written_name(name: str) -> str | None:
+    """Of the temporary file of `replacing`, the name of the file that it was to be; None of others."""
+    found = _TEMPORARY.fullmatch(name)
+    return None if found is None else found[3]
+
+
+def is_leftover(path: Path) -> bool:
+    """Whether a process that has ended was writing a file, or another host, which has not touched it for an hour."""
+    import psutil
+
+    found = _TEMPORARY.fullmatch(path.name)
+    if found is None:
+        return False
+    if found[1] and int(found[1], 16) == _HOST:
+        return not psutil.pid_exists(int(found[2], 16))
+    with suppress(OSError):
+        return time.time() - path.stat().st_mtime > _LEFT_AFTER
+    return False
+
+
+def require_file(path: str | os.PathLike[str]) -> Path:
+    """A path, if it is that of a file that can be read; `InputError` of what is missing, a folder, device or pipe."""
+    path = Path(path)
+    with refusing(path, "cannot be read"):
+        try:
+            path.stat()
+        except FileNotFoundError:
+            raise InputError(f"{path}: no such file") from None
+        except ValueError as error:  # an impossible name
+            raise InputError(f"{str(path)!r}: not a file name ({error})") from None
+        if not path.is_file():  # reading a pipe would block
+            raise InputError(f"{path}: is no file; expected one to read")
+    return path
 
 
 def _to_disk(path: Path) -> None:

@@ -12,7 +12,8 @@ import numpy as np
 
 from ..core import events
 from ..core.errors import InputError
-from ..core.events.folders import EVENTS, INDEX, RECIPE, SetFolder
+from ..core.events.folders import INDEX, RECIPE, SetFolder
+from ..core.events.store import EVENTS, SHARDS
 from ..core.memory import readable_size
 from ..core.recording import recorded_warnings
 from . import storage
@@ -82,10 +83,9 @@ def _recipe_note(path: Path) -> Note:
 def _set_note(path: Path) -> Note:
     """How many events there are, and how large they are."""
     folder = SetFolder(path)
-    numbers, models = folder.numbers(), tuple(folder.recipe.models)
-    size = sum(folder.event_path(number).stat().st_size for number in numbers)
-    planned = len(folder.planned())
-    return Note(f"{len(numbers)} of {planned} events, {readable_size(size)}", models=models)
+    places, models = folder.store.places(), tuple(folder.recipe.models)
+    size = sum(place.size or place.path.stat().st_size for place in places.values())
+    return Note(f"{len(places)} of {sum(map(len, folder.asked))} events, {readable_size(size)}", models=models)
 
 
 def _note(path: Path, read: Callable[[Path], Note]) -> Note:
@@ -123,7 +123,7 @@ def _stamp(path: Path) -> _Stamp:
     looked, stamp = _stamps.get(path, (-_LOOK, ()))
     if bpy.app.background or now - looked >= _LOOK:
         found = []
-        for item in (path, path / RECIPE, path / INDEX, path / EVENTS):
+        for item in (path, path / RECIPE, path / INDEX, path / EVENTS, path / SHARDS):
             try:
                 state = item.stat()
             except OSError:

@@ -1,5 +1,6 @@
 """Writing files such that the old or the new one is always there, whole."""
 
+import errno
 import itertools
 import os
 import platform
@@ -67,6 +68,30 @@ def write_bytes(path: str | os.PathLike[str], data: bytes | memoryview) -> None:
                 raise
 
 
+class Locked(InputError):
+    """Another process is at the same work."""
+
+
+@contextmanager
+def locked(path: Path, refusal: str) -> Iterator[None]:
+    """Hold a lock, whose file is made, which ends with this process; `Locked` with `refusal` where another holds it."""
+    with refusing(path, "cannot be written"), open(path, "a+b") as file:
+        try:
+            if os.name == "nt":
+                import msvcrt
+
+                msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)  # type: ignore[attr-defined]
+            else:
+                import fcntl
+
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            if error.errno in (errno.EACCES, errno.EAGAIN, errno.EDEADLK):
+                raise Locked(refusal) from None
+            raise
+        yield
+
+
 def written_name(name: str) -> str | None:
     """Of the temporary file of `replacing`, the name of the file that it was to be; None of others."""
     found = _TEMPORARY.fullmatch(name)
@@ -78,9 +103,9 @@ def is_leftover(path: Path) -> bool:
     import psutil
 
     found = _TEMPORARY.fullmatch(path.name)
-    if found is None:
-        return False
-    if found[1] and int(found[1], 16) == _HOST:
+    if found is None or not found[1]:  # earlier versions named no process
+        return found is not None
+    if int(found[1], 16) == _HOST:
         return not psutil.pid_exists(int(found[2], 16))
     with suppress(OSError):
         return time.time() - path.stat().st_mtime > _LEFT_AFTER

@@ -1,7 +1,8 @@
 """HDF5 files with a seal, which says what every byte of them must be, and the checks of all HDF5 before it is read.
 
 A sealed file begins with 512 bytes of text, HDF5's "user block", which its readers skip: what the file is, how many bytes
-of HDF5 follow, and the SHA-256 of the table behind these, which has that of each of their blocks: parts are checked alone.
+of HDF5 follow, and a SHA-256 of this and of the table behind them, which has that of each of their blocks: so a part of the
+file can be checked alone.
 """
 
 import hashlib
@@ -12,7 +13,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -41,7 +42,7 @@ class Seal:
 
     kind: str  # such as "mphDRR event"
     size: int  # bytes of HDF5
-    sha256: str  # of the table of blocks; in version 1, of the HDF5
+    sha256: str  # of the lines before it and of the table of blocks; in version 1, of the HDF5
     fields: dict[str, str] = field(default_factory=dict)
     version: int = _VERSION
 
@@ -51,10 +52,18 @@ class Seal:
         table = 0 if self.version == 1 else _DIGEST * -(-self.size // _BLOCK)
         return HEADER + self.size + table
 
+    def lines(self, **more: str) -> bytes:
+        """The text's lines before the last."""
+        lines = {self.kind: self.version, **self.fields, "bytes": self.size, **more}
+        return "".join(f"{name} {value}\n" for name, value in lines.items()).encode()
+
     def text(self) -> bytes:
         """The text, padded to `HEADER` bytes."""
-        lines = {self.kind: self.version, **self.fields, "bytes": self.size, "sha256": self.sha256}
-        return "".join(f"{name} {value}\n" for name, value in lines.items()).encode().ljust(HEADER, b"\0")
+        return self.lines(sha256=self.sha256).ljust(HEADER, b"\0")
+
+    def digest(self, table: bytes) -> str:
+        """What `sha256` has to be."""
+        return hashlib.sha256(self.lines() + table).hexdigest()
 
 
 def pack(kind: str, fields: dict[str, str], fill: Callable[[Any], None]) -> memoryview:
@@ -69,8 +78,8 @@ def pack(kind: str, fields: dict[str, str], fill: Callable[[Any], None]) -> memo
         fill(file)
     with memory.getbuffer() as content:
         table = _table(content[HEADER:])
-    seal = Seal(kind, len(memory.getvalue()) - HEADER, hashlib.sha256(table).hexdigest(), fields)
-    memory.seek(0, os.SEEK_END)
+    seal = Seal(kind, memory.seek(0, os.SEEK_END) - HEADER, "", fields)
+    seal = replace(seal, sha256=seal.digest(table))
     memory.write(table)
     memory.seek(0)
     memory.write(seal.text())
@@ -150,7 +159,7 @@ class _Sealed(io.RawIOBase):
             raise InputError(f"cut: {size} of {seal.file_size} bytes")
         file.seek(self._start + seal.size)
         self._table = file.read(seal.file_size - HEADER - seal.size) if seal.version > 1 else self._table_of_old()
-        if seal.version > 1 and hashlib.sha256(self._table).hexdigest() != seal.sha256:
+        if seal.version > 1 and seal.digest(self._table) != seal.sha256:
             raise InputError("changed: its last bytes are not those that were written")
         self._at, self._read, self._from, self._kept = 0, set[int](), 0, b""
 

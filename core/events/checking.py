@@ -4,15 +4,16 @@ import os
 from collections import Counter
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 from ..errors import InputError, refusing
-from ..files import ensure_folder
+from ..files import ensure_folder, is_leftover, written_name
 from ..progress import Progress, tell
-from .event_files import header, verify
-from .folders import EVENTS, INDEX, INPUT_LIST, INPUTS, RECIPE, SetFolder, is_leftover
-from .planning import plan
+from .event_files import Place, header, verify
+from .folders import ASKED, INDEX, INPUT_LIST, INPUTS, RECIPE, SetFolder
+from .store import EVENTS, LOCK, SHARDS
 
 
 @dataclass(frozen=True)
@@ -35,6 +36,8 @@ class Status:
     size: int  # bytes of the events
     phantoms: dict[str, int]  # events made, by phantom
     splits: dict[str, int]  # and by split
+    builds: dict[str, int]  # and by the build of mphDRR that made them; "" of earlier versions
+    shards: int = 0  # files of many events
 
 
 def status(folder: str | os.PathLike[str]) -> Status:
@@ -43,16 +46,26 @@ def status(folder: str | os.PathLike[str]) -> Status:
     `InputError` where the folder is no event set.
     """
     target = SetFolder(folder)
-    fingerprint = target.recipe.fingerprint
-    rows = {row["event"]: row for row in target.rows() or [plan(target.recipe, n).row() for n in target.numbers()]}
-    made = [number for number in rows if target.is_made(number, fingerprint)]
+    fingerprint, lines = target.recipe.fingerprint, target.index.read()
+    made = {}
+    for number, place in target.store.places().items():
+        with suppress(InputError):
+            found = header(place)
+            if found.event == number and found.recipe == fingerprint:
+                made[number] = found
+    asked = target.planned() or list(made)
+    made = {number: made[number] for number in asked if number in made}
+    phantom, split = (target.index.columns.index(name) for name in ("phantom", "split"))
+    rows = [lines.get(number) or target.index.line(number) for number in made]
     return Status(
-        asked=len(rows),
+        asked=len(asked),
         made=len(made),
-        missing=sorted(set(rows) - set(made)),
-        size=sum(target.event_path(number).stat().st_size for number in made),
-        phantoms=dict(sorted(Counter(rows[number]["phantom"] for number in made).items())),
-        splits=dict(sorted(Counter(rows[number]["split"] or "none" for number in made).items())),
+        missing=[number for number in asked if number not in made],
+        size=sum(found.size for found in made.values()),
+        phantoms=dict(sorted(Counter(row[phantom] for row in rows).items())),
+        splits=dict(sorted(Counter(row[split] or "none" for row in rows).items())),
+        builds=dict(sorted(Counter(found.build for found in made.values()).items())),
+        shards=len(target.store.shard_paths()),
     )
 
 
@@ -79,16 +92,17 @@ def check(folder: str | os.PathLike[str], progress: Progress | None = None) -> l
     if faults:  # what events should be is not known without them
         return faults
     faults += _index(target)
-    planned, there = set(_planned(target)), target.numbers()
+    planned, places = set(_planned(target)), target.store.places()
     fingerprint = target.recipe.fingerprint
 
     def faults_of(number: int) -> Fault | None:
-        fault = _event_fault(target, number, fingerprint)
+        place = places.get(number, Place(target.store.event_path(number)))
+        fault = _event_fault(place, number, fingerprint)
         if fault is None or number in planned:
             return fault
         return Fault("foreign", fault.path, f"{fault.text}, and not in the index")  # nobody asked for it
 
-    numbers = sorted({*planned, *there})
+    numbers = sorted({*planned, *places})
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         for done, fault in enumerate(pool.map(faults_of, numbers), 1):
             if fault is not None:
@@ -112,15 +126,17 @@ def repair(folder: str | os.PathLike[str], faults: list[Fault]) -> list[int]:
     for fault in faults:
         if fault.kind == "input":
             raise InputError(f"{fault.text}; put the original back, or make a new set")
-    rewrite = any(fault.kind == "index" for fault in faults)
     planned = _planned(target)
+    shards = {fault.path for fault in faults if fault.path.parent == target.store.shards and fault.event is not None}
+    if shards:
+        target.store.unpack(shards=shards)  # what is whole in them stays
     for fault in faults:
         if fault.kind == "foreign":
             _move(fault.path, target)
-        elif fault.kind in ("damaged", "another recipe", "leftover"):
+        elif fault.kind in ("damaged", "another recipe", "leftover") and fault.path not in shards:
             _remove(fault.path, target)
-    if rewrite:
-        target.write_index(planned)
+    if any(fault.kind == "index" for fault in faults):
+        target.index.complete(target.store.places, planned, anew=True)
     return sorted({fault.event for fault in faults if fault.event is not None})
 
 
@@ -144,40 +160,45 @@ def _inputs(target: SetFolder) -> Iterator[Fault]:
 
 
 def _planned(target: SetFolder) -> list[int]:
-    """The events that the set should have: of the index, and those there of its recipe; without an index, all there."""
-    there = target.numbers()
+    """The events that the set should have: those asked for; where nothing says these, all that are there of its recipe."""
     try:
-        planned = target.planned()
+        asked = target.planned()
     except InputError:
-        planned = []
-    if not planned:
-        return there
-    beside = set(there) - set(planned)  # of an index that was cut
-    return sorted({*planned, *(n for n in beside if target.is_made(n, target.recipe.fingerprint))})
+        asked = []
+    if target.asked_path.is_dir() and asked:
+        return asked
+    beside = {n: place for n, place in target.store.places().items() if n not in asked}  # of an index that was cut
+    return sorted({*asked, *(n for n, place in beside.items() if not asked or target.is_made(n, place))})
 
 
 def _index(target: SetFolder) -> list[Fault]:
-    path = target.index_path
-    numbers = _planned(target)
-    if not path.is_file():
-        return [Fault("index", path, f"{path}: missing")] if target.numbers() else []
-    if path.read_bytes() != target.index_text(numbers).encode():
-        return [Fault("index", path, f"{path}: changed: it is not what recipe.toml says of these events")]
+    index, made = target.index, target.store.places()
+    if not index.path.is_file():
+        return [Fault("index", index.path, f"{index.path}: missing")] if made else []
+    planned = set(_planned(target))
+    try:
+        there = index.read()
+    except InputError:
+        there = {}
+    wanted = {number: index.line(number) for number in (*there, *made) if number in planned}
+    if index.path.read_bytes() != index.text(wanted):
+        text = f"{index.path}: changed: it is not what recipe.toml says of these events"
+        return [Fault("index", index.path, text)]
     return []
 
 
-def _event_fault(target: SetFolder, number: int, fingerprint: str) -> Fault | None:
-    path = target.event_path(number)
+def _event_fault(place: Place, number: int, fingerprint: str) -> Fault | None:
+    path = place.path
     if not path.exists():
         return Fault("missing", path, f"{path}: missing", number)
     try:
-        found = header(path)
+        found = header(place)
         if found.recipe != fingerprint:
             text = f"{path}: of another recipe ({found.recipe[:8]}…, the set's is {fingerprint[:8]}…)"
             return Fault("another recipe", path, text, number)
         if found.event != number:
             return Fault("damaged", path, f"{path}: it is event {found.event}", number)
-        verify(path)
+        verify(place)
     except InputError as error:
         return Fault("damaged", path, str(error), number)
     return None
@@ -185,23 +206,25 @@ def _event_fault(target: SetFolder, number: int, fingerprint: str) -> Fault | No
 
 def _foreign(target: SetFolder) -> Iterator[Fault]:
     """Files and folders that do not belong to the set."""
-    events = {target.event_path(number).name for number in target.numbers()}
+    store = target.store
     inputs = {INPUT_LIST, *(copy.path.name for copy in target.copies().values())}
     originals = [
         Path(os.path.normpath(target.path / name)) for name in target.recipe.files
     ]  # may lie beside the recipe
     for folder, known in (
-        (target.path, {RECIPE, INDEX, INPUTS, EVENTS}),
+        (target.path, {RECIPE, INDEX, INPUTS, ASKED, EVENTS, SHARDS}),
         (target.inputs, inputs),
-        (target.events, events),
+        (target.asked_path, {f"{part[0]}-{part[-1]}" for part in target.asked} if target.asked_path.is_dir() else ()),
+        (store.events, {store.event_path(number).name for number in store.alone()}),
+        (store.shards, {LOCK, *(path.name for path in store.shard_paths())}),
     ):
         for name in sorted(os.listdir(folder)) if folder.is_dir() else ():
             path = folder / name
             if name in known or any(original.is_relative_to(path) for original in originals):
                 continue
-            if is_leftover(name):
-                yield Fault("leftover", path, f"{path}: left by a work that was interrupted, or is under way")
-            else:
+            if is_leftover(path):
+                yield Fault("leftover", path, f"{path}: left by a work that was interrupted")
+            elif written_name(name) is None:  # else it is under way
                 yield Fault("foreign", path, f"{path}: not of this set")
 
 

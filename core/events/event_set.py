@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, overload
@@ -12,18 +13,18 @@ from typing import TYPE_CHECKING, Any, overload
 import numpy as np
 from numpy.typing import NDArray
 
+from .. import hdf5
 from ..errors import InputError
-from ..geometry.grid import Grid
 from ..geometry.system import PinholeSystem
 from ..geometry.views import Views
-from ..physics.noise import sample_counts
+from ..physics.noise import draw_counts
 from ..runs.recipe import Recipe, recorded_recipe
 from ..runs.run import ProjectionRun
 from ..runs.run_recipe import recipe_model, with_phantom
 from ..validation import freeze, positive
 from ..volumes.images import Images
 from ..volumes.volume import Volume
-from .event_files import header, names_of, read_array, read_truth
+from .event_files import Place, read_array, read_truth
 from .folders import SetFolder
 from .making import EventMaker, radon_views
 from .planning import PlannedEvent, plan
@@ -54,17 +55,26 @@ class _Source:
         return EventMaker(self.recipe)
 
     @cached_property
-    def rows(self) -> dict[int, dict[str, Any]]:
-        """The index by event."""
-        return {row["event"]: row for row in self.folder.rows()}
+    def places(self) -> dict[int, Place]:
+        """The events' files; found anew where one is not there any more, since sets may be packed while they are read."""
+        return self.folder.store.places()
+
+    @cached_property
+    def lines(self) -> dict[int, list[str]]:
+        """The rows of the index, by event."""
+        return self.folder.index.read()
+
+    def line(self, number: int) -> list[str]:
+        """A row of the index, drawn where the index has none."""
+        return self.lines.get(number) or self.folder.index.line(number)
 
 
 def _numbers(name: str, text: str) -> Any:
     """A property of `Event`: an array of its file, with its docstring."""
 
     def read(event: Event) -> Floats:
-        with event._open() as file:
-            return np.asarray(file[name][()], np.float64)
+        with event.opened() as file:
+            return np.asarray(hdf5.numbers(event._dataset(file, name)), np.float64)
 
     return property(read, doc=text)
 
@@ -74,6 +84,31 @@ class Event:
 
     def __init__(self, source: _Source, number: int) -> None:
         self._source, self.number = source, number
+        self._file: Any = None
+
+    @contextmanager
+    def opened(self) -> Iterator[Any]:
+        """Its file, an ``h5py.File``, whose bytes are checked as they are read; `InputError` where it is damaged."""
+        if self._file is not None:
+            yield self._file
+            return
+        if not self.path.exists():
+            vars(self._source).pop("places", None)
+        with hdf5.opened(self.path, self._place.offset) as file:
+            if file.attrs["event"] != self.number or file.attrs["recipe_sha256"] != self.recipe.fingerprint:
+                raise InputError("an event of another number or recipe")
+            yield file
+
+    @contextmanager
+    def held(self) -> Iterator[Event]:
+        """The same event with its file open, for several readings in one thread."""
+        held = Event(self._source, self.number)
+        with self.opened() as held._file:
+            yield held
+
+    @property
+    def _place(self) -> Place:
+        return self._source.places.get(self.number) or Place(self._source.folder.store.event_path(self.number))
 
     @property
     def recipe(self) -> EventRecipe:
@@ -82,19 +117,18 @@ class Event:
 
     @property
     def path(self) -> Path:
-        """Its file."""
-        return self._source.folder.event_path(self.number)
+        """Its file, or the shard that it is in."""
+        return self._place.path
 
     @property
     def row(self) -> dict[str, Any]:
         """Its row of the index, by column."""
-        row = self._source.rows.get(self.number)
-        return plan(self._source.recipe, self.number).row() if row is None else row
+        return self._source.folder.index.values(self._source.line(self.number))
 
     @cached_property
     def attributes(self) -> dict[str, Any]:
         """Of its file."""
-        with self._open() as file:
+        with self.opened() as file:
             items = file.attrs.items()
             return {name: value.item() if isinstance(value, np.generic) else value for name, value in items}
 
@@ -107,6 +141,11 @@ class Event:
     def split(self) -> str | None:
         """Such as "train"; None where the recipe has no splits."""
         return self.attributes["split"] or None
+
+    @property
+    def _split(self) -> str:
+        """As the index says, in which all of a set are found quickly."""
+        return self._source.line(self.number)[self._source.folder.index.columns.index("split")]
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -135,9 +174,15 @@ class Event:
     @property
     def truth(self) -> Volume:
         """The volume of which all images are."""
-        grid, quantity = self._source.recipe.grid, self._source.recipe.quantity
-        with self._open() as file:
-            return Volume(freeze(read_truth(file, grid)), Grid(grid.shape, file["truth_affine"][()]), quantity)
+        return Volume(freeze(self.truth_part()), self.recipe.grid, self.recipe.quantity)
+
+    def truth_part(self, part: tuple[slice, ...] = (), out: NDArray[np.float32] | None = None) -> NDArray[np.float32]:
+        """The numbers of the truth, or of a part of it, of which alone the bytes are read; into `out`, zeros, if given."""
+        grid = self.recipe.grid
+        with self.opened() as file:
+            if "truth" in file:
+                self._dataset(file, "truth", grid.shape)
+            return read_truth(file, grid, part, out)
 
     @property
     def views(self) -> Views:
@@ -152,13 +197,13 @@ class Event:
     @property
     def models(self) -> list[str]:
         """The names of the models that it has images of."""
-        with self._open() as file:
-            return list(names_of(file, "images"))
+        with self.opened() as file:
+            return list(file.get("images", ()))
 
     def unit(self, model: str) -> str:
         """Of a model's images, such as "counts"."""
-        with self._open() as file:
-            return str(self._dataset(file, "images", model).attrs["unit"])
+        with self.opened() as file:
+            return str(self._images(file, model).attrs["unit"])
 
     def images(
         self, model: str, noise_seed: int | None = None, level: float = 1.0, modules: Any = slice(None)
@@ -188,23 +233,25 @@ class Event:
             No such model, or noise or a level of images that are no counts.
         """
         level = positive(level, "level")
-        with self._open() as file:
-            dataset = self._dataset(file, "images", model)
+        with self.opened() as file:
+            dataset = self._images(file, model)
             if (noise_seed is not None or level != 1.0) and dataset.attrs["unit"] not in COUNTED:
                 unit = dataset.attrs["unit"]
                 raise InputError(f"{model}: only counts and photons have noise and levels, its images are {unit}")
-            images = read_array(file, f"images/{model}", () if noise_seed is not None else modules)
+            one = isinstance(modules, slice) and modules.step in (None, 1)
+            part = (modules, slice(None), slice(None)) if one and noise_seed is None else ()
+            images = read_array(file, dataset.name, part)
         if level != 1.0:
             images *= np.float32(level)
-        if noise_seed is None:
-            return images
-        return sample_counts(images, noise_seed)[modules].astype(np.float32)
+        if noise_seed is not None:
+            draw_counts(images, noise_seed, images)
+        return images if part else images[modules]
 
     def radon(self, count: int) -> NDArray[np.float32]:
         """The parallel projections (count, n_v, n_u) at so many angles, value x mm."""
-        with self._open() as file:
-            self._dataset(file, "radon", str(count))
-            return Images.of(read_array(file, f"radon/{count}"), self._source.recipe.quantity)
+        with self.opened() as file:
+            shape = None if self.recipe.radon is None else (count, *self.recipe.radon.shape)
+            return Images.of(read_array(file, self._dataset(file, f"radon/{count}", shape).name), self.recipe.quantity)
 
     def radon_views(self, count: int) -> Views:
         """Of the parallel projections."""
@@ -247,20 +294,19 @@ class Event:
     def __repr__(self) -> str:
         return f"Event({self.number}, {self.path})"
 
-    def _open(self) -> Any:
-        import h5py
+    def _images(self, file: Any, model: str) -> Any:
+        """The dataset of a model's images."""
+        return self._dataset(file, f"images/{model}", (len(self.views), *self.views.shape))
 
-        try:
-            return h5py.File(self.path, "r")
-        except OSError:
-            header(self.path)  # says what is wrong, where it knows
-            raise InputError(f"{self.path}: cannot be read as HDF5; mphdrr events check says more") from None
-
-    def _dataset(self, file: Any, group: str, name: str) -> Any:
-        if name not in names_of(file, group):
-            known = ", ".join(names_of(file, group)) or "none"
-            raise InputError(f"{self.path}: no {group} of {name!r}; there are {known}")
-        return file[group][name]
+    def _dataset(self, file: Any, name: str, shape: tuple[int, ...] | None = None) -> Any:
+        """A dataset of the file, of the shape that the recipe says."""
+        group, _, last = name.rpartition("/")
+        there = file.get(group, {}) if group else file
+        if last not in there:
+            raise InputError(f"no {group or 'array'} of {last!r}; there are {', '.join(there) or 'none'}")
+        if shape is not None and file[name].shape != shape:
+            raise InputError(f"{name} of shape {file[name].shape}, the recipe says {shape}")
+        return file[name]
 
 
 class EventSet:
@@ -291,7 +337,7 @@ class EventSet:
     def __init__(self, folder: str | os.PathLike[str]) -> None:
         source = _Source(folder)
         _ = source.recipe  # which every set has
-        self._events = [Event(source, number) for number in source.folder.numbers()]
+        self._events = [Event(source, number) for number in source.places]
 
     @classmethod
     def _of(cls, events: list[Event]) -> EventSet:
@@ -348,11 +394,11 @@ class EventSet:
 
     def split(self, name: str) -> EventSet:
         """The events of a split, such as "train"; `InputError` where the recipe has no such split."""
-        found = self.where(lambda row: row["split"] == name)
-        known = {row["split"] for row in self.index if row["split"]}
-        if not found and name not in known | set(self.recipe.splits):
+        splits = [event._split for event in self._events]
+        known = set(splits) - {""} | (set(self.recipe.splits) if self._events else set())
+        if name not in known:
             raise InputError(f"split {name!r}: there are {', '.join(sorted(known)) or 'none'}")
-        return found
+        return self._of([event for event, split in zip(self._events, splits, strict=True) if split == name])
 
     def __repr__(self) -> str:
         return f"EventSet({len(self)} events)"

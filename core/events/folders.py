@@ -1,27 +1,24 @@
-"""The folder of an event set: recipe, copies of what it names, index, and a file for each event."""
+"""The folder of an event set: recipe, copies of what it names, which events were asked for, index, and the events' files."""
 
-import csv
-import io
 import json
 import os
 import re
-from collections.abc import Iterable
+from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
-from ..errors import InputError
-from ..files import ensure_folder, replacing
-from .event_files import header
+from ..errors import InputError, warn
+from ..files import ensure_folder, is_leftover, write_bytes, written_name
+from ..version import build
+from .event_files import Place, header
+from .index import Index
 from .inputs import Input
-from .planning import plan
 from .recipe import EventRecipe, read_recipe
+from .store import Store
 
-RECIPE, INDEX, INPUTS, EVENTS = "recipe.toml", "index.csv", "inputs", "events"
+RECIPE, INDEX, INPUTS, ASKED = "recipe.toml", "index.csv", "inputs", "asked"
 INPUT_LIST = "inputs.json"
-_EVENT = re.compile(r"(\d{6,})\.h5")
-_LEFTOVER = re.compile(r"\.[0-9a-f]{8}-.+")
-"""Names of files that are being written (`files.replacing`)."""
+_RANGE = re.compile(r"(\d+)-(\d+)")
 
 
 class SetFolder:
@@ -29,31 +26,21 @@ class SetFolder:
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = Path(path).absolute()
-        self.recipe_path, self.index_path = self.path / RECIPE, self.path / INDEX
-        self.inputs, self.events = self.path / INPUTS, self.path / EVENTS
+        self.recipe_path, self.inputs, self.asked_path = self.path / RECIPE, self.path / INPUTS, self.path / ASKED
+        self.store = Store(self.path)
 
-    def event_path(self, number: int) -> Path:
-        """The file of an event."""
-        return self.events / f"{number:06d}.h5"
+    @cached_property
+    def index(self) -> Index:
+        """Its table of events."""
+        return Index(self.path / INDEX, self.recipe)
 
-    def numbers(self) -> list[int]:
-        """Of the events that have a file, in order."""
+    def is_made(self, number: int, place: Place) -> bool:
+        """Whether an event is as long as it should be and of this recipe."""
         try:
-            names = os.listdir(self.events)
-        except FileNotFoundError:
-            return []
-        except OSError as error:
-            raise InputError(f"{self.events}: {error.strerror or error}") from None
-        found = (_EVENT.fullmatch(name) for name in names)
-        return sorted(number for match in found if match and self.event_path(number := int(match[1])).name == match[0])
-
-    def is_made(self, number: int, fingerprint: str) -> bool:
-        """Whether an event's file is there, as long as it should be and of this recipe."""
-        try:
-            found = header(self.event_path(number))
+            found = header(place)
         except InputError:
             return False
-        return found.event == number and found.recipe == fingerprint
+        return found.event == number and found.recipe == self.recipe.fingerprint
 
     @cached_property
     def recipe(self) -> EventRecipe:
@@ -77,48 +64,64 @@ class SetFolder:
         except (OSError, ValueError, TypeError, KeyError) as error:
             raise InputError(f"{path}: cannot be read ({error})") from None
 
-    def prepare(self, recipe: EventRecipe) -> EventRecipe:
-        """Put a recipe and what it names into the folder, unless they are there; the recipe that reads these copies.
+    def prepare(self, recipe: EventRecipe, asked: Sequence[range], mine: Sequence[int]) -> list[int]:
+        """Put a recipe and what it names into the folder, unless they are there, and note which events are asked for.
 
-        `InputError` where the folder holds another recipe, events of another one, or files that are no event set.
+        Gives those of the events `mine` that are missing. `InputError` where the folder holds another recipe, events of
+        another one, or files that are no event set.
         """
         ensure_folder(self.path)
-        for folder in (self.path, self.inputs):  # of a work that was killed
-            for path in folder.glob(".????????-*"):
-                if is_leftover(path.name):
-                    path.unlink(missing_ok=True)
+        for path in (path for folder in (self.path, self.inputs) for path in folder.glob(".*")):
+            if is_leftover(path):
+                path.unlink(missing_ok=True)
         if not self.recipe_path.exists():
-            if others := [name for name in os.listdir(self.path) if not _LEFTOVER.fullmatch(name)]:
+            if others := [name for name in os.listdir(self.path) if written_name(name) is None]:
                 raise InputError(
                     f"{self.path}: holds {others[0]} and no {RECIPE}: choose a new folder for the event set"
                 )
-            _write_text(self.recipe_path, recipe.text)
-        there = read_recipe(self.recipe_path)
+            write_bytes(self.recipe_path, recipe.text.encode())
+        there, places = read_recipe(self.recipe_path), self.store.places()
         if there.values != recipe.values:
-            no_events = "" if self.numbers() else f", or remove {self.path}, which holds no events yet"
+            no_events = "" if places else f", or remove {self.path}, which holds no events yet"
             raise InputError(f"{self.recipe_path}: another recipe: choose another folder for {recipe.name}{no_events}")
-        ensure_folder(self.events)
+        ensure_folder(self.store.events)
+        self.store.remove_leftovers()
         copies = self.copies()
-        if set(copies) != set(recipe.files) or not self.numbers():
+        if set(copies) != set(recipe.files) or not places:
             copies = self._copy(recipe, copies)
-        mine = EventRecipe(there.text, there.name, there.folder, copies)
-        if mine.fingerprint != recipe.fingerprint:
+        vars(self)["recipe"] = EventRecipe(there.text, there.name, there.folder, copies)
+        if self.recipe.fingerprint != recipe.fingerprint:
             raise InputError(
                 f"{recipe.name}: a file that it names has changed since the set was begun; the set's own copies are in "
                 f"{self.inputs}: go on with these (mphdrr events make {self.path}), or choose another folder"
             )
-        for number in self.numbers():
+        self._ask(asked)
+        return self._missing(mine, places)
+
+    def _missing(self, mine: Sequence[int], places: dict[int, Place]) -> list[int]:
+        """Which of some events are not there as they should be; `InputError` for one of another recipe."""
+        missing, said = [], False
+        for number in mine:
+            place = places.get(number)
             try:
-                found = header(self.event_path(number))
+                found = None if place is None else header(place)
             except InputError:
+                found = None
+            if found is None or found.event != number:
+                missing.append(number)
                 continue
-            if found.recipe != mine.fingerprint:
+            if found.recipe != self.recipe.fingerprint:
                 raise InputError(
-                    f"{self.event_path(number)}: an event of another recipe: choose another folder, or "
+                    f"{self.store.event_path(number)}: an event of another recipe: choose another folder, or "
                     f"`mphdrr events check {self.path} --repair` makes such events anew"
                 )
-        vars(self)["recipe"] = mine
-        return mine
+            if found.build != build() and not said:
+                said = True
+                warn(
+                    f"{self.path}: event {number} was made by another build of mphDRR ({found.build or 'of version 0.1'}, "
+                    f"this is {build()}): events of the two may differ in their last digits, or by what was mended between"
+                )
+        return missing
 
     def _copy(self, recipe: EventRecipe, known: dict[str, Input]) -> dict[str, Input]:
         """Copies of what the recipe names; those that hold the same already are kept."""
@@ -131,81 +134,47 @@ class SetFolder:
         listed = {
             name: {"file": copy.path.name, "what": copy.what, "sha256": copy.sha256} for name, copy in copies.items()
         }
-        _write_text(self.inputs / INPUT_LIST, json.dumps(listed, indent=1, sort_keys=True) + "\n")
+        write_bytes(self.inputs / INPUT_LIST, json.dumps(listed, indent=1, sort_keys=True).encode() + b"\n")
         kept = {copy.path for copy in copies.values()}
         for copy in known.values():  # of a recipe that was changed before its first event
             if copy.path not in kept:
                 copy.path.unlink(missing_ok=True)
         return copies
 
+    @property
+    def asked(self) -> list[range]:
+        """The events that were asked for, in order: by the names of empty files, so that works add to them at once."""
+        names = os.listdir(self.asked_path) if self.asked_path.is_dir() else []
+        found = [range(int(match[1]), int(match[2]) + 1) for match in map(_RANGE.fullmatch, names) if match]
+        if not found and (self.path / INDEX).exists():  # of an earlier version
+            found = [range(n, n + 1) for n in self.index.read()]
+        return _joined(found)
+
+    def _ask(self, asked: Sequence[range]) -> None:
+        """Note which events are asked for; ranges that touch become one."""
+        before = self.asked
+        ensure_folder(self.asked_path)
+        for part in (whole := _joined([*before, *asked])):
+            (self.asked_path / f"{part[0]}-{part[-1]}").touch()
+        for part in before:
+            if part not in whole:
+                (self.asked_path / f"{part[0]}-{part[-1]}").unlink(missing_ok=True)
+
     def planned(self) -> list[int]:
-        """The numbers of the events that were asked for, in order: those of the index."""
-        return [row["event"] for row in self.rows()]
+        """The numbers of the events that were asked for, in order."""
+        return [number for part in self.asked for number in part]
 
-    def rows(self) -> list[dict[str, Any]]:
-        """The rows of the index, one for each event that was asked for; empty where there is no index."""
-        try:
-            with open(self.index_path, newline="", encoding="utf-8") as file:
-                rows = [{key: _value(key, text) for key, text in row.items()} for row in csv.DictReader(file)]
-        except FileNotFoundError:
-            return []
-        except (OSError, ValueError, csv.Error) as error:
-            raise InputError(
-                f"{self.index_path}: cannot be read ({error}): mphdrr events check {self.path} --repair writes it anew"
-            ) from None
-        if not all(isinstance(row.get("event"), int) for row in rows):
-            raise InputError(
-                f"{self.index_path}: cannot be read: mphdrr events check {self.path} --repair writes it anew"
-            )
-        return rows
-
-    def index_text(self, numbers: Iterable[int]) -> str:
-        """The index of events, CSV: drawn from the recipe alone, so that all shards of a set write the same."""
-        rows = [plan(self.recipe, number).row() for number in sorted(set(numbers))]
-        columns = list(dict.fromkeys(key for row in rows for key in row))
-        text = io.StringIO()
-        writer = csv.DictWriter(text, columns, restval="", lineterminator="\n")
-        writer.writeheader()
-        for row in rows:
-            writer.writerow({key: value if isinstance(value, str) else json.dumps(value) for key, value in row.items()})
-        return text.getvalue()
-
-    def write_index(self, numbers: Iterable[int]) -> None:
-        """Write the index of these events unless it is there."""
-        text = self.index_text(numbers)
-        if not self.index_path.is_file() or self.index_path.read_bytes() != text.encode():
-            _write_text(self.index_path, text)
-
-    def remove_leftovers(self, number: int) -> None:
-        """Remove what a write of this event has left that was interrupted."""
-        for path in self.events.glob(f".????????-{self.event_path(number).name}"):
-            path.unlink(missing_ok=True)
+    def complete_index(self, anew: bool = False) -> None:
+        """Have a row of the index for each event that is there."""
+        self.index.complete(lambda: self.store.places(), frozenset(self.planned()), anew)
 
 
-def _write_text(path: Path, text: str) -> None:
-    """Write a file that other shards may write at the same time: what one begins another may remove (`prepare`)."""
-    for attempt in range(3):
-        try:
-            with replacing(path) as temporary:
-                temporary.write_text(text, encoding="utf-8", newline="")
-            return
-        except InputError:
-            if attempt == 2:
-                raise
-
-
-def is_leftover(name: str) -> bool:
-    """Whether a file's name is that of one that was being written."""
-    return _LEFTOVER.fullmatch(name) is not None
-
-
-def _value(key: str, text: str | None) -> Any:
-    """What a cell of the index holds."""
-    if not text:
-        return None
-    if key in ("phantom", "split", "file"):
-        return text
-    try:
-        return json.loads(text)
-    except ValueError:
-        return text
+def _joined(ranges: Sequence[range]) -> list[range]:
+    """Ranges in order, those that touch as one."""
+    found: list[range] = []
+    for part in sorted(ranges, key=lambda part: part.start):
+        if found and part.start <= found[-1].stop:
+            found[-1] = range(found[-1].start, max(found[-1].stop, part.stop))
+        else:
+            found.append(part)
+    return found

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import InputError
-from ..files import replacing
+from ..files import write_bytes
 from ..physics.ct_numbers import hu_to_mu
 from ..physics.isotopes import photon_energy
 from ..volumes.volume import Volume
@@ -38,8 +38,7 @@ class Input:
             number += 1
             target = folder / f"{stem}-{number}{ending}"
         if self.what == "copy":
-            with replacing(target) as temporary:
-                temporary.write_bytes(self.path.read_bytes())
+            write_bytes(target, self.path.read_bytes())
         else:
             write_volume(self.volume(), target)
         return Input(target, self.what, self.sha256, True)

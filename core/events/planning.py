@@ -19,6 +19,11 @@ from .draws import Dice, options
 from .entries import PhantomEntry, as_settings
 from .recipe import EventRecipe
 
+FIXED_COLUMNS = (
+    *("event", "phantom", "split", "x_mm", "y_mm", "z_mm", "phi_degrees", "theta_degrees", "psi_degrees", "mirror"),
+    *("size", "activity_factor", "noise_seed"),
+)
+"""Of the index, those that all recipes have."""
 _GOLDEN = (math.sqrt(5) - 1) / 2
 
 
@@ -93,15 +98,15 @@ class PlannedEvent:
 
     def row(self) -> dict[str, Any]:
         """The event's row of the index, by column."""
-        phi, theta, psi = self.euler_degrees
-        x, y, z = self.position
+        fixed = (
+            *(self.number, self.name, self.split or "", *self.position, *self.euler_degrees, self.mirror, self.size),
+            *(self.activity_factor, self.noise_seed),
+        )
         return {
-            "event": self.number, "phantom": self.name, "split": self.split or "", "x_mm": x, "y_mm": y, "z_mm": z,
-            "phi_degrees": phi, "theta_degrees": theta, "psi_degrees": psi, "mirror": self.mirror, "size": self.size,
-            "activity_factor": self.activity_factor, "noise_seed": self.noise_seed,
+            **dict(zip(FIXED_COLUMNS, fixed, strict=True)),
             **({} if self.file is None else {"file": self.file}),
             **{f"phantom.{key}": value for key, value in self.settings.items()},
-        }  # fmt: skip
+        }
 
 
 def plan(recipe: EventRecipe, number: int) -> PlannedEvent:

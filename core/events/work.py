@@ -2,11 +2,15 @@
 
 import os
 import re
+import time
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 from ..errors import InputError, warn
+from ..files import Locked, ensure_folder
+from ..memory import readable_size
 from ..progress import Progress, tell
 from ..validation import whole_number
 from .dask_work import in_cluster
@@ -16,7 +20,13 @@ from .making import EventMaker
 from .planning import plan
 from .pool import in_processes
 from .recipe import EventRecipe
+from .store import SHARD_BYTES, Store
 from .writing import EventWriter, Written
+
+_MOST = 10**7
+"""Events in a set."""
+_CHECKED, _CHECK_SECONDS = 1000, 1.0
+"""Of how many events the settings are checked before the work begins, and how long at most."""
 
 
 @dataclass(frozen=True)
@@ -31,6 +41,49 @@ class Made:
     total: int  # that it makes in all
 
 
+class Making(Iterator[Made]):
+    """Work on a set: gives each event once it is made. `missing` says which are to be made, `folder` where."""
+
+    def __init__(self, folder: SetFolder, missing: Sequence[int], written: Iterator[Written]) -> None:
+        self.folder, self.missing = folder, missing
+        self._made = self._follow(written)
+
+    def __next__(self) -> Made:
+        return next(self._made)
+
+    def _follow(self, written: Iterator[Written]) -> Iterator[Made]:
+        """What is said of events as they are written; each warning is given once, for the first event that it is of."""
+        said: set[str] = set()
+        store, unpacked = self.folder.store, 0
+        try:
+            for done, event in enumerate(written, 1):
+                for text in event.warnings:
+                    if (
+                        words := re.sub(r"[\d.]+", "", text)
+                    ) not in said:  # the same with other numbers says nothing new
+                        said.add(words)
+                        warn(f"event {event.number}: {text}", 3)
+                path = store.event_path(event.number)
+                yield Made(event.number, path, event.size, event.seconds, done, len(self.missing))
+                unpacked += event.size
+                if unpacked >= SHARD_BYTES and store.shards.is_dir():
+                    _pack(store)
+                    unpacked = 0
+        except BaseException:
+            with suppress(InputError):  # of the same full disk
+                self.folder.complete_index()
+            raise
+        self.folder.complete_index()
+        if store.shards.is_dir():
+            _pack(store)
+
+
+def _pack(store: Store) -> None:
+    """Put what was made into shards, unless another work is doing it."""
+    with suppress(Locked):
+        store.pack()
+
+
 def making(
     recipe: EventRecipe,
     folder: str | os.PathLike[str],
@@ -40,7 +93,8 @@ def making(
     shard: tuple[int, int] = (1, 1),
     progress: Progress | None = None,
     dask: str | None = None,
-) -> Iterator[Made]:
+    pack: bool = False,
+) -> Making:
     """Make the events of a set that are missing, one by one, as `make` does.
 
     Parameters
@@ -55,10 +109,13 @@ def making(
         Address of a Dask scheduler, whose workers make the events and see `folder` under the same path; ``"local"``: as many
         workers as `workers` on this machine.
 
-    Yields
-    ------
-    Made
-        Each event, once it is in the set.
+    pack
+        Whether events go into shards; a set that has some goes on so.
+
+    Returns
+    -------
+    Making
+        Iterates over `Made`: each event, once it is in the set. Nothing is computed before its first.
 
     Raises
     ------
@@ -66,34 +123,23 @@ def making(
         As of `make`.
     """
     target, missing = prepare(recipe, folder, count, first, shard)
+    if pack:
+        ensure_folder(target.store.shards)
     if dask is not None and missing:
-        return followed(target, in_cluster(target, missing, dask, whole_number(workers, "workers")), len(missing))
-    return _made(target, missing, workers, progress)
+        return Making(target, missing, in_cluster(target, missing, dask, whole_number(workers, "workers")))
+    return _making(target, missing, workers, progress)
 
 
-def making_again(folder: str | os.PathLike[str], numbers: Sequence[int], workers: int = 1) -> Iterator[Made]:
-    """Make some events of a set anew, as `making` does, whatever is there."""
-    return _made(SetFolder(folder), numbers, workers)
+def making_again(folder: str | os.PathLike[str], numbers: Sequence[int], workers: int = 1) -> Making:
+    """Make some events of a set, as `making` does, which are not there or have been removed."""
+    return _making(SetFolder(folder), numbers, workers)
 
 
-def _made(target: SetFolder, missing: Sequence[int], workers: int, progress: Progress | None = None) -> Iterator[Made]:
+def _making(target: SetFolder, missing: Sequence[int], workers: int, progress: Progress | None = None) -> Making:
     workers = whole_number(workers, "workers")
     if workers > 1 and len(missing) > 1:
-        written = in_processes(target, missing, min(workers, len(missing)))
-    else:
-        written = _in_turn(target, missing, progress)
-    return followed(target, written, len(missing))
-
-
-def followed(target: SetFolder, written: Iterator[Written], total: int) -> Iterator[Made]:
-    """What is said of events as they are written; each warning is given once, for the first event that it is of."""
-    said: set[str] = set()
-    for done, event in enumerate(written, 1):
-        for text in event.warnings:
-            if (words := re.sub(r"[\d.]+", "", text)) not in said:  # the same with other numbers says nothing new
-                said.add(words)
-                warn(f"event {event.number}: {text}", 3)
-        yield Made(event.number, target.event_path(event.number), event.size, event.seconds, done, total)
+        return Making(target, missing, in_processes(target, missing, min(workers, len(missing))))
+    return Making(target, missing, _in_turn(target, missing, progress))
 
 
 def prepare(
@@ -106,21 +152,26 @@ def prepare(
     """Put recipe, copies and index into a set's folder; and the numbers of the shard's events that are still missing."""
     if isinstance(first, bool) or not isinstance(first, int) or first < 0:
         raise InputError(f"first: expected a whole number of at least 0, got {first!r}")
-    part, parts = shard
-    if not (isinstance(part, int) and isinstance(parts, int) and 1 <= part <= parts):
-        raise InputError(f"shard: expected i/n with i from 1 to n, got {part}/{parts}")
+    place, parts = shard
+    if not (isinstance(place, int) and isinstance(parts, int) and 1 <= place <= parts):
+        raise InputError(f"shard: expected i/n with i from 1 to n, got {place}/{parts}")
     target = SetFolder(folder)
-    numbers = target.planned() if count is None else list(range(first, first + whole_number(count, "count")))
-    if not numbers:
+    asked = target.asked if count is None else [range(first, first + whole_number(count, "count"))]
+    if not asked:
         raise InputError(f"{target.path}: it holds no events: say how many to make (-n)")
-    mine = [number for number in numbers if number % parts == part - 1]
-    for number in mine:  # what does not fit together shows before the first is computed; a torso's check takes 20 ms
-        if not target.event_path(number).exists():
+    maker, most = EventMaker(recipe), asked[-1].stop
+    if most > _MOST:
+        size = readable_size(maker.raw_bytes * most)
+        raise InputError(f"count: at most {_MOST:,} events in a set, got {most:,}, of up to {size} uncompressed")
+    maker.require_memory()
+    mine = [n for part in asked for n in range(part.start + (place - 1 - part.start) % parts, part.stop, parts)]
+    end = time.monotonic() + _CHECK_SECONDS
+    for number in mine[
+        :: max(1, len(mine) // _CHECKED)
+    ]:  # what does not fit together shows before the first is computed
+        if time.monotonic() < end and not target.store.event_path(number).exists():
             _ = plan(recipe, number).phantom
-    EventMaker(recipe).require_memory()
-    recipe = target.prepare(recipe)
-    target.write_index([*target.planned(), *numbers])
-    return target, [number for number in mine if not target.is_made(number, recipe.fingerprint)]
+    return target, target.prepare(recipe, asked, mine)
 
 
 def _in_turn(target: SetFolder, missing: Sequence[int], progress: Progress | None) -> Iterator[Written]:

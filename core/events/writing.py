@@ -4,10 +4,10 @@ import os
 import time
 from typing import Any, NamedTuple
 
-from ..files import replacing
+from ..files import write_bytes
 from ..progress import Progress
 from ..recording import recorded_warnings
-from .event_files import packed
+from .event_files import Place, packed
 from .folders import SetFolder
 from .making import EventMaker
 
@@ -30,17 +30,21 @@ class EventWriter:
     def __init__(self, folder: str | os.PathLike[str], threads: int | None = None) -> None:
         self.folder = SetFolder(folder)
         self.maker = EventMaker(self.folder.recipe, threads)
+        self._indexed = set(self.folder.index.read())
 
     def write(self, number: int, progress: Progress | None = None) -> Written:
-        """Make an event and write its file; `progress` as of `EventMaker.make`."""
+        """Make an event and write its file, unless another work has; `progress` as of `EventMaker.make`."""
         started, folder = time.monotonic(), self.folder
-        folder.remove_leftovers(number)
-        with recorded_warnings() as said:
-            event = self.maker.make(number, progress)
-        data = packed(event, folder.recipe, self._geometry(), self.maker.threads)
-        with replacing(folder.event_path(number)) as temporary:
-            temporary.write_bytes(data)
-        return Written(number, len(data), time.monotonic() - started, (*event.warnings, *said))
+        place, said, size = Place(folder.store.event_path(number)), list[str](), 0
+        if not folder.is_made(number, place):
+            with recorded_warnings() as said:
+                event = self.maker.make(number, progress)
+            data = packed(event, folder.recipe, self._geometry(), self.maker.threads)
+            write_bytes(place.path, data)
+            said, size = [*event.warnings, *said], len(data)
+        if number not in self._indexed:
+            folder.index.add(number)
+        return Written(number, size or place.path.stat().st_size, time.monotonic() - started, tuple(said))
 
     def _geometry(self) -> dict[str, Any]:
         maker = self.maker

@@ -1,5 +1,7 @@
 """Poisson noise of counts."""
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -16,17 +18,21 @@ def sample_counts(mean: ArrayLike, seed: int) -> NDArray[np.int64]:
     `mean` is (M, n_v, n_u) or any array whose first axis is the views. Each view has its own random generator, made from
     the seed, a whole number of at least 0, and the view's index, so its counts do not depend on the other views.
     """
-    if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
-        raise InputError(f"seed: expected a whole number of at least 0, got {seed!r}")
     values = real_array(mean, "expected counts", None)
     if not values.ndim:
         raise InputError("expected counts: expected an array whose first axis is the views, got one number")
-    if values.size and not 0 <= values.min() <= values.max() <= _LARGEST_MEAN:
-        raise InputError(
-            f"expected counts: must lie from 0 to {_LARGEST_MEAN:g}, got {values.min():g} to {values.max():g}"
-        )
-    counts = np.empty(values.shape, np.int64)
-    for view, expected in enumerate(values):
-        generator = np.random.default_rng(np.random.SeedSequence(int(seed), spawn_key=(view,)))
-        counts[view] = generator.poisson(expected)
+    counts = np.zeros(values.shape, np.int64)
+    draw_counts(values, seed, counts)
     return counts
+
+
+def draw_counts(mean: NDArray[Any], seed: int, out: NDArray[Any]) -> None:
+    """`sample_counts` of an array of numbers into another of the same shape, which may be `mean` itself."""
+    if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
+        raise InputError(f"seed: expected a whole number of at least 0, got {seed!r}")
+    if mean.size and not 0 <= mean.min() <= mean.max() <= _LARGEST_MEAN:
+        raise InputError(f"expected counts: must lie from 0 to {_LARGEST_MEAN:g}, got {mean.min():g} to {mean.max():g}")
+    for view, (expected, counts) in enumerate(zip(mean, out, strict=True)):
+        generator = np.random.default_rng(np.random.SeedSequence(int(seed), spawn_key=(view,)))
+        there = expected != 0  # what is expected to be 0 is 0, and takes no random number
+        counts[there] = generator.poisson(expected[there])

@@ -36,7 +36,7 @@ def _run(arguments: argparse.Namespace) -> None:
     record = [{**asdict(fault), "path": str(fault.path)} for fault in faults]
     if not arguments.repair or not faults:
         if not faults:
-            lines = [f"{folder}: {len(SetFolder(folder).planned())} events, every byte as it was written"]
+            lines = [f"{folder}: {sum(map(len, SetFolder(folder).asked))} events, every byte as it was written"]
         print_answer(arguments, record, lines)
         if faults:
             raise InputError(
@@ -46,7 +46,7 @@ def _run(arguments: argparse.Namespace) -> None:
     for line in lines:
         sys.stderr.write(f"mphdrr: {line}\n")
     again = repair(folder, faults)
-    done = watched(making_again(folder, again, arguments.workers), SetFolder(folder), quiet=True)
+    done = watched(making_again(folder, again, arguments.workers), quiet=True)
     left = check(folder, progress_bar("checking again"))
     record = [{**asdict(fault), "path": str(fault.path)} for fault in left]
     said = f"{folder}: {len(faults)} fault{'s' * (len(faults) > 1)} mended, {done} events made anew"

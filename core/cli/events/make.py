@@ -4,14 +4,15 @@ import argparse
 import shutil
 import sys
 import time
-from collections.abc import Iterator
+from itertools import islice
 from pathlib import Path
 
 from ...errors import InputError
+from ...events.event_files import header
 from ...events.folders import SetFolder
 from ...events.making import EventMaker
 from ...events.recipe import EventRecipe, read_recipe
-from ...events.work import Made, making
+from ...events.work import Made, Making, making
 from ...memory import readable_size
 from ..options import add_command
 
@@ -39,6 +40,8 @@ def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     parser.add_argument("--shard", type=_shard, default=(1, 1), metavar="I/N", help=text)
     text = "let the workers of a Dask cluster make them, which see SET under the same path; local: --workers of this machine"
     parser.add_argument("--dask", metavar="ADDRESS|local", help=text)
+    text = "put events into shards, files of many, as they become enough; a set that has shards goes on so"
+    parser.add_argument("--pack", action="store_true", help=text)
     parser.add_argument("--quiet", action="store_true", help="say nothing on standard error but warnings")
     parser.set_defaults(run=_run)
 
@@ -66,16 +69,16 @@ def _run(arguments: argparse.Namespace) -> None:
         arguments.workers,
         arguments.shard,
         dask=arguments.dask,
+        pack=arguments.pack,
     )
-    done = watched(work, SetFolder(arguments.folder), arguments.quiet, arguments.shard)
-    folder = SetFolder(arguments.folder)
-    there = len(folder.numbers())
-    print(f"{arguments.folder}: {there} of {len(folder.planned())} events, {done} made now")
+    done, folder = watched(work, arguments.quiet), work.folder
+    there, asked = len(folder.store.places()), sum(map(len, folder.asked))
+    print(f"{arguments.folder}: {there} of {asked} events, {done} made now")
 
 
-def watched(work: Iterator[Made], folder: SetFolder, quiet: bool, shard: tuple[int, int] = (1, 1)) -> int:
+def watched(work: Making, quiet: bool) -> int:
     """Do the work and say how far it is; the number of events that it made."""
-    report, done = _Report(folder, quiet, shard), 0
+    report, done = _Report(work, quiet), 0
     try:
         for made in work:
             done = made.done
@@ -88,22 +91,22 @@ def watched(work: Iterator[Made], folder: SetFolder, quiet: bool, shard: tuple[i
 class _Report:
     """Says how large the set becomes, and what is left, on standard error."""
 
-    def __init__(self, folder: SetFolder, quiet: bool, shard: tuple[int, int]) -> None:
-        self.folder, self.quiet, self.shows = folder, quiet, sys.stderr.isatty() and not quiet
+    def __init__(self, work: Making, quiet: bool) -> None:
+        self.folder, self.quiet, self.shows = work.folder, quiet, sys.stderr.isatty() and not quiet
         self.started, self.bytes, self.open_line = time.monotonic(), 0, False
         if quiet:
             return
-        part, parts = shard
-        mine = [number for number in folder.planned() if number % parts == part - 1]
-        missing = [number for number in mine if not folder.event_path(number).exists()]
-        sizes = [folder.event_path(n).stat().st_size for n in folder.numbers()[:100]]
-        raw = EventMaker(folder.recipe).raw_bytes
+        missing = len(work.missing)
+        sizes = [
+            header(place).size for place in islice(self.folder.store.places().values(), 100) if place.path.exists()
+        ]
+        raw = EventMaker(self.folder.recipe).raw_bytes
         if sizes:
             each = sum(sizes) / len(sizes)
-            size = f"about {readable_size(each)} each, {readable_size(each * len(missing))} in all"
+            size = f"about {readable_size(each)} each, {readable_size(each * missing)} in all"
         else:
-            size = f"up to {readable_size(raw)} each, {readable_size(raw * len(missing))} in all, before they are compressed"
-        self._say(f"events missing: {len(missing)}, {size}; {readable_size(self._free())} are free")
+            size = f"up to {readable_size(raw)} each, {readable_size(raw * missing)} in all, before they are compressed"
+        self._say(f"events missing: {missing}, {size}; {readable_size(self._free())} are free")
 
     def __call__(self, made: Made) -> None:
         self.bytes += made.size

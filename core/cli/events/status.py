@@ -24,6 +24,11 @@ def _run(arguments: argparse.Namespace) -> None:
     for name, counts in (("phantoms", found.phantoms), ("splits", found.splits)):
         if counts:
             lines.append(f"{name}: " + ", ".join(f"{key} {count}" for key, count in counts.items()))
+    if found.shards:
+        lines.append(f"in {found.shards} shard{'s' * (found.shards > 1)}")
+    if len(found.builds) > 1:
+        builds = ", ".join(f"{build or 'of version 0.1'} {count}" for build, count in found.builds.items())
+        lines.append(f"builds of mphDRR: {builds}; events of two may differ in their last digits")
     if found.missing:
         lines.append(f"missing: {numbers_text(found.missing)}; mphdrr events make {arguments.folder} makes them")
     print_answer(arguments, asdict(found), lines)

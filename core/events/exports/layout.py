@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import InputError
-from ...files import replacing
+from ...files import write_bytes
 from ..event_set import Event, EventSet
 from ..fields import Shapes, field_shapes, float32_bytes
 from ..noise_choice import NoiseChoice, chosen_seed, noisy_images
@@ -106,8 +106,7 @@ class Layout:
         """Write a part; call `written` after each event."""
         for i in part.events:
             for name, content in self.contents(rows[i], self.chosen.events[i]):
-                with replacing(folder / name) as temporary:
-                    temporary.write_bytes(content)
+                write_bytes(folder / name, content)
             written()
 
 

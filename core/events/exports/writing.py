@@ -13,17 +13,14 @@ from pathlib import Path
 from typing import Any
 
 from ...errors import InputError
-from ...files import ensure_folder, replacing
+from ...files import ensure_folder, is_leftover, write_bytes, written_name
 from ...memory import readable_size
 from ...progress import Progress, tell
-from ..folders import is_leftover
 from ..noise_choice import chosen_seed
 from .layout import Chosen, Layout, Part, Row
 
 REQUEST, TABLE = "export.json", "events.csv"
 _FORMAT = "mphDRR export"
-_MARK = len(".01234567-")
-"""Of files that are being written, what stands before their names."""
 
 
 @dataclass(frozen=True)
@@ -65,10 +62,10 @@ class Plan:
         self._remove_leftovers()
         self._remove_changed()
         # First, so that whatever there is of an unfinished export is known to be of it.
-        _write(self.folder / REQUEST, json.dumps(self.request, indent=1).encode() + b"\n")
+        write_bytes(self.folder / REQUEST, json.dumps(self.request, indent=1).encode() + b"\n")
         tables = {TABLE: table(self.rows), **self.layout.tables(self.rows)}
         for name, content in tables.items():
-            _write(self.folder / name, content)
+            write_bytes(self.folder / name, content)
         done = len(self.rows) - self.events
 
         def written() -> None:
@@ -83,7 +80,8 @@ class Plan:
         """Remove what a killed export was writing: readers of whole folders would find it."""
         known = {self.folder / file for part in self.layout.parts(self.rows) for file in part.files}
         for path in (*self.folder.glob(".*"), *self.folder.glob("*/.*")):
-            if is_leftover(path.name) and (path.with_name(path.name[_MARK:]) in known or path.parent == self.folder):
+            name = written_name(path.name)
+            if name and is_leftover(path) and (path.with_name(name) in known or path.parent == self.folder):
                 path.unlink(missing_ok=True)
 
     def _remove_changed(self) -> None:
@@ -140,7 +138,7 @@ def plan_export(layout: Layout, chosen: Chosen, folder: Path, program: str, opti
 
 def _require_same(folder: Path, request: dict[str, Any], rows: list[Row]) -> int:
     """How many events the same export had in the folder before; `InputError` if something else is in it."""
-    if all(is_leftover(path.name) for path in folder.iterdir()):
+    if all(written_name(path.name) for path in folder.iterdir()):
         return 0
     try:
         asked = json.loads((folder / REQUEST).read_text(encoding="utf-8"))
@@ -176,8 +174,3 @@ def _rows_of(folder: Path) -> list[list[str]] | None:
     except OSError:
         return None
     return list(csv.reader(io.StringIO(text)))[1:]
-
-
-def _write(path: Path, content: bytes) -> None:
-    with replacing(path) as temporary:
-        temporary.write_bytes(content)

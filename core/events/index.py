@@ -1,0 +1,105 @@
+"""The index of an event set: a table (CSV) with a row for each event that was made, drawn from the recipe.
+
+It only says sooner what the recipe says: rows that are missing, such as those of work that was killed, are drawn when asked
+for. So works that write it at once need not wait for each other; the last one that ends finds what is missing.
+"""
+
+import csv
+import io
+import json
+from collections.abc import Callable, Collection, Iterable, Mapping
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from ..errors import InputError, refusing
+from ..files import write_bytes
+from .planning import FIXED_COLUMNS, plan
+from .recipe import EventRecipe
+
+_TEXTS = ("phantom", "split", "file")
+
+
+class Index:
+    """The rows as they are in the file, by event; numbers are read when a row is asked for."""
+
+    def __init__(self, path: Path, recipe: EventRecipe) -> None:
+        self.path, self._recipe = path, recipe
+
+    @cached_property
+    def columns(self) -> list[str]:
+        """The same for all events of the recipe."""
+        entries = self._recipe.phantoms
+        files = ["file"] if any(entry.file is not None for entry in entries) else []
+        return [*FIXED_COLUMNS, *files, *dict.fromkeys(f"phantom.{key}" for entry in entries for key in entry.settings)]
+
+    def read(self) -> dict[int, list[str]]:
+        """The rows that are there, in the order of `columns`; a row that was cut is left out."""
+        try:
+            with open(self.path, newline="", encoding="utf-8") as file:
+                lines = csv.reader(file)
+                heading = next(lines, [])
+                if heading == self.columns:
+                    return {int(line[0]): line for line in lines if len(line) == len(heading) and line[0].isdigit()}
+                return {
+                    int(row["event"]): [row.get(name) or "" for name in self.columns]
+                    for row in (dict(zip(heading, line, strict=False)) for line in lines)
+                    if row.get("event", "").isdigit()
+                }
+        except FileNotFoundError:
+            return {}
+        except (OSError, ValueError, csv.Error) as error:
+            folder = self.path.parent
+            raise InputError(
+                f"{self.path}: cannot be read ({error}): mphdrr events check {folder} --repair writes it anew"
+            ) from None
+
+    def line(self, number: int) -> list[str]:
+        """The row of an event, as the recipe says."""
+        row = plan(self._recipe, number).row()
+        values = (row.get(name, "") for name in self.columns)
+        return [value if isinstance(value, str) else json.dumps(value) for value in values]
+
+    def values(self, line: Iterable[str]) -> dict[str, Any]:
+        """What a row says, by column; None where it is empty."""
+        return {name: _value(name, text) for name, text in zip(self.columns, line, strict=True)}
+
+    def text(self, lines: Mapping[int, list[str]]) -> bytes:
+        """The file with these rows, in order."""
+        return _csv([self.columns, *(lines[number] for number in sorted(lines))])
+
+    def add(self, number: int) -> None:
+        """Add the row of an event that was made, at the end of the file."""
+        with refusing(self.path, "cannot be written"), open(self.path, "ab") as file:
+            file.write(_csv([*([] if file.tell() else [self.columns]), self.line(number)]))
+
+    def complete(self, made: Callable[[], Collection[int]], asked: Collection[int], anew: bool = False) -> None:
+        """Have a row for each event that is made, in order; again until nobody adds others meanwhile.
+
+        Rows of other events are kept where they were asked for. `anew`: all rows are drawn, whatever is there.
+        """
+        while True:
+            there = {} if anew else self.read()
+            wanted = {number for number in (*there, *made()) if number in asked}
+            content = self.text({number: there.get(number) or self.line(number) for number in wanted})
+            if self.path.is_file() and self.path.read_bytes() == content:
+                return
+            write_bytes(self.path, content)
+
+
+def _csv(lines: Iterable[list[str]]) -> bytes:
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows(lines)
+    return text.getvalue().encode()
+
+
+def _value(name: str, text: str) -> Any:
+    """What a cell holds."""
+    if not text:
+        return None
+    if name in _TEXTS:
+        return text
+    try:
+        return json.loads(text)
+    except ValueError:
+        return text

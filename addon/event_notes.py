@@ -13,7 +13,7 @@ import numpy as np
 from ..core import events
 from ..core.errors import InputError
 from ..core.events.folders import INDEX, RECIPE, SetFolder
-from ..core.events.store import EVENTS, SHARDS
+from ..core.events.store import EVENTS, SHARDS, size_of
 from ..core.memory import readable_size
 from ..core.recording import recorded_warnings
 from . import storage
@@ -84,7 +84,7 @@ def _set_note(path: Path) -> Note:
     """How many events there are, and how large they are."""
     folder = SetFolder(path)
     places, models = folder.store.places(), tuple(folder.recipe.models)
-    size = sum(place.size or place.path.stat().st_size for place in places.values())
+    size = sum(map(size_of, places.values()))
     return Note(f"{len(places)} of {sum(map(len, folder.asked))} events, {readable_size(size)}", models=models)
 
 

@@ -49,8 +49,7 @@ class Seal:
     @property
     def file_size(self) -> int:
         """Bytes of the whole file."""
-        table = 0 if self.version == 1 else _DIGEST * -(-self.size // _BLOCK)
-        return HEADER + self.size + table
+        return file_size(self.size, self.version)
 
     def lines(self, **more: str) -> bytes:
         """The text's lines before the last."""
@@ -64,6 +63,11 @@ class Seal:
     def digest(self, table: bytes) -> str:
         """What `sha256` has to be."""
         return hashlib.sha256(self.lines() + table).hexdigest()
+
+
+def file_size(size: int, version: int = _VERSION) -> int:
+    """Bytes of a sealed file with so many bytes of HDF5."""
+    return HEADER + size + (0 if version == 1 else _DIGEST * -(-size // _BLOCK))
 
 
 def pack(kind: str, fields: dict[str, str], fill: Callable[[Any], None]) -> memoryview:

@@ -13,6 +13,7 @@ from ..files import ensure_folder, is_leftover, written_name
 from ..progress import Progress, tell
 from .event_files import Place, header, verify
 from .folders import ASKED, INDEX, INPUT_LIST, INPUTS, RECIPE, SetFolder
+from .index import column
 from .store import EVENTS, LOCK, SHARDS
 
 
@@ -55,15 +56,14 @@ def status(folder: str | os.PathLike[str]) -> Status:
                 made[number] = found
     asked = target.planned() or list(made)
     made = {number: made[number] for number in asked if number in made}
-    phantom, split = (target.index.columns.index(name) for name in ("phantom", "split"))
     rows = [lines.get(number) or target.index.line(number) for number in made]
     return Status(
         asked=len(asked),
         made=len(made),
         missing=[number for number in asked if number not in made],
         size=sum(found.size for found in made.values()),
-        phantoms=dict(sorted(Counter(row[phantom] for row in rows).items())),
-        splits=dict(sorted(Counter(row[split] or "none" for row in rows).items())),
+        phantoms=dict(sorted(Counter(column(row, 1) for row in rows).items())),
+        splits=dict(sorted(Counter(column(row, 2) or "none" for row in rows).items())),
         builds=dict(sorted(Counter(found.build for found in made.values()).items())),
         shards=len(target.store.shard_paths()),
     )
@@ -96,7 +96,7 @@ def check(folder: str | os.PathLike[str], progress: Progress | None = None) -> l
     fingerprint = target.recipe.fingerprint
 
     def faults_of(number: int) -> Fault | None:
-        place = places.get(number, Place(target.store.event_path(number)))
+        place = places.get(number, Place(str(target.store.event_path(number))))
         fault = _event_fault(place, number, fingerprint)
         if fault is None or number in planned:
             return fault
@@ -188,7 +188,7 @@ def _index(target: SetFolder) -> list[Fault]:
 
 
 def _event_fault(place: Place, number: int, fingerprint: str) -> Fault | None:
-    path = place.path
+    path = Path(place.path)
     if not path.exists():
         return Fault("missing", path, f"{path}: missing", number)
     try:

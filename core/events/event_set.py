@@ -26,6 +26,7 @@ from ..volumes.images import Images
 from ..volumes.volume import Volume
 from .event_files import Place, read_array, read_truth
 from .folders import SetFolder
+from .index import column
 from .making import EventMaker, radon_views
 from .planning import PlannedEvent, plan
 from .recipe import EventRecipe
@@ -60,11 +61,11 @@ class _Source:
         return self.folder.store.places()
 
     @cached_property
-    def lines(self) -> dict[int, list[str]]:
+    def lines(self) -> dict[int, str]:
         """The rows of the index, by event."""
         return self.folder.index.read()
 
-    def line(self, number: int) -> list[str]:
+    def line(self, number: int) -> str:
         """A row of the index, drawn where the index has none."""
         return self.lines.get(number) or self.folder.index.line(number)
 
@@ -108,7 +109,7 @@ class Event:
 
     @property
     def _place(self) -> Place:
-        return self._source.places.get(self.number) or Place(self._source.folder.store.event_path(self.number))
+        return self._source.places.get(self.number) or Place(str(self._source.folder.store.event_path(self.number)))
 
     @property
     def recipe(self) -> EventRecipe:
@@ -118,7 +119,7 @@ class Event:
     @property
     def path(self) -> Path:
         """Its file, or the shard that it is in."""
-        return self._place.path
+        return Path(self._place.path)
 
     @property
     def row(self) -> dict[str, Any]:
@@ -141,11 +142,6 @@ class Event:
     def split(self) -> str | None:
         """Such as "train"; None where the recipe has no splits."""
         return self.attributes["split"] or None
-
-    @property
-    def _split(self) -> str:
-        """As the index says, in which all of a set are found quickly."""
-        return self._source.line(self.number)[self._source.folder.index.columns.index("split")]
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -394,7 +390,7 @@ class EventSet:
 
     def split(self, name: str) -> EventSet:
         """The events of a split, such as "train"; `InputError` where the recipe has no such split."""
-        splits = [event._split for event in self._events]
+        splits = [column(event._source.line(event.number), 2) for event in self._events]
         known = set(splits) - {""} | (set(self.recipe.splits) if self._events else set())
         if name not in known:
             raise InputError(f"split {name!r}: there are {', '.join(sorted(known)) or 'none'}")

@@ -21,7 +21,7 @@ _TEXTS = ("phantom", "split", "file")
 
 
 class Index:
-    """The rows as they are in the file, by event; numbers are read when a row is asked for."""
+    """The rows by event, lines as they are in the file: what they say is read when it is asked for."""
 
     def __init__(self, path: Path, recipe: EventRecipe) -> None:
         self.path, self._recipe = path, recipe
@@ -33,45 +33,42 @@ class Index:
         files = ["file"] if any(entry.file is not None for entry in entries) else []
         return [*FIXED_COLUMNS, *files, *dict.fromkeys(f"phantom.{key}" for entry in entries for key in entry.settings)]
 
-    def read(self) -> dict[int, list[str]]:
-        """The rows that are there, in the order of `columns`; a row that was cut is left out."""
+    def read(self) -> dict[int, str]:
+        """The rows that are there, each a line as it is in the file; what is no row is left out."""
         try:
-            with open(self.path, newline="", encoding="utf-8") as file:
-                lines = csv.reader(file)
-                heading = next(lines, [])
-                if heading == self.columns:
-                    return {int(line[0]): line for line in lines if len(line) == len(heading) and line[0].isdigit()}
-                return {
-                    int(row["event"]): [row.get(name) or "" for name in self.columns]
-                    for row in (dict(zip(heading, line, strict=False)) for line in lines)
-                    if row.get("event", "").isdigit()
-                }
+            heading, *lines = self.path.read_text(encoding="utf-8").split("\n")
         except FileNotFoundError:
             return {}
-        except (OSError, ValueError, csv.Error) as error:
+        except (OSError, ValueError) as error:
             folder = self.path.parent
             raise InputError(
                 f"{self.path}: cannot be read ({error}): mphdrr events check {folder} --repair writes it anew"
             ) from None
+        found = {int(first): line for line in lines if (first := line.partition(",")[0]).isdigit()}
+        if heading != _csv(self.columns):  # of an earlier version: the columns of what was drawn
+            names = next(csv.reader([heading]), [])
+            rows = {n: dict(zip(names, next(csv.reader([line])), strict=False)) for n, line in found.items()}
+            found = {n: _csv([row.get(name, "") for name in self.columns]) for n, row in rows.items()}
+        return found
 
-    def line(self, number: int) -> list[str]:
+    def line(self, number: int) -> str:
         """The row of an event, as the recipe says."""
         row = plan(self._recipe, number).row()
         values = (row.get(name, "") for name in self.columns)
-        return [value if isinstance(value, str) else json.dumps(value) for value in values]
+        return _csv([value if isinstance(value, str) else json.dumps(value) for value in values])
 
-    def values(self, line: Iterable[str]) -> dict[str, Any]:
+    def values(self, line: str) -> dict[str, Any]:
         """What a row says, by column; None where it is empty."""
-        return {name: _value(name, text) for name, text in zip(self.columns, line, strict=True)}
+        return {name: _value(name, text) for name, text in zip(self.columns, next(csv.reader([line])), strict=True)}
 
-    def text(self, lines: Mapping[int, list[str]]) -> bytes:
+    def text(self, lines: Mapping[int, str]) -> bytes:
         """The file with these rows, in order."""
-        return _csv([self.columns, *(lines[number] for number in sorted(lines))])
+        return "".join(f"{line}\n" for line in (_csv(self.columns), *(lines[n] for n in sorted(lines)))).encode()
 
     def add(self, number: int) -> None:
         """Add the row of an event that was made, at the end of the file."""
         with refusing(self.path, "cannot be written"), open(self.path, "ab") as file:
-            file.write(_csv([*([] if file.tell() else [self.columns]), self.line(number)]))
+            file.write(f"{self.line(number)}\n".encode() if file.tell() else self.text({number: self.line(number)}))
 
     def complete(self, made: Callable[[], Collection[int]], asked: Collection[int], anew: bool = False) -> None:
         """Have a row for each event that is made, in order; again until nobody adds others meanwhile.
@@ -87,10 +84,17 @@ class Index:
             write_bytes(self.path, content)
 
 
-def _csv(lines: Iterable[list[str]]) -> bytes:
+def column(line: str, place: int) -> str:
+    """One of the first cells of a row."""
+    cells = line.split(",", place + 1)
+    return next(csv.reader([line]))[place] if '"' in "".join(cells[: place + 1]) else cells[place]
+
+
+def _csv(cells: Iterable[str]) -> str:
+    """A line of the table."""
     text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerows(lines)
-    return text.getvalue().encode()
+    csv.writer(text, lineterminator="").writerow(cells)
+    return text.getvalue()
 
 
 def _value(name: str, text: str) -> Any:

@@ -42,10 +42,11 @@ class Store:
         """
         found: dict[int, Place] = {}
         for shard in self.shard_paths():
-            found |= {number: Place(shard, offset, size) for number, offset, size in _members(shard)}
+            found |= dict(_members(shard))
+        folder = f"{self.events}{os.sep}"
         for name in _names(self.events):
-            if (match := _EVENT.fullmatch(name)) and f"{int(match[1]):06d}" == match[1]:
-                found[int(match[1])] = Place(self.events / name)
+            if (match := _EVENT.fullmatch(name)) and f"{(number := int(match[1])):06d}" == match[1]:
+                found[number] = Place(folder + name)
         return dict(sorted(found.items()))
 
     def shard_paths(self) -> list[Path]:
@@ -60,7 +61,7 @@ class Store:
 
     def alone(self) -> list[int]:
         """The events that have a file of their own."""
-        return [number for number, place in self.places().items() if place.path.parent == self.events]
+        return [number for number, place in self.places().items() if not place.offset]
 
     def pack(self, progress: Progress | None = None, shard_bytes: int = SHARD_BYTES) -> int:
         """Put the events that have files of their own into shards of about so many bytes; how many.
@@ -72,7 +73,7 @@ class Store:
             self.shards.mkdir(exist_ok=True)
         with locked(self.shards / LOCK, f"{self.shards}: another work is packing this set; wait for its end"):
             numbers, there = self.alone(), self.shard_paths()
-            packed = {n: Place(shard, at, size) for shard in there for n, at, size in _members(shard)}
+            packed = dict(member for shard in there for member in _members(shard))
             last, done = _by_number(there[-1].name) if there else 0, 0
             while done < len(numbers):
                 done += self._append(self.shards / f"{last:06d}.tar", numbers[done:], packed, shard_bytes)
@@ -83,7 +84,7 @@ class Store:
     def _append(self, shard: Path, numbers: Sequence[int], packed: Mapping[int, Place], shard_bytes: int) -> int:
         """Write events at the end of a shard until it is as large as it should be; how many."""
         is_new = not shard.exists()
-        end = 0 if is_new else max((at + _padded(size) for _, at, size in _members(shard)), default=0)
+        end = 0 if is_new else max((place.offset + _padded(place.size or 0) for _, place in _members(shard)), default=0)
         count, flushed, batch = 0, end, list[Path]()
         with refusing(shard, "cannot be written"), open(shard, "xb" if is_new else "r+b") as file:
             try:
@@ -91,7 +92,7 @@ class Store:
                     if end >= shard_bytes:
                         break
                     path = self.event_path(number)
-                    verify(Place(path))
+                    verify(Place(str(path)))
                     data = path.read_bytes()
                     if number not in packed or read_bytes(packed[number]) != data:  # else it was about to be removed
                         _write_member(file, end, path.name, data)
@@ -113,7 +114,7 @@ class Store:
         """
         with locked(self.shards / LOCK, f"{self.shards}: another work is packing this set; wait for its end"):
             shards = self.shard_paths() if shards is None else shards
-            packed = [(n, place) for n, place in self.places().items() if place.path in shards]
+            packed = [(n, place) for n, place in self.places().items() if Path(place.path) in shards]
             for done, (number, place) in enumerate(packed, 1):
                 if _is_whole(place):
                     write_bytes(self.event_path(number), read_bytes(place))
@@ -122,6 +123,11 @@ class Store:
                 with refusing(shard, "cannot be removed"):
                     shard.unlink()
         return len(packed)
+
+
+def size_of(place: Place) -> int:
+    """Bytes of an event's file, as the disk says."""
+    return os.stat(place.path).st_size if place.size is None else place.size
 
 
 def read_bytes(place: Place) -> bytes:
@@ -139,8 +145,8 @@ def _is_whole(place: Place) -> bool:
     return True
 
 
-def _members(shard: Path) -> Iterator[tuple[int, int, int]]:
-    """Number, offset and size of each whole event in a shard."""
+def _members(shard: Path) -> Iterator[tuple[int, Place]]:
+    """The number and the place of each whole event in a shard."""
     with refusing(shard, "cannot be read"), open(shard, "rb", buffering=0) as file:
         at, end = 0, file.seek(0, os.SEEK_END)
         while at + _TAR < end:
@@ -153,7 +159,7 @@ def _members(shard: Path) -> Iterator[tuple[int, int, int]]:
                 return
             if name is None or at + _TAR + size > end:
                 return
-            yield int(name[1]), at + _TAR, size
+            yield int(name[1]), Place(str(shard), at + _TAR, size)
             at += _TAR + _padded(size)
 
 

@@ -35,7 +35,7 @@ class EventWriter:
     def write(self, number: int, progress: Progress | None = None) -> Written:
         """Make an event and write its file, unless another work has; `progress` as of `EventMaker.make`."""
         started, folder = time.monotonic(), self.folder
-        place, said, size = Place(folder.store.event_path(number)), list[str](), 0
+        place, said, size = Place(str(folder.store.event_path(number))), list[str](), 0
         if not folder.is_made(number, place):
             with recorded_warnings() as said:
                 event = self.maker.make(number, progress)
@@ -44,7 +44,7 @@ class EventWriter:
             said, size = [*event.warnings, *said], len(data)
         if number not in self._indexed:
             folder.index.add(number)
-        return Written(number, size or place.path.stat().st_size, time.monotonic() - started, tuple(said))
+        return Written(number, size or os.stat(place.path).st_size, time.monotonic() - started, tuple(said))
 
     def _geometry(self) -> dict[str, Any]:
         maker = self.maker

@@ -8,7 +8,6 @@ from itertools import islice
 from pathlib import Path
 
 from ...errors import InputError
-from ...events.event_files import header
 from ...events.folders import SetFolder
 from ...events.making import EventMaker
 from ...events.recipe import EventRecipe, read_recipe
@@ -97,9 +96,7 @@ class _Report:
         if quiet:
             return
         missing = len(work.missing)
-        sizes = [
-            header(place).size for place in islice(self.folder.store.places().values(), 100) if place.path.exists()
-        ]
+        sizes = [size_of(place) for place in islice(self.folder.store.places().values(), 100)]
         raw = EventMaker(self.folder.recipe).raw_bytes
         if sizes:
             each = sum(sizes) / len(sizes)

@@ -202,7 +202,12 @@ class Event:
             return str(self._images(file, model).attrs["unit"])
 
     def images(
-        self, model: str, noise_seed: int | None = None, level: float = 1.0, modules: Any = slice(None)
+        self,
+        model: str,
+        noise_seed: int | None = None,
+        level: float = 1.0,
+        modules: Any = slice(None),
+        out: NDArray[np.float32] | None = None,
     ) -> NDArray[np.float32]:
         """A model's images.
 
@@ -217,6 +222,8 @@ class Event:
             Share of the acquisition time; only of counts and photons.
         modules
             Which of them: an index, a slice or a list of indices. Their noise does not depend on the others.
+        out
+            Zeros, (M, n_v, n_u) float32, which the images of all modules are written to.
 
         Returns
         -------
@@ -236,7 +243,7 @@ class Event:
                 raise InputError(f"{model}: only counts and photons have noise and levels, its images are {unit}")
             one = isinstance(modules, slice) and modules.step in (None, 1)
             part = (modules, slice(None), slice(None)) if one and noise_seed is None else ()
-            images = read_array(file, dataset.name, part)
+            images = read_array(file, dataset.name, part, out)
         if level != 1.0:
             images *= np.float32(level)
         if noise_seed is not None:

@@ -34,11 +34,13 @@ def mixed_seed(own: int, *others: int) -> int:
     return int(np.random.SeedSequence((own, *others)).generate_state(1, np.uint64)[0])
 
 
-def noisy_images(event: Event, model: str, seed: int | None, level: float) -> NDArray[np.float32]:
+def noisy_images(
+    event: Event, model: str, seed: int | None, level: float, out: NDArray[np.float32] | None = None
+) -> NDArray[np.float32]:
     """A model's images (M, n_v, n_u): of counts and photons with noise of a seed and a level, others as they are."""
     if event.unit(model) not in COUNTED:
-        return event.images(model)
-    return event.images(model, noise_seed=seed, level=level)
+        return event.images(model, out=out)
+    return event.images(model, noise_seed=seed, level=level, out=out)
 
 
 def require_counted(events: EventSet, models: Collection[str]) -> None:

@@ -32,6 +32,7 @@ def torch_dataset(
     levels: float | Sequence[float] | None = None,
     seed: int = 0,
     slots: str | os.PathLike[str] | None = None,
+    skip_damaged: bool = False,
 ) -> "Dataset[dict[str, Any]]":
     """The events as a torch `Dataset` of dicts of float32 tensors, for a `DataLoader` with any number of workers.
 
@@ -64,6 +65,9 @@ def torch_dataset(
         Of random crops, levels and the noise of "epoch": a whole number of at least 0.
     slots
         A table of them (`read_slots`), for "NAME/slots", instead of a row of images and its mirrored ones.
+    skip_damaged
+        Instead of an event whose file is damaged or missing the next one is read, with an `InputWarning`; otherwise that is
+        an `InputError`, also in a loader's workers.
 
     Returns
     -------
@@ -115,7 +119,9 @@ def torch_dataset(
         require_counted(events, [name for name in models if name in names or f"{name}{_SLOTS}" in names])
     shapes = {name: known[name] for name in names}
     crops = _crops(crop, shapes)
-    return TorchEvents(events, names, crops, crop_at == "random", noise, chosen_levels, seed, chosen_slots)
+    return TorchEvents(
+        events, shapes, crops, crop_at == "random", noise, chosen_levels, seed, chosen_slots, skip_damaged
+    )
 
 
 def _crops(crop: Crop, shapes: Mapping[str, tuple[int, ...]]) -> dict[tuple[str, ...], tuple[int | None, ...]]:

@@ -1,7 +1,7 @@
 """``mphdrr events ACTION``: an action is a module here with ``add_parser(actions)``."""
 
 from ..options import add_command
-from . import check, export, make, new, show, status
+from . import check, export, make, new, pack, show, status
 
 
 def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
@@ -9,5 +9,5 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     example = "mphdrr events make set -n 1000 --recipe derenzo.toml"
     events = add_command(subparsers, "events", "make sets of training events from a recipe", example)
     actions = events.add_subparsers(metavar="ACTION", required=True)
-    for action in (new, make, status, check, show, export):
+    for action in (new, make, status, check, show, pack, export):
         action.add_parser(actions)

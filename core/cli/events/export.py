@@ -35,6 +35,7 @@ def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
         help="3dunet: images by slots, to Radon images (the default); or back-projection, to truth",
     )
     add("--events-per-shard", type=int, metavar="N", help="webdataset; default: as many as make about a gigabyte")
+    add("--uncompressed", action="store_true", default=None, help="webdataset: .npy members instead of .npy.gz")
     programs = "\n".join(f"  {program.name:<13}{program.title}" for program in PROGRAMS.values())
     parser.epilog = f"programs:\n{programs}\n{parser.epilog}"
     parser.set_defaults(run=_run)
@@ -54,6 +55,7 @@ def _run(arguments: argparse.Namespace) -> None:
         slots=arguments.slots,
         raw=arguments.raw,
         events_per_shard=arguments.events_per_shard,
+        uncompressed=arguments.uncompressed,
     )
     sys.stderr.write(f"mphdrr: {plan.says()}\n")
     sys.stderr.flush()

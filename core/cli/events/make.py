@@ -11,6 +11,7 @@ from ...errors import InputError
 from ...events.folders import SetFolder
 from ...events.making import EventMaker
 from ...events.recipe import EventRecipe, read_recipe
+from ...events.store import size_of
 from ...events.work import Made, Making, making
 from ...memory import readable_size
 from ..options import add_command

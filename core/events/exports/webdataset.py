@@ -1,13 +1,16 @@
-"""WebDataset: tar archives, shards, whose members of one key are an event: 000012.truth.npy, 000012.radon96.npy, ...
+"""WebDataset: tar archives, shards, whose members of one key are an event: 000012.truth.npy.gz, 000012.radon96.npy.gz, ...
 
-A model's images are 000012.NAME.npy, 000012.json says the rest (`record`). Shards are of one split each,
-``train-000003.tar``, so that a brace pattern or a glob names what is trained on. The same set makes the same bytes.
+A model's images are 000012.NAME.npy.gz, 000012.json says the rest (`record`); uncompressed, they end in .npy. Shards are of
+one split each, ``train-000003.tar``, so that a brace pattern or a glob names what is trained on. The same set makes the same
+bytes.
 """
 
+import gzip
 import io
 import json
 import tarfile
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 
 from ...files import replacing
@@ -22,10 +25,11 @@ SHARD_BYTES = 10**9
 
 
 class WebDataset(Layout):
-    """`events_per_shard`: how many events are in a shard; default: as many as make about a gigabyte."""
+    """`events_per_shard`: how many events are in a shard; default: as many as make about a gigabyte uncompressed."""
 
-    def __init__(self, chosen: Chosen, *, events_per_shard: int | None = None) -> None:
+    def __init__(self, chosen: Chosen, *, events_per_shard: int | None = None, uncompressed: bool = False) -> None:
         super().__init__(chosen)
+        self.packed = not uncompressed
         if events_per_shard is None:
             events_per_shard = max(1, SHARD_BYTES // self.event_bytes)
         self.events_per_shard = strict_whole(events_per_shard, "events_per_shard", "a whole number of at least 1")
@@ -56,9 +60,15 @@ class WebDataset(Layout):
     def contents(self, row: Row, event: Event) -> Iterator[tuple[str, bytes]]:
         """The members of an event."""
         key = f"{row['i']:06d}"
-        yield f"{key}.truth.npy", npy(event.truth.array)
-        for model in self.chosen.models:
-            yield f"{key}.{model}.npy", npy(self.chosen.images(event, model))
-        for n in self.chosen.radon_counts:
-            yield f"{key}.radon{n}.npy", npy(event.radon(n))
+        arrays = {"truth": lambda: event.truth.array}
+        arrays |= {model: partial(self.chosen.images, event, model) for model in self.chosen.models}
+        arrays |= {f"radon{n}": partial(event.radon, n) for n in self.chosen.radon_counts}
+        for name, array in arrays.items():
+            content = npy(array())
+            # of no time, so that the same set makes the same bytes
+            yield (
+                (f"{key}.{name}.npy.gz", gzip.compress(content, 4, mtime=0))
+                if self.packed
+                else (f"{key}.{name}.npy", content)
+            )
         yield f"{key}.json", json.dumps(record(self.chosen, event)).encode()

@@ -138,7 +138,16 @@ def opened(path: str | os.PathLike[str], offset: int = 0) -> Iterator[Any]:
                 with h5py.File(path if sealed is None else sealed, "r") as content:
                     _refuse_foreign(content)
                     yield content
-        except (OSError, RuntimeError, KeyError, ValueError, TypeError, AttributeError, OverflowError) as error:
+        except (
+            OSError,
+            RuntimeError,
+            SystemError,
+            ArithmeticError,
+            LookupError,
+            ValueError,
+            TypeError,
+            AttributeError,
+        ) as error:
             if isinstance(error, InputError):
                 raise
             lines = (str(error) or type(error).__name__).splitlines()
@@ -235,19 +244,19 @@ def _refuse_foreign(file: Any) -> None:
     """Raise `InputError` for what leads out of the file, before any data is touched."""
     import h5py
 
-    def look(name: str, link: Any) -> None:
+    links: dict[str, Any] = {}
+    file.visititems_links(lambda name, link: links.update({name: link}))  # nothing may be raised within
+    for name, link in links.items():
         if isinstance(link, h5py.ExternalLink):
             raise InputError(f"{name}: a link to another file, {link.filename!r}, which is not followed")
         if not isinstance(link, h5py.HardLink):  # a soft link leads to what has a name of its own, or nowhere
-            return
+            continue
         item = h5py.h5o.open(file.id, name.encode())
         if not isinstance(item, h5py.h5d.DatasetID):
-            return
+            continue
         storage = item.get_create_plist()
         if storage.get_layout() == h5py.h5d.VIRTUAL or storage.get_external_count():
             raise InputError(f"{name}: its numbers are in other files, which are not read")
         kind = item.dtype
         if kind.hasobject and h5py.check_string_dtype(kind) is None:
             raise InputError(f"{name}: expected numbers or text, found objects")
-
-    file.visititems_links(look)

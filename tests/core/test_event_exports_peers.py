@@ -89,9 +89,9 @@ def test_webdataset_loads_shards(wds, event_set, tmp_path):
     assert len(samples) == 5
     for sample in samples:
         event = event_set[int(sample["__key__"])]
-        assert np.array_equal(sample["truth.npy"], event.truth.array)
-        assert np.array_equal(sample["counts.npy"], event.images("counts", event.noise_seed))
-        assert np.array_equal(sample["radon16.npy"], event.radon(16))
+        assert np.array_equal(sample["truth.npy.gz"], event.truth.array)
+        assert np.array_equal(sample["counts.npy.gz"], event.images("counts", event.noise_seed))
+        assert np.array_equal(sample["radon16.npy.gz"], event.radon(16))
         assert sample["json"]["number"] == event.number and sample["json"]["split"] == event.split
 
 
@@ -99,7 +99,7 @@ def test_webdataset_makes_batches_with_workers(wds, event_set, tmp_path):
     export_events(event_set, tmp_path, "webdataset", models="rays", events_per_shard=1)
     last = len(event_set.split("train")) - 1
     pattern = f"{tmp_path}/train-{{000000..{last:06d}}}.tar"
-    dataset = wds.WebDataset(pattern, shardshuffle=False).decode().to_tuple("rays.npy", "truth.npy").batched(1)
+    dataset = wds.WebDataset(pattern, shardshuffle=False).decode().to_tuple("rays.npy.gz", "truth.npy.gz").batched(1)
     loader = wds.WebLoader(dataset, batch_size=None, num_workers=2)
     images = {np.asarray(batch[0]).tobytes() for batch in loader}
     assert images == {event.images("rays")[None].tobytes() for event in event_set.split("train")}

@@ -13,6 +13,9 @@ from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from ...files import replacing
 from ...validation import strict_whole
 from ..event_set import Event
@@ -60,7 +63,7 @@ class WebDataset(Layout):
     def contents(self, row: Row, event: Event) -> Iterator[tuple[str, bytes]]:
         """The members of an event."""
         key = f"{row['i']:06d}"
-        arrays = {"truth": lambda: event.truth.array}
+        arrays: dict[str, Callable[[], NDArray[np.float32]]] = {"truth": event.truth_part}
         arrays |= {model: partial(self.chosen.images, event, model) for model in self.chosen.models}
         arrays |= {f"radon{n}": partial(event.radon, n) for n in self.chosen.radon_counts}
         for name, array in arrays.items():

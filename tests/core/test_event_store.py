@@ -333,7 +333,7 @@ def test_a_part_reads_only_what_it_needs(tmp_path, monkeypatch):
     whole, all_of_it = event.truth.array, len(read)
     part = (slice(33, 39), slice(30, 45), slice(40, 41))
     read.clear()
-    assert np.array_equal(event.truth_part(part), whole[part]) and 0 < len(read) < all_of_it / 4
+    assert np.array_equal(event.truth_part(part), whole[part]) and 0 < len(read) <= 2 < all_of_it
     # bricks without activity are in no file, and zeros
     assert all_of_it < 27 and np.array_equal(whole, event.truth_part()) and whole.any()
 

@@ -81,7 +81,7 @@ def pack(kind: str, fields: dict[str, str], fill: Callable[[Any], None]) -> memo
     with h5py.File(memory, "w", userblock_size=HEADER) as file:
         fill(file)
     with memory.getbuffer() as content:
-        table = _table(content[HEADER:])
+        table = digests(content[HEADER:])
     seal = Seal(kind, memory.seek(0, os.SEEK_END) - HEADER, "", fields)
     seal = replace(seal, sha256=seal.digest(table))
     memory.write(table)
@@ -182,7 +182,7 @@ class _Sealed(io.RawIOBase):
         content = self._file.read(self._seal.size)
         if hashlib.sha256(content).hexdigest() != self._seal.sha256:
             raise InputError("changed: its bytes are not those that were written")
-        return _table(content)
+        return digests(content)
 
     def body(self, start: int, stop: int) -> bytes:
         """The HDF5's bytes from `start` to `stop`."""
@@ -223,7 +223,7 @@ class _Sealed(io.RawIOBase):
         return len(data)
 
 
-def _table(content: bytes | memoryview) -> bytes:
+def digests(content: bytes | memoryview) -> bytes:
     """The SHA-256 of each block."""
     return b"".join(hashlib.sha256(content[i : i + _BLOCK]).digest() for i in range(0, len(content), _BLOCK))
 

@@ -74,6 +74,7 @@ class Making(Iterator[Made]):
                 self.folder.complete_index()
             raise
         self.folder.complete_index()
+        store.remove_leftovers()  # of workers that died
         if store.shards.is_dir():
             _pack(store)
 

@@ -14,7 +14,6 @@ import tempfile
 import time
 import warnings
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -43,9 +42,9 @@ def many(folder: Path, count: int) -> mph.events.EventRecipe:
     body = bytes(1000)
     for number in range(count - count // 50):
         fields = {"event": str(number), "recipe": target.recipe.fingerprint, "build": build()}
-        seal = hdf5.Seal("mphDRR event", len(body), "", fields)
+        seal = hdf5.Seal("mphDRR event", len(body), fields)
         table = hdf5.digests(body)
-        seal = replace(seal, sha256=seal.digest(table))
+        seal = seal._replace(sha256=seal.digest(table))
         target.store.event_path(number).write_bytes(seal.text() + body + table)
     target.complete_index()
     return recipe

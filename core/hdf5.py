@@ -9,13 +9,13 @@ import hashlib
 import io
 import math
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,11 +23,13 @@ from numpy.typing import NDArray
 from .errors import InputError, naming
 from .files import require_file
 from .memory import require
+from .progress import Cancelled
 
 HEADER = 512
 """Bytes of text before the HDF5 data."""
 _BLOCK, _DIGEST = 1 << 16, 32
 _VERSION = 2
+_TEXT = re.compile(rb"(mphDRR [a-zA-Z0-9 ]+) (\d+)\n((?:\w+ \w+\n)*)bytes (\d+)\nsha256 (\w{64})\n\0*")
 _PROBE_SECONDS = 60
 _PROBE = (  # what hangs HDF5 hangs a process that can be ended
     "import h5py, sys\n"
@@ -36,20 +38,19 @@ _PROBE = (  # what hangs HDF5 hangs a process that can be ended
 )
 
 
-@dataclass(frozen=True)
-class Seal:
+class Seal(NamedTuple):
     """The text at the beginning of a sealed file."""
 
     kind: str  # such as "mphDRR event"
     size: int  # bytes of HDF5
-    sha256: str  # of the lines before it and of the table of blocks; in version 1, of the HDF5
-    fields: dict[str, str] = field(default_factory=dict)
+    fields: dict[str, str]
+    sha256: str = ""  # of the lines before it and of the table of blocks; in version 1, of the HDF5
     version: int = _VERSION
 
     @property
     def file_size(self) -> int:
         """Bytes of the whole file."""
-        return file_size(self.size, self.version)
+        return HEADER + self.size + (0 if self.version == 1 else _DIGEST * -(-self.size // _BLOCK))
 
     def lines(self, **more: str) -> bytes:
         """The text's lines before the last."""
@@ -65,11 +66,6 @@ class Seal:
         return hashlib.sha256(self.lines() + table).hexdigest()
 
 
-def file_size(size: int, version: int = _VERSION) -> int:
-    """Bytes of a sealed file with so many bytes of HDF5."""
-    return HEADER + size + (0 if version == 1 else _DIGEST * -(-size // _BLOCK))
-
-
 def pack(kind: str, fields: dict[str, str], fill: Callable[[Any], None]) -> memoryview:
     """The bytes of a sealed file, in which `fill` puts what it holds: an ``h5py.File``, open for writing.
 
@@ -82,40 +78,43 @@ def pack(kind: str, fields: dict[str, str], fill: Callable[[Any], None]) -> memo
         fill(file)
     with memory.getbuffer() as content:
         table = digests(content[HEADER:])
-    seal = Seal(kind, memory.seek(0, os.SEEK_END) - HEADER, "", fields)
-    seal = replace(seal, sha256=seal.digest(table))
+    seal = Seal(kind, memory.seek(0, os.SEEK_END) - HEADER, fields)
+    seal = seal._replace(sha256=seal.digest(table))
     memory.write(table)
     memory.seek(0)
     memory.write(seal.text())
     return memory.getbuffer()
 
 
-def read_seal(file: BinaryIO, offset: int = 0) -> Seal | None:
-    """The seal of what begins at `offset` of an open file; None where there is none. `InputError` where it is damaged."""
-    file.seek(offset)
-    start = file.read(HEADER)
-    if not start.startswith(b"mphDRR "):
+def parse_seal(start: bytes) -> Seal | None:
+    """The seal that the first `HEADER` bytes of a file are; None where they are none. `InputError` where it is damaged."""
+    found = _TEXT.fullmatch(start)
+    if found is None:
+        if start.startswith(b"mphDRR "):
+            raise InputError(f"changed: its first {HEADER} bytes are not as they were written")
         return None
-    try:
-        (kind, version), *lines = (
-            line.rpartition(" ")[::2] for line in start.rstrip(b"\0").decode("ascii").splitlines()
-        )
-        values = dict(lines)
-        seal = Seal(kind, int(values.pop("bytes")), values.pop("sha256"), values, int(version))
-    except (ValueError, KeyError):
-        raise InputError("changed: its first line is not as it was written") from None
-    if seal.version > _VERSION:
-        raise InputError(f"written by a newer mphDRR (format {seal.version}); update to read it")
-    if seal.text() != start:
-        raise InputError(f"changed: its first {HEADER} bytes are not as they were written")
-    return seal
+    kind, version, fields, size, sha256 = found.groups()
+    if int(version) > _VERSION:
+        raise InputError(f"written by a newer mphDRR (format {version.decode()}); update to read it")
+    named = dict(line.split(" ") for line in fields.decode().splitlines())
+    return Seal(kind.decode(), int(size), named, sha256.decode(), int(version))
 
 
-def verify(file: BinaryIO, seal: Seal, offset: int = 0) -> None:
+def read_seal(file: BinaryIO, offset: int = 0) -> Seal | None:
+    """The seal of what begins at `offset` of an open file, as of `parse_seal`."""
+    file.seek(offset)
+    return parse_seal(file.read(HEADER))
+
+
+def verify(path: str | os.PathLike[str], offset: int = 0) -> None:
     """Raise `InputError` unless every byte of a sealed file, which begins at `offset`, is as it was written."""
-    blocks = _Sealed(file, seal, offset)
-    for start in range(0, seal.size, _BLOCK):
-        blocks.body(start, min(start + _BLOCK, seal.size))
+    with open(path, "rb") as file:
+        seal = read_seal(file, offset)
+        if seal is None:
+            raise InputError("it has no seal")
+        blocks = _Sealed(file, seal, offset)
+        for start in range(0, seal.size, _BLOCK):
+            blocks.body(start, min(start + _BLOCK, seal.size))
 
 
 @contextmanager
@@ -138,18 +137,9 @@ def opened(path: str | os.PathLike[str], offset: int = 0) -> Iterator[Any]:
                 with h5py.File(path if sealed is None else sealed, "r") as content:
                     _refuse_foreign(content)
                     yield content
-        except (
-            OSError,
-            RuntimeError,
-            SystemError,
-            ArithmeticError,
-            LookupError,
-            ValueError,
-            TypeError,
-            AttributeError,
-        ) as error:
-            if isinstance(error, InputError):
-                raise
+        except (InputError, MemoryError, Cancelled):
+            raise
+        except Exception as error:  # whatever HDF5 raises on a damaged file
             lines = (str(error) or type(error).__name__).splitlines()
             raise InputError(f"cannot be read as HDF5 ({lines[0]})") from error
 

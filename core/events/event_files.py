@@ -3,7 +3,6 @@
 import itertools
 import json
 import os
-import re
 import zlib
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -26,7 +25,6 @@ _KIND = "mphDRR event"
 _COMPRESS_FROM = 1 << 13  # bytes: below, compressing costs more than it saves
 _BRICK = 32  # voxels along each axis of the truth's chunks, which are left out where they are empty
 _PIECE = 1 << 18  # numbers in a chunk of a list
-_TEXT = re.compile(rb"mphDRR event (\d+)\nevent (\d+)\nrecipe (\w+)\n(?:build (\w+)\n)?bytes (\d+)\nsha256 \w{64}\n\0*")
 
 Floats = NDArray[np.float32]
 
@@ -76,25 +74,22 @@ def header(place: Place) -> Header:
             os.close(descriptor)
     except OSError as error:
         raise InputError(f"{path}: {error.strerror or error}") from None
-    found = _TEXT.fullmatch(start)
-    if found is None:
+    try:
+        seal = hdf5.parse_seal(start)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    if seal is None or seal.kind != _KIND or "recipe" not in seal.fields:
         raise InputError(f"{path}: not an event of mphDRR")
-    version, event, recipe, build, body = found.groups(b"")
-    if int(version) > VERSION:
-        raise InputError(f"{path}: written by a newer mphDRR (format {version.decode()}); update to read it")
-    whole = hdf5.file_size(int(body), int(version))
-    if size != whole:
-        raise InputError(f"{path}: cut: {size} of {whole} bytes")
-    return Header(int(event), recipe.decode(), whole, build.decode())
+    if size != seal.file_size:
+        raise InputError(f"{path}: cut: {size} of {seal.file_size} bytes")
+    return Header(int(seal.fields.get("event", -1)), seal.fields["recipe"], size, seal.fields.get("build", ""))
 
 
 def verify(place: Place) -> Header:
     """The header of an event's file, after every byte of the file was compared with it; `InputError` says what is wrong."""
     found = header(place)
-    with naming(place.path), open(place.path, "rb") as file:
-        seal = hdf5.read_seal(file, place.offset)
-        assert seal is not None  # as `header` has found
-        hdf5.verify(file, seal, place.offset)
+    with naming(place.path):
+        hdf5.verify(place.path, place.offset)
     return found
 
 

@@ -107,7 +107,7 @@ def folder_for_event(folder: Path, others: Path) -> Path:
 
 DAMAGE = {
     cut: "cut: ", other_recipe: "of another recipe", changed_byte: "changed: its bytes", missing: "missing",
-    renamed: "it is event 0", header_byte: "not an event of mphDRR", foreign: "not of this set",
+    renamed: "it is event 0", header_byte: "changed: its first", foreign: "not of this set",
     leftover: "interrupted", index: "changed: it is not what recipe.toml says",
     index_saved_elsewhere: "changed: ", index_cut_between_rows: "changed: ", index_of_no_text: "changed: ",
     foreign_event: "not in the index", folder_for_event: "",

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from ..errors import InputError, refusing
 from ..files import ensure_folder
+from ..memory import cores
 from ..progress import Progress, tell
 from .event_files import header, verify
 from .folders import EVENTS, INDEX, INPUT_LIST, INPUTS, RECIPE, SetFolder, is_leftover
@@ -89,7 +90,7 @@ def check(folder: str | os.PathLike[str], progress: Progress | None = None) -> l
         return Fault("foreign", fault.path, f"{fault.text}, and not in the index")  # nobody asked for it
 
     numbers = sorted({*planned, *there})
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
+    with ThreadPoolExecutor(cores()) as pool:
         for done, fault in enumerate(pool.map(faults_of, numbers), 1):
             if fault is not None:
                 faults.append(fault)

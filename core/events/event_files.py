@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..geometry.grid import Grid
+from ..memory import cores
 from ..runs.run import versions
 from ..volumes.volume import Volume
 from .making import EventArrays
@@ -111,7 +112,7 @@ def packed(event: EventArrays, recipe: EventRecipe, geometry: dict[str, Any], th
 
     planned = event.planned
     memory = io.BytesIO()
-    with ThreadPoolExecutor(threads) as pool, h5py.File(memory, "w", userblock_size=HEADER) as file:
+    with ThreadPoolExecutor(threads or cores()) as pool, h5py.File(memory, "w", userblock_size=HEADER) as file:
         file.attrs.update({
             "format": _FORMAT, "format_version": VERSION, "conventions": CONVENTIONS, "recipe_sha256": recipe.fingerprint,
             "event": planned.number, "phantom": planned.name, "split": planned.split or "",

@@ -88,7 +88,7 @@ def reconstruct_run(
         also = f"; for these images: {others}" if others else ""
         raise InputError(f"reconstruction.method: {method.name} needs a run of counts, not of line integrals{also}")
     grid = reconstruction_grid(run, recipe)
-    require(16.0 * grid.n_voxels, "a reconstruction of {} x {} x {} voxels".format(*grid.shape))
+    require(22.0 * grid.n_voxels, "a reconstruction of {} x {} x {} voxels".format(*grid.shape))
     modelled = model_of(run, recipe)
     flatters = flattering(run, grid, modelled)
     for text in flatters:

@@ -134,6 +134,13 @@ def strict_whole(value: Any, name: str, expected: str) -> int:
     return int(value)
 
 
+def seed_number(value: Any, name: str = "seed", also: str = "") -> int:
+    """`value` as a whole number from 0 to 2^64 - 1, which every file can hold, or `InputError`; `also` may stand there."""
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or not 0 <= value < 2**64:
+        raise InputError(f"{name}: expected {also}a whole number from 0 to 2^64 - 1, got {_short(value)}")
+    return int(value)
+
+
 def positive(value: Any, name: str, unit: str = "") -> float:
     """`value` as a finite number above 0, or `InputError`."""
     number = float(real_array(value, name, ()))

@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import InputError
-from ..files import ensure_folder, replacing
+from ..files import ensure_folder, folder_path, replacing
+from .cells import escaped, unescaped
 from .event_files import header
 from .inputs import Input
 from .planning import plan
@@ -28,7 +29,7 @@ class SetFolder:
     """Where everything of an event set is; nothing is read before it is asked for."""
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
-        self.path = Path(path).absolute()
+        self.path = folder_path(path)
         self.recipe_path, self.index_path = self.path / RECIPE, self.path / INDEX
         self.inputs, self.events = self.path / INPUTS, self.path / EVENTS
 
@@ -60,8 +61,7 @@ class SetFolder:
         """The set's recipe, with the copies of the files that it names; `InputError` where there is none."""
         if not self.recipe_path.is_file():
             raise InputError(f"{self.path}: no event set: it holds no {RECIPE}")
-        read = read_recipe(self.recipe_path)
-        return EventRecipe(read.text, read.name, read.folder, self.copies())
+        return read_recipe(self.recipe_path, self.copies())
 
     def copies(self) -> dict[str, Input]:
         """The set's copies of the files that the recipe names, by their names there; empty where none are made yet."""
@@ -93,7 +93,7 @@ class SetFolder:
                     f"{self.path}: holds {others[0]} and no {RECIPE}: choose a new folder for the event set"
                 )
             _write_text(self.recipe_path, recipe.text)
-        there = read_recipe(self.recipe_path)
+        there = read_recipe(self.recipe_path, self.copies())
         if there.values != recipe.values:
             no_events = "" if self.numbers() else f", or remove {self.path}, which holds no events yet"
             raise InputError(f"{self.recipe_path}: another recipe: choose another folder for {recipe.name}{no_events}")
@@ -167,7 +167,7 @@ class SetFolder:
         writer = csv.DictWriter(text, columns, restval="", lineterminator="\n")
         writer.writeheader()
         for row in rows:
-            writer.writerow({key: value if isinstance(value, str) else json.dumps(value) for key, value in row.items()})
+            writer.writerow({key: escaped(v) if isinstance(v, str) else json.dumps(v) for key, v in row.items()})
         return text.getvalue()
 
     def write_index(self, numbers: Iterable[int]) -> None:
@@ -204,8 +204,8 @@ def _value(key: str, text: str | None) -> Any:
     if not text:
         return None
     if key in ("phantom", "split", "file"):
-        return text
+        return unescaped(text)
     try:
         return json.loads(text)
     except ValueError:
-        return text
+        return unescaped(text)

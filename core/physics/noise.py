@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InputError
-from ..validation import real_array
+from ..validation import real_array, seed_number
 
 # numpy draws no Poisson numbers with a larger mean.
 _LARGEST_MEAN = 9e18
@@ -14,10 +14,9 @@ def sample_counts(mean: ArrayLike, seed: int) -> NDArray[np.int64]:
     """Counts drawn from Poisson distributions with given means.
 
     `mean` is (M, n_v, n_u) or any array whose first axis is the views. Each view has its own random generator, made from
-    the seed, a whole number of at least 0, and the view's index, so its counts do not depend on the other views.
+    the seed, a whole number from 0 to 2^64 - 1, and the view's index, so its counts do not depend on the other views.
     """
-    if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
-        raise InputError(f"seed: expected a whole number of at least 0, got {seed!r}")
+    seed = seed_number(seed)
     values = real_array(mean, "expected counts", None)
     if not values.ndim:
         raise InputError("expected counts: expected an array whose first axis is the views, got one number")
@@ -27,6 +26,6 @@ def sample_counts(mean: ArrayLike, seed: int) -> NDArray[np.int64]:
         )
     counts = np.empty(values.shape, np.int64)
     for view, expected in enumerate(values):
-        generator = np.random.default_rng(np.random.SeedSequence(int(seed), spawn_key=(view,)))
+        generator = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(view,)))
         counts[view] = generator.poisson(expected)
     return counts

@@ -136,8 +136,10 @@ def strict_whole(value: Any, name: str, expected: str) -> int:
 
 def seed_number(value: Any, name: str = "seed", also: str = "") -> int:
     """`value` as a whole number from 0 to 2^64 - 1, which every file can hold, or `InputError`; `also` may stand there."""
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or not 0 <= value < 2**64:
-        raise InputError(f"{name}: expected {also}a whole number from 0 to 2^64 - 1, got {_short(value)}")
+    is_whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
+    if not is_whole or not 0 <= value < 2**64:
+        bound = "below 2^64" if is_whole and value > 0 else "of at least 0"
+        raise InputError(f"{name}: expected {also}a whole number {bound}, got {_short(value)}")
     return int(value)
 
 

@@ -175,7 +175,7 @@ def _require_fitting(arguments: argparse.Namespace, is_text: bool) -> None:
         if arguments.count > 1 or any(arguments.box):
             raise InputError("--count and --box need --random")
     else:
-        seed_number(arguments.random, "--random")
+        seed_number(arguments.random, "--random", "a seed, ")
         refuse(arguments, ("euler",), "has no effect with --random, which draws the angles")
     if "frames" in arguments:
         refuse(arguments, (f"{_DEST}phase",), "has no effect with --frames, which takes phases evenly over the cycle")

@@ -18,7 +18,7 @@ def checked_noise(noise: object) -> NoiseChoice:
     """`noise` where it is one of a `NoiseChoice`, or `InputError`."""
     if noise is None or noise == "own":
         return noise  # type: ignore[return-value]
-    return seed_number(noise, "noise", "own, or a seed: ")
+    return seed_number(noise, f"noise {noise!r:.40}", "own, or a seed: ")
 
 
 def chosen_seed(own: int, noise: NoiseChoice) -> int | None:

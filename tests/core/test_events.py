@@ -320,9 +320,9 @@ def test_a_beating_torso_is_the_mean_of_its_gates(tmp_path):
     [
         ("version = 1", "", "version: missing"),
         ("version = 1", "version = 2", "version: expected 1, got 2"),
-        ("seed = 5", "seed = -5", r"seed: expected a whole number from 0 to 2\^64 - 1, got -5"),
-        ("seed = 5", f"seed = {2**64}", r"seed: expected a whole number from 0 to 2\^64 - 1, got 18446744073709551616"),
-        ("seed = 5", "seed = 1e3", r"seed: expected a whole number from 0 to 2\^64 - 1, got 1000.0"),
+        ("seed = 5", "seed = -5", "seed: expected a whole number of at least 0, got -5"),
+        ("seed = 5", f"seed = {2**64}", r"seed: expected a whole number below 2\^64, got 18446744073709551616"),
+        ("seed = 5", "seed = 1e3", "seed: expected a whole number of at least 0, got 1000.0"),
         ("seed = 5", "sed = 5", "sed: no such entry; expected version, seed"),
         ("spacing = 6.0", "", "truth.spacing: missing"),
         ("[radon]", "[rdon]", "rdon: no such entry"),

@@ -13,7 +13,7 @@ from ...events.making import EventMaker
 from ...events.recipe import EventRecipe, read_recipe
 from ...events.work import Made, making
 from ...memory import readable_size
-from ..options import add_command
+from ..options import add_command, print_answer
 
 
 def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
@@ -39,6 +39,7 @@ def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     parser.add_argument("--shard", type=_shard, default=(1, 1), metavar="I/N", help=text)
     text = "let the workers of a Dask cluster make them, which see SET under the same path; local: --workers of this machine"
     parser.add_argument("--dask", metavar="ADDRESS|local", help=text)
+    parser.add_argument("--json", action="store_true", help="say what there is at the end as JSON")
     parser.add_argument("--quiet", action="store_true", help="say nothing on standard error but warnings")
     parser.set_defaults(run=_run)
 
@@ -69,8 +70,9 @@ def _run(arguments: argparse.Namespace) -> None:
     )
     done = watched(work, SetFolder(arguments.folder), arguments.quiet, arguments.shard)
     folder = SetFolder(arguments.folder)
-    there = len(folder.numbers())
-    print(f"{arguments.folder}: {there} of {len(folder.planned())} events, {done} made now")
+    record = {"folder": arguments.folder, "asked": len(folder.planned()), "events": len(folder.numbers()), "made": done}
+    said = "{folder}: {events} of {asked} events, {made} made now".format(**record)
+    print_answer(arguments, record, [said])
 
 
 def watched(work: Iterator[Made], folder: SetFolder, quiet: bool, shard: tuple[int, int] = (1, 1)) -> int:

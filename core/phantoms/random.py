@@ -25,7 +25,7 @@ def random_pose(
     if isinstance(seed, np.random.Generator):
         rng = seed
     else:
-        rng = np.random.default_rng(seed_number(seed, also="a numpy Generator or "))
+        rng = np.random.default_rng(seed_number(seed))
     one_side = isinstance(box, int | float | np.integer | np.floating)
     sides = real_array(np.full(3, box) if one_side else box, "box of random poses", (3,))
     if np.any(sides < 0):

@@ -1,5 +1,7 @@
-"""Adds the library of the C kernels to the package that pyproject.toml describes."""
+"""Adds the library of the C kernels to the package that pyproject.toml describes, and what type checkers read."""
 
+import ast
+import os
 import sys
 from pathlib import Path
 
@@ -12,17 +14,35 @@ sys.path.insert(0, str(ROOT / "tools"))
 import build_kernels  # noqa: E402
 
 
+def stub_of(source):
+    """Give what says the names of a package's public interface to type checkers: imports count if they name them twice."""
+    imports = [node for node in ast.parse(source).body if isinstance(node, ast.ImportFrom)]
+    lines = [
+        f"from {'.' * node.level}{node.module or ''} import {name.name} as {name.name}\n"
+        for node in imports
+        for name in node.names
+    ]
+    return "".join(lines)
+
+
 class WithKernels(build_py):
     """Builds the library into the package; into the tree itself for `pip install -e`."""
+
+    def find_package_modules(self, package, package_dir):
+        """Leave out this file, which lies beside the package's own."""
+        return [found for found in super().find_package_modules(package, package_dir) if found[1] != "setup"]
 
     def run(self):
         """Do so, or say that there is none for this machine."""
         super().run()
+        if not self.editable_mode:
+            stub = Path(self.build_lib, "mphdrr", "core", "__init__.pyi")
+            stub.write_text(stub_of((ROOT / "core" / "__init__.py").read_text(encoding="utf-8")), encoding="utf-8")
         if name := self.get_finalized_command("bdist_wheel").kernels:
             folder = build_kernels.KERNELS.relative_to(ROOT)
             build_kernels.build(name, ROOT / folder if self.editable_mode else Path(self.build_lib, "mphdrr", folder))
         else:
-            self.warn("the C kernels are not built for this machine: torch and numpy do the work")
+            self.warn("the C kernels are not built: torch or numpy does the work, many times slower")
 
 
 class PlatformWheel(bdist_wheel):
@@ -30,7 +50,8 @@ class PlatformWheel(bdist_wheel):
 
     def finalize_options(self):
         """Choose the platform."""
-        self.kernels = self.plat_name or build_kernels.this_platform()
+        without = os.environ.get(build_kernels.WITHOUT_KERNELS)
+        self.kernels = None if without else self.plat_name or build_kernels.this_platform()
         super().finalize_options()
 
     def get_tag(self):

@@ -4,7 +4,6 @@ The arrays' column index grows along +u, so an image's columns are reversed; its
 Each module has two: one holds the exact float32 numbers in R, G and B, the other, as the mosaic, shows them in colours.
 """
 
-import os
 from collections.abc import Callable, Generator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -15,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.geometry.views import Views
+from ..core.memory import cores
 from ..core.progress import Progress, tell
 from ..core.runs.display import Display
 from ..core.runs.exr import exr_bytes
@@ -220,7 +220,7 @@ def _in_threads(
 ) -> list[bytes]:
     """What `make` makes of each picture."""
     files: list[bytes] = []
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
+    with ThreadPoolExecutor(cores()) as pool:
         for file in pool.map(make, pictures):
             files.append(file)
             tell(progress, done + len(files), total)

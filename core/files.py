@@ -140,17 +140,29 @@ def _to_disk(path: Path) -> None:
 
 def refuse_folder(path: Path) -> None:
     """Raise `InputError` if `path` is a folder or cannot be the name of a file."""
+    if _is_folder(path):
+        raise InputError(f"{path}: is a folder; expected the name of a file to write")
+
+
+def _is_folder(path: Path) -> bool:
     if "\0" in str(path):
         raise InputError(f"{str(path)!r}: not a file name (it holds a NUL)")
     with refusing(repr(str(path)), "not a file name"):  # such as one that is too long
-        is_folder = path.is_dir()
-    if is_folder:
-        raise InputError(f"{path}: is a folder; expected the name of a file to write")
+        return path.is_dir()
+
+
+def folder_path(path: str | os.PathLike[str]) -> Path:
+    """The absolute path of a folder, there or not; `InputError` where it cannot be one's name, such as an empty one."""
+    if not os.fspath(path):
+        raise InputError("expected the name of a folder, got an empty one (. is the current folder)")
+    folder = Path(path).absolute()
+    _is_folder(folder)
+    return folder
 
 
 def ensure_folder(path: str | os.PathLike[str]) -> Path:
     """Make the folder `path` and its parents unless they exist; `InputError` if it cannot be made or written to."""
-    folder = Path(path).absolute()
+    folder = folder_path(path)
     probe = folder / f".{uuid.uuid4().hex[:8]}"
     with refusing(folder, "cannot be written"):
         folder.mkdir(parents=True, exist_ok=True)

@@ -1,9 +1,10 @@
 """Progress and cancellation of long work."""
 
-import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, TypeVar
+
+from .memory import cores
 
 Part = TypeVar("Part")
 
@@ -50,7 +51,7 @@ def part_of(progress: Progress | None, number: int, count: int) -> Progress | No
 
 
 def in_threads(work: Callable[[Part], None], parts: Sequence[Part], progress: Progress | None = None) -> None:
-    """Call ``work(part)`` for all parts, in a thread for each processor core; an exception of `progress` stops the rest."""
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
+    """Call ``work(part)`` for all parts, in a thread for each core of the job; an exception of `progress` stops the rest."""
+    with ThreadPoolExecutor(cores()) as pool:
         for done, _ in enumerate(pool.map(work, parts), 1):
             tell(progress, done, len(parts))  # leaving the loop cancels the parts that have not begun

@@ -134,6 +134,15 @@ def strict_whole(value: Any, name: str, expected: str) -> int:
     return int(value)
 
 
+def seed_number(value: Any, name: str = "seed", also: str = "") -> int:
+    """`value` as a whole number from 0 to 2^64 - 1, which every file can hold, or `InputError`; `also` may stand there."""
+    is_whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
+    if not is_whole or not 0 <= value < 2**64:
+        bound = "below 2^64" if is_whole and value > 0 else "of at least 0"
+        raise InputError(f"{name}: expected {also}a whole number {bound}, got {_short(value)}")
+    return int(value)
+
+
 def positive(value: Any, name: str, unit: str = "") -> float:
     """`value` as a finite number above 0, or `InputError`."""
     number = float(real_array(value, name, ()))

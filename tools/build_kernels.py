@@ -7,6 +7,7 @@ once per level of processor and number type.
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import os
 import platform
 import shutil
@@ -17,6 +18,8 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
+WITHOUT_KERNELS = "MPHDRR_WITHOUT_KERNELS"
+"""Environment variable that asks for a package without the library."""
 KERNELS = Path(__file__).resolve().parents[1] / "core/projector/backends/kernels"
 AVX2 = ("-mavx2", "-mfma", "-mprfchw")
 AVX512 = (*AVX2, "-mavx512f", "-mavx512vl", "-mavx512dq", "-mavx512bw")
@@ -89,6 +92,11 @@ def build(name: str, folder: Path) -> Path:
     two minutes.
     """
     made_for = PLATFORMS[name]
+    if importlib.util.find_spec("ziglang") is None:
+        raise SystemExit(
+            "the C kernels need a compiler that is missing: pip install ziglang==0.17.1; or set the environment variable "
+            f"{WITHOUT_KERNELS}=1, and torch or numpy does their work, many times slower"
+        )
     with tempfile.TemporaryDirectory() as objects:
         options = (
             "-dynamic",

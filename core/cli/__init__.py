@@ -6,6 +6,7 @@ arguments. `addon.cli` adds those that need Blender.
 
 import argparse
 import contextlib
+import io
 import sys
 import warnings
 from collections.abc import Callable, Sequence
@@ -28,6 +29,9 @@ class _Parser(argparse.ArgumentParser):
         super().__init__(*arguments, **details)
         for name in (None, "store"):
             self.register("action", name, NotingStore)
+
+    def _print_message(self, message: str, file: Any = None) -> None:
+        (file or sys.stderr).write(message)  # argparse would not say that it cannot be written
 
     def error(self, message: str) -> NoReturn:
         sys.stderr.write(f"{self.prog}: {message} (see {self.prog} --help)\n")
@@ -54,6 +58,25 @@ def build_parser(more_commands: Sequence[AddParser] = ()) -> argparse.ArgumentPa
 
 def main(argv: Sequence[str] | None = None, more_commands: Sequence[AddParser] = ()) -> int:
     """Run one command line and return its exit status: 0, 1 (the user's input), 2 (usage) or 130 (interrupted)."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")  # a terminal of ASCII has no µ, ° or …
+    try:
+        status = _status(argv, more_commands)
+        sys.stdout.flush()
+        return status
+    except (KeyboardInterrupt, Cancelled):
+        return _fail("cancelled; no file is left half-written", INTERRUPTED)
+    except OSError as error:
+        if error.filename is None:
+            with contextlib.suppress(OSError):
+                sys.stdout.close()  # Python would say it once more when it ends
+        if isinstance(error, BrokenPipeError):  # the reader, such as `head`, has had enough
+            return OK
+        return _fail(f"{error.filename or 'output'}: {error.strerror or error}", INPUT_ERROR)
+
+
+def _status(argv: Sequence[str] | None, more_commands: Sequence[AddParser]) -> int:
     try:
         arguments = build_parser(more_commands).parse_args(argv)
     except SystemExit as stop:  # --help, --version and usage errors
@@ -67,11 +90,6 @@ def main(argv: Sequence[str] | None = None, more_commands: Sequence[AddParser] =
             return _fail(str(error), INPUT_ERROR)
         except MemoryError:
             return _fail("not enough memory: choose fewer voxels or pixels", INPUT_ERROR)
-        except (KeyboardInterrupt, Cancelled):
-            return _fail("cancelled; no file is left half-written", INTERRUPTED)
-        except BrokenPipeError:  # the reader, such as `head`, has had enough
-            with contextlib.suppress(OSError):
-                sys.stdout.close()
     return OK
 
 

@@ -44,6 +44,8 @@ class NotingStore(argparse.Action):
         self, parser: argparse.ArgumentParser, namespace: argparse.Namespace, values: Any, option_string: Any = None
     ) -> None:
         """Called by argparse."""
+        if "" in (values if isinstance(values, list) else [values]):
+            parser.error(f"argument {'/'.join(self.option_strings) or self.metavar or self.dest}: got an empty text")
         setattr(namespace, self.dest, values)
         vars(namespace).setdefault("typed", {})[self.dest] = option_string
 

@@ -19,7 +19,7 @@ from ..phantoms.language import read_phantom, write_phantom
 from ..phantoms.phantom import QUANTITIES, Phantom, ShapePhantom
 from ..phantoms.random import random_pose
 from ..phantoms.shapes import Box, Cylinder, Ellipsoid, Sphere
-from ..validation import whole_shape
+from ..validation import seed_number, whole_shape
 from ..volumes.volume import UNITS
 from ..volumes.volume_files import VOLUME_FORMATS, write_volume
 from .options import add_command, numbered_path, one_or_three, output_path, progress_bar, refuse
@@ -174,9 +174,8 @@ def _require_fitting(arguments: argparse.Namespace, is_text: bool) -> None:
     if arguments.random is None:
         if arguments.count > 1 or any(arguments.box):
             raise InputError("--count and --box need --random")
-    elif arguments.random < 0:
-        raise InputError(f"--random: expected a seed of at least 0, got {arguments.random}")
     else:
+        seed_number(arguments.random, "--random", "a seed, ")
         refuse(arguments, ("euler",), "has no effect with --random, which draws the angles")
     if "frames" in arguments:
         refuse(arguments, (f"{_DEST}phase",), "has no effect with --frames, which takes phases evenly over the cycle")

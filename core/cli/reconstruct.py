@@ -63,11 +63,12 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
 
 
 def _chosen(arguments: argparse.Namespace, run: ProjectionRun) -> Recipe:
-    recipe = recipe_of(run, None if arguments.recipe is None else read_recipe(arguments.recipe))
+    asked = Recipe() if arguments.recipe is None else read_recipe(arguments.recipe)
     changes = typed_entries(arguments)
     for key in changes:
         if key.partition(".")[0] not in TABLES:
             raise InputError(f"--set {key}: expected an entry of {', '.join(f'[{table}]' for table in TABLES)}")
+    recipe = recipe_of(run, asked if "recipe" in run.settings else asked.updated(changes))
     if changes.get("attenuation.file") is not None:  # instead of what attenuated in the run
         changes = {"attenuation.of_phantom": None, "attenuation.object": None} | changes
     return recipe.updated(changes)

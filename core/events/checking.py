@@ -10,6 +10,7 @@ from pathlib import Path
 
 from ..errors import InputError, refusing
 from ..files import ensure_folder, is_leftover, written_name
+from ..memory import cores
 from ..progress import Progress, tell
 from .event_files import Place, header, verify
 from .folders import ASKED, INDEX, INPUT_LIST, INPUTS, RECIPE, SetFolder
@@ -103,7 +104,7 @@ def check(folder: str | os.PathLike[str], progress: Progress | None = None) -> l
         return Fault("foreign", fault.path, f"{fault.text}, and not in the index")  # nobody asked for it
 
     numbers = sorted({*planned, *places})
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
+    with ThreadPoolExecutor(cores()) as pool:
         for done, fault in enumerate(pool.map(faults_of, numbers), 1):
             if fault is not None:
                 faults.append(fault)

@@ -49,13 +49,6 @@ def share(value: Any, name: str) -> float:
     return number
 
 
-def seed_of(value: Any) -> int:
-    """A whole number of at least 0."""
-    if isinstance(value, bool) or not isinstance(value, int) or value < 0:
-        raise InputError(f"seed: expected a whole number of at least 0, got {value!r}")
-    return value
-
-
 @dataclass(frozen=True)
 class PhantomEntry:
     """One of the phantoms that an event may have."""

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from .. import hdf5
 from ..errors import InputError, naming
 from ..geometry.grid import Grid
+from ..memory import cores
 from ..runs.run import versions
 from ..version import build
 from ..volumes.volume import Volume
@@ -125,7 +126,7 @@ def packed(event: EventArrays, recipe: EventRecipe, geometry: dict[str, Any], th
         for count, images in event.radon.items():
             _write_images(file, f"radon/{count}", images, f"{event.truth.unit} mm", recipe, pool)
 
-    with ThreadPoolExecutor(threads) as pool:
+    with ThreadPoolExecutor(threads or cores()) as pool:
         return hdf5.pack(_KIND, {"event": str(planned.number), "recipe": recipe.fingerprint, "build": build()}, fill)
 
 

@@ -5,10 +5,9 @@ import os
 import re
 from collections.abc import Sequence
 from functools import cached_property
-from pathlib import Path
 
 from ..errors import InputError, warn
-from ..files import ensure_folder, is_leftover, write_bytes, written_name
+from ..files import ensure_folder, folder_path, is_leftover, write_bytes, written_name
 from ..version import build
 from .event_files import Place, header
 from .index import Index
@@ -25,7 +24,7 @@ class SetFolder:
     """Where everything of an event set is; nothing is read before it is asked for."""
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
-        self.path = Path(path).absolute()
+        self.path = folder_path(path)
         self.recipe_path, self.inputs, self.asked_path = self.path / RECIPE, self.path / INPUTS, self.path / ASKED
         self.store = Store(self.path)
 
@@ -47,8 +46,7 @@ class SetFolder:
         """The set's recipe, with the copies of the files that it names; `InputError` where there is none."""
         if not self.recipe_path.is_file():
             raise InputError(f"{self.path}: no event set: it holds no {RECIPE}")
-        read = read_recipe(self.recipe_path)
-        return EventRecipe(read.text, read.name, read.folder, self.copies())
+        return read_recipe(self.recipe_path, self.copies())
 
     def copies(self) -> dict[str, Input]:
         """The set's copies of the files that the recipe names, by their names there; empty where none are made yet."""
@@ -80,7 +78,7 @@ class SetFolder:
                     f"{self.path}: holds {others[0]} and no {RECIPE}: choose a new folder for the event set"
                 )
             write_bytes(self.recipe_path, recipe.text.encode())
-        there, places = read_recipe(self.recipe_path), self.store.places()
+        there, places = read_recipe(self.recipe_path, self.copies()), self.store.places()
         if there.values != recipe.values:
             no_events = "" if places else f", or remove {self.path}, which holds no events yet"
             raise InputError(f"{self.recipe_path}: another recipe: choose another folder for {recipe.name}{no_events}")

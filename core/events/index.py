@@ -7,13 +7,14 @@ for. So works that write it at once need not wait for each other; the last one t
 import csv
 import io
 import json
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 from ..errors import InputError, refusing
 from ..files import write_bytes
+from .cells import escaped, unescaped
 from .planning import FIXED_COLUMNS, plan
 from .recipe import EventRecipe
 
@@ -36,7 +37,7 @@ class Index:
     def read(self) -> dict[int, str]:
         """The rows that are there, each a line as it is in the file; what is no row is left out."""
         try:
-            heading, *lines = self.path.read_text(encoding="utf-8").split("\n")
+            heading, *lines = _lines(self.path.read_bytes().decode())
         except FileNotFoundError:
             return {}
         except (OSError, ValueError) as error:
@@ -46,8 +47,8 @@ class Index:
             ) from None
         found = {int(first): line for line in lines if (first := line.partition(",")[0]).isdigit()}
         if heading != _csv(self.columns):  # of an earlier version: the columns of what was drawn
-            names = next(csv.reader([heading]), [])
-            rows = {n: dict(zip(names, next(csv.reader([line])), strict=False)) for n, line in found.items()}
+            names = _cells(heading)
+            rows = {n: dict(zip(names, _cells(line), strict=False)) for n, line in found.items()}
             found = {n: _csv([row.get(name, "") for name in self.columns]) for n, row in rows.items()}
         return found
 
@@ -55,11 +56,11 @@ class Index:
         """The row of an event, as the recipe says."""
         row = plan(self._recipe, number).row()
         values = (row.get(name, "") for name in self.columns)
-        return _csv([value if isinstance(value, str) else json.dumps(value) for value in values])
+        return _csv([escaped(value) if isinstance(value, str) else json.dumps(value) for value in values])
 
     def values(self, line: str) -> dict[str, Any]:
         """What a row says, by column; None where it is empty."""
-        return {name: _value(name, text) for name, text in zip(self.columns, next(csv.reader([line])), strict=True)}
+        return {name: _value(name, text) for name, text in zip(self.columns, _cells(line), strict=True)}
 
     def text(self, lines: Mapping[int, str]) -> bytes:
         """The file with these rows, in order."""
@@ -84,10 +85,26 @@ class Index:
             write_bytes(self.path, content)
 
 
+def _lines(text: str) -> Iterator[str]:
+    """The rows of a table: lines, but for line ends within quotes."""
+    begun = ""
+    for line in text.split("\n"):
+        begun += line
+        if begun.count('"') % 2 == 0:
+            yield begun
+            begun = ""
+        else:
+            begun += "\n"
+
+
 def column(line: str, place: int) -> str:
     """One of the first cells of a row."""
     cells = line.split(",", place + 1)
-    return next(csv.reader([line]))[place] if '"' in "".join(cells[: place + 1]) else cells[place]
+    return unescaped(_cells(line)[place] if '"' in "".join(cells[: place + 1]) else cells[place])
+
+
+def _cells(line: str) -> list[str]:
+    return next(csv.reader(io.StringIO(line, newline="")), [])
 
 
 def _csv(cells: Iterable[str]) -> str:
@@ -102,8 +119,8 @@ def _value(name: str, text: str) -> Any:
     if not text:
         return None
     if name in _TEXTS:
-        return text
+        return unescaped(text)
     try:
         return json.loads(text)
     except ValueError:
-        return text
+        return unescaped(text)

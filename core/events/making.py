@@ -30,6 +30,7 @@ from .planning import PlannedEvent, plan
 from .recipe import EventRecipe
 
 _KEPT_VOLUMES = 2
+_WORKER = 100 * 2**20  # bytes of a worker's Python and its libraries
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +78,7 @@ class EventMaker:
     def require_memory(self, workers: int = 1) -> None:
         """Raise `InputError` where so many events at once do not fit into memory, or the scanner cannot be read."""
         what = f"an event of {readable_size(self.raw_bytes)}" if workers == 1 else f"{workers} workers"
-        require(workers * 2.5 * self.raw_bytes, what)
+        require(workers * (2.5 * self.raw_bytes + (workers > 1) * _WORKER), what)
 
     def plan(self, number: int) -> PlannedEvent:
         """What an event is."""

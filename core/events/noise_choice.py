@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
+from ..validation import seed_number
 from .event_set import COUNTED, Event, EventSet
 
 NoiseChoice = int | Literal["own"] | None
@@ -17,9 +18,7 @@ def checked_noise(noise: object) -> NoiseChoice:
     """`noise` where it is one of a `NoiseChoice`, or `InputError`."""
     if noise is None or noise == "own":
         return noise  # type: ignore[return-value]
-    if isinstance(noise, bool) or not isinstance(noise, int | np.integer) or noise < 0:
-        raise InputError(f"noise {noise!r}: expected own, or a seed: a whole number of at least 0")
-    return int(noise)
+    return seed_number(noise, f"noise {noise!r:.40}", "own, or a seed: ")
 
 
 def chosen_seed(own: int, noise: NoiseChoice) -> int | None:

@@ -2,15 +2,18 @@
 
 import os
 import signal
+import sys
 import threading
 from collections import deque
 from collections.abc import Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from multiprocessing import get_context, parent_process
 from pathlib import Path
 
 from ..errors import InputError
+from ..memory import cores
 from .folders import SetFolder
 from .making import EventMaker
 from .writing import EventWriter, Written
@@ -44,7 +47,8 @@ def in_processes(target: SetFolder, numbers: Sequence[int], workers: int) -> Ite
         try:
             while waiting or under_way:
                 while waiting and len(under_way) < workers + 1:  # one more, so that no worker waits for the next
-                    under_way[pool.submit(_write, waiting[0])] = waiting[0]
+                    with _interrupts_held():
+                        under_way[pool.submit(_write, waiting[0])] = waiting[0]
                     waiting.popleft()
                 done, _ = wait(under_way, return_when=FIRST_COMPLETED)
                 for future in sorted(done, key=under_way.__getitem__):
@@ -62,19 +66,37 @@ def in_processes(target: SetFolder, numbers: Sequence[int], workers: int) -> Ite
                     '"__main__":)'
                 ) from None
             waiting.extendleft(reversed(missing))
+        except (KeyboardInterrupt, GeneratorExit):  # nobody waits for what is under way
+            for worker in list(pool._processes.values()):
+                worker.kill()
+            pool.shutdown(cancel_futures=True)
+            target.store.remove_leftovers()
+            raise
         finally:
-            pool.shutdown(wait=True, cancel_futures=True)  # what is under way is finished: it counts
+            pool.shutdown(cancel_futures=True)  # what is under way is finished: it counts
 
 
 def threads_each(workers: int) -> int:
-    """Of each worker: together they use all cores."""
-    return max(1, (os.cpu_count() or 1) // workers)
+    """Of each worker: together they use all cores of the job."""
+    return max(1, cores() // workers)
+
+
+@contextmanager
+def _interrupts_held() -> Iterator[None]:
+    """Ctrl-C comes after this block, and never to processes that begin in it: their parent ends them."""
+    if sys.platform != "win32":
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        if sys.platform != "win32":
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _begin(folder: Path, threads: int) -> None:
     """Begin a worker."""
     global _writer
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes: the parent ends the work
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # where it could not be held
     threading.Thread(target=_end_with_parent, daemon=True).start()
     _writer = EventWriter(folder, threads)
 

@@ -3,6 +3,7 @@
 import copy
 import hashlib
 import json
+import math
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -16,9 +17,9 @@ from ..errors import InputError, naming
 from ..geometry.grid import Grid
 from ..runs.recipe import Recipe
 from ..toml import parse_toml, toml_text
-from ..validation import lengths, one_of, real_array, whole_number, whole_shape
+from ..validation import lengths, one_of, real_array, seed_number, whole_number, whole_shape
 from .draws import check_number, check_odds, options
-from .entries import PhantomEntry, phantom_entry, plain_name, seed_of, share, table, unknown
+from .entries import PhantomEntry, phantom_entry, plain_name, share, table, unknown
 from .inputs import Input, original_input
 
 VERSION = 1
@@ -99,7 +100,7 @@ class EventRecipe:
     @cached_property
     def seed(self) -> int:
         """Of all random numbers."""
-        return seed_of(self.values.get("seed", 0))
+        return seed_number(self.values.get("seed", 0))
 
     @cached_property
     def system(self) -> Recipe:
@@ -241,7 +242,9 @@ class EventRecipe:
             check_odds(list(splits.values()), len(splits), "splits")
             for name in splits:
                 plain_name(name, "splits")
-        total = sum(splits.values())
+        total = math.fsum(splits.values())
+        if splits and abs(total - 1) > 1e-6 and not self.inputs:  # sets that are begun keep what they were begun with
+            raise InputError(f"splits: expected shares that sum to 1, got {total:.9g}")
         return {name: value / total for name, value in splits.items()}
 
     @cached_property
@@ -315,7 +318,10 @@ class EventRecipe:
         return values
 
 
-def read_recipe(path: str | os.PathLike[str]) -> EventRecipe:
-    """The recipe of an event set in a TOML file; paths in it are relative to its folder. `InputError` names the entry."""
+def read_recipe(path: str | os.PathLike[str], inputs: Mapping[str, Input] | None = None) -> EventRecipe:
+    """The recipe of an event set in a TOML file; paths in it are relative to its folder. `InputError` names the entry.
+
+    `inputs` as of `EventRecipe`.
+    """
     path = Path(path)
-    return EventRecipe(toml_text(path), str(path), path.absolute().parent)
+    return EventRecipe(toml_text(path), str(path), path.absolute().parent, inputs or {})

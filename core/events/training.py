@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Literal
 
 from ..errors import InputError
-from ..validation import instance, one_of, positive, strict_whole
+from ..validation import instance, one_of, positive, seed_number, strict_whole
 from .event_set import EventSet
 from .exports.slots import read_slots, row_slots
 from .fields import Shapes, field_shapes
@@ -98,8 +98,7 @@ def torch_dataset(
     arrays = field_shapes(events)
     one_of(crop_at, ("random", "center"), "crop_at")
     one_of(noise, (None, "own", "epoch"), "noise")
-    if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
-        raise InputError(f"seed: expected a whole number of at least 0, got {seed!r}")
+    seed_number(seed)
     if levels is None:
         levels = (1.0,) if noise is None else events.recipe.levels
     elif noise is None:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import InputError
-from ..files import ensure_folder
+from ..files import ensure_folder, folder_path
 
 
 @dataclass(frozen=True)
@@ -37,9 +37,10 @@ class Format:
 @contextmanager
 def new_folder(path: Path) -> Iterator[Path]:
     """Give a temporary folder beside `path`; rename it to `path` on success, remove it on failure."""
+    path = folder_path(path)
     if path.exists() and (not path.is_dir() or any(path.iterdir())):
         raise InputError(f"{path}: expected a new folder or an empty one")
-    temporary = ensure_folder(path.absolute().parent) / f".{uuid.uuid4().hex[:8]}-{path.name}"
+    temporary = ensure_folder(path.parent) / f".{uuid.uuid4().hex[:8]}-{path.name}"
     try:
         temporary.mkdir()
         yield temporary

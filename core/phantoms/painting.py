@@ -6,7 +6,6 @@ shapes, of the mean of that change, and each shape is sampled as finely as its o
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -17,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..geometry.grid import Grid
-from ..memory import require
+from ..memory import cores, require
 from ..progress import Progress, tell
 from .shapes import Shape
 
@@ -173,7 +172,7 @@ def paint_voxels(
     painted = zip(layers, _seen_beneath(layers), changes, strict=True)
     strokes = [stroke for each in painted if (stroke := _Stroke(grid, *each)).blocks]
     total, done = sum(len(stroke.blocks) for stroke in strokes), 0
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
+    with ThreadPoolExecutor(cores()) as pool:
         for stroke in strokes:
             box = image[tuple(map(slice, stroke.start, stroke.stop))]
             for _ in (stroke.paint_points if stroke.is_small else stroke.paint_cells)(box, pool):

@@ -5,7 +5,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InputError
 from ..geometry.frames import euler_pose
-from ..validation import real_array
+from ..validation import real_array, seed_number
 
 
 def random_pose(
@@ -22,12 +22,7 @@ def random_pose(
     >>> rng = np.random.default_rng(7)
     >>> poses = [random_pose(rng, box=(40, 40, 40)) for _ in range(1000)]
     """
-    if isinstance(seed, np.random.Generator):
-        rng = seed
-    elif isinstance(seed, int | np.integer) and not isinstance(seed, bool) and seed >= 0:
-        rng = np.random.default_rng(seed)
-    else:
-        raise InputError(f"seed: expected a whole number of at least 0 or a numpy Generator, got {seed!r}")
+    rng = seed if isinstance(seed, np.random.Generator) else np.random.default_rng(seed_number(seed))
     one_side = isinstance(box, int | float | np.integer | np.floating)
     sides = real_array(np.full(3, box) if one_side else box, "box of random poses", (3,))
     if np.any(sides < 0):

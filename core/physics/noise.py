@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InputError
-from ..validation import real_array
+from ..validation import real_array, seed_number
 
 # numpy draws no Poisson numbers with a larger mean.
 _LARGEST_MEAN = 9e18
@@ -16,7 +16,7 @@ def sample_counts(mean: ArrayLike, seed: int) -> NDArray[np.int64]:
     """Counts drawn from Poisson distributions with given means.
 
     `mean` is (M, n_v, n_u) or any array whose first axis is the views. Each view has its own random generator, made from
-    the seed, a whole number of at least 0, and the view's index, so its counts do not depend on the other views.
+    the seed, a whole number from 0 to 2^64 - 1, and the view's index, so its counts do not depend on the other views.
     """
     values = real_array(mean, "expected counts", None)
     if not values.ndim:
@@ -28,11 +28,10 @@ def sample_counts(mean: ArrayLike, seed: int) -> NDArray[np.int64]:
 
 def draw_counts(mean: NDArray[Any], seed: int, out: NDArray[Any]) -> None:
     """`sample_counts` of an array of numbers into another of the same shape, which may be `mean` itself."""
-    if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
-        raise InputError(f"seed: expected a whole number of at least 0, got {seed!r}")
+    seed = seed_number(seed)
     if mean.size and not 0 <= mean.min() <= mean.max() <= _LARGEST_MEAN:
         raise InputError(f"expected counts: must lie from 0 to {_LARGEST_MEAN:g}, got {mean.min():g} to {mean.max():g}")
     for view, (expected, counts) in enumerate(zip(mean, out, strict=True)):
-        generator = np.random.default_rng(np.random.SeedSequence(int(seed), spawn_key=(view,)))
+        generator = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(view,)))
         there = expected != 0  # what is expected to be 0 is 0, and takes no random number
         counts[there] = generator.poisson(expected[there])

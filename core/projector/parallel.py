@@ -11,6 +11,7 @@ import numpy as np
 
 from ..arrays import ArrayOrTensor
 from ..errors import InputError
+from ..memory import cores
 
 In = TypeVar("In")
 Out = TypeVar("Out")
@@ -74,13 +75,13 @@ _usual: int | None = None
 
 
 def set_usual_threads(threads: int | None) -> None:
-    """How many threads are used where nobody says; None: as many as this process may use processors."""
+    """How many threads are used where nobody says; None: as many as the job has cores."""
     global _usual
     _usual = None if threads is None else thread_count(threads)
 
 
 def thread_count(threads: int | None) -> int:
-    """`threads`, or the usual number: that of `set_usual_threads`, or of the processors that this process may use.
+    """`threads`, or the usual number: that of `set_usual_threads`, or of the cores that the job has (`memory.cores`).
 
     Raises
     ------
@@ -90,7 +91,7 @@ def thread_count(threads: int | None) -> int:
     if threads is None and _usual is not None:
         return _usual
     if threads is None:
-        return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        return cores()
     if isinstance(threads, bool) or not isinstance(threads, int | np.integer) or threads < 1:
         raise InputError(f"threads: expected a whole number of at least 1, got {threads!r}")
     return int(threads)

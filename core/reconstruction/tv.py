@@ -59,7 +59,7 @@ def tv(
     """
     loop = least_squares_loop("TV", A, iterations, start, mask, callback, progress, stop, nonnegative=nonnegative)
     weight = positive(weight, "weight")
-    require(4 * (13 * A.grid.n_voxels + 5 * int(np.prod(A.shape_out))), "the arrays of tv")
+    require(4 * (30 * A.grid.n_voxels + 5 * int(np.prod(A.shape_out))), "the arrays of tv")
     problem = Problem.of(A, images, loop.mask)
     closeness = A.grid.spacing.min() / A.grid.spacing
     per_pixel = inverse(problem.forward(problem.inside, loop.preparing()))

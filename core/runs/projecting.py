@@ -13,7 +13,7 @@ from ..memory import require
 from ..physics.noise import sample_counts
 from ..progress import Progress, tell
 from ..projector import Emission, Model, Projector, Transmission, intensity
-from ..validation import positive
+from ..validation import positive, seed_number
 from ..volumes.volume import Volume
 from .run import ProjectionRun
 
@@ -66,10 +66,12 @@ def project_run(
         photons = positive(photons, "photons")
     elif noise_seed is not None and not isinstance(model, Emission):
         raise InputError("noise_seed: only the counts of an Emission, or photons that pass, have noise")
+    noise_seed = None if noise_seed is None else seed_number(noise_seed)
     views = system.views(shape=shape, detector=detector, magnification=magnification, pitch=pitch)
     warn_of_images(volume, system, views, magnification, model)
     n_v, n_u = views.shape
-    require(4.0 * len(views) * n_v * n_u, f"a set of {len(views)} projections of {n_v} x {n_u} pixels")
+    each = 4.0 if noise_seed is None else 20.0  # bytes; counts are drawn from float64, as int64
+    require(each * len(views) * n_v * n_u, f"a set of {len(views)} projections of {n_v} x {n_u} pixels")
     projector = Projector(volume.grid, views, model=model, backend=backend, threads=threads)
     images = np.empty((len(views), n_v, n_u), np.float32)
     for m, image in enumerate(projector.iter_views(volume)):

@@ -21,7 +21,7 @@ from ..volumes.volume import Volume
 from ..volumes.volume_files import read_volume
 from .recipe import Recipe
 from .run import ProjectionRun
-from .run_recipe import projector_of_run
+from .run_recipe import projector_of_run, recipe_model
 from .settings import SAMPLING
 
 Watch = Callable[[int, NDArray[Any], Sequence[float]], bool | None]
@@ -49,10 +49,11 @@ def reconstruct_run(
     Parameters
     ----------
     run : ProjectionRun
-        Simulated or measured, with a recipe.
+        Simulated or measured.
     recipe : Recipe
         Its tables `TABLES` say how; by default the run's own. What is modelled is what made the run, unless the settings of
-        the reconstruction say otherwise: another model of the hole, no attenuation, no blur.
+        the reconstruction say otherwise: another model of the hole, no attenuation, no blur. For a run without a recipe, as
+        those of version 0.1.0, it needs the whole model, ``model.kind`` and all that this takes.
     mu : Volume
         What attenuates, instead of what the recipe says.
     start : Volume or Reconstruction
@@ -70,15 +71,16 @@ def reconstruct_run(
     Raises
     ------
     InputError
-        The run holds no recipe, the method needs other images than it has, its attenuation cannot be made again, or memory
-        does not suffice.
+        The run holds no recipe and none with a model is given, the method needs other images than it has, its attenuation
+        cannot be made again, or memory does not suffice.
 
     Warns
     -----
     InputWarning
         The images were made from voxels that are not at least twice as fine as those of the reconstruction, or with no
         better model of the hole: model and data then share errors that a real scanner's data does not have. Or the whole
-        hole cannot be reckoned with, and few rays take its place.
+        hole cannot be reckoned with, and few rays take its place. Or the record of a run without a recipe contradicts the
+        model that is given.
     """
     recipe = recipe_of(run, recipe)
     method = METHODS[recipe["reconstruction.method"]]
@@ -88,7 +90,9 @@ def reconstruct_run(
         also = f"; for these images: {others}" if others else ""
         raise InputError(f"reconstruction.method: {method.name} needs a run of counts, not of line integrals{also}")
     grid = reconstruction_grid(run, recipe)
-    require(16.0 * grid.n_voxels, "a reconstruction of {} x {} x {} voxels".format(*grid.shape))
+    require(22.0 * grid.n_voxels, "a reconstruction of {} x {} x {} voxels".format(*grid.shape))
+    if "recipe" not in run.settings:
+        _compare_with_record(run, recipe, mu is not None)
     modelled = model_of(run, recipe)
     flatters = flattering(run, grid, modelled)
     for text in flatters:
@@ -168,10 +172,28 @@ def _rules(recipe: Recipe, grid: Grid) -> StopWhen | None:
 
 
 def recipe_of(run: ProjectionRun, recipe: Recipe | None = None) -> Recipe:
-    """The run's recipe, where `recipe` does not say how to reconstruct, in `TABLES`, otherwise."""
+    """The run's recipe, where `recipe` does not say how to reconstruct, in `TABLES`, otherwise.
+
+    A run without one, as those of version 0.1.0, takes all of the model from `recipe`, which then names its kind.
+    """
     if recipe is None:
         return run.recipe
-    return run.recipe.updated({key: value for key, value in recipe.given.items() if key.partition(".")[0] in TABLES})
+    given = {key: value for key, value in recipe.given.items() if key.partition(".")[0] in TABLES}
+    return Recipe(given) if "recipe" not in run.settings and "model.kind" in given else run.recipe.updated(given)
+
+
+def _compare_with_record(run: ProjectionRun, recipe: Recipe, has_mu: bool) -> None:
+    """Warn where the model of a recipe is not what a run without a recipe says of its own."""
+    model, record = recipe_model(recipe, run.system), {"photons": None, "mu": None, **run.settings}
+    if record.get("aperture_points") == 1:  # how version 0.1.0 says it
+        record.setdefault("hole", "point")
+    asked = {"model": model.name, "photons": recipe["model.photons"], **model.record()}
+    if not has_mu and not any(key.startswith("attenuation.") for key in recipe.given):
+        asked["mu"] = None
+    names = [name for name in asked if name in record and f"model.{name}" not in SAMPLING]
+    different = [f"{name} {record[name]}, not {asked[name]}" for name in names if asked[name] != record[name]]
+    if different:
+        warn(f"the run's record says of its model: {'; '.join(different)} as in the model that is given", 3)
 
 
 def reconstruction_grid(run: ProjectionRun, recipe: Recipe) -> Grid:

@@ -80,7 +80,7 @@ class ProjectionRun:
     def recipe(self) -> Recipe:
         """What was asked for; `InputError` where the run does not say it, as those of version 0.1.0 do not."""
         if "recipe" not in self.settings:
-            raise InputError("the run holds no recipe: it was made by version 0.1.0, or without one")
+            raise InputError("the run holds no recipe: give its model, as by --set model.kind=emission or --recipe")
         return recipe_of_tables(self.settings["recipe"], recorded=True)
 
     def intrinsics(self) -> NDArray[np.float64]:

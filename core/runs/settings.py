@@ -5,7 +5,6 @@ and operator, and the record in a run file follow from it. A new setting of a mo
 same name in the model's class.
 """
 
-import math
 import operator
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
@@ -98,7 +97,7 @@ class Setting:
         else:
             bounds = ((self.least, operator.ge), (self.above, operator.gt), (self.most, operator.le))
             good = isinstance(value, Integral if self.kind is int else Real) and not isinstance(value, bool)
-            good = good and math.isfinite(value) and all(b is None or holds(value, b) for b, holds in bounds)
+            good = good and abs(value) < 1e308 and all(b is None or holds(value, b) for b, holds in bounds)
             value = self.kind(value) if good else value
         if not good:
             raise InputError(f"{self.key}: expected {self.expected}, got {value!r}")
@@ -268,7 +267,8 @@ _DECLARED = (
     Setting("detector.pitch", float, None, "Pixel size", "the image covers the crystal's whole side", unit="mm", above=0,
             slider=10, label="Pixel Size (mm)"),
     Setting("noise.seed", int, None, "Draw Poisson counts with this seed; of several states with SEED, SEED + 1 …",
-            "their expected means", least=0, needs=("model.kind=emission or model.photons", _MADE), option="--noise"),
+            "their expected means", least=0, most=2**64 - 1,
+            needs=("model.kind=emission or model.photons", _MADE), option="--noise"),
     Setting("reconstruction.method", str, "osem", "How the volume is found",
             words={method.name: (method.label, method.text) for method in METHODS.values()}),
     Setting("reconstruction.iterations", int, None, "How often all images are used", "what suits the method: "

@@ -19,6 +19,8 @@ from mphdrr.core.errors import InputError
 from mphdrr.core.events.exports import PROGRAMS, export_events
 from mphdrr.core.events.exports.slots import read_slots, row_slots
 
+from .small_events import small_recipe
+
 
 def rows_of(folder: Path, name: str) -> list[dict[str, str]]:
     with open(folder / name, newline="") as file:
@@ -326,3 +328,24 @@ def test_command_says_the_size_first_and_writes(event_set, tmp_path, capsys):
     assert all(sample["json"]["level"] == 0.25 for sample in samples.values())
     assert main([*arguments, "--noise", "loud", "-o", out]) == 2
     assert "expected own, or a seed" in capsys.readouterr().err
+
+
+def test_make_new_and_export_say_what_they_did_as_json(tmp_path, capsys):
+    recipe, folder = tmp_path / "small.toml", str(tmp_path / "set")
+
+    def said(*words: str) -> dict[str, object]:
+        capsys.readouterr()
+        assert main(["events", *words, "--json"]) == 0
+        return json.loads(capsys.readouterr().out)  # nothing else is on standard output
+
+    new = said("new", "-o", str(recipe))
+    assert new == {"file": str(recipe), "recipe": recipe.read_text(encoding="utf-8")}
+    printed = said("new")
+    assert printed["file"] is None and "[[phantoms]]" in printed["recipe"]
+    small_recipe(tmp_path)
+    made = said("make", folder, "--recipe", str(recipe), "-n", "3", "--first", "1")
+    assert made == {"folder": folder, "asked": 3, "events": 3, "made": 3}
+    assert said("make", folder, "-n", "4") == {"folder": folder, "asked": 4, "events": 4, "made": 1}
+    out = str(tmp_path / "npz")
+    exported = said("export", folder, "--to", "npz", "-o", out)
+    assert exported == {"folder": out, "program": "npz", "events": 4}

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import psutil
 import pytest
@@ -35,7 +36,7 @@ def undisturbed(tmp_path_factory) -> dict[str, bytes]:
     return tree(folder / "set")
 
 
-def begin(folder: Path, *options: str) -> subprocess.Popen[str]:
+def begin(folder: Path, *options: str, **how: Any) -> subprocess.Popen[str]:
     """The command, begun."""
     command = [
         sys.executable,
@@ -48,7 +49,7 @@ def begin(folder: Path, *options: str) -> subprocess.Popen[str]:
         str(folder / "small.toml"),
     ]
     command += ["-n", str(COUNT), *options]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=folder)
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=folder, **how)
 
 
 def test_workers_and_shards_make_the_same_bytes(tmp_path, undisturbed):
@@ -175,6 +176,36 @@ def test_a_killed_worker_costs_nothing_but_time(tmp_path, undisturbed):
         time.sleep(0.005)
     assert work.wait(120) == 0, work.communicate()
     assert tree(tmp_path / "set") == undisturbed
+
+
+LONG = (
+    TEXT.replace('modules = "1-4,21-24"', "")
+    .replace("rows = 14\ncolumns = 16", "rows = 256\ncolumns = 256")
+    .replace("voxels = 16\nspacing = 6.0", "voxels = 128\nspacing = 0.8")
+    .replace('hole = "point"\npixel_points = 1', 'hole = "rays"\naperture_points = 37\npixel_points = 4')
+)
+"""Events that take minutes."""
+
+
+@pytest.mark.long
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no process groups of this kind")
+@pytest.mark.parametrize("seconds", [1.5, 2.5, 6])
+@pytest.mark.parametrize("whom", ["all", "parent"])
+def test_an_interrupt_ends_two_workers_within_three_seconds(tmp_path, whom, seconds):
+    """When they begin, and in the middle of an event."""
+    small_recipe(tmp_path, LONG)
+    work = begin(tmp_path, "--workers", "2", start_new_session=True)
+    time.sleep(seconds)
+    workers = [child for child in psutil.Process(work.pid).children() if is_worker(child)]
+    assert work.poll() is None and (workers or seconds < 6)
+    sent = time.monotonic()
+    (os.killpg if whom == "all" else os.kill)(work.pid, signal.SIGINT)
+    _, said = work.communicate(timeout=60)
+    assert time.monotonic() - sent < 3
+    assert work.returncode == 130, said
+    assert said.splitlines()[-1] == "mphdrr: cancelled; no file is left half-written" and "Traceback" not in said
+    assert not psutil.wait_procs(workers, timeout=1)[1]
+    assert not list(tmp_path.glob("set/events/*")) and not list(tmp_path.glob("set/.*"))
 
 
 def test_workers_that_die_again_and_again_are_refused(tmp_path, monkeypatch):

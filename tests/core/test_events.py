@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 import mphdrr.core as mph
+from mphdrr.addon.cli import main
 from mphdrr.core import events
 from mphdrr.core.events.draws import Dice
 
@@ -320,6 +321,8 @@ def test_a_beating_torso_is_the_mean_of_its_gates(tmp_path):
         ("version = 1", "", "version: missing"),
         ("version = 1", "version = 2", "version: expected 1, got 2"),
         ("seed = 5", "seed = -5", "seed: expected a whole number of at least 0, got -5"),
+        ("seed = 5", f"seed = {2**64}", r"seed: expected a whole number below 2\^64, got 18446744073709551616"),
+        ("seed = 5", "seed = 1e3", "seed: expected a whole number of at least 0, got 1000.0"),
         ("seed = 5", "sed = 5", "sed: no such entry; expected version, seed"),
         ("spacing = 6.0", "", "truth.spacing: missing"),
         ("[radon]", "[rdon]", "rdon: no such entry"),
@@ -337,6 +340,11 @@ def test_a_beating_torso_is_the_mean_of_its_gates(tmp_path):
         ("angles = [6, 8]", "angles = [6, 6]", "radon.angles: expected different numbers of angles"),
         ("levels = [1.0, 0.25]", "levels = [0]", "noise.levels: expected shares of the acquisition time above 0"),
         ("train = 0.8", "train = -1", "splits: expected 2 odds of 0 or more"),
+        ("train = 0.8", "train = nan", "splits: expected 2 odds of 0 or more"),
+        ("train = 0.8", "train = '0.8'", "splits: expected 2 odds of 0 or more"),
+        ("train = 0.8", "train = 8", "splits: expected shares that sum to 1, got 8.2"),
+        ("train = 0.8", "train = 0.79999", "splits: expected shares that sum to 1, got 0.99999"),
+        ("test = 0.2", "", "splits: expected shares that sum to 1, got 0.8"),
         ("voxels = 16", "voxels = true", "truth.voxels: expected 3 whole numbers"),
         ("version = 1", "version = true", "version: expected 1, got True"),
         ("voxels = 16", 'voxels = 16\nstore = "float8"', "truth.store 'float8': expected one of float32, float16, sparse"),
@@ -353,6 +361,53 @@ def test_what_is_not_understood_is_refused_by_name(tmp_path, old, new, said):
         events.make(small_recipe(tmp_path, TEXT.replace(old, new, 1)), tmp_path / "set", 8)
     assert "\n" not in str(caught.value)
     assert not list((tmp_path / "set").glob("events/*"))
+
+
+def test_shares_may_be_rounded(tmp_path):
+    text = TEXT.replace("train = 0.8", "train = 0.3333333\nb = 0.3333333").replace("test = 0.2", "test = 0.3333333")
+    assert sum(small_recipe(tmp_path, text).splits.values()) == pytest.approx(1, abs=1e-15)
+
+
+def test_a_set_that_was_begun_with_other_shares_goes_on(tmp_path, monkeypatch):
+    """Earlier versions divided the shares by their sum."""
+    text = TEXT.replace("train = 0.8", "train = 4").replace("test = 0.2", "test = 1")
+    with monkeypatch.context() as earlier:
+        earlier.setattr("mphdrr.core.events.recipe.abs", lambda _: 0.0, raising=False)
+        before = events.make(small_recipe(tmp_path, text), tmp_path / "set", 2)
+    rows = [row["split"] for row in before.index]
+    assert events.EventSet(tmp_path / "set").recipe.splits == {"train": 0.8, "test": 0.2}
+    assert main(["events", "make", str(tmp_path / "set"), "-n", "4"]) == 0
+    after = events.EventSet(tmp_path / "set")
+    assert len(after) == 4 and [row["split"] for row in after.index][:2] == rows
+    assert not events.check(tmp_path / "set")
+
+
+def test_the_largest_seed_is_kept_in_every_file(tmp_path):
+    seed = 2**64 - 1
+    made = events.make(small_recipe(tmp_path, TEXT.replace("seed = 5", f"seed = {seed}")), tmp_path / "set", 1)
+    assert int(made[0].attributes["seed"]) == seed
+    run = made[0].run("emission", noise_seed=seed)
+    for name in ("run.h5", "run.npz"):
+        mph.write_run(run, tmp_path / name)
+        assert mph.read_run(tmp_path / name).seed == seed
+
+
+@pytest.mark.parametrize("seed", [-1, 2**64, 10**400, 1.5, True, "1", None])
+def test_other_seeds_are_refused_wherever_they_enter(event_set, scanner, tmp_path, seed):
+    volume = mph.Volume(np.ones((2, 2, 2)), mph.Grid.centered((2, 2, 2), 9.0))
+    calls = [lambda: mph.sample_counts(np.ones((1, 2, 2)), seed), lambda: mph.random_pose(seed)]
+    if seed is not None:  # which stands for no noise
+        model = mph.Emission(scanner[:1], hole="point")
+        calls += [
+            lambda: mph.project_run(scanner[:1], volume, (2, 2), model=model, noise_seed=seed),
+            lambda: mph.Recipe({"model.kind": "emission", "noise.seed": seed}),
+            lambda: events.export_events(event_set, tmp_path / "export", "npz", noise=seed),
+            lambda: event_set[0].images("counts", noise_seed=seed),
+        ]
+    for call in calls:
+        with pytest.raises(mph.InputError, match="whole number") as caught:
+            call()
+        assert "\n" not in str(caught.value)
 
 
 def test_another_recipe_in_the_folder_is_refused(tmp_path, small):

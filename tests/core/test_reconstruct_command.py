@@ -49,6 +49,59 @@ def refused(capsys, *words: object) -> str:
     return line
 
 
+OLD = Path(__file__).parent / "data"
+MODEL = {
+    "model.kind": "emission", "model.time": 600.0, "model.isotope": "Tc-99m", "model.aperture_mu": "tungsten",
+    "model.hole": "point",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("suffix", [".h5", ".npz"])
+def test_runs_of_version_0_1_0_reconstruct_when_the_model_is_given(suffix, tmp_path, capsys):
+    file, recipe = str(OLD / f"run-0.1.0{suffix}"), tmp_path / "model.toml"
+    small = ["--voxels", "5", "--spacing", "18", "--iterations", "3", "--method", "mlem", "--quiet"]
+    assert main(["reconstruct", file, *small, "-o", str(tmp_path / "a.npz")]) == 1
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1 and "holds no recipe" in said and "--set model.kind=emission" in said
+    entries = [word for key, value in MODEL.items() for word in ("--set", f"{key}={value}")]
+    assert main(["reconstruct", file, *small, *entries, "-o", str(tmp_path / "a.npz")]) == 0
+    assert "warning" not in capsys.readouterr().err
+    mph.write_recipe(mph.Recipe(MODEL), recipe)
+    assert main(["reconstruct", file, *small, "--recipe", str(recipe), "-o", str(tmp_path / "b.npz")]) == 0
+    by_options, by_recipe = (mph.read_volume(tmp_path / f"{name}.npz") for name in "ab")
+    np.testing.assert_array_equal(by_options.array, by_recipe.array)
+
+    run = mph.read_run(file)
+    model = mph.Emission(
+        run.system, isotope="Tc-99m", aperture_mu="tungsten", time=600, hole="point", pixel_points=1, tolerance=1e9
+    )
+    A = mph.Projector(by_recipe.grid, run.views, model)
+    found = mph.mlem(A, run.projections, iterations=3)
+    assert by_recipe.array.max() > 0
+    np.testing.assert_allclose(
+        A(by_recipe.array).sum(), A(found.volume.array).sum(), rtol=0.02
+    )  # the same activity; the recipe's hole is reckoned with as reconstructions do
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"model.time": 60.0}, "time 600.0, not 60.0"),
+        ({"model.isotope": None, "model.aperture_mu": 3.597170699883768}, "photons_per_decay 0.891, not 1.0"),
+        ({"model.hole": None}, "hole point, not auto"),
+        ({"model.kind": "transmission"}, "model emission, not transmission"),
+    ],
+)
+def test_a_model_that_the_record_contradicts_is_warned_of(changes, said):
+    run = mph.read_run(OLD / "run-0.1.0.npz")
+    given = {key: value for key, value in (MODEL | changes).items() if value is not None}
+    if given["model.kind"] == "transmission":
+        given = {"model.kind": "transmission", "reconstruction.method": "sirt"}
+    recipe = mph.Recipe({**given, "reconstruction.voxels": 5, "reconstruction.iterations": 1})
+    with pytest.warns(mph.InputWarning, match=said):
+        mph.reconstruct_run(run, recipe)
+
+
 def test_the_command_does_what_python_does_and_logs_each_iteration(run, file, tmp_path, capsys):
     output = tmp_path / "new" / "v.nii.gz"
     command(file, *SMALL, "--subsets", "4", "-o", output)

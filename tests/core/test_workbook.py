@@ -8,6 +8,7 @@ import hashlib
 import io
 import pickle
 import re
+import tracemalloc
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -845,6 +846,40 @@ def test_file_of_absurd_size_is_refused_unread(workbook, monkeypatch):
     monkeypatch.setattr("mphdrr.core.workbook.book.MAX_FILE_BYTES", 10_000)
     with pytest.raises(InputError, match="expected a workbook of at most 10000 bytes"):
         read_system(workbook)
+
+
+def with_part(workbook: Path, path: Path, said: int | None = None) -> Path:
+    """The workbook with 300 MB of blanks in its first sheet, whose size the archive gives as `said`."""
+    name = "xl/worksheets/sheet1.xml"
+    with zipfile.ZipFile(workbook) as old, zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as new:
+        for info in old.infolist():
+            with new.open(info.filename, "w") as part:
+                before, data, after = old.read(info).partition(b"<sheetData>")
+                part.write(before + data)
+                for _ in range(300 if info.filename == name else 0):
+                    part.write(b" " * 10**6)
+                part.write(after)
+        size = new.getinfo(name).file_size
+    if said is not None:
+        path.write_bytes(path.read_bytes().replace(size.to_bytes(4, "little"), said.to_bytes(4, "little")))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("said", "found"),
+    [(None, "unpacks to 286 MiB, expected at most 128 MiB"), (5000, "is damaged or cannot be read (Bad CRC-32")],
+)
+def test_a_sheet_of_300_mb_of_blanks_is_refused_without_unpacking_it(workbook, tmp_path, said, found):
+    """Also where the archive lies about the size."""
+    bomb = with_part(workbook, tmp_path / "bomb.xlsx", said)
+    read_system(workbook)
+    tracemalloc.start()
+    with pytest.raises(InputError) as refusal:
+        read_system(bomb)
+    most = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert f"bomb.xlsx: its part xl/worksheets/sheet1.xml {found}" in str(refusal.value)
+    assert most < 4 * 2**20
 
 
 def test_too_many_rows_are_refused(tmp_path, monkeypatch):

@@ -6,7 +6,7 @@ import sys
 from ...events.event_set import EventSet
 from ...events.exports import PROGRAMS, planned_export
 from ...events.exports.unet3d import RAW
-from ..options import add_command, progress_bar
+from ..options import add_command, print_answer, progress_bar
 
 
 def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
@@ -29,13 +29,11 @@ def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     add("--noise", type=_noise, metavar="own|SEED", help="with each event's own noise, or another; default: none")
     add("--level", type=float, default=1.0, metavar="SHARE", help="of the acquisition time, with --noise")
     add("--slots", metavar="CSV", help="legacy, 3dunet: which module each slot shows, as slots.csv says")
-    add(
-        "--raw",
-        choices=RAW,
-        help="3dunet: images by slots, to Radon images (the default); or back-projection, to truth",
-    )
+    text = "3dunet: images by slots, to Radon images (the default); or back-projection, to truth"
+    add("--raw", choices=RAW, help=text)
     add("--events-per-shard", type=int, metavar="N", help="webdataset; default: as many as make about a gigabyte")
     add("--uncompressed", action="store_true", default=None, help="webdataset: .npy members instead of .npy.gz")
+    add("--json", action="store_true", help="say what was written as JSON")
     programs = "\n".join(f"  {program.name:<13}{program.title}" for program in PROGRAMS.values())
     parser.epilog = f"programs:\n{programs}\n{parser.epilog}"
     parser.set_defaults(run=_run)
@@ -45,22 +43,16 @@ def _run(arguments: argparse.Namespace) -> None:
     events = EventSet(arguments.folder)
     if arguments.split is not None:
         events = events.split(arguments.split)
-    plan = planned_export(
-        events,
-        arguments.output,
-        arguments.to,
-        models=arguments.model,
-        noise=arguments.noise,
-        level=arguments.level,
-        slots=arguments.slots,
-        raw=arguments.raw,
-        events_per_shard=arguments.events_per_shard,
-        uncompressed=arguments.uncompressed,
-    )
+    options = {
+        name: getattr(arguments, name)
+        for name in ("noise", "level", "slots", "raw", "events_per_shard", "uncompressed")
+    }
+    plan = planned_export(events, arguments.output, arguments.to, models=arguments.model, **options)
     sys.stderr.write(f"mphdrr: {plan.says()}\n")
     sys.stderr.flush()
     plan.write(progress_bar("exporting"))
-    print(f"{arguments.output}: {len(plan.rows)} events, {PROGRAMS[arguments.to].title}")
+    record = {"folder": arguments.output, "program": arguments.to, "events": len(plan.rows)}
+    print_answer(arguments, record, [f"{arguments.output}: {len(plan.rows)} events, {PROGRAMS[arguments.to].title}"])
 
 
 def _noise(text: str) -> int | str:

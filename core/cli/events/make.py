@@ -14,7 +14,7 @@ from ...events.recipe import EventRecipe, read_recipe
 from ...events.store import size_of
 from ...events.work import Made, Making, making
 from ...memory import readable_size
-from ..options import add_command
+from ..options import add_command, print_answer
 
 
 def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
@@ -42,6 +42,7 @@ def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     parser.add_argument("--dask", metavar="ADDRESS|local", help=text)
     text = "put events into shards, files of many, as they become enough; a set that has shards goes on so"
     parser.add_argument("--pack", action="store_true", help=text)
+    parser.add_argument("--json", action="store_true", help="say what there is at the end as JSON")
     parser.add_argument("--quiet", action="store_true", help="say nothing on standard error but warnings")
     parser.set_defaults(run=_run)
 
@@ -73,7 +74,8 @@ def _run(arguments: argparse.Namespace) -> None:
     )
     done, folder = watched(work, arguments.quiet), work.folder
     there, asked = len(folder.store.places()), sum(map(len, folder.asked))
-    print(f"{arguments.folder}: {there} of {asked} events, {done} made now")
+    record = {"folder": arguments.folder, "asked": asked, "events": there, "made": done}
+    print_answer(arguments, record, [f"{arguments.folder}: {there} of {asked} events, {done} made now"])
 
 
 def watched(work: Making, quiet: bool) -> int:

@@ -2,13 +2,12 @@
 
 import argparse
 import os
-import sys
 from pathlib import Path
 
 from ...errors import InputError
 from ...events.templates import EXAMPLE, TEMPLATES, template_text
 from ...files import replacing
-from ..options import add_command, output_path
+from ..options import add_command, output_path, print_answer
 
 
 def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
@@ -23,6 +22,7 @@ def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     add("--like", choices=tuple(TEMPLATES), default="derenzo", metavar="NAME", help="see the list below")
     add("--system", metavar="FILE", help="the scanner's geometry workbook; default: that of the examples")
     add("-o", "--output", metavar="FILE", help="a new file (.toml); default: standard output")
+    add("--json", action="store_true", help="print the recipe and its file as JSON")
     names = "\n".join(f"  {name:<13}{text}" for name, text in TEMPLATES.items())
     parser.epilog = f"recipes:\n{names}\n{parser.epilog}"
     parser.set_defaults(run=_run)
@@ -33,14 +33,17 @@ def _run(arguments: argparse.Namespace) -> None:
     if not workbook.is_file():
         raise InputError(f"--system {workbook}: no such file; expected a geometry workbook (.xlsx, .xlsm)")
     if arguments.output is None:
-        sys.stdout.write(template_text(arguments.like, workbook.absolute()))
+        text = template_text(arguments.like, workbook.absolute())
+        print_answer(arguments, {"file": None, "recipe": text}, [text.removesuffix("\n")])
         return
     path = output_path(arguments.output, (".toml",))
     if path.exists():  # recipes are edited by hand
         raise InputError(f"{path}: it exists; choose another name, or remove it first")
     with replacing(path) as temporary:
-        temporary.write_text(template_text(arguments.like, _seen_from(path.parent, workbook)), encoding="utf-8")
-    print(f"{path}: edit it, then: mphdrr events make SET --recipe {path} -n 1000")
+        text = template_text(arguments.like, _seen_from(path.parent, workbook))
+        temporary.write_text(text, encoding="utf-8")
+    said = f"{path}: edit it, then: mphdrr events make SET --recipe {path} -n 1000"
+    print_answer(arguments, {"file": str(path), "recipe": text}, [said])
 
 
 def _seen_from(folder: Path, workbook: Path) -> str:

@@ -7,10 +7,10 @@ import inspect
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from ...errors import InputError
+from ...files import folder_path
 from ...progress import Progress
 from ...validation import instance, one_of, positive
 from ..event_set import EventSet
@@ -83,7 +83,7 @@ def planned_export(
         require_counted(events, names)
     chosen = Chosen(events, tuple(dict.fromkeys(names)), noise, level)
     layout = chosen_program.layout(chosen, **options)
-    return plan_export(layout, chosen, Path(folder), program, {**options, **layout.contained()})
+    return plan_export(layout, chosen, folder_path(folder), program, {**options, **layout.contained()})
 
 
 def export_events(

@@ -16,6 +16,7 @@ from ...errors import InputError
 from ...files import ensure_folder, is_leftover, write_bytes, written_name
 from ...memory import readable_size
 from ...progress import Progress, tell
+from ..cells import escaped, unescaped
 from ..noise_choice import chosen_seed
 from .layout import Chosen, Layout, Part, Row
 
@@ -152,8 +153,7 @@ def _require_same(folder: Path, request: dict[str, Any], rows: list[Row]) -> int
     before = _rows_of(folder)
     if before is None:
         return 0
-    same = [line.split(",") for line in table(rows).decode().splitlines()[1 : len(before) + 1]]
-    if same != before:
+    if _cells(table(rows).decode())[: len(before)] != before:
         raise InputError(f"{folder}: holds an export of other events (see {TABLE}); choose another folder")
     return len(before)
 
@@ -163,14 +163,18 @@ def table(rows: list[Row]) -> bytes:
     text = io.StringIO()
     lines = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
     lines.writeheader()
-    lines.writerows(rows)
+    lines.writerows({key: escaped(value) for key, value in row.items()} for row in rows)
     return text.getvalue().encode()
 
 
 def _rows_of(folder: Path) -> list[list[str]] | None:
     """The fields of the lines of events.csv without its heading; None where there is none."""
     try:
-        text = (folder / TABLE).read_text(encoding="utf-8")
+        return _cells((folder / TABLE).read_text(encoding="utf-8"))
     except OSError:
         return None
-    return list(csv.reader(io.StringIO(text)))[1:]
+
+
+def _cells(text: str) -> list[list[str]]:
+    """What the cells of a table say, without its heading."""
+    return [[unescaped(cell) for cell in line] for line in csv.reader(io.StringIO(text, newline=""))][1:]

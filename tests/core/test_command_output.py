@@ -1,0 +1,153 @@
+"""What commands do where their output, or the names that they are given, cannot be what they usually are."""
+
+from __future__ import annotations
+
+import argparse
+import io
+import os
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import mphdrr.core as mph
+from mphdrr.addon.cli import demo, figure, main, scene
+from mphdrr.core.cli import build_parser
+
+from .conftest import WORKBOOK, refused, run_python
+
+
+def parsers(
+    parser: argparse.ArgumentParser, words: tuple[str, ...] = ()
+) -> Iterator[tuple[tuple[str, ...], argparse.ArgumentParser]]:
+    """All commands, with the words that are typed for them."""
+    yield words, parser
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            for name, below in action.choices.items():
+                yield from parsers(below, (*words, name))
+
+
+ALL = dict(parsers(build_parser((figure.add_parser, scene.add_parser, demo.add_parser))))
+SHORT = [
+    ("--version",), ("geometry", "show", str(WORKBOOK)), ("geometry", "show", str(WORKBOOK), "--json"),
+    ("geometry", "check", str(WORKBOOK)), ("geometry", "performance", str(WORKBOOK)), ("events", "new"),
+]  # fmt: skip
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no /dev/full")
+@pytest.mark.parametrize("buffering", [-1, 1], ids=["in the end", "at once"])
+def test_output_that_cannot_be_written_is_one_line_of_every_command(monkeypatch, capsys, buffering):
+    for command in [(*words, "--help") for words in ALL] + SHORT[:4] + SHORT[5:]:
+        with open("/dev/full", "w", buffering) as full, monkeypatch.context() as patch:
+            patch.setattr(sys, "stdout", full)
+            status = main(command)
+            assert full.closed
+        said = capsys.readouterr().err
+        assert (status, said) == (1, "mphdrr: output: No space left on device\n"), command
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no /dev/full")
+@pytest.mark.parametrize("arguments", ["--help", "geometry show {} --json"])
+def test_nothing_more_is_said_when_python_ends(arguments):
+    words = arguments.format(WORKBOOK).split()
+    for unbuffered in ("", "1"):
+        said = run_python(
+            f"import os, sys; os.dup2(os.open('/dev/full', os.O_WRONLY), 1)\n"
+            f"from mphdrr.addon.cli import main; sys.exit(main({words}))",
+            {"PYTHONUNBUFFERED": unbuffered},
+        )
+        assert (said.returncode, said.stderr) == (1, "mphdrr: output: No space left on device\n")
+
+
+def test_terminals_of_ascii_show_every_command(monkeypatch):
+    for command in [(*words, "--help") for words in ALL] + SHORT:
+        streams = [io.TextIOWrapper(io.BytesIO(), encoding="ascii") for _ in range(2)]
+        with monkeypatch.context() as patch:
+            patch.setattr(sys, "stdout", streams[0])
+            patch.setattr(sys, "stderr", streams[1])
+            status = main(command)
+        out, err = (stream.buffer.getvalue() for stream in streams)
+        assert status in (0, 2) and out and b"Traceback" not in err, command
+
+
+def test_errors_with_names_beyond_ascii_are_one_line(tmp_path):
+    said = run_python(
+        "import sys; from mphdrr.addon.cli import main; sys.exit(main(['phantom', 'derenzo', '-o', 'µ/°….txt']))",
+        {"PYTHONIOENCODING": "ascii", "LANG": "C", "PYTHONUTF8": "0"},
+        cwd=tmp_path,
+    )
+    assert said.returncode == 1 and said.stderr.startswith("mphdrr: ?/??.txt: expected a name ending in")
+    assert said.stderr.count("\n") == 1
+
+
+WRITING = [
+    "geometry set WORKBOOK --modules 1 --diameter 2 -o NAME/a.xlsx",
+    "geometry generate ellipse --semi-axes 273 220.5 --z 0 -o NAME/a.xlsx",
+    "geometry export WORKBOOK -o NAME/scanner.xml --detector real",
+    "geometry export WORKBOOK --format gate9 -o NAME",
+    "geometry map WORKBOOK --voxels 4 --modules 1 -o NAME/a.nii.gz",
+    "phantom derenzo --voxels 4 -o NAME/a.nii.gz",
+    "phantom derenzo -o NAME.toml",
+    "volume convert VOLUME -o NAME/a.nrrd",
+    "project WORKBOOK --phantom derenzo --voxels 4 --size 2 2 -o NAME/run.h5",
+    "project WORKBOOK --phantom derenzo --write-recipe NAME/a.toml",
+    "export RUN -o NAME/a.npz",
+    "export RUN --mosaic NAME/a.png",
+    "reconstruct RUN --method sirt -o NAME/a.nii.gz",
+    "backproject RUN -o NAME/a.nii.gz",
+    "events new -o NAME/a.toml",
+    "events make NAME --recipe RECIPE -n 1",
+    "events show SET -o NAME/a.png",
+    "events export SET --to npz -o NAME",
+    "demo --output NAME --voxels 4 --size 4",
+]
+
+
+@pytest.fixture
+def typed(event_set, tmp_path, monkeypatch):
+    """Gives a command's words with this name for `NAME`, in an empty folder."""
+    beside = tmp_path / "beside"
+    assert main(["phantom", "derenzo", "--voxels", "4", "-o", str(beside / "volume.nii.gz")]) == 0
+    words = f"--phantom derenzo --voxels 4 --size 2 2 --modules 1 -o {beside / 'run.h5'}".split()
+    assert main(["project", str(WORKBOOK), *words]) == 0
+    folder = event_set[0].path.parents[1]
+    places = {
+        "WORKBOOK": WORKBOOK, "VOLUME": beside / "volume.nii.gz", "RUN": beside / "run.h5", "SET": folder,
+        "RECIPE": folder.parent / "small.toml",
+    }  # fmt: skip
+    here = tmp_path / "here"
+    here.mkdir()
+    monkeypatch.chdir(here)
+    return lambda command, name: [
+        str(places.get(word, "" if "NAME" in word and not name else word.replace("NAME", name)))
+        for word in command.split()
+    ]
+
+
+@pytest.mark.parametrize("length", [256, 5000])
+def test_names_that_are_too_long_are_one_line_of_every_command_that_writes(typed, capsys, length):
+    capsys.readouterr()
+    for command in WRITING:
+        assert main(typed(command, "x" * length)) == 1, command
+        said = capsys.readouterr().err
+        assert said.count("\n") == 1 and said.startswith("mphdrr: ") and "File name too long" in said, (command, said)
+        assert not list(Path().iterdir())
+
+
+def test_a_name_that_is_empty_is_never_the_current_folder(typed, event_set, capsys):
+    capsys.readouterr()
+    for command in [*WRITING, "events status NAME", "events check NAME --repair", "events show NAME", "export NAME"]:
+        status = main(typed(command, ""))
+        said = capsys.readouterr().err
+        assert status in (1, 2) and said.count("\n") == 1, (command, said)
+        assert not list(Path().iterdir())
+    for call in (
+        lambda: mph.events.make(event_set.recipe, "", 1),
+        lambda: mph.events.EventSet(""),
+        lambda: mph.events.export_events(event_set, "", "npz"),
+        lambda: mph.events.status(""),
+    ):
+        refused(call, "the name of a folder", "empty")
+    assert not list(Path().iterdir())

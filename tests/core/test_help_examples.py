@@ -1,0 +1,104 @@
+"""Every example of every command's help runs, in a folder with small files of the names that it has."""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import mphdrr.core as mph
+from mphdrr.addon.cli import demo, figure, scene
+from mphdrr.core.cli import build_parser
+
+from .conftest import WORKBOOK
+from .dicom_files import write_series
+from .small_events import TEXT
+
+THORAX = WORKBOOK.parent / "phantoms" / "thorax.toml"
+
+
+def examples(parser: argparse.ArgumentParser) -> Iterator[str]:
+    for line in (parser.epilog or "").splitlines():
+        if line.startswith("example: "):
+            yield line.removeprefix("example: ")
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            for name in dict.fromkeys(action.choices):
+                yield from examples(action.choices[name])
+
+
+ALL = list(dict.fromkeys(examples(build_parser((figure.add_parser, scene.add_parser, demo.add_parser)))))
+
+
+def run(folder: Path, command: str) -> str:
+    words = [sys.executable, "-m", "mphdrr", *shlex.split(command)[1:]]
+    done = subprocess.run(words, cwd=folder, capture_output=True, text=True)
+    assert done.returncode == 0 and "Traceback" not in done.stderr, f"{command}: {done.stderr}"
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Files of the names in the examples, small."""
+    folder = tmp_path_factory.mktemp("examples")
+    shutil.copy(WORKBOOK, folder / "scanner.xlsx")
+    shutil.copy(THORAX, folder / "thorax.toml")
+    grid = mph.Grid.centered((24, 24, 24), 10.0)
+    body = np.where(np.indices(grid.shape).min(axis=0) > 4, 500.0, -1000.0).astype(np.float32)
+    ct = mph.Volume(body, grid, "hu")
+    mph.write_volume(ct, folder / "ct.nii.gz")
+    mph.write_volume(mph.Volume(np.where(body > 0, 0.015, 0.0).astype(np.float32), grid, "mu"), folder / "ct-mu.nii.gz")
+    write_series(ct, folder / "dicom_folder")
+    for name, radius in (("body", 60.0), ("heart", 20.0)):
+        small = mph.Grid.centered((20, 20, 20), radius / 8)
+        ball = mph.Volume((np.hypot(*np.indices(small.shape)[:2] - 9.5) < 6).astype(np.float32), small, "mu")
+        mph.write_mesh(mph.volume_to_mesh(ball, 0.5), folder / f"{name}.stl")
+    np.save(folder / "counts.npy", np.ones((80, 16, 16)))
+    (folder / "study.toml").write_text('[reconstruction]\nmethod = "osem"\niterations = 2\n')
+    model = TEXT[TEXT.index("[models.emission]") : TEXT.index("[radon]")]
+    text = TEXT.replace("[radon]", model.replace("models.emission", "models.counts") + "[radon]")
+    (folder / "derenzo.toml").write_text(
+        text.replace('modules = "1-4,21-24"', "").replace("[6, 8]", "[96]\nrows = 14\ncolumns = 16")
+    )
+    run(folder, "mphdrr phantom derenzo --voxels 24 --spacing 4 -o heart.nii.gz")
+    heart = "mphdrr project scanner.xlsx --volume heart.nii.gz --emission --time 600 --set model.intrinsic_fwhm=2"
+    run(folder, f"{heart} --size 24 24 --write-recipe heart.toml")
+    run(folder, "mphdrr project heart.toml -o run.h5")
+    run(folder, "mphdrr events make set --recipe derenzo.toml -n 13")
+    return folder
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("example", ALL)
+def test_every_example_runs(example, inputs, tmp_path):
+    if example.split()[1] in ("demo", "scene") or "cut-away" in example or "figure scanner" in example:
+        pytest.importorskip("bpy")
+    here = tmp_path / "here"
+    shutil.copytree(inputs, here)
+    words = example.split()
+    # A few events of many (the fiftieth part of 150 has three), and a small picture.
+    example = example.replace("-n 100000 ", "-n 150 ").replace("-n 1000", "-n 6").replace("1600x900", "320x240")
+    if words[1:3] == ["events", "make"] and "--recipe" in words:
+        shutil.rmtree(here / "set")
+    if words[1] == "score":  # of a volume that has what is scored
+        kind = " ".join(words[3:]) if not words[3].startswith("--") else "derenzo"
+        run(here, f"mphdrr phantom {kind.split(' --euler')[0]} --voxels 96 -o volume.nii.gz")
+    for option in ("-o", "--output", "--write-recipe"):
+        for i, word in enumerate(words[:-1]):
+            if word == option and (here / words[i + 1]).is_file():
+                (here / words[i + 1]).unlink()
+    run(here, example)
+    for i, word in enumerate(words[:-1]):
+        if word in ("-o", "--output", "--write-recipe", "--picture", "--mosaic"):
+            assert (here / words[i + 1]).exists()
+
+
+def test_every_command_that_does_something_has_an_example():
+    assert len(ALL) > 60

@@ -92,7 +92,7 @@ def check(folder: str | os.PathLike[str], progress: Progress | None = None) -> l
     faults = list(_inputs(target))
     if faults:  # what events should be is not known without them
         return faults
-    faults += _index(target)
+    faults += index_faults(folder)
     planned, places = set(_planned(target)), target.store.places()
     fingerprint = target.recipe.fingerprint
 
@@ -172,7 +172,9 @@ def _planned(target: SetFolder) -> list[int]:
     return sorted({*asked, *(n for n, place in beside.items() if not asked or target.is_made(n, place))})
 
 
-def _index(target: SetFolder) -> list[Fault]:
+def index_faults(folder: str | os.PathLike[str]) -> list[Fault]:
+    """What is wrong with the index alone, as `check` says it."""
+    target = SetFolder(folder)
     index, made = target.index, target.store.places()
     if not index.path.is_file():
         return [Fault("index", index.path, f"{index.path}: missing")] if made else []

@@ -404,7 +404,6 @@ class ExportJob(JobOperator, ExportHelper):
 class MPHDRR_OT_cancel_job(bpy.types.Operator):
     """Stop a job, or take it out of the queue; the scene stays as it was"""
 
-    bl_idname = ids.CANCEL_JOB
     bl_label = "Cancel"
     bl_options = {"INTERNAL"}
 
@@ -421,7 +420,6 @@ class MPHDRR_OT_cancel_job(bpy.types.Operator):
 class MPHDRR_OT_finish_job(bpy.types.Operator):
     """End the running job after the step that it is at, and keep what it has made so far"""
 
-    bl_idname = ids.FINISH_JOB
     bl_label = "Finish Now"
     bl_options = {"INTERNAL"}
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import bpy
 from bpy.props import BoolProperty, EnumProperty, StringProperty
 
-from ..addon import ids, jobs, scanner, scanner_files, selection, storage
+from ..addon import jobs, scanner, scanner_files, selection, storage
 from ..addon.decimals import typed
 from ..addon.reports import needs
 from ..addon.scanner_files import WORKBOOK_SUFFIXES
@@ -18,7 +18,6 @@ _FORMATS = tuple((f.name, f.name, f.title, FORMAT_NUMBERS[f.name]) for f in FORM
 class MPHDRR_OT_export_geometry(jobs.ExportJob, bpy.types.Operator):
     """Write the scanner as it stands in the scene to a workbook, into a copy of the one it came from"""
 
-    bl_idname = ids.EXPORT_GEOMETRY
     bl_label = "Export Pinhole Geometry"
 
     poll = needs(selection.SCANNER)
@@ -60,7 +59,6 @@ class MPHDRR_OT_export_for_program(jobs.ExportJob, bpy.types.Operator):
     Monte Carlo simulations. Images are those of the Projections panel
     """
 
-    bl_idname = ids.EXPORT_FOR_PROGRAM
     bl_label = "Export Geometry for a Program"
     bl_options = set()
 

@@ -3,14 +3,13 @@
 import bpy
 from bpy.props import StringProperty
 
-from ..addon import ids, jobs, storage, volumes
+from ..addon import jobs, storage, volumes
 from ..addon.reports import needs
 from ..addon.volume_export import WRITTEN_ENDINGS, exporting
 from ..core.errors import InputError
 
 
 class MPHDRR_OT_export_volume(jobs.JobOperator, bpy.types.Operator):
-    bl_idname = ids.EXPORT_VOLUME
     bl_label = "Export Volume"
     bl_description = (
         f"Write every voxel of the active volume, where it stands in the world; endings: {', '.join(WRITTEN_ENDINGS)}"

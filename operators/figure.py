@@ -5,7 +5,7 @@ from pathlib import Path
 import bpy
 from bpy.props import BoolProperty, EnumProperty, IntProperty, StringProperty
 
-from ..addon import figures, ids, jobs, scanner, storage, volumes
+from ..addon import figures, jobs, scanner, storage, volumes
 from ..addon.reports import Need, needs
 from ..core.errors import InputError
 from ..core.figures.page import LARGEST, SUFFIXES
@@ -19,7 +19,6 @@ _SHOWN: Need = (
 class MPHDRR_OT_export_figure(jobs.JobOperator, bpy.types.Operator):
     """Draw a figure of the scanner, the volume or the last projections as PNG, or as SVG whose labels are text"""
 
-    bl_idname = ids.EXPORT_FIGURE
     bl_label = "Export Figure"
     bl_options = set()
 

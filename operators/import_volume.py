@@ -9,7 +9,7 @@ from typing import Any
 import bpy
 from bpy.props import BoolProperty, CollectionProperty, EnumProperty, FloatProperty, IntProperty, StringProperty
 
-from ..addon import choices, ids, jobs, storage
+from ..addon import choices, jobs, storage
 from ..addon.decimals import typed
 from ..addon.layouts import labelled
 from ..addon.volume_import import READ_ENDINGS, importing, name_of
@@ -85,7 +85,6 @@ class ReadVolumes(jobs.JobOperator):
 class MPHDRR_OT_import_volume(ReadVolumes, bpy.types.Operator):
     """Read a CT, an image or an OpenVDB grid as a volume to project; of a DICOM series choose the folder"""
 
-    bl_idname = ids.IMPORT_VOLUME
     bl_label = "Import Volume"
     asks_for = "filepath"
 
@@ -104,7 +103,6 @@ class MPHDRR_OT_import_volume(ReadVolumes, bpy.types.Operator):
 class MPHDRR_OT_import_volume_sequence(ReadVolumes, bpy.types.Operator):
     """Read several files, in the order of their numbers, as one volume that plays over the frames"""
 
-    bl_idname = ids.IMPORT_VOLUME_SEQUENCE
     bl_label = "Import Volume Sequence"
     asks_for = "files"
 

@@ -2,7 +2,7 @@
 
 import bpy
 
-from ..addon import frustums, ids, jobs, selection, volumes
+from ..addon import frustums, jobs, selection, volumes
 from ..addon.perspective_properties import PerspectiveSettings
 from ..addon.reports import needs
 
@@ -19,7 +19,6 @@ class MPHDRR_OT_show_in_perspective(_InPerspective, bpy.types.Operator):
     the module; the settings are what the panel says now, unless a script gives others
     """
 
-    bl_idname = ids.SHOW_IN_PERSPECTIVE
     bl_label = "Show in Perspective"
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
@@ -31,7 +30,6 @@ class MPHDRR_OT_resample_in_perspective(_InPerspective, bpy.types.Operator):
     voxels, as a new volume: what these cells keep of it. Beyond what the module sees, it is empty
     """
 
-    bl_idname = ids.RESAMPLE_IN_PERSPECTIVE
     bl_label = "Volume Through Module"
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
@@ -41,7 +39,6 @@ class MPHDRR_OT_resample_in_perspective(_InPerspective, bpy.types.Operator):
 class MPHDRR_OT_clear_perspective(bpy.types.Operator):
     """Remove all volumes in perspective, of all modules"""
 
-    bl_idname = ids.CLEAR_PERSPECTIVE
     bl_label = "Clear Perspective"
     bl_options = {"REGISTER", "UNDO"}
 

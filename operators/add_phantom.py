@@ -8,7 +8,6 @@ from bpy.props import BoolProperty, FloatProperty, FloatVectorProperty, StringPr
 from ..addon import jobs, phantoms, storage
 from ..addon.layouts import labelled
 from ..addon.phantom_properties import FILE, PhantomSettings, identifier, sampling, settings_class
-from ..core.errors import InputError
 from ..core.geometry.frames import euler_pose
 from ..core.phantoms.kinds import KINDS
 from ..core.phantoms.language import read_phantom
@@ -81,9 +80,7 @@ class MPHDRR_OT_import_phantom(PhantomSettings, AddPhantom, bpy.types.Operator):
     asks_for = "filepath"
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        if not self.filepath:
-            raise InputError("no file given: set filepath to a phantom's TOML file")
-        path = storage.absolute(self.filepath)
+        path = self.given_file("set filepath to a phantom's TOML file")
         return self.adding(self.name or read_phantom(path).name or path.stem)
 
     def phantom(self) -> Phantom:

@@ -3,10 +3,9 @@
 import bpy
 from bpy.props import StringProperty
 
-from ..addon import jobs, storage, volumes
+from ..addon import jobs, volumes
 from ..addon.reports import needs
 from ..addon.volume_export import WRITTEN_ENDINGS, exporting
-from ..core.errors import InputError
 
 
 class MPHDRR_OT_export_volume(jobs.JobOperator, bpy.types.Operator):
@@ -29,6 +28,5 @@ class MPHDRR_OT_export_volume(jobs.JobOperator, bpy.types.Operator):
         return {"RUNNING_MODAL"}
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        if not self.filepath:
-            raise InputError(f"no file given: expected a name ending in {', '.join(WRITTEN_ENDINGS)}")
-        return exporting(context.object, storage.absolute(self.filepath))
+        path = self.given_file(f"expected a name ending in {', '.join(WRITTEN_ENDINGS)}")
+        return exporting(context.object, path)

@@ -95,9 +95,8 @@ class MPHDRR_OT_import_volume(ReadVolumes, bpy.types.Operator):
     name: StringProperty(name="Name", description="The object's name. Empty: the file's", options={"SKIP_SAVE"})
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        if not self.filepath:
-            raise InputError("no file given: set filepath to a volume's file, or to the folder of a DICOM series")
-        return self.importing([storage.absolute(self.filepath)], self.name)
+        path = self.given_file("set filepath to a volume's file, or to the folder of a DICOM series")
+        return self.importing([path], self.name)
 
 
 class MPHDRR_OT_import_volume_sequence(ReadVolumes, bpy.types.Operator):

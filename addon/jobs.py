@@ -405,8 +405,7 @@ class ExportJob(JobOperator, ExportHelper):
 
     def ask(self, context: bpy.types.Context) -> set[str] | None:
         """Open the file browser."""
-        answer: set[str] = ExportHelper.invoke(self, context, None)
-        return answer
+        return ExportHelper.invoke(self, context, None)
 
 
 class MPHDRR_OT_cancel_job(bpy.types.Operator):

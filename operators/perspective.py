@@ -4,7 +4,7 @@ import bpy
 
 from ..addon import frustums, jobs, selection, volumes
 from ..addon.perspective_properties import PerspectiveSettings
-from ..addon.reports import needs
+from ..addon.reports import Reported, needs
 
 
 class _InPerspective(PerspectiveSettings, jobs.JobOperator):
@@ -36,15 +36,13 @@ class MPHDRR_OT_resample_in_perspective(_InPerspective, bpy.types.Operator):
         return frustums.resampling(context, *map(self.given_or(context.scene.mphdrr_perspective), ("cells", "uniform")))
 
 
-class MPHDRR_OT_clear_perspective(bpy.types.Operator):
+class MPHDRR_OT_clear_perspective(Reported, bpy.types.Operator):
     """Remove all volumes in perspective, of all modules"""
 
     bl_label = "Clear Perspective"
-    bl_options = {"REGISTER", "UNDO"}
 
     poll = needs((lambda context: frustums.frustums(context.scene), "No volume is shown in perspective"))
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
+    def act(self, context: bpy.types.Context) -> str:
         count = frustums.remove(context.scene)
-        self.report({"INFO"}, f"Removed {count} volume{'s' * (count > 1)} in perspective")
-        return {"FINISHED"}
+        return f"Removed {count} volume{'s' * (count > 1)} in perspective"

@@ -87,12 +87,8 @@ def part_material(part: str) -> bpy.types.Material:
     shader.inputs["Roughness"].default_value = look.roughness
     shader.inputs["Alpha"].default_value = look.color[3]
     if part == "ROI":  # transparent but for its rim
-        nodes, links = material.node_tree.nodes, material.node_tree.links
-        weight, scale = nodes.new("ShaderNodeLayerWeight"), nodes.new("ShaderNodeMath")
-        weight.location, scale.location = (-520, 0), (-260, 0)
-        weight.inputs["Blend"].default_value = 0.25
-        scale.operation = "MULTIPLY"
-        scale.inputs[1].default_value = 0.35
-        links.new(weight.outputs["Facing"], scale.inputs[0])
-        links.new(scale.outputs[0], shader.inputs["Alpha"])
+        tree = material.node_tree
+        weight = compat.add_node(tree, "ShaderNodeLayerWeight", (-520, 0), {"Blend": 0.25})
+        scaled = compat.add_math(tree, "MULTIPLY", (-260, 0), weight.outputs["Facing"], 0.35)
+        tree.links.new(scaled, shader.inputs["Alpha"])
     return material

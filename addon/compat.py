@@ -1,5 +1,7 @@
 """Differences between Blender versions; the only file that looks at `bpy.app.version`."""
 
+from typing import Any
+
 import bpy
 
 # Voxel index i of an OpenVDB grid is drawn over [i, i + 1] in 4.5, centred on i in 5.0 and later. Files that a scene draws
@@ -16,11 +18,36 @@ def blank_material(name: str) -> bpy.types.Material:
     return material
 
 
+Place = tuple[float, float]
+"""Of a node in its editor."""
+
+
+def add_node(
+    tree: bpy.types.NodeTree, kind: str, place: Place, inputs: dict[Any, Any] | None = None, **settings: Any
+) -> bpy.types.Node:
+    """Add a node to a tree, its `inputs` linked to outputs of other nodes or set to values."""
+    node = tree.nodes.new(kind)
+    node.location = place
+    for name, value in settings.items():
+        setattr(node, name, value)
+    for key, given in (inputs or {}).items():
+        if isinstance(given, bpy.types.NodeSocket):
+            tree.links.new(given, node.inputs[key])
+        else:
+            node.inputs[key].default_value = given
+    return node
+
+
+def add_math(
+    tree: bpy.types.NodeTree, operation: str, place: Place, one: Any, other: Any, **settings: Any
+) -> bpy.types.NodeSocket:
+    """Add a node that calculates with two numbers, outputs of other nodes or values; returns its output."""
+    return add_node(tree, "ShaderNodeMath", place, {0: one, 1: other}, operation=operation, **settings).outputs[0]
+
+
 def surface_material(name: str, kind: str) -> tuple[bpy.types.Material, bpy.types.Node]:
     """A new material whose surface is a shader of that kind, and the shader."""
     material = blank_material(name)
-    tree = material.node_tree
-    shader, output = tree.nodes.new(kind), tree.nodes.new("ShaderNodeOutputMaterial")
-    output.location = (300.0, 0.0)
-    tree.links.new(shader.outputs[0], output.inputs["Surface"])
+    shader = add_node(material.node_tree, kind, (0.0, 0.0))
+    add_node(material.node_tree, "ShaderNodeOutputMaterial", (300.0, 0.0), {"Surface": shader.outputs[0]})
     return material, shader

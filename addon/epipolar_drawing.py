@@ -5,7 +5,6 @@ from typing import Any
 import bpy
 import gpu
 import numpy as np
-from gpu_extras.batch import batch_for_shader
 from numpy.typing import NDArray
 
 from . import epipolar, ids, images, planes, tiles, windows
@@ -189,8 +188,4 @@ def _lines(ends: Floats, color: tuple[float, ...], width: float) -> None:
         return
     points = np.zeros((2 * len(ends), 3), np.float32)
     points[:, : ends.shape[-1]] = ends.reshape(-1, ends.shape[-1])
-    shader = gpu.shader.from_builtin("POLYLINE_UNIFORM_COLOR")
-    shader.uniform_float("viewportSize", gpu.state.viewport_get()[2:])
-    shader.uniform_float("lineWidth", width)
-    shader.uniform_float("color", color)
-    batch_for_shader(shader, "LINES", {"pos": points}).draw(shader)
+    windows.draw_lines(points, color, width)

@@ -3,7 +3,7 @@
 PREFIX = "mphdrr"
 CATEGORY = "mphDRR"  # the sidebar tab
 
-# --- Operators: idname as in `bpy.ops.<idname>` -------------------------------------------------------------
+# --- Operators: idname as in `bpy.ops.<idname>`, see `operator_name` --------------------------------------------------
 IMPORT_GEOMETRY = "mphdrr.import_geometry"
 BROWSE_EXAMPLE = "mphdrr.browse_example"
 LOAD_EXAMPLE = "mphdrr.load_example"
@@ -80,6 +80,11 @@ PLANES = "mphDRR projections"  # the collection of the planes that show them
 PERSPECTIVES = "mphDRR perspective"  # the collection of volumes in modules' coordinates (`frustums.py`)
 STUDIO = "mphDRR studio"  # the collection of the lights, and a world
 PREVIEW = ".preview"  # in the names of coarser copies of large volumes, for display only
+
+
+def operator_name(class_name: str) -> str:
+    """The idname of an operator's class: "mphdrr.show_run" of "MPHDRR_OT_show_run"."""
+    return class_name.replace("MPHDRR_OT_", f"{PREFIX}.")
 
 
 def module_name(number: int, n_modules: int = 80) -> str:

@@ -12,6 +12,7 @@ import time
 import traceback
 from collections.abc import Callable, Generator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import bpy
@@ -23,7 +24,7 @@ from ..core.cli.options import progress_bar
 from ..core.errors import InputError
 from ..core.progress import Cancelled, Progress, StagedProgress
 from ..core.recording import recorded_warnings
-from . import ids
+from . import ids, storage
 from .reports import warnings_reported
 from .windows import redraw_sidebars
 
@@ -218,6 +219,7 @@ class JobOperator:
         bl_idname: str
         bl_label: str
         properties: Any
+        filepath: str  # of one that reads or writes a file
 
         def report(self, type: set[str], message: str) -> None: ...
         def as_keywords(self, *, ignore: tuple[str, ...] = ()) -> dict[str, Any]: ...
@@ -229,6 +231,12 @@ class JobOperator:
     def given_or(self, panel: bpy.types.PropertyGroup) -> Callable[[str], Any]:
         """What gives a setting by its name: that of the operator where it is given, else the panel's."""
         return lambda name: getattr(self if self.properties.is_property_set(name) else panel, name)
+
+    def given_file(self, what_to_do: str) -> Path:
+        """The file that `filepath` names; `InputError`, with `what_to_do`, where it names none."""
+        if not self.filepath:
+            raise InputError(f"no file given: {what_to_do}")
+        return storage.absolute(self.filepath)
 
     def ask(self, context: bpy.types.Context) -> set[str] | None:
         """Open a dialog or a file browser, whose button starts the job; None where there is nothing to ask."""
@@ -397,14 +405,12 @@ class ExportJob(JobOperator, ExportHelper):
 
     def ask(self, context: bpy.types.Context) -> set[str] | None:
         """Open the file browser."""
-        answer: set[str] = ExportHelper.invoke(self, context, None)
-        return answer
+        return ExportHelper.invoke(self, context, None)
 
 
 class MPHDRR_OT_cancel_job(bpy.types.Operator):
     """Stop a job, or take it out of the queue; the scene stays as it was"""
 
-    bl_idname = ids.CANCEL_JOB
     bl_label = "Cancel"
     bl_options = {"INTERNAL"}
 
@@ -421,7 +427,6 @@ class MPHDRR_OT_cancel_job(bpy.types.Operator):
 class MPHDRR_OT_finish_job(bpy.types.Operator):
     """End the running job after the step that it is at, and keep what it has made so far"""
 
-    bl_idname = ids.FINISH_JOB
     bl_label = "Finish Now"
     bl_options = {"INTERNAL"}
 

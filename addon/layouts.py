@@ -1,8 +1,14 @@
 """How panels and dialogs show settings."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from typing import Any
 
 import bpy
+
+
+def shown_where(is_met: Callable[[bpy.types.Context], Any]) -> Any:
+    """The `poll` of a panel: in which contexts it is shown."""
+    return classmethod(lambda panel, context: bool(is_met(context)))
 
 
 def labelled(layout: bpy.types.UILayout) -> bpy.types.UILayout:

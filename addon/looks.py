@@ -4,6 +4,8 @@ The solid viewport knows no materials of volumes and cannot cut their smoke: whe
 none. The surface is a mesh that Blender makes of the voxels that are shown; it goes with the object and with their changes.
 """
 
+from functools import partial
+
 import bpy
 from mathutils import Vector
 
@@ -97,13 +99,12 @@ def _cutting(name: str) -> bpy.types.NodeTree:
     tree = bpy.data.node_groups.new(name, "GeometryNodeTree")
     for direction in ("INPUT", "OUTPUT"):
         tree.interface.new_socket("Geometry", in_out=direction, socket_type="NodeSocketGeometry")
-    start, end = tree.nodes.new("NodeGroupInput"), tree.nodes.new("NodeGroupOutput")
-    place, delete = tree.nodes.new("GeometryNodeInputPosition"), tree.nodes.new("GeometryNodeDeleteGeometry")
-    delete.domain = "FACE"
-    start.location, delete.location, end.location, place.location = (200, 0), (440, 0), (680, 0), (-440, -660)
-    tree.links.new(start.outputs[0], delete.inputs["Geometry"])
-    tree.links.new(volume_materials.in_front(tree, place.outputs[0]), delete.inputs["Selection"])
-    tree.links.new(delete.outputs[0], end.inputs[0])
+    add_node = partial(compat.add_node, tree)
+    start = add_node("NodeGroupInput", (200, 0))
+    place = add_node("GeometryNodeInputPosition", (-440, -660))
+    deleted = {"Geometry": start.outputs[0], "Selection": volume_materials.in_front(tree, place.outputs[0])}
+    delete = add_node("GeometryNodeDeleteGeometry", (440, 0), deleted, domain="FACE")
+    add_node("NodeGroupOutput", (680, 0), {0: delete.outputs[0]})
     return tree
 
 

@@ -104,8 +104,7 @@ class KindSettings(PhantomSettings):
 
     def phantom(self) -> Phantom:
         """The phantom; float32 settings are read as the decimal numbers that the user typed."""
-        phantom: Phantom = self.kind.phantom(**self._arguments())
-        return phantom
+        return self.kind.phantom(**self._arguments())
 
     def recipe(self) -> dict[str, Any]:
         """The class's fields, their units in their names, and the number of frames of one that beats."""

@@ -91,8 +91,7 @@ class ReconstructionProperties(ReconstructionSettings, bpy.types.PropertyGroup):
     @property
     def known(self) -> Mapping[str, Any]:
         """What is known of the last reconstruction: `title`, `objective` by iteration, its name, `scores` and `flatters`."""
-        found: Mapping[str, Any] = json.loads(self.record) if self.record else {}
-        return found
+        return json.loads(self.record) if self.record else {}
 
 
 ReconstructionProperties.__annotations__["how"] = _PUT_TOGETHER

@@ -177,8 +177,10 @@ def register(command: Callable[..., int] | None = None) -> None:
     updates.FUNCTIONS.update(UPDATES)
     try:
         for cls in CLASSES:
-            if issubclass(cls, bpy.types.Operator) and cls.__doc__ is not None:
-                cls.bl_description = " ".join(cls.__doc__.split())  # Blender would keep line breaks and indentation
+            if issubclass(cls, bpy.types.Operator):
+                cls.bl_idname = vars(cls).get("bl_idname", ids.operator_name(cls.__name__))
+                if cls.__doc__ is not None:
+                    cls.bl_description = " ".join(cls.__doc__.split())  # Blender would keep line breaks and indentation
             bpy.utils.register_class(cls)
             _registered.callback(bpy.utils.unregister_class, cls)
         for owner, name, group in properties.POINTERS:

@@ -3,7 +3,6 @@
 import bpy
 import gpu
 import numpy as np
-from gpu_extras.batch import batch_for_shader
 from numpy.typing import NDArray
 
 from . import cameras, following, scanner, selection, windows
@@ -45,14 +44,10 @@ def draw() -> None:
     context = bpy.context
     if not context.space_data.overlay.show_overlays:
         return
-    shader = gpu.shader.from_builtin("POLYLINE_UNIFORM_COLOR")
     gpu.state.blend_set("ALPHA")
     gpu.state.depth_test_set("LESS_EQUAL")
     for name, ends in lines(context).items():
-        shader.uniform_float("viewportSize", gpu.state.viewport_get()[2:])
-        shader.uniform_float("lineWidth", _WIDTH)
-        shader.uniform_float("color", _DRAWN[name][0])
-        batch_for_shader(shader, "LINES", {"pos": ends.reshape(-1, 3).astype(np.float32)}).draw(shader)
+        windows.draw_lines(ends.reshape(-1, 3).astype(np.float32), _DRAWN[name][0], _WIDTH)
     gpu.state.depth_test_set("NONE")
     gpu.state.blend_set("NONE")
 

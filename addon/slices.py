@@ -18,7 +18,7 @@ from ..core.errors import InputError
 from ..core.volumes.volume import Volume
 from . import looks, vdb, volume_materials, volumes
 from .cameras import remove_objects
-from .compat import blank_material
+from .compat import add_node, blank_material
 
 _PLANES = ("Sagittal", "Coronal", "Axial")  # across world x, y, z
 _KEY = "mphdrr_slice"  # custom property: the axis of the grid that a plane is across
@@ -233,18 +233,13 @@ def _plane(item: bpy.types.Object, volume: Volume, axis: int, name: str) -> bpy.
 def _material(name: str, image: bpy.types.Image) -> bpy.types.Material:
     """A picture that shines by itself, seen from both sides, in colours that no light changes."""
     material = blank_material(name)
-    tree = material.node_tree
-    texture = tree.nodes.new("ShaderNodeTexImage")
-    texture.name, texture.image, texture.interpolation, texture.extension = "Slice", image, "Closest", "EXTEND"
-    emission, nothing = tree.nodes.new("ShaderNodeEmission"), tree.nodes.new("ShaderNodeBsdfTransparent")
-    mix, output = tree.nodes.new("ShaderNodeMixShader"), tree.nodes.new("ShaderNodeOutputMaterial")
-    emission.location, nothing.location = (300.0, 0.0), (300.0, -150.0)
-    mix.location, output.location = (500.0, 0.0), (700.0, 0.0)
-    tree.links.new(texture.outputs["Color"], emission.inputs["Color"])
-    tree.links.new(texture.outputs["Alpha"], mix.inputs[0])
-    tree.links.new(nothing.outputs[0], mix.inputs[1])
-    tree.links.new(emission.outputs[0], mix.inputs[2])
-    tree.links.new(mix.outputs[0], output.inputs["Surface"])
+    tree, shown = material.node_tree, {"image": image, "interpolation": "Closest", "extension": "EXTEND"}
+    texture = add_node(tree, "ShaderNodeTexImage", (0.0, 0.0), name="Slice", **shown)
+    emission = add_node(tree, "ShaderNodeEmission", (300.0, 0.0), {"Color": texture.outputs["Color"]})
+    nothing = add_node(tree, "ShaderNodeBsdfTransparent", (300.0, -150.0))
+    mixed = {0: texture.outputs["Alpha"], 1: nothing.outputs[0], 2: emission.outputs[0]}
+    mix = add_node(tree, "ShaderNodeMixShader", (500.0, 0.0), mixed)
+    add_node(tree, "ShaderNodeOutputMaterial", (700.0, 0.0), {"Surface": mix.outputs[0]})
     return material
 
 

@@ -4,14 +4,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import bpy
-import gpu
 import numpy as np
-from gpu_extras.batch import batch_for_shader
 from numpy.typing import ArrayLike, NDArray
 
 from ..core.errors import InputError
 from ..core.runs.display import Display
-from . import ids, images, scanner, selection
+from . import ids, images, scanner, selection, windows
 
 _ACTIVE = (1.0, 1.0, 1.0, 1.0)  # the frame's colour
 _WIDTH = 2.0  # of its lines, in pixels of the screen
@@ -156,9 +154,5 @@ def draw() -> None:
     to_region = context.region.view2d.view_to_region
     left, top = to_region(column / width, 1.0 - row / height, clip=False)
     right, bottom = to_region((column + columns) / width, 1.0 - (row + rows) / height, clip=False)
-    shader = gpu.shader.from_builtin("POLYLINE_UNIFORM_COLOR")
-    shader.uniform_float("viewportSize", gpu.state.viewport_get()[2:])
-    shader.uniform_float("lineWidth", _WIDTH)
-    shader.uniform_float("color", _ACTIVE)
     corners = [(left, top, 0), (right, top, 0), (right, bottom, 0), (left, bottom, 0), (left, top, 0)]
-    batch_for_shader(shader, "LINE_STRIP", {"pos": corners}).draw(shader)
+    windows.draw_lines(corners, _ACTIVE, _WIDTH, "LINE_STRIP")

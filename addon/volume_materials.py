@@ -11,7 +11,7 @@ import bpy
 import numpy as np
 
 from ..core.volumes.volume import UNITS
-from .compat import blank_material
+from .compat import add_math, add_node, blank_material
 
 # Positions and linear RGB, evenly brighter.
 _PURPLES = (
@@ -66,56 +66,32 @@ def usual_range(quantity: str, low: float, high: float) -> tuple[float, float]:
 def new_material(name: str, quantity: str, size: float) -> bpy.types.Material:
     """A material that glows and is opaque where the grid `quantity` is high (`set_range`); for a volume of `size` mm."""
     material = blank_material(name)
-    tree = material.node_tree
-
-    def node(kind: str, column: int, row: float = 0.0, **settings: object) -> bpy.types.Node:
-        new = tree.nodes.new(kind)
-        new.location = (column * 220.0, row * -220.0)
-        for key, value in settings.items():
-            setattr(new, key, value)
-        return new
-
-    attribute = node("ShaderNodeAttribute", 0, attribute_name=quantity)
-    relative = node("ShaderNodeMapRange", 1, name=_RANGE, label=_RANGE, clamp=True)
-    colors = ramp(quantity)
-    color = node("ShaderNodeValToRGB", 2, -1)
+    tree, colors = material.node_tree, ramp(quantity)
+    attribute = add_node(tree, "ShaderNodeAttribute", (0.0, 0.0), attribute_name=quantity)
+    ranged = {"Value": attribute.outputs["Fac"]}
+    relative = add_node(
+        tree, "ShaderNodeMapRange", (220.0, 0.0), ranged, name=_RANGE, label=_RANGE, clamp=True
+    ).outputs[0]
+    color = add_node(tree, "ShaderNodeValToRGB", (440.0, 220.0), {"Fac": relative})
     elements = color.color_ramp.elements
     while len(elements) < len(colors):
         elements.new(0.5)
     for element, (position, rgb) in zip(elements, colors, strict=True):
         element.position, element.color = position, (*rgb, 1.0)
-    opacity = node("ShaderNodeValue", 1, 1.3, name=_OPACITY_NODE, label="Opacity (1/mm)")
-    opacity.outputs[0].default_value = (_OPACITY if quantity == "activity" else _OPACITY_THROUGH) / size
-    exponent = node("ShaderNodeMath", 2, 1.3, operation="POWER", name=_EXPONENT, label=_EXPONENT)
-    gain = node("ShaderNodeMath", 2, 2.3, operation="MULTIPLY", name=_GAIN, label=_GAIN)
-    exponent.inputs[1].default_value = gain.inputs[1].default_value = 1.0
-    place = node("ShaderNodeTexCoord", -2, 3)
-    kept = node("ShaderNodeMath", 2, 3.3, operation="SUBTRACT", label="Not Cut Away")
-    kept.inputs[0].default_value = 1.0
-    seen = node("ShaderNodeMath", 3, 2.3, operation="MULTIPLY")
-    extinction = node("ShaderNodeMath", 3, 0.3, operation="MULTIPLY")
-    absorption = node("ShaderNodeVolumeAbsorption", 4, 0.6)
-    absorption.inputs["Color"].default_value = (0.0, 0.0, 0.0, 1.0)
-    emission = node("ShaderNodeEmission", 4, -0.4)
-    both = node("ShaderNodeAddShader", 5)
-    output = node("ShaderNodeOutputMaterial", 6)
-
-    link = tree.links.new
-    link(attribute.outputs["Fac"], relative.inputs["Value"])
-    link(relative.outputs["Result"], color.inputs["Fac"])
-    link(relative.outputs["Result"], exponent.inputs[0])
-    link(opacity.outputs[0], gain.inputs[0])
-    link(in_front(tree, place.outputs["Object"]), kept.inputs[1])
-    link(gain.outputs[0], seen.inputs[0])
-    link(kept.outputs[0], seen.inputs[1])
-    link(exponent.outputs[0], extinction.inputs[0])
-    link(seen.outputs[0], extinction.inputs[1])
-    link(extinction.outputs[0], absorption.inputs["Density"])
-    link(color.outputs["Color"], emission.inputs["Color"])
-    link(extinction.outputs[0], emission.inputs["Strength"])
-    link(absorption.outputs[0], both.inputs[0])
-    link(emission.outputs[0], both.inputs[1])
-    link(both.outputs[0], output.inputs["Volume"])
+    opacity = add_node(tree, "ShaderNodeValue", (220.0, -286.0), name=_OPACITY_NODE, label="Opacity (1/mm)").outputs[0]
+    opacity.default_value = (_OPACITY if quantity == "activity" else _OPACITY_THROUGH) / size
+    exponent = add_math(tree, "POWER", (440.0, -286.0), relative, 1.0, name=_EXPONENT, label=_EXPONENT)
+    gain = add_math(tree, "MULTIPLY", (440.0, -506.0), opacity, 1.0, name=_GAIN, label=_GAIN)
+    place = add_node(tree, "ShaderNodeTexCoord", (-440.0, -660.0)).outputs["Object"]
+    kept = add_math(tree, "SUBTRACT", (440.0, -726.0), 1.0, in_front(tree, place), label="Not Cut Away")
+    seen = add_math(tree, "MULTIPLY", (660.0, -506.0), gain, kept)
+    extinction = add_math(tree, "MULTIPLY", (660.0, -66.0), exponent, seen)
+    black = {"Color": (0.0, 0.0, 0.0, 1.0), "Density": extinction}
+    absorption = add_node(tree, "ShaderNodeVolumeAbsorption", (880.0, -132.0), black)
+    glow = {"Color": color.outputs["Color"], "Strength": extinction}
+    emission = add_node(tree, "ShaderNodeEmission", (880.0, 88.0), glow)
+    both = add_node(tree, "ShaderNodeAddShader", (1100.0, 0.0), {0: absorption.outputs[0], 1: emission.outputs[0]})
+    add_node(tree, "ShaderNodeOutputMaterial", (1320.0, 0.0), {"Volume": both.outputs[0]})
     material.diffuse_color = (*colors[-1][1], 1.0)  # of the solid viewport's smoke
     return material
 
@@ -129,24 +105,13 @@ def set_range(material: bpy.types.Material, low: float, high: float) -> None:
 
 def in_front(tree: bpy.types.NodeTree, place: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
     """Add nodes whose output is 1 where the `place` is cut away (`set_cut`), else 0; to any kind of tree."""
-    result = None
+    result: Any = None
     for axis in range(3):
-        along = tree.nodes.new("ShaderNodeVectorMath")
-        beyond = tree.nodes.new("ShaderNodeMath")
-        along.operation, beyond.operation = "DOT_PRODUCT", "GREATER_THAN"
-        along.name, beyond.name = f"{_CUT} {axis} along", f"{_CUT} {axis}"
-        along.location, beyond.location = (-220.0, -660.0 - 180.0 * axis), (0.0, -660.0 - 180.0 * axis)
-        beyond.inputs[1].default_value = _FAR
-        tree.links.new(place, along.inputs[0])
-        tree.links.new(along.outputs["Value"], beyond.inputs[0])
-        if result is None:
-            result = beyond.outputs[0]
-            continue
-        both = tree.nodes.new("ShaderNodeMath")
-        both.operation, both.location = "MULTIPLY", (220.0, -660.0 - 180.0 * axis)
-        tree.links.new(result, both.inputs[0])
-        tree.links.new(beyond.outputs[0], both.inputs[1])
-        result = both.outputs[0]
+        row, name = -660.0 - 180.0 * axis, f"{_CUT} {axis}"
+        dot: dict[str, Any] = {"operation": "DOT_PRODUCT", "name": f"{name} along"}
+        along = add_node(tree, "ShaderNodeVectorMath", (-220.0, row), {0: place}, **dot).outputs["Value"]
+        beyond = add_math(tree, "GREATER_THAN", (0.0, row), along, _FAR, name=name)
+        result = beyond if result is None else add_math(tree, "MULTIPLY", (220.0, row), result, beyond)
     return result
 
 

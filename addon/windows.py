@@ -1,8 +1,11 @@
-"""The editors in Blender's windows, to have them drawn again."""
+"""The editors in Blender's windows: to have them drawn again, and to draw lines over them."""
 
 from collections.abc import Iterator
+from typing import Any
 
 import bpy
+import gpu
+from gpu_extras.batch import batch_for_shader
 
 
 def areas(*types: str) -> Iterator[bpy.types.Area]:
@@ -23,3 +26,12 @@ def redraw_sidebars() -> None:
         for region in area.regions:
             if region.type == "UI":
                 region.tag_redraw()
+
+
+def draw_lines(points: Any, color: tuple[float, ...], width: float, kind: str = "LINES") -> None:
+    """Draw lines `width` pixels wide through points (N, 3): by "LINES" two points each, by "LINE_STRIP" one through all."""
+    shader = gpu.shader.from_builtin("POLYLINE_UNIFORM_COLOR")
+    shader.uniform_float("viewportSize", gpu.state.viewport_get()[2:])
+    shader.uniform_float("lineWidth", width)
+    shader.uniform_float("color", color)
+    batch_for_shader(shader, kind, {"pos": points}).draw(shader)

@@ -1,1 +1,4 @@
-"""One file per task that a user asks for: read the properties, call `addon` and `core`, report."""
+"""One file per task that a user asks for: read the properties, call `addon` and `core`, report.
+
+An operator's `bl_idname` follows from the name of its class, `ids.operator_name`: Blender is told when it is registered.
+"""

@@ -5,10 +5,9 @@ from typing import Any
 import bpy
 from bpy.props import BoolProperty, FloatProperty, FloatVectorProperty, StringProperty
 
-from ..addon import ids, jobs, phantoms, storage
+from ..addon import jobs, phantoms, storage
 from ..addon.layouts import labelled
 from ..addon.phantom_properties import FILE, PhantomSettings, identifier, sampling, settings_class
-from ..core.errors import InputError
 from ..core.geometry.frames import euler_pose
 from ..core.phantoms.kinds import KINDS
 from ..core.phantoms.language import read_phantom
@@ -60,7 +59,6 @@ ADD_KINDS = tuple(
         (AddKind, bpy.types.Operator),
         __annotations__={"name": StringProperty(name="Name", description="The object's name", default=kind.label)},
         __doc__=f"Add {kind.summary}, as a volume",
-        bl_idname=ids.ADD_PHANTOM + identifier(kind),
         bl_label=f"Add {kind.label}",
     )
     for kind in KINDS
@@ -70,7 +68,6 @@ ADD_KINDS = tuple(
 class MPHDRR_OT_import_phantom(PhantomSettings, AddPhantom, bpy.types.Operator):
     """Add the phantom that a TOML file describes as a volume; its text becomes one of the .blend"""
 
-    bl_idname = ids.IMPORT_PHANTOM
     bl_label = "Import Phantom"
 
     __annotations__ = {
@@ -83,9 +80,7 @@ class MPHDRR_OT_import_phantom(PhantomSettings, AddPhantom, bpy.types.Operator):
     asks_for = "filepath"
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        if not self.filepath:
-            raise InputError("no file given: set filepath to a phantom's TOML file")
-        path = storage.absolute(self.filepath)
+        path = self.given_file("set filepath to a phantom's TOML file")
         return self.adding(self.name or read_phantom(path).name or path.stem)
 
     def phantom(self) -> Phantom:

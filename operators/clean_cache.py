@@ -2,14 +2,13 @@
 
 import bpy
 
-from ..addon import ids, preferences
+from ..addon import preferences
 from ..addon.reports import Reported, needs
 
 
 class MPHDRR_OT_clean_cache(Reported, bpy.types.Operator):
     """Delete compiled code; it is made again when it is needed"""
 
-    bl_idname = ids.CLEAN_CACHE
     bl_label = "Clean Cache"
     bl_options = {"INTERNAL"}
 

@@ -2,7 +2,7 @@
 
 import bpy
 
-from ..addon import ids, jobs, phantoms
+from ..addon import jobs, phantoms
 from ..addon.reports import Reported, needs
 
 
@@ -20,14 +20,12 @@ class _EditPhantom(jobs.JobOperator):
 class MPHDRR_OT_update_phantom(_EditPhantom, bpy.types.Operator):
     """Make the active phantom's voxels again from its settings; its place stays"""
 
-    bl_idname = ids.UPDATE_PHANTOM
     bl_label = "Update Phantom"
 
 
 class MPHDRR_OT_apply_phantom_pose(_EditPhantom, bpy.types.Operator):
     """Make the active phantom's voxels again on a grid along the world's axes; its settings are given up"""
 
-    bl_idname = ids.APPLY_PHANTOM_POSE
     bl_label = "Apply Pose"
 
     bake = True
@@ -36,7 +34,6 @@ class MPHDRR_OT_apply_phantom_pose(_EditPhantom, bpy.types.Operator):
 class MPHDRR_OT_show_phantom_outline(Reported, bpy.types.Operator):
     """Show or hide the surfaces of the active phantom's shapes as wires that go with it"""
 
-    bl_idname = ids.SHOW_PHANTOM_OUTLINE
     bl_label = "Outline"
 
     poll = needs(phantoms.ACTIVE)

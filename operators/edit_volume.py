@@ -3,7 +3,7 @@
 import bpy
 from bpy.props import FloatProperty, StringProperty
 
-from ..addon import ids, jobs, recovery, slices, storage, volume_import, volumes
+from ..addon import jobs, recovery, slices, storage, volume_import, volumes
 from ..addon.decimals import typed
 from ..addon.reports import Reported, needs
 
@@ -11,7 +11,6 @@ from ..addon.reports import Reported, needs
 class MPHDRR_OT_add_slices(Reported, bpy.types.Operator):
     """Show an axial, a coronal and a sagittal slice of the active volume as planes that go with it"""
 
-    bl_idname = ids.ADD_SLICES
     bl_label = "Add Slices"
 
     poll = needs(volumes.ACTIVE)
@@ -23,7 +22,6 @@ class MPHDRR_OT_add_slices(Reported, bpy.types.Operator):
 class MPHDRR_OT_remove_slices(bpy.types.Operator):
     """Remove the active volume's slice planes"""
 
-    bl_idname = ids.REMOVE_SLICES
     bl_label = "Remove Slices"
     bl_options = {"REGISTER", "UNDO"}
 
@@ -41,7 +39,6 @@ def _is_ct(context: bpy.types.Context) -> bool:
 class MPHDRR_OT_ct_to_attenuation(jobs.JobOperator, bpy.types.Operator):
     """Make a volume of attenuation coefficients (1/mm) from the active volume of CT numbers; the CT stays"""
 
-    bl_idname = ids.CT_TO_ATTENUATION
     bl_label = "CT to Attenuation"
     dialog = {"confirm_text": "Convert"}
 
@@ -58,7 +55,6 @@ class MPHDRR_OT_ct_to_attenuation(jobs.JobOperator, bpy.types.Operator):
 class MPHDRR_OT_clean_volume_files(Reported, bpy.types.Operator):
     """Remove the files of voxels and runs in this .blend's folder that no volume and no list of runs needs any more"""
 
-    bl_idname = ids.CLEAN_VOLUME_FILES
     bl_label = "Clean Up Volume Files"
     bl_options = {"REGISTER"}
 
@@ -78,7 +74,6 @@ class MPHDRR_OT_clean_volume_files(Reported, bpy.types.Operator):
 class MPHDRR_OT_remake_volumes(jobs.JobOperator, bpy.types.Operator):
     """Make the phantoms and maps again whose files of voxels are missing, as after a crash; they stay where they are"""
 
-    bl_idname = ids.REMAKE_VOLUMES
     bl_label = "Make Missing Volumes Again"
 
     poll = needs((lambda context: recovery.missing(context.scene)[0], "No phantom or map misses its file of voxels"))
@@ -90,7 +85,6 @@ class MPHDRR_OT_remake_volumes(jobs.JobOperator, bpy.types.Operator):
 class MPHDRR_OT_find_volume_files(Reported, bpy.types.Operator):
     """Look for the missing files of voxels, by their names, in a folder and all below it"""
 
-    bl_idname = ids.FIND_VOLUME_FILES
     bl_label = "Find Missing Volume Files"
 
     directory: StringProperty(name="Folder", description="Where to look", subtype="DIR_PATH", options={"SKIP_SAVE"})

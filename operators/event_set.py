@@ -4,7 +4,7 @@ import bpy
 from bpy.props import EnumProperty, StringProperty
 from bpy_extras.io_utils import ExportHelper
 
-from ..addon import choices, event_sets, ids, jobs
+from ..addon import choices, event_sets, jobs
 from ..addon.event_properties import COUNT, FOLDER, MODEL, NEXT, OPENED, RECIPE
 from ..addon.reports import Reported
 from ..core.events.templates import TEMPLATES
@@ -15,7 +15,6 @@ class MPHDRR_OT_new_event_recipe(Reported, ExportHelper, bpy.types.Operator):
     example's where there is none
     """
 
-    bl_idname = ids.NEW_EVENT_RECIPE
     bl_label = "New Event Recipe"
 
     filename_ext = ".toml"
@@ -34,7 +33,6 @@ class MPHDRR_OT_try_event(jobs.JobOperator, bpy.types.Operator):
     none. The number goes up by one; the same number always is the same phantom
     """
 
-    bl_idname = ids.TRY_EVENT
     bl_label = "Another Phantom of the Recipe"
 
     recipe: RECIPE  # type: ignore[valid-type]
@@ -52,7 +50,6 @@ class MPHDRR_OT_make_event_set(jobs.JobOperator, bpy.types.Operator):
     on from there the next time
     """
 
-    bl_idname = ids.MAKE_EVENT_SET
     bl_label = "Make Event Set"
 
     recipe: RECIPE  # type: ignore[valid-type]
@@ -68,7 +65,6 @@ class MPHDRR_OT_open_event(jobs.JobOperator, bpy.types.Operator):
     with its settings, hidden, and its projections as a run
     """
 
-    bl_idname = ids.OPEN_EVENT
     bl_label = "Open Event"
 
     folder: FOLDER  # type: ignore[valid-type]

@@ -5,11 +5,10 @@ from pathlib import Path
 import bpy
 from bpy.props import BoolProperty, EnumProperty, StringProperty
 
-from ..addon import ids, jobs, scanner, scanner_files, selection, storage
+from ..addon import jobs, scanner, scanner_files, selection, storage
 from ..addon.decimals import typed
 from ..addon.reports import needs
 from ..addon.scanner_files import WORKBOOK_SUFFIXES
-from ..core.errors import InputError
 from ..core.exchange import FORMAT_NUMBERS, FORMATS
 
 _FORMATS = tuple((f.name, f.name, f.title, FORMAT_NUMBERS[f.name]) for f in FORMATS.values())
@@ -18,7 +17,6 @@ _FORMATS = tuple((f.name, f.name, f.title, FORMAT_NUMBERS[f.name]) for f in FORM
 class MPHDRR_OT_export_geometry(jobs.ExportJob, bpy.types.Operator):
     """Write the scanner as it stands in the scene to a workbook, into a copy of the one it came from"""
 
-    bl_idname = ids.EXPORT_GEOMETRY
     bl_label = "Export Pinhole Geometry"
 
     poll = needs(selection.SCANNER)
@@ -49,10 +47,8 @@ class MPHDRR_OT_export_geometry(jobs.ExportJob, bpy.types.Operator):
         return True
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        if not self.filepath:
-            raise InputError("no file given: set filepath to a name ending in .xlsx")
-        collection, path = scanner.required_scanner(context.scene), storage.absolute(self.filepath)
-        return scanner_files.exporting_scanner(collection, path, self.use_template)
+        path = self.given_file("set filepath to a name ending in .xlsx")
+        return scanner_files.exporting_scanner(scanner.required_scanner(context.scene), path, self.use_template)
 
 
 class MPHDRR_OT_export_for_program(jobs.ExportJob, bpy.types.Operator):
@@ -60,7 +56,6 @@ class MPHDRR_OT_export_for_program(jobs.ExportJob, bpy.types.Operator):
     Monte Carlo simulations. Images are those of the Projections panel
     """
 
-    bl_idname = ids.EXPORT_FOR_PROGRAM
     bl_label = "Export Geometry for a Program"
     bl_options = set()
 
@@ -84,9 +79,7 @@ class MPHDRR_OT_export_for_program(jobs.ExportJob, bpy.types.Operator):
         return before != self.filepath
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        if not self.filepath:
-            raise InputError("no file given: set filepath")
-        path, images = storage.absolute(self.filepath), context.scene.mphdrr_projections
+        path, images = self.given_file("set filepath"), context.scene.mphdrr_projections
         shape, magnification = (images.height, images.width), typed(images.magnification)
         collection, detector = scanner.required_scanner(context.scene), images.detector.lower()
         return scanner_files.exporting_for_program(collection, path, self.format, shape, detector, magnification)

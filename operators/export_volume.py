@@ -3,14 +3,12 @@
 import bpy
 from bpy.props import StringProperty
 
-from ..addon import ids, jobs, storage, volumes
+from ..addon import jobs, volumes
 from ..addon.reports import needs
 from ..addon.volume_export import WRITTEN_ENDINGS, exporting
-from ..core.errors import InputError
 
 
 class MPHDRR_OT_export_volume(jobs.JobOperator, bpy.types.Operator):
-    bl_idname = ids.EXPORT_VOLUME
     bl_label = "Export Volume"
     bl_description = (
         f"Write every voxel of the active volume, where it stands in the world; endings: {', '.join(WRITTEN_ENDINGS)}"
@@ -30,6 +28,5 @@ class MPHDRR_OT_export_volume(jobs.JobOperator, bpy.types.Operator):
         return {"RUNNING_MODAL"}
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        if not self.filepath:
-            raise InputError(f"no file given: expected a name ending in {', '.join(WRITTEN_ENDINGS)}")
-        return exporting(context.object, storage.absolute(self.filepath))
+        path = self.given_file(f"expected a name ending in {', '.join(WRITTEN_ENDINGS)}")
+        return exporting(context.object, path)

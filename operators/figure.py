@@ -5,7 +5,7 @@ from pathlib import Path
 import bpy
 from bpy.props import BoolProperty, EnumProperty, IntProperty, StringProperty
 
-from ..addon import figures, ids, jobs, scanner, storage, volumes
+from ..addon import figures, jobs, scanner, volumes
 from ..addon.reports import Need, needs
 from ..core.errors import InputError
 from ..core.figures.page import LARGEST, SUFFIXES
@@ -19,7 +19,6 @@ _SHOWN: Need = (
 class MPHDRR_OT_export_figure(jobs.JobOperator, bpy.types.Operator):
     """Draw a figure of the scanner, the volume or the last projections as PNG, or as SVG whose labels are text"""
 
-    bl_idname = ids.EXPORT_FIGURE
     bl_label = "Export Figure"
     bl_options = set()
 
@@ -58,10 +57,9 @@ class MPHDRR_OT_export_figure(jobs.JobOperator, bpy.types.Operator):
         return True
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        if not self.filepath:
-            raise InputError(f"no file given: set filepath to a name ending in {' or '.join(SUFFIXES)}")
+        path = self.given_file(f"set filepath to a name ending in {' or '.join(SUFFIXES)}")
         if bool(self.width) != bool(self.height):
             raise InputError("size: give both width and height, or neither")
         size = (self.width, self.height) if self.width else None
-        name, paths = self.figure.lower().replace("_", "-"), [storage.absolute(self.filepath)]
-        return figures.figure_job(context, name, paths, size, self.modules or None, self.labels, self.samples)
+        name = self.figure.lower().replace("_", "-")
+        return figures.figure_job(context, name, [path], size, self.modules or None, self.labels, self.samples)

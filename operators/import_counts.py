@@ -12,7 +12,7 @@ from bpy.props import (
     StringProperty,
 )
 
-from ..addon import choices, counts_import, ids, jobs, storage
+from ..addon import choices, counts_import, jobs, storage
 from ..addon.decimals import typed
 from ..addon.layouts import labelled
 from ..core.runs.frame_files import COUNTS_FORMATS, RAW_TYPES
@@ -30,7 +30,6 @@ class MPHDRR_OT_import_counts(jobs.JobOperator, bpy.types.Operator):
     lie on the crystals and the exposure time are never guessed: say them, and check the mosaic
     """
 
-    bl_idname = ids.IMPORT_COUNTS
     bl_label = "Import Measured Counts"
     asks_for = "filepath"
 

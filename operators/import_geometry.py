@@ -20,7 +20,6 @@ from . import column_map_dialog
 class MPHDRR_OT_import_geometry(bpy.types.Operator):
     """Read a workbook of pinhole modules and build the scanner: a camera, a collimator and a crystal each"""
 
-    bl_idname = ids.IMPORT_GEOMETRY
     bl_label = "Import Pinhole Geometry"
     bl_options = {"REGISTER", "UNDO"}
 

@@ -9,7 +9,7 @@ from typing import Any
 import bpy
 from bpy.props import BoolProperty, CollectionProperty, EnumProperty, FloatProperty, IntProperty, StringProperty
 
-from ..addon import choices, ids, jobs, storage
+from ..addon import choices, jobs, storage
 from ..addon.decimals import typed
 from ..addon.layouts import labelled
 from ..addon.volume_import import READ_ENDINGS, importing, name_of
@@ -85,7 +85,6 @@ class ReadVolumes(jobs.JobOperator):
 class MPHDRR_OT_import_volume(ReadVolumes, bpy.types.Operator):
     """Read a CT, an image or an OpenVDB grid as a volume to project; of a DICOM series choose the folder"""
 
-    bl_idname = ids.IMPORT_VOLUME
     bl_label = "Import Volume"
     asks_for = "filepath"
 
@@ -96,15 +95,13 @@ class MPHDRR_OT_import_volume(ReadVolumes, bpy.types.Operator):
     name: StringProperty(name="Name", description="The object's name. Empty: the file's", options={"SKIP_SAVE"})
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        if not self.filepath:
-            raise InputError("no file given: set filepath to a volume's file, or to the folder of a DICOM series")
-        return self.importing([storage.absolute(self.filepath)], self.name)
+        path = self.given_file("set filepath to a volume's file, or to the folder of a DICOM series")
+        return self.importing([path], self.name)
 
 
 class MPHDRR_OT_import_volume_sequence(ReadVolumes, bpy.types.Operator):
     """Read several files, in the order of their numbers, as one volume that plays over the frames"""
 
-    bl_idname = ids.IMPORT_VOLUME_SEQUENCE
     bl_label = "Import Volume Sequence"
     asks_for = "files"
 

@@ -2,7 +2,7 @@
 
 import bpy
 
-from ..addon import example, ids, jobs
+from ..addon import example, jobs
 from ..addon.cli.demo import EXAMPLE
 from ..addon.reports import needs
 
@@ -10,7 +10,6 @@ from ..addon.reports import needs
 class MPHDRR_OT_load_example(jobs.JobOperator, bpy.types.Operator):
     """Load the bundled scanner of 80 modules with a Derenzo phantom, and show what every module sees of it"""
 
-    bl_idname = ids.LOAD_EXAMPLE
     bl_label = "Load Example"
 
     poll = needs((lambda context: not jobs.is_running(), "Another job is running: wait for it or cancel it"))
@@ -22,7 +21,6 @@ class MPHDRR_OT_load_example(jobs.JobOperator, bpy.types.Operator):
 class MPHDRR_OT_browse_example(bpy.types.Operator):
     """Choose the bundled workbook, a scanner of 80 modules in 4 rings"""
 
-    bl_idname = ids.BROWSE_EXAMPLE
     bl_label = "Example Workbook"
     bl_options = {"INTERNAL"}
 

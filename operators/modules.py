@@ -5,7 +5,7 @@ import math
 import bpy
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty
 
-from ..addon import following, ids, jobs, maps, module_edits, scanner, selection
+from ..addon import following, jobs, maps, module_edits, scanner, selection
 from ..addon.decimals import typed
 from ..addon.reports import needs
 from ..addon.scanner_parts import modules_text
@@ -14,7 +14,6 @@ from ..addon.scanner_parts import modules_text
 class MPHDRR_OT_show_modules(selection.OnScanner, bpy.types.Operator):
     """Show or hide modules with their collimators and crystals, in the viewport and in renders"""
 
-    bl_idname = ids.SHOW_MODULES
     bl_label = "Show Modules"
 
     first: IntProperty(name="First", description="First module number of the range", default=1)
@@ -37,7 +36,6 @@ class MPHDRR_OT_show_modules(selection.OnScanner, bpy.types.Operator):
 class MPHDRR_OT_look_through_module(selection.OnScanner, bpy.types.Operator):
     """Make the module's pinhole camera the scene's camera, and look through it"""
 
-    bl_idname = ids.LOOK_THROUGH_MODULE
     bl_label = "Look Through Module"
 
     number: IntProperty(name="Number", description="Module number", default=1)
@@ -52,7 +50,6 @@ class MPHDRR_OT_look_through_module(selection.OnScanner, bpy.types.Operator):
 class MPHDRR_OT_aim_modules(selection.OnScanner, bpy.types.Operator):
     """Turn every module that does not look at the isocentre, without moving it"""
 
-    bl_idname = ids.AIM_MODULES
     bl_label = "Aim at Isocentre"
 
     def change(self, context: bpy.types.Context, collection: bpy.types.Collection) -> str:
@@ -63,7 +60,6 @@ class MPHDRR_OT_aim_modules(selection.OnScanner, bpy.types.Operator):
 class MPHDRR_OT_duplicate_modules(selection.OnModules, bpy.types.Operator):
     """Copy the selected modules, with collimators and crystals, to further places on their rings"""
 
-    bl_idname = ids.DUPLICATE_MODULES
     bl_label = "Duplicate Along Ring"
 
     count: IntProperty(name="Copies", description="Number of copies of each module", default=1, min=1, soft_max=40)
@@ -87,7 +83,6 @@ class MPHDRR_OT_duplicate_modules(selection.OnModules, bpy.types.Operator):
 class MPHDRR_OT_remove_modules(selection.OnModules, bpy.types.Operator):
     """Delete the selected modules with their collimators and crystals"""
 
-    bl_idname = ids.REMOVE_MODULES
     bl_label = "Remove Modules"
 
     def change(self, context: bpy.types.Context, collection: bpy.types.Collection) -> str:
@@ -102,7 +97,6 @@ class MPHDRR_OT_tidy_modules(selection.OnScanner, bpy.types.Operator):
     crystals whose camera was deleted
     """
 
-    bl_idname = ids.TIDY_MODULES
     bl_label = "Tidy Modules"
 
     def change(self, context: bpy.types.Context, collection: bpy.types.Collection) -> str:
@@ -116,7 +110,6 @@ class MPHDRR_OT_tidy_modules(selection.OnScanner, bpy.types.Operator):
 class MPHDRR_OT_renumber_modules(selection.OnScanner, bpy.types.Operator):
     """Number all modules 1, 2, ...; they are listed, projected and exported in that order from now on"""
 
-    bl_idname = ids.RENUMBER_MODULES
     bl_label = "Renumber Modules"
 
     order: EnumProperty(
@@ -136,7 +129,6 @@ class MPHDRR_OT_renumber_modules(selection.OnScanner, bpy.types.Operator):
 class MPHDRR_OT_reset_cameras(selection.OnScanner, bpy.types.Operator):
     """Set lens and sensor of the modules' cameras to what the projections show"""
 
-    bl_idname = ids.RESET_CAMERAS
     bl_label = "Reset Cameras"
 
     def change(self, context: bpy.types.Context, collection: bpy.types.Collection) -> str:
@@ -147,7 +139,6 @@ class MPHDRR_OT_reset_cameras(selection.OnScanner, bpy.types.Operator):
 class MPHDRR_OT_set_up_scene(selection.OnScanner, bpy.types.Operator):
     """Set the scene's units to millimetres, and look at the whole scanner: for a scanner from another file"""
 
-    bl_idname = ids.SET_UP_SCENE
     bl_label = "Set Up Scene"
 
     def change(self, context: bpy.types.Context, collection: bpy.types.Collection) -> str:
@@ -158,7 +149,6 @@ class MPHDRR_OT_set_up_scene(selection.OnScanner, bpy.types.Operator):
 class MPHDRR_OT_remove_scanner(selection.OnScanner, bpy.types.Operator):
     """Remove the scanner with its cameras, collimators, crystals and projections in the scene; your own objects stay"""
 
-    bl_idname = ids.REMOVE_SCANNER
     bl_label = "Remove Scanner"
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
@@ -180,7 +170,6 @@ class MPHDRR_OT_check_geometry(selection.OnScanner, bpy.types.Operator):
     their ROI; select the modules concerned
     """
 
-    bl_idname = ids.CHECK_GEOMETRY
     bl_label = "Check Geometry"
 
     def change(self, context: bpy.types.Context, collection: bpy.types.Collection) -> str:
@@ -197,7 +186,6 @@ class MPHDRR_OT_add_map(jobs.JobOperator, bpy.types.Operator):
     in place of the scanner's last map of this quantity
     """
 
-    bl_idname = ids.ADD_MAP
     bl_label = "Add Map"
 
     poll = needs(selection.SCANNER)

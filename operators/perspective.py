@@ -2,9 +2,9 @@
 
 import bpy
 
-from ..addon import frustums, ids, jobs, selection, volumes
+from ..addon import frustums, jobs, selection, volumes
 from ..addon.perspective_properties import PerspectiveSettings
-from ..addon.reports import needs
+from ..addon.reports import Reported, needs
 
 
 class _InPerspective(PerspectiveSettings, jobs.JobOperator):
@@ -19,7 +19,6 @@ class MPHDRR_OT_show_in_perspective(_InPerspective, bpy.types.Operator):
     the module; the settings are what the panel says now, unless a script gives others
     """
 
-    bl_idname = ids.SHOW_IN_PERSPECTIVE
     bl_label = "Show in Perspective"
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
@@ -31,23 +30,19 @@ class MPHDRR_OT_resample_in_perspective(_InPerspective, bpy.types.Operator):
     voxels, as a new volume: what these cells keep of it. Beyond what the module sees, it is empty
     """
 
-    bl_idname = ids.RESAMPLE_IN_PERSPECTIVE
     bl_label = "Volume Through Module"
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
         return frustums.resampling(context, *map(self.given_or(context.scene.mphdrr_perspective), ("cells", "uniform")))
 
 
-class MPHDRR_OT_clear_perspective(bpy.types.Operator):
+class MPHDRR_OT_clear_perspective(Reported, bpy.types.Operator):
     """Remove all volumes in perspective, of all modules"""
 
-    bl_idname = ids.CLEAR_PERSPECTIVE
     bl_label = "Clear Perspective"
-    bl_options = {"REGISTER", "UNDO"}
 
     poll = needs((lambda context: frustums.frustums(context.scene), "No volume is shown in perspective"))
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
+    def act(self, context: bpy.types.Context) -> str:
         count = frustums.remove(context.scene)
-        self.report({"INFO"}, f"Removed {count} volume{'s' * (count > 1)} in perspective")
-        return {"FINISHED"}
+        return f"Removed {count} volume{'s' * (count > 1)} in perspective"

@@ -5,7 +5,7 @@ import numpy as np
 from bpy.props import FloatProperty, IntProperty
 from bpy_extras import view3d_utils
 
-from ..addon import epipolar, epipolar_drawing, ids, images, tiles
+from ..addon import epipolar, epipolar_drawing, images, tiles
 from ..addon.decimals import typed
 from ..addon.eyedropper import Eyedropper, region_under
 from ..addon.reports import Reported, needs
@@ -17,7 +17,6 @@ class MPHDRR_OT_pick_pixel(Eyedropper, Reported, bpy.types.Operator):
     other modules' projections its epipolar lines. Esc or a right click leaves all as it was
     """
 
-    bl_idname = ids.PICK_PIXEL
     bl_label = "Pick Pixel"
 
     module: IntProperty(name="Module", description="Number of the module", default=1, options={"SKIP_SAVE"})
@@ -70,7 +69,6 @@ class MPHDRR_OT_pick_pixel(Eyedropper, Reported, bpy.types.Operator):
 class MPHDRR_OT_clear_pixel(bpy.types.Operator):
     """Draw no ray and no epipolar lines any more"""
 
-    bl_idname = ids.CLEAR_PIXEL
     bl_label = "Clear Picked Pixel"
     bl_options = {"REGISTER", "UNDO"}
 

@@ -18,7 +18,6 @@ class MPHDRR_OT_pick_window(Eyedropper, bpy.types.Operator):
     the mouse stands in the status bar; Esc or a right click leaves all as it was
     """
 
-    bl_idname = ids.PICK_WINDOW
     bl_label = "Pick Window"
     bl_options = {"REGISTER", "UNDO"}
 

@@ -2,14 +2,13 @@
 
 import bpy
 
-from ..addon import ids, jobs, preview, selection, volumes
+from ..addon import jobs, preview, selection, volumes
 from ..addon.reports import needs
 
 
 class MPHDRR_OT_live_preview(bpy.types.Operator):
     """Show in the 3D views what the active module sees, made again while it, the phantom or a number changes; again: stop"""
 
-    bl_idname = ids.LIVE_PREVIEW
     bl_label = "Live Preview"
 
     _can_start = needs(

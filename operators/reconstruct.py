@@ -21,7 +21,6 @@ class MPHDRR_OT_reconstruct(ReconstructionSettings, jobs.JobOperator, bpy.types.
     it away again, Finish Now keeps what there is. The settings are what the panel says now, unless a script gives others
     """
 
-    bl_idname = ids.RECONSTRUCT
     bl_label = "Reconstruct Projections"
 
     poll = needs(_RUN)
@@ -39,7 +38,6 @@ class MPHDRR_OT_backproject(BackprojectionSettings, jobs.JobOperator, bpy.types.
     script gives others
     """
 
-    bl_idname = ids.BACKPROJECT
     bl_label = "Back-Project Projections"
 
     poll = needs(_RUN)
@@ -54,7 +52,6 @@ class MPHDRR_OT_show_reconstruction(ShowPicture, bpy.types.Operator):
     none
     """
 
-    bl_idname = ids.SHOW_RECONSTRUCTION
     bl_label = "Show Slices of Reconstructed Volume"
 
     picture = ids.RECONSTRUCTION

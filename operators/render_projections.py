@@ -21,7 +21,6 @@ class MPHDRR_OT_render_projections(ProjectionSettings, jobs.JobOperator, bpy.typ
     the .blend. The settings are what the panel says now, unless a script gives others
     """
 
-    bl_idname = ids.RENDER_PROJECTIONS
     bl_label = "Render Projections"
 
     volume: StringProperty(name="Volume", description="Name of the volume object to project", options={"SKIP_SAVE"})
@@ -57,7 +56,6 @@ class MPHDRR_OT_use_preset(bpy.types.Operator):
     blur stay as they are
     """
 
-    bl_idname = ids.USE_PRESET
     bl_label = "Physics Preset"
     bl_options = {"REGISTER", "UNDO"}
 
@@ -77,7 +75,6 @@ class MPHDRR_OT_load_recipe(Reported, ImportHelper, bpy.types.Operator):
     scene has objects of their names, volumes. By default the recipe of the last run
     """
 
-    bl_idname = ids.LOAD_RECIPE
     bl_label = "Load Recipe"
 
     filter_glob: StringProperty(default="*.toml;*.h5;*.hdf5;*.npz;*.pt", options={"HIDDEN"})
@@ -105,7 +102,6 @@ class ShowPicture:
 class MPHDRR_OT_show_projections(ShowPicture, bpy.types.Operator):
     """Show the mosaic of the last run in an Image Editor, opened below the 3D view if there is none"""
 
-    bl_idname = ids.SHOW_PROJECTIONS
     bl_label = "Show Projections"
 
     poll = needs(images.PROJECTED)
@@ -119,7 +115,6 @@ def _shows_mosaic(context: bpy.types.Context) -> bool:
 class MPHDRR_OT_pick_module(bpy.types.Operator):
     """Make the module active whose image in the mosaic is clicked"""
 
-    bl_idname = ids.PICK_MODULE
     bl_label = "Pick Module"
     bl_options = {"UNDO", "INTERNAL"}
 
@@ -137,7 +132,6 @@ class MPHDRR_OT_pick_module(bpy.types.Operator):
 class MPHDRR_OT_export_dataset(jobs.ExportJob, bpy.types.Operator):
     """Write the shown run, with geometry, volume and provenance, as HDF5 (.h5), NumPy (.npz) or PyTorch (.pt)"""
 
-    bl_idname = ids.EXPORT_DATASET
     bl_label = "Export mphDRR Dataset"
     bl_options = set()
 

@@ -5,7 +5,7 @@ from typing import Any
 import bpy
 from bpy.props import EnumProperty, IntProperty
 
-from ..addon import ids, images, jobs, rendering, runs
+from ..addon import images, jobs, rendering, runs
 from ..addon.reports import Need, Reported, needs
 from ..core.errors import InputError
 from ..core.progress import Progress
@@ -28,7 +28,6 @@ _LISTED: Need = (lambda context: context.scene.mphdrr_projections.runs, "No runs
 class MPHDRR_OT_show_run(jobs.JobOperator, bpy.types.Operator):
     """Show a run of the list: its images, the mosaic and the planes in the scene. Modules and volumes stay as they are"""
 
-    bl_idname = ids.SHOW_RUN
     bl_label = "Show Run"
     bl_options = {"REGISTER", "UNDO", "INTERNAL"}  # a click in the list
 
@@ -44,7 +43,6 @@ class MPHDRR_OT_show_run(jobs.JobOperator, bpy.types.Operator):
 class MPHDRR_OT_remove_run(Reported, bpy.types.Operator):
     """Remove a run from the list, and its file from the disk if it is in this .blend's own folder"""
 
-    bl_idname = ids.REMOVE_RUN
     bl_label = "Remove Run"
 
     poll = needs(_LISTED)
@@ -76,7 +74,6 @@ class MPHDRR_OT_compare_runs(jobs.JobOperator, bpy.types.Operator):
     red where the shown one has more, blue where it has less
     """
 
-    bl_idname = ids.COMPARE_RUNS
     bl_label = "Compare Runs"
 
     poll = needs(_LISTED)

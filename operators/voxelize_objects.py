@@ -3,7 +3,7 @@
 import bpy
 from bpy.props import EnumProperty, FloatProperty, IntProperty, StringProperty
 
-from ..addon import choices, ids, jobs, meshes, volumes
+from ..addon import choices, jobs, meshes, volumes
 from ..addon.decimals import typed
 from ..addon.reports import needs
 
@@ -13,7 +13,6 @@ class MPHDRR_OT_voxelize_objects(jobs.JobOperator, bpy.types.Operator):
     object's custom property 'activity' or 'mu' counts instead of the value; later names cover earlier ones
     """
 
-    bl_idname = ids.VOXELIZE_OBJECTS
     bl_label = "Voxelize Meshes"
     dialog = {"confirm_text": "Voxelize", "width": 320}
 
@@ -42,7 +41,6 @@ class MPHDRR_OT_voxelize_objects(jobs.JobOperator, bpy.types.Operator):
 class MPHDRR_OT_mesh_from_volume(jobs.JobOperator, bpy.types.Operator):
     """Make a closed mesh of the active volume's surface of one value, for display and print"""
 
-    bl_idname = ids.MESH_FROM_VOLUME
     bl_label = "Mesh from Volume"
     dialog = {"confirm_text": "Make"}
 

@@ -4,7 +4,7 @@ import bpy
 from bpy.app.translations import pgettext_iface as iface
 
 from ..addon import ids, images, selection, tiles
-from ..addon.layouts import labelled
+from ..addon.layouts import labelled, shown_where
 from .geometry import Sidebar
 
 
@@ -13,9 +13,7 @@ class _Display:
 
     bl_label = "Display"
 
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return ids.MOSAIC in bpy.data.images
+    poll = shown_where(lambda context: ids.MOSAIC in bpy.data.images)
 
     def draw(self, context: bpy.types.Context) -> None:
         layout = labelled(self.layout)  # type: ignore[attr-defined]

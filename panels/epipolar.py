@@ -4,7 +4,7 @@ import bpy
 from bpy.app.translations import pgettext_iface as iface
 
 from ..addon import epipolar, ids
-from ..addon.layouts import invoking, labelled
+from ..addon.layouts import invoking, labelled, shown_where
 from .geometry import Sidebar, draw_facts, draw_text
 
 
@@ -14,9 +14,7 @@ class _Epipolar:
     bl_label = "Epipolar Lines"
     bl_options = {"DEFAULT_CLOSED"}
 
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return ids.MOSAIC in bpy.data.images
+    poll = shown_where(lambda context: ids.MOSAIC in bpy.data.images)
 
     def draw(self, context: bpy.types.Context) -> None:
         layout = labelled(self.layout)  # type: ignore[attr-defined]

@@ -8,7 +8,7 @@ import numpy as np
 from bpy.app.translations import pgettext_iface as iface
 
 from ..addon import following, ids, jobs, scanner, selection
-from ..addon.layouts import invoking
+from ..addon.layouts import invoking, shown_where
 
 _LINE = 32  # letters that fit into the sidebar at its usual width
 
@@ -99,9 +99,7 @@ class ScannerPanel(Sidebar):
     bl_parent_id = "MPHDRR_PT_geometry"
     bl_options = {"DEFAULT_CLOSED"}  # so that Phantom and Projections are in sight
 
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return scanner.active_scanner(context.scene) is not None
+    poll = shown_where(lambda context: scanner.active_scanner(context.scene) is not None)
 
     def draw(self, context: bpy.types.Context) -> None:
         collection = scanner.active_scanner(context.scene)

@@ -4,7 +4,7 @@ import bpy
 from bpy.app.translations import pgettext_iface as iface
 
 from ..addon import ids, jobs, rendering, runs, scanner, volumes
-from ..addon.layouts import draw_settings, invoking, labelled
+from ..addon.layouts import draw_settings, invoking, labelled, shown_where
 from ..addon.projection_properties import drawn, makes_counts
 from .geometry import Sidebar, draw_hint, draw_text
 from .runs import draw_changes
@@ -55,9 +55,7 @@ class MPHDRR_PT_physics(Sidebar, bpy.types.Panel):
     bl_parent_id = "MPHDRR_PT_projections"
     bl_options = {"DEFAULT_CLOSED"}
 
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return bool(context.scene.mphdrr_projections.model != "INVERSE_SQUARE")
+    poll = shown_where(lambda context: context.scene.mphdrr_projections.model != "INVERSE_SQUARE")
 
     def draw_header_preset(self, context: bpy.types.Context) -> None:
         self.layout.operator_menu_enum(ids.USE_PRESET, "preset", text="", icon="PRESET")

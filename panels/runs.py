@@ -4,7 +4,7 @@ import bpy
 from bpy.app.translations import pgettext_iface as iface
 
 from ..addon import ids, images, jobs, runs
-from ..addon.layouts import invoking
+from ..addon.layouts import invoking, shown_where
 from .geometry import Sidebar, draw_text
 
 
@@ -33,9 +33,7 @@ class _Runs:
 
     bl_label = "Runs"
 
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return bool(context.scene.mphdrr_projections.runs)
+    poll = shown_where(lambda context: context.scene.mphdrr_projections.runs)
 
     def draw(self, context: bpy.types.Context) -> None:
         layout = self.layout  # type: ignore[attr-defined]

@@ -4,6 +4,7 @@ import bpy
 from mathutils import Matrix, Vector
 
 from ..addon import slices
+from ..addon.layouts import shown_where
 
 _COLORS = ((1.0, 0.2, 0.32), (0.55, 0.86, 0.0), (0.16, 0.56, 1.0))  # of Blender's axes
 
@@ -17,9 +18,7 @@ class MPHDRR_GGT_slices(bpy.types.GizmoGroup):
     bl_region_type = "WINDOW"
     bl_options = {"3D", "PERSISTENT"}
 
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return slices.sliced(context) is not None
+    poll = shown_where(lambda context: slices.sliced(context) is not None)
 
     def setup(self, context: bpy.types.Context) -> None:
         for axis, color in enumerate(_COLORS):

@@ -20,12 +20,8 @@ from .scene import INSTALL_BLENDER, new_scene, quiet, save_scene
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "dc-spect-80.xlsx"
 EULER_DEGREES = (30.0, 55.0, 0.0)  # tilted, so that modules see along and across the rods
-# Besides the modules' ranges: name, kind and modules.
-_FIGURES = (
-    ("phantom", "inside", None),
-    ("cut-away", "cut-away", None),
-    ("sums", "sums", None),
-)
+_FIGURES = {"phantom": "inside", "cut-away": "cut-away", "sums": "sums"}
+"""Name and kind of those besides the modules' ranges."""
 _SIZE = dict.fromkeys(("scanner", "inside", "cut-away"), (880, 510))
 """Smaller than usual: they take most of the demo's time."""
 
@@ -86,8 +82,9 @@ def _make_scene(scene: Any, run: ProjectionRun, out: Path) -> None:
         rendering.show_run(scene, run, out / "run.h5", item)
         save_scene(out / "scanner.blend")
     with _step("pictures"), quiet():
-        ranges = {f"modules-{first}-{last}": f"{first}-{last}" for first, last in scanner.quick_ranges(run.system)}
-        for name, figure, modules in (*((name, "scanner", text) for name, text in ranges.items()), *_FIGURES):
+        ranges = (f"{first}-{last}" for first, last in scanner.quick_ranges(run.system))
+        wanted = [(f"modules-{modules}", "scanner", modules) for modules in ranges]
+        for name, figure, modules in (*wanted, *((name, kind, None) for name, kind in _FIGURES.items())):
             path = out / f"{name}.png"
             jobs.run(figures.figure_job(bpy.context, figure, [path], _SIZE.get(figure), modules, samples=8))
 

@@ -26,11 +26,10 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     parser.add_argument("--how", choices=tuple(HOW), default="sum", help=text)
     for name in ("voxels", "spacing", "center"):
         add_setting(parser, SETTINGS[f"reconstruction.{name}"])
-    text = f"the volume: {', '.join(VOLUME_FORMATS)}"
-    parser.add_argument("-o", "--output", required=True, metavar="FILE", help=text)
-    text = "also write how many views see each voxel, as a volume"
-    parser.add_argument("--views-that-see", metavar="FILE", help=text)
-    parser.add_argument("--json", action="store_true", help="print JSON")
+    add = parser.add_argument
+    add("-o", "--output", required=True, metavar="FILE", help=f"the volume: {', '.join(VOLUME_FORMATS)}")
+    add("--views-that-see", metavar="FILE", help="also write how many views see each voxel, as a volume")
+    add("--json", action="store_true", help="print JSON")
     parser.set_defaults(run=_run, entries=[])
 
 

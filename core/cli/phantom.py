@@ -162,8 +162,7 @@ def _add_output(parser: argparse.ArgumentParser, make: Make) -> None:
     add("--box", type=float, nargs="+", default=[0], metavar="MM", help=box)
     add("--count", type=int, default=1, metavar="N", help="with --random: how many, as FILE-1, FILE-2 …")
     add("--json", action="store_true", help="print what was written, with the poses, as JSON")
-    formats = f"{', '.join(VOLUME_FORMATS)}; .toml writes the shapes"
-    add("-o", "--output", required=True, metavar="FILE", help=formats)
+    add("-o", "--output", required=True, metavar="FILE", help=f"{', '.join(VOLUME_FORMATS)}; .toml writes the shapes")
     parser.set_defaults(run=_run, make=make)
 
 

@@ -13,8 +13,7 @@ Gradients = Callable[[Tensor, Sequence[bool]], Sequence[Tensor | None]]
 
 def linear(forward: Callable[[Tensor], Tensor], adjoint: Callable[[Tensor], Tensor], x: Tensor) -> Tensor:
     """``forward(x)``, a linear map with that `adjoint`; differentiable to any order, in both modes."""
-    result: Tensor = _Linear.apply(forward, adjoint, x)
-    return result
+    return _Linear.apply(forward, adjoint, x)
 
 
 class _Linear(torch.autograd.Function):
@@ -23,8 +22,7 @@ class _Linear(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, forward: Any, adjoint: Any, x: Tensor) -> Tensor:
         ctx.maps = forward, adjoint
-        result: Tensor = forward(x.detach())
-        return result
+        return forward(x.detach())
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[None, None, Tensor]:
@@ -46,8 +44,7 @@ def step(run: Callable[[Sequence[bool]], tuple[Tensor, Gradients]], *inputs: Any
         Of which inputs need a gradient: the result, and a function of the result's gradient and of which inputs need one
         that returns their gradients, None for the others.
     """
-    result: Tensor = _Step.apply(run, *inputs)
-    return result
+    return _Step.apply(run, *inputs)
 
 
 class _Step(torch.autograd.Function):

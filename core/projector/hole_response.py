@@ -216,8 +216,7 @@ class WholeHoles(DepthResponses):
 
 def _line(edges: Array) -> Array:
     """Along u, v and k, per mm of depth, the line on which a voxel lies by its depth; its `edges` (3, 3) are columns, mm."""
-    line: Array = edges @ edges[2] / (edges[2] @ edges[2])
-    return line
+    return edges @ edges[2] / (edges[2] @ edges[2])
 
 
 def _cells_of_pixel(pitch: float, shadow: float, voxel: float) -> int:

@@ -115,8 +115,7 @@ def recipe_model(recipe: Recipe, system: PinholeSystem, mu: Volume | None = None
         if "model.opening_angle_degrees" in recipe.given:
             given["opening_angle"] = math.radians(recipe["model.opening_angle_degrees"])
         given["mu"] = mu
-    model: Model = cls(**given) if cls is Transmission else cls(system, **given)
-    return model
+    return cls(**given) if cls is Transmission else cls(system, **given)
 
 
 def projector_of_run(
@@ -270,8 +269,7 @@ def recipe_phantom(recipe: Recipe) -> Phantom:
     if recipe["phantom.text"] is not None:
         return parse_phantom(recipe["phantom.text"])
     (kind,) = (kind for kind in KINDS if kind.name == recipe["phantom.kind"])
-    phantom: Phantom = kind.phantom(**{**kind.usual, **recipe.fields("phantom", kind.phantom)})
-    return phantom
+    return kind.phantom(**{**kind.usual, **recipe.fields("phantom", kind.phantom)})
 
 
 def truth_of_run(run: ProjectionRun) -> tuple[Volume | Phantom, NDArray[np.float64] | None]:

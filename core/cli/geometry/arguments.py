@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from ...geometry.collimator import angle_from_degrees
 from ...geometry.system import PinholeSystem
+from ...geometry.views import Views
 from ...physics.isotopes import ISOTOPES, isotope
 from ...physics.materials import APERTURES, CRYSTALS, module_coefficients
 from ..options import add_command, add_workbook, number_or_name
@@ -24,6 +25,20 @@ def add_action(actions, name: str, summary: str, example: str, run: Any) -> argp
     parser.add_argument("--json", action="store_true", help="print JSON")
     parser.set_defaults(run=run)
     return parser
+
+
+def add_views(parser: argparse.ArgumentParser, pixels: str) -> None:
+    """Add the images, for `views_of`; `pixels` is the help of their size."""
+    add = parser.add_argument
+    add("--size", type=int, nargs=2, default=[256, 256], metavar=("ROWS", "COLUMNS"), help=pixels)
+    add("--detector", choices=("virtual", "real"), default="virtual", help="upright in front, or crystal")
+    add("--magnification", type=float, default=10.0, help="virtual detector's distance in units of l")
+    add("--pitch", type=float, metavar="MM", help="pixel size; default: the crystal's whole side")
+
+
+def views_of(system: PinholeSystem, arguments: argparse.Namespace) -> Views:
+    """The views of a scanner that the options of `add_views` ask for."""
+    return system.views(tuple(arguments.size), arguments.detector, arguments.magnification, arguments.pitch)
 
 
 def table_rows(columns: dict[str, NDArray[Any]]) -> list[dict[str, Any]]:

@@ -14,7 +14,7 @@ from ...perspective.epipolar import epipolar_lines, epipolar_segments, epipole
 from ...perspective.triangulation import fit_marker
 from ...perspective.view_rays import points_at_depths
 from ..options import chosen_modules, print_answer, read_workbook
-from .arguments import add_action, table_rows
+from .arguments import add_action, add_views, table_rows, views_of
 
 # A module is named as one that does not fit if the chance of its misfit is below this, counted for all modules.
 _CHANCE = 0.01
@@ -34,16 +34,13 @@ def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     add("--depth", type=float, nargs="+", metavar="MM", help=depth)
     add("--sigma", type=float, metavar="PX", help="of several: standard deviation of columns and rows (default: 1)")
     add("--modules", metavar="RANGE", help="those to list, such as 1-40 or 1-20,41; default: all")
-    add("--size", type=int, nargs=2, default=[256, 256], metavar=("ROWS", "COLUMNS"), help="pixels of the images")
-    add("--detector", choices=("virtual", "real"), default="virtual", help="upright in front, or crystal")
-    add("--magnification", type=float, default=10.0, help="virtual detector's distance in units of l")
-    add("--pitch", type=float, metavar="MM", help="pixel size; default: the crystal's whole side")
+    add_views(parser, "pixels of the images")
 
 
 def _run(arguments: argparse.Namespace) -> None:
     system = read_workbook(arguments)
     pixels = [_pixel(system, text) for text in arguments.pixel]
-    views = system.views(tuple(arguments.size), arguments.detector, arguments.magnification, arguments.pitch)
+    views = views_of(system, arguments)
     if len(pixels) == 1:
         if arguments.sigma is not None:
             raise InputError("--sigma: expected several --pixel, whose point is sought")

@@ -11,6 +11,7 @@ from ...exchange import FORMATS, Format, write_geometry
 from ...geometry.grid import Grid
 from ...volumes.volume_files import read_volume
 from ..options import add_command, add_workbook, chosen_modules, output_path, read_workbook
+from .arguments import add_views, views_of
 
 _WORDS = {bool: "yes|no", int: "N", float: "NUMBER", str: "TEXT", tuple: "NUMBER,NUMBER,...", Grid: "VOLUME-FILE"}
 """How a value of each type is shown in the help; options of other types are for scripts."""
@@ -28,13 +29,9 @@ def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     add_workbook(parser)
     add = parser.add_argument
     add("-o", "--output", required=True, metavar="OUT", help="file, or new folder, to write")
-    default = "see the list below; default: the only one with OUT's ending"
-    add("--format", choices=FORMATS, metavar="NAME", help=default)
+    add("--format", choices=FORMATS, metavar="NAME", help="see the list below; default: the only one with OUT's ending")
     add("--set", action="append", default=[], metavar="NAME=VALUE", help="an option of the format; may be repeated")
-    add("--size", type=int, nargs=2, default=[256, 256], metavar=("ROWS", "COLUMNS"), help="pixels")
-    add("--detector", choices=("virtual", "real"), default="virtual", help="upright in front, or crystal")
-    add("--magnification", type=float, default=10.0, help="virtual detector's distance in units of l")
-    add("--pitch", type=float, metavar="MM", help="pixel size; default: the crystal's whole side")
+    add_views(parser, "pixels")
     add("--modules", metavar="RANGE", help="such as 1-40 or 1-20,41; default: all")
     described = "\n".join(map(_described, FORMATS.values()))
     parser.epilog = f"formats, with their options for --set:\n{described}\n{parser.epilog}"
@@ -46,8 +43,7 @@ def _run(arguments: argparse.Namespace) -> None:
     options = dict(_option(format, text) for text in arguments.set)
     path = output_path(arguments.output, format.suffixes) if format.suffixes else Path(arguments.output)
     system = chosen_modules(read_workbook(arguments), arguments.modules)
-    views = system.views(tuple(arguments.size), arguments.detector, arguments.magnification, arguments.pitch)
-    write_geometry(system, path, format.name, views=views, **options)
+    write_geometry(system, path, format.name, views=views_of(system, arguments), **options)
     print(f"{path}: {format.title}, {len(system)} module{'s' * (len(system) > 1)}")
 
 

@@ -29,13 +29,11 @@ class ProjectorPhysics(LinearPhysics):
 
     def A_adjoint(self, y: Tensor, **_: Any) -> Tensor:
         """The exact adjoint of the linear part."""
-        volumes: Tensor = self.projector.T(y)
-        return volumes
+        return self.projector.T(y)
 
     def forward(self, x: Tensor, **options: Any) -> Tensor:
         """Measurements: the expected counts with background, through the noise model and the sensor."""
-        measured: Tensor = self.sensor(self.noise(self.A(x, add_background=True, **options)))
-        return measured
+        return self.sensor(self.noise(self.A(x, add_background=True, **options)))
 
     def split_physics(self, n: int) -> StackedLinearPhysics:
         """The physics of `n` balanced subsets of the views."""

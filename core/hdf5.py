@@ -12,14 +12,14 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .errors import InputError, naming
+from .errors import InputError, reading
 from .files import require_file
 from .memory import require
 
@@ -28,11 +28,21 @@ HEADER = 512
 _BLOCK, _DIGEST = 1 << 16, 32
 _VERSION = 2
 _PROBE_SECONDS = 60
-_PROBE = (  # what hangs HDF5 hangs a process that can be ended
-    "import h5py, sys\n"
-    "with h5py.File(sys.argv[1], 'r') as file:\n"
-    "    file.visititems(lambda _, item: item.id.get_num_chunks() and None if getattr(item, 'chunks', None) else None)\n"
-)
+_PROBE = """
+import h5py, sys
+from contextlib import suppress
+with h5py.File(sys.argv[1], "r") as file:
+    def look(name, link):
+        with suppress(Exception):
+            if isinstance(link, h5py.HardLink):
+                item = file[name]
+                dict(item.attrs)
+                if getattr(item, "chunks", None):
+                    item.id.get_num_chunks()
+    look("/", h5py.HardLink())
+    file.visititems_links(look)
+"""
+"""What looks at all of a file but its numbers: what hangs or crashes HDF5 does so to a process that can be ended."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +51,7 @@ class Seal:
 
     kind: str  # such as "mphDRR event"
     size: int  # bytes of HDF5
-    sha256: str  # of the table of blocks; in version 1, of the HDF5
+    sha256: str  # of this text without it, and the table of blocks; in version 1, of the HDF5
     fields: dict[str, str] = field(default_factory=dict)
     version: int = _VERSION
 
@@ -56,6 +66,11 @@ class Seal:
         lines = {self.kind: self.version, **self.fields, "bytes": self.size, "sha256": self.sha256}
         return "".join(f"{name} {value}\n" for name, value in lines.items()).encode().ljust(HEADER, b"\0")
 
+    def signed(self, table: bytes) -> "Seal":
+        """The seal with the `sha256` of itself and the `table` of blocks."""
+        text = replace(self, sha256="").text()
+        return replace(self, sha256=hashlib.sha256(text + table).hexdigest())
+
 
 def pack(kind: str, fields: dict[str, str], fill: Callable[[Any], None]) -> memoryview:
     """The bytes of a sealed file, in which `fill` puts what it holds: an ``h5py.File``, open for writing.
@@ -67,13 +82,12 @@ def pack(kind: str, fields: dict[str, str], fill: Callable[[Any], None]) -> memo
     memory = io.BytesIO()
     with h5py.File(memory, "w", userblock_size=HEADER) as file:
         fill(file)
-    with memory.getbuffer() as content:
-        table = _table(content[HEADER:])
-    seal = Seal(kind, len(memory.getvalue()) - HEADER, hashlib.sha256(table).hexdigest(), fields)
-    memory.seek(0, os.SEEK_END)
+    table = _table(memory.getbuffer()[HEADER:])
+    text = Seal(kind, memory.seek(0, os.SEEK_END) - HEADER, "", fields).signed(table).text()
+    assert len(text) == HEADER, "the text is too long"
     memory.write(table)
     memory.seek(0)
-    memory.write(seal.text())
+    memory.write(text)
     return memory.getbuffer()
 
 
@@ -115,28 +129,22 @@ def opened(path: str | os.PathLike[str], offset: int = 0) -> Iterator[Any]:
     import h5py
 
     path = require_file(path)
-    with naming(path):
-        try:
-            with open(path, "rb") as file:
-                seal = read_seal(file, offset)
-                sealed = None if seal is None else _Sealed(file, seal, offset)
-                if sealed is None:
-                    _probe(path)
-                with h5py.File(path if sealed is None else sealed, "r") as content:
-                    _refuse_foreign(content)
-                    yield content
-        except (OSError, RuntimeError, KeyError, ValueError, TypeError, AttributeError, OverflowError) as error:
-            if isinstance(error, InputError):
-                raise
-            lines = (str(error) or type(error).__name__).splitlines()
-            raise InputError(f"cannot be read as HDF5 ({lines[0]})") from error
+    with reading(path, "HDF5"), open(path, "rb") as file:
+        seal = read_seal(file, offset)
+        sealed = None if seal is None else _Sealed(file, seal, offset)
+        if sealed is None and offset:
+            raise InputError(f"damaged: nothing of mphDRR begins at its byte {offset}")
+        if sealed is None:
+            _probe(path)
+        with h5py.File(path if sealed is None else sealed, "r") as content:
+            _refuse_foreign(content)
+            yield content
 
 
 def numbers(dataset: Any) -> NDArray[Any]:
-    """All of a dataset, which has to fit into memory."""
-    require(
-        math.prod(dataset.shape) * dataset.dtype.itemsize, f"{dataset.name} of {' x '.join(map(str, dataset.shape))}"
-    )
+    """All of a dataset, which has to fit into memory, as has each of its chunks."""
+    count = max(math.prod(dataset.shape), math.prod(dataset.chunks or ()))
+    require(count * dataset.dtype.itemsize, f"{dataset.name} of {' x '.join(map(str, dataset.shape))}")
     return np.asarray(dataset[()])
 
 
@@ -150,8 +158,8 @@ class _Sealed(io.RawIOBase):
             raise InputError(f"cut: {size} of {seal.file_size} bytes")
         file.seek(self._start + seal.size)
         self._table = file.read(seal.file_size - HEADER - seal.size) if seal.version > 1 else self._table_of_old()
-        if seal.version > 1 and hashlib.sha256(self._table).hexdigest() != seal.sha256:
-            raise InputError("changed: its last bytes are not those that were written")
+        if seal.version > 1 and seal.signed(self._table) != seal:
+            raise InputError("changed: its first or last bytes are not those that were written")
         self._at, self._read, self._from, self._kept = 0, set[int](), 0, b""
 
     def _table_of_old(self) -> bytes:
@@ -193,12 +201,13 @@ class _Sealed(io.RawIOBase):
 
     def readinto(self, memory: Any) -> int:
         """Of a raw file."""
-        stop = min(self._at + len(memory), HEADER + self._seal.size)
+        stop = max(self._at, min(self._at + len(memory), HEADER + self._seal.size))
         text = self._seal.text()[self._at : stop]
-        data = text + self.body(max(0, self._at - HEADER), stop - HEADER) if stop > HEADER else text
-        memory[: len(data)] = data
-        self._at += len(data)
-        return len(data)
+        if stop > max(self._at, HEADER):
+            text += self.body(max(0, self._at - HEADER), stop - HEADER)
+        memory[: len(text)] = text
+        self._at += len(text)
+        return len(text)
 
 
 def _table(content: bytes | memoryview) -> bytes:
@@ -208,13 +217,19 @@ def _table(content: bytes | memoryview) -> bytes:
 
 def _probe(path: Path) -> None:
     """Raise `InputError` where looking through a file that has no seal crashes HDF5 or does not end."""
+    if "python" not in Path(sys.executable or "").name.lower():  # a program that has Python in it
+        return
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-    command = [sys.executable, "-c", _PROBE, str(path)]
+    window = getattr(subprocess, "CREATE_NO_WINDOW", 0)
+    command = [sys.executable, "-P", "-c", _PROBE, str(path.absolute())]
     try:
-        status = subprocess.run(command, env=environment, capture_output=True, timeout=_PROBE_SECONDS).returncode
+        status = subprocess.run(
+            command, env=environment, stdin=subprocess.DEVNULL, capture_output=True, timeout=_PROBE_SECONDS,
+            creationflags=window,
+        ).returncode  # fmt: skip
     except subprocess.TimeoutExpired:
         raise InputError("damaged: HDF5 finds no end of it") from None
-    if status < 0:
+    if status not in (0, 1):  # 1: an error, which is raised here, too
         raise InputError("damaged: HDF5 crashes on it")
 
 

@@ -27,7 +27,7 @@ HEADER = 512
 """Bytes of text before the HDF5 data."""
 _BLOCK, _DIGEST = 1 << 16, 32
 _VERSION = 2
-_PROBE_SECONDS = 60
+_PROBE_SECONDS = 30
 _PROBE = """
 import h5py, sys
 from contextlib import suppress
@@ -114,14 +114,14 @@ def read_seal(file: BinaryIO, offset: int = 0) -> Seal | None:
 
 def verify(file: BinaryIO, seal: Seal, offset: int = 0) -> None:
     """Raise `InputError` unless every byte of a sealed file, which begins at `offset`, is as it was written."""
-    blocks = _Sealed(file, seal, offset)
-    for start in range(0, seal.size, _BLOCK):
-        blocks.body(start, min(start + _BLOCK, seal.size))
+    _Sealed(file, seal, offset).check()
 
 
 @contextmanager
-def opened(path: str | os.PathLike[str], offset: int = 0) -> Iterator[Any]:
+def opened(path: str | os.PathLike[str], offset: int = 0, *, whole: bool = False) -> Iterator[Any]:
     """An HDF5 file, open for reading: an ``h5py.File`` whose bytes are checked as they are read, where it has a seal.
+
+    With `whole`, all are checked before. Else HDF5 reads zeros for what was changed, and leaving the context raises.
 
     `InputError`, which names the file, whatever is wrong with it: it cannot be read, was changed, reads other files
     (external and virtual storage, links), or holds types that are no numbers and no text.
@@ -134,11 +134,19 @@ def opened(path: str | os.PathLike[str], offset: int = 0) -> Iterator[Any]:
         sealed = None if seal is None else _Sealed(file, seal, offset)
         if sealed is None and offset:
             raise InputError(f"damaged: nothing of mphDRR begins at its byte {offset}")
+        if sealed is not None and whole:
+            sealed.check()
         if sealed is None:
             _probe(path)
-        with h5py.File(path if sealed is None else sealed, "r") as content:
-            _refuse_foreign(content)
-            yield content
+        try:
+            with h5py.File(path if sealed is None else sealed, "r") as content:
+                _refuse_foreign(content)
+                yield content
+        except Exception:  # dropped here: its traceback keeps what crashes Python when it ends
+            if sealed is None or sealed.wrong is None:
+                raise
+        if sealed is not None and sealed.wrong is not None:
+            raise sealed.wrong
 
 
 def numbers(dataset: Any) -> NDArray[Any]:
@@ -161,6 +169,7 @@ class _Sealed(io.RawIOBase):
         if seal.version > 1 and seal.signed(self._table) != seal:
             raise InputError("changed: its first or last bytes are not those that were written")
         self._at, self._read, self._from, self._kept = 0, set[int](), 0, b""
+        self.wrong: Exception | None = None  # found while HDF5 was reading, which then reads zeros
 
     def _table_of_old(self) -> bytes:
         """Of version 1, which has none: made of the content, which is read at once."""
@@ -169,6 +178,11 @@ class _Sealed(io.RawIOBase):
         if hashlib.sha256(content).hexdigest() != self._seal.sha256:
             raise InputError("changed: its bytes are not those that were written")
         return _table(content)
+
+    def check(self) -> None:
+        """Raise `InputError` unless every block is as it was written."""
+        for start in range(0, self._seal.size, _BLOCK):
+            self.body(start, min(start + _BLOCK, self._seal.size))
 
     def body(self, start: int, stop: int) -> bytes:
         """The HDF5's bytes from `start` to `stop`."""
@@ -204,7 +218,11 @@ class _Sealed(io.RawIOBase):
         stop = max(self._at, min(self._at + len(memory), HEADER + self._seal.size))
         text = self._seal.text()[self._at : stop]
         if stop > max(self._at, HEADER):
-            text += self.body(max(0, self._at - HEADER), stop - HEADER)
+            try:
+                text += self.body(max(0, self._at - HEADER), stop - HEADER)
+            except Exception as error:  # raised here, h5py would lose it; its traceback crashes Python when it ends
+                self.wrong = self.wrong or error.with_traceback(None)
+                text += bytes(stop - self._at - len(text))
         memory[: len(text)] = text
         self._at += len(text)
         return len(text)
@@ -229,6 +247,8 @@ def _probe(path: Path) -> None:
         ).returncode  # fmt: skip
     except subprocess.TimeoutExpired:
         raise InputError("damaged: HDF5 finds no end of it") from None
+    except OSError:  # it cannot be started
+        return
     if status not in (0, 1):  # 1: an error, which is raised here, too
         raise InputError("damaged: HDF5 crashes on it")
 
@@ -237,19 +257,21 @@ def _refuse_foreign(file: Any) -> None:
     """Raise `InputError` for what leads out of the file, before any data is touched."""
     import h5py
 
-    def look(name: str, link: Any) -> None:
+    def wrong(name: str, link: Any) -> str | None:
         if isinstance(link, h5py.ExternalLink):
-            raise InputError(f"{name}: a link to another file, {link.filename!r}, which is not followed")
+            return f"{name}: a link to another file, {link.filename!r}, which is not followed"
         if not isinstance(link, h5py.HardLink):  # a soft link leads to what has a name of its own, or nowhere
-            return
+            return None
         item = h5py.h5o.open(file.id, name.encode())
         if not isinstance(item, h5py.h5d.DatasetID):
-            return
+            return None
         storage = item.get_create_plist()
         if storage.get_layout() == h5py.h5d.VIRTUAL or storage.get_external_count():
-            raise InputError(f"{name}: its numbers are in other files, which are not read")
+            return f"{name}: its numbers are in other files, which are not read"
         kind = item.dtype
         if kind.hasobject and h5py.check_string_dtype(kind) is None:
-            raise InputError(f"{name}: expected numbers or text, found objects")
+            return f"{name}: expected numbers or text, found objects"
+        return None
 
-    file.visititems_links(look)
+    if (found := file.visititems_links(wrong)) is not None:  # h5py loses what is raised there
+        raise InputError(found)

@@ -46,7 +46,7 @@ def read_reconstruction(path: str | os.PathLike[str]) -> Reconstruction:
 
     path = _named(path)
     volume = read_volume(path)
-    with reading(path, "a reconstruction"), opened(path) as file:
+    with reading(path, "a reconstruction"), opened(path, whole=True) as file:
         group = file.get(_GROUP)
         if not isinstance(group, h5py.Group):
             raise InputError("it holds a volume, but no reconstruction: use it as start with read_volume")

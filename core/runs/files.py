@@ -162,7 +162,7 @@ def _read_hdf5(path: Path) -> _Contents:
         if isinstance(item, h5py.Dataset):
             arrays[name] = numbers(item)
 
-    with opened(path) as file:
+    with opened(path, whole=True) as file:
         file.visititems(take)
         attributes = {
             name: value.item() if isinstance(value, np.generic) else value for name, value in file.attrs.items()

@@ -233,8 +233,10 @@ def _hdf5(path: Path, layout: Layout) -> Counts:
         if isinstance(item, h5py.Dataset):
             arrays[name] = item
 
-    with opened(path) as file:
+    with opened(path, whole=True) as file:
         file.visititems(take)
+        if layout.dataset is not None and layout.dataset in file:  # of an array's names, the visit gives one
+            take(layout.dataset.strip("/"), file[layout.dataset])
         dataset = arrays[_chosen(arrays, layout)]
         _require_memory(dataset.shape, dataset.dtype.itemsize)
         return _counts(numbers(dataset))

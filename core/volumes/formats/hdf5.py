@@ -14,7 +14,7 @@ def read(path: Path) -> Contents:
     """Read .h5 or .hdf5: the volume at the file's root, or in the group ``volume`` of a run file."""
     import h5py
 
-    with opened(path) as file:
+    with opened(path, whole=True) as file:
         place = file["volume"] if isinstance(file.get("volume"), h5py.Group) else file
         array, affine = place.get("array"), place.get("affine")
         for name, dataset in (("array", array), ("affine", affine)):

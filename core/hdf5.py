@@ -138,8 +138,9 @@ def opened(path: str | os.PathLike[str], offset: int = 0, *, whole: bool = False
             sealed.check()
         if sealed is None:
             _probe(path)
+        is_checked = sealed is None or (whole and not offset)
         try:
-            with h5py.File(path if sealed is None else sealed, "r") as content:
+            with h5py.File(path if is_checked else sealed, "r") as content:
                 _refuse_foreign(content)
                 yield content
         except Exception:  # dropped here: its traceback keeps what crashes Python when it ends

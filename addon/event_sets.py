@@ -15,7 +15,7 @@ from ..core import events
 from ..core.errors import InputError
 from ..core.events.folders import SetFolder
 from ..core.events.templates import template_text
-from ..core.files import replacing
+from ..core.files import write_bytes
 from ..core.memory import readable_size
 from ..core.progress import Progress, stages_of
 from ..core.runs.files import write_run
@@ -57,8 +57,7 @@ def write_recipe(scene: bpy.types.Scene, filepath: str, like: str) -> str:
     workbook = storage.absolute(known) if known else EXAMPLE
     is_near = workbook.is_relative_to(path.parent)
     text = template_text(like, workbook.relative_to(path.parent).as_posix() if is_near else workbook)
-    with replacing(path) as temporary:
-        temporary.write_text(text, encoding="utf-8", newline="")
+    write_bytes(path, text.encode())
     scene.mphdrr_events.recipe = storage.stored_path(path)
     return f"Wrote {path}, of {workbook.name}: edit it in any editor of text"
 

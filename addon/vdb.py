@@ -16,13 +16,12 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.errors import InputError, warn
-from ..core.files import replacing
+from ..core.errors import InputError, reading, warn
+from ..core.files import replacing, require_file
 from ..core.geometry.grid import Grid
 from ..core.memory import require
 from ..core.validation import freeze, positive
 from ..core.version import VERSION
-from ..core.volumes.formats.contents import reading
 from ..core.volumes.volume import AIR_HU, UNITS, Volume
 
 SMOKE = "smoke for display"  # a grid that only Blender's solid viewport uses
@@ -60,6 +59,8 @@ def write_vdb(
         grids[-1].name = SMOKE
     with replacing(path) as temporary:
         openvdb().write(str(temporary), grids=grids)
+        if _end(temporary) != temporary.stat().st_size:  # OpenVDB does not say that a write failed
+            raise OSError("the disk is full, or has gone")
 
 
 def read_vdb(path: str | Path, quantity: str | None = None, grid: str | None = None, *, unit: float = 1.0) -> Volume:
@@ -80,13 +81,11 @@ def read_vdb(path: str | Path, quantity: str | None = None, grid: str | None = N
     unit
         Length in mm of the file's unit, for files of other programs: 1000 for one in metres.
     """
-    path = Path(path)
-    if not path.is_file():
-        raise InputError(f"{path}: no such file")
+    path = require_file(path)
     if quantity is not None and quantity not in UNITS:
         raise InputError(f"quantity {quantity!r}: expected one of {', '.join(UNITS)}")
     unit = positive(unit, "unit of the file's lengths", "mm")
-    if missing := _missing_bytes(path):
+    if (missing := _end(path) - path.stat().st_size) > 0:
         raise InputError(f"{path}: is cut off, {missing} bytes are missing at its end")
     with reading(path, "an OpenVDB volume"):
         name = _chosen(_described(path), quantity, grid)
@@ -241,13 +240,13 @@ def _values(grid: Any, first: NDArray[Any], shape: Sequence[int]) -> NDArray[np.
     return array
 
 
-def _missing_bytes(path: Path) -> int:
-    """How many bytes a file lacks at its end; 0 also where its layout does not say.
+def _end(path: Path) -> int:
+    """Where the last grid of a file ends; 0 where its layout does not say.
 
     OpenVDB itself reads past a missing end and takes what it finds for values. Its `io::Archive` is a header, the file's
     metadata, then each grid after a descriptor with the offsets at which its parts begin and end.
     """
-    with path.open("rb") as file:
+    with open(path, "rb") as file:
 
         def numbers(kinds: str) -> tuple[int, ...]:
             return struct.unpack(f"<{kinds}", file.read(struct.calcsize(f"<{kinds}")))
@@ -276,4 +275,4 @@ def _missing_bytes(path: Path) -> int:
                 file.seek(max(end, 0))
         except struct.error:  # OpenVDB itself refuses a file that is cut off in its header
             return 0
-        return max(0, end - path.stat().st_size)
+        return end

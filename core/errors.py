@@ -1,12 +1,20 @@
-"""Errors and warnings about the user's input."""
+"""Errors and warnings about the user's input, and the exception of cancelled work."""
 
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 
 
 class InputError(ValueError):
     """The user's input cannot be used: one line that names the place, what was found and what was expected."""
+
+
+class Cancelled(Exception):
+    """Raised by a progress callback to stop the work. Nothing half-done is left behind."""
+
+    reconstruction: Any = None
+    """Of an iterative reconstruction: the `Reconstruction` after its last whole iteration, which can be resumed."""
 
 
 class InputWarning(UserWarning):
@@ -29,8 +37,28 @@ def refusing(place: object, what: str) -> Iterator[None]:
 
 @contextmanager
 def naming(name: object) -> Iterator[None]:
-    """Put a name, such as a file's, before the messages of input errors."""
+    """Put a name, such as a file's, before the messages of input errors that do not begin with it."""
     try:
         yield
     except InputError as error:
+        if str(error).startswith(f"{name}: "):
+            raise
         raise InputError(f"{name}: {error}") from None
+
+
+@contextmanager
+def reading(name: object, kind: str) -> Iterator[None]:
+    """Make whatever a library raises on a damaged file an input error, and put the file's `name` before all of these."""
+    with naming(name):
+        try:
+            yield
+        except (InputError, Cancelled):
+            raise
+        except Exception as error:
+            raise InputError(f"cannot be read as {kind} ({first_line(error)})") from error
+
+
+def first_line(error: BaseException) -> str:
+    """A library's error message, as one line."""
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    return lines[0] if lines else type(error).__name__

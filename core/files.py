@@ -1,11 +1,11 @@
 """Writing files such that the old or the new one is always there, whole."""
 
 import errno
-import itertools
 import os
 import platform
 import re
 import shutil
+import stat
 import time
 import uuid
 import zlib
@@ -15,12 +15,11 @@ from pathlib import Path
 
 from .errors import InputError, refusing
 
-_TEMPORARY = re.compile(r"\.(?:[0-9a-f]{8}|([0-9a-f]{4})([0-9a-f]{8})[0-9a-f]{4})-(.+)")
+_TEMPORARY = re.compile(r"\.(?:[0-9a-f]{8}|([0-9a-f]{4})([0-9a-f]{8})[0-9a-f]{8})-(.+)")
 """Names of files that are being written: by which host and process, so that what a killed one has left is known."""
 _LEFT_AFTER = 3600  # seconds: what other hosts have not touched since is not written any more
 _ATTEMPTS = 3
 _HOST = zlib.crc32(platform.node().encode()) & 0xFFFF
-_count = itertools.count()
 
 
 @contextmanager
@@ -29,31 +28,29 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
 
     Even if the program is killed or the power fails, there is either the old or the new file at `path`, whose folder must
     exist. If `path` is a link, the file it points to is replaced. The temporary path, of the same folder and suffixes, does
-    not exist yet.
+    not exist yet. For libraries that write to a path; what is in memory is written by `write_bytes`.
     """
     refuse_folder(Path(path).absolute())
     target = Path(os.path.realpath(path))
-    if not target.parent.is_dir():
-        raise InputError(f"{target.parent}: no such folder; make it first or choose another")
-    number = next(_count) & 0xFFFF
-    temporary = target.with_name(f".{_HOST:04x}{os.getpid():08x}{number:04x}-{target.name}")
-    try:
-        # Tried, because os.access knows neither read-only disks nor Windows' permissions.
-        with open(temporary, "xb"):
-            pass
-        temporary.unlink()
-        yield temporary
-        if target.exists():
-            shutil.copymode(target, temporary)
-        _to_disk(temporary)
-        os.replace(temporary, target)
-        with suppress(OSError):  # not possible on Windows and on some file systems
-            _to_disk(target.parent)
-    except OSError as error:
-        raise InputError(f"{target}: cannot be written ({error.strerror or error})") from error
-    finally:
-        with suppress(OSError):  # the disk may be gone
-            temporary.unlink(missing_ok=True)
+    temporary = target.with_name(f".{_HOST:04x}{os.getpid():08x}{os.urandom(4).hex()}-{target.name}")
+    with refusing(target, "cannot be written"):
+        if not target.parent.is_dir():
+            raise InputError(f"{target.parent}: no such folder; make it first or choose another")
+        try:
+            # Tried, because os.access knows neither read-only disks nor Windows' permissions.
+            with open(temporary, "xb"):
+                pass
+            temporary.unlink()
+            yield temporary
+            if target.exists():
+                shutil.copymode(target, temporary)
+            _to_disk(temporary)
+            os.replace(temporary, target)
+            with suppress(OSError):  # not possible on Windows and on some file systems
+                _to_disk(target.parent)
+        finally:
+            with suppress(OSError):  # the disk has gone, or Windows lets no file go that a library has left open
+                temporary.unlink()
 
 
 def write_bytes(path: str | os.PathLike[str], data: bytes | memoryview) -> None:
@@ -93,6 +90,26 @@ def locked(path: Path, refusal: str) -> Iterator[None]:
         yield
 
 
+@contextmanager
+def new_folder(path: Path) -> Iterator[Path]:
+    """Give a temporary folder beside `path`; rename it to `path`, a new folder or an empty one, or remove it on failure."""
+    path = folder_path(path)
+    if path.exists() and (not path.is_dir() or any(path.iterdir())):
+        raise InputError(f"{path}: expected a new folder or an empty one")
+    temporary = ensure_folder(path.parent) / f".{uuid.uuid4().hex[:8]}-{path.name}"
+    with refusing(path, "cannot be written"):
+        try:
+            temporary.mkdir()
+            yield temporary
+            if path.exists():
+                path.rmdir()
+            os.replace(temporary, path)
+        except InputError as error:  # of a file in it
+            raise InputError(str(error).replace(str(temporary), str(path))) from error
+        finally:
+            shutil.rmtree(temporary, ignore_errors=True)
+
+
 def written_name(name: str) -> str | None:
     """Of the temporary file of `replacing`, the name of the file that it was to be; None of others."""
     found = _TEMPORARY.fullmatch(name)
@@ -113,19 +130,27 @@ def is_leftover(path: Path) -> bool:
     return False
 
 
-def require_file(path: str | os.PathLike[str]) -> Path:
+def require_file(path: str | os.PathLike[str], expected: str = "a file") -> Path:
     """A path, if it is that of a file that can be read; `InputError` of what is missing, a folder, device or pipe."""
     path = Path(path)
+    if "\0" in str(path):
+        raise InputError(f"{str(path)!r}: not a file name (it holds a NUL)")
     with refusing(path, "cannot be read"):
         try:
-            path.stat()
+            kind = path.stat().st_mode
         except FileNotFoundError:
             raise InputError(f"{path}: no such file") from None
-        except ValueError as error:  # an impossible name
-            raise InputError(f"{str(path)!r}: not a file name ({error})") from None
-        if not path.is_file():  # reading a pipe would block
-            raise InputError(f"{path}: is no file; expected one to read")
+        if not stat.S_ISREG(kind):  # reading a pipe would block
+            found = "a folder" if stat.S_ISDIR(kind) else "neither a file nor a folder"
+            raise InputError(f"{path}: is {found}, expected {expected}")
+        path.open("rb").close()  # libraries say little about files that they may not read
     return path
+
+
+def read_bytes(path: str | os.PathLike[str]) -> bytes:
+    """All of a file; `InputError` where `require_file` gives it, or it cannot be read."""
+    with refusing(path, "cannot be read"):
+        return require_file(path).read_bytes()
 
 
 def _to_disk(path: Path) -> None:
@@ -139,9 +164,11 @@ def _to_disk(path: Path) -> None:
 
 
 def refuse_folder(path: Path) -> None:
-    """Raise `InputError` if `path` is a folder or cannot be the name of a file."""
+    """Raise `InputError` if `path` is a folder, a device or a pipe, or cannot be the name of a file."""
     if _is_folder(path):
         raise InputError(f"{path}: is a folder; expected the name of a file to write")
+    if path.exists() and not path.is_file():  # which would be replaced
+        raise InputError(f"{path}: is no file; expected the name of one to write")
 
 
 def _is_folder(path: Path) -> bool:

@@ -1,8 +1,7 @@
 """HDF5 files with a seal, which says what every byte of them must be, and the checks of all HDF5 before it is read.
 
 A sealed file begins with 512 bytes of text, HDF5's "user block", which its readers skip: what the file is, how many bytes
-of HDF5 follow, and a SHA-256 of this and of the table behind them, which has that of each of their blocks: so a part of the
-file can be checked alone.
+of HDF5 follow, and the SHA-256 of the table behind these, which has that of each of their blocks: parts are checked alone.
 """
 
 import hashlib
@@ -20,22 +19,31 @@ from typing import Any, BinaryIO, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .errors import InputError, naming
+from .errors import InputError, reading, refusing
 from .files import require_file
 from .memory import require
-from .progress import Cancelled
 
 HEADER = 512
 """Bytes of text before the HDF5 data."""
 _BLOCK, _DIGEST = 1 << 16, 32
 _VERSION = 2
 _TEXT = re.compile(rb"(mphDRR [a-zA-Z0-9 ]+) (\d+)\n((?:\w+ \w+\n)*)bytes (\d+)\nsha256 (\w{64})\n\0*")
-_PROBE_SECONDS = 60
-_PROBE = (  # what hangs HDF5 hangs a process that can be ended
-    "import h5py, sys\n"
-    "with h5py.File(sys.argv[1], 'r') as file:\n"
-    "    file.visititems(lambda _, item: item.id.get_num_chunks() and None if getattr(item, 'chunks', None) else None)\n"
-)
+_PROBE_SECONDS = 30
+_PROBE = """
+import h5py, sys
+from contextlib import suppress
+with h5py.File(sys.argv[1], "r") as file:
+    def look(name, link):
+        with suppress(Exception):
+            if isinstance(link, h5py.HardLink):
+                item = file[name]
+                dict(item.attrs)
+                if getattr(item, "chunks", None):
+                    item.id.get_num_chunks()
+    look("/", h5py.HardLink())
+    file.visititems_links(look)
+"""
+"""What looks at all of a file but its numbers: what hangs or crashes HDF5 does so to a process that can be ended."""
 
 
 class Seal(NamedTuple):
@@ -44,7 +52,7 @@ class Seal(NamedTuple):
     kind: str  # such as "mphDRR event"
     size: int  # bytes of HDF5
     fields: dict[str, str]
-    sha256: str = ""  # of the lines before it and of the table of blocks; in version 1, of the HDF5
+    sha256: str = ""  # of this text without it, and the table of blocks; in version 1, of the HDF5
     version: int = _VERSION
 
     @property
@@ -52,18 +60,14 @@ class Seal(NamedTuple):
         """Bytes of the whole file."""
         return HEADER + self.size + (0 if self.version == 1 else _DIGEST * -(-self.size // _BLOCK))
 
-    def lines(self, **more: str) -> bytes:
-        """The text's lines before the last."""
-        lines = {self.kind: self.version, **self.fields, "bytes": self.size, **more}
-        return "".join(f"{name} {value}\n" for name, value in lines.items()).encode()
-
     def text(self) -> bytes:
         """The text, padded to `HEADER` bytes."""
-        return self.lines(sha256=self.sha256).ljust(HEADER, b"\0")
+        lines = {self.kind: self.version, **self.fields, "bytes": self.size, "sha256": self.sha256}
+        return "".join(f"{name} {value}\n" for name, value in lines.items()).encode().ljust(HEADER, b"\0")
 
-    def digest(self, table: bytes) -> str:
-        """What `sha256` has to be."""
-        return hashlib.sha256(self.lines() + table).hexdigest()
+    def signed(self, table: bytes) -> "Seal":
+        """The seal with the `sha256` of itself and the `table` of blocks."""
+        return self._replace(sha256=hashlib.sha256(self._replace(sha256="").text() + table).hexdigest())
 
 
 def pack(kind: str, fields: dict[str, str], fill: Callable[[Any], None]) -> memoryview:
@@ -76,13 +80,12 @@ def pack(kind: str, fields: dict[str, str], fill: Callable[[Any], None]) -> memo
     memory = io.BytesIO()
     with h5py.File(memory, "w", userblock_size=HEADER) as file:
         fill(file)
-    with memory.getbuffer() as content:
-        table = digests(content[HEADER:])
-    seal = Seal(kind, memory.seek(0, os.SEEK_END) - HEADER, fields)
-    seal = seal._replace(sha256=seal.digest(table))
+    table = digests(memory.getbuffer()[HEADER:])
+    text = Seal(kind, memory.seek(0, os.SEEK_END) - HEADER, fields).signed(table).text()
+    assert len(text) == HEADER, "the text is too long"
     memory.write(table)
     memory.seek(0)
-    memory.write(seal.text())
+    memory.write(text)
     return memory.getbuffer()
 
 
@@ -100,26 +103,19 @@ def parse_seal(start: bytes) -> Seal | None:
     return Seal(kind.decode(), int(size), named, sha256.decode(), int(version))
 
 
-def read_seal(file: BinaryIO, offset: int = 0) -> Seal | None:
-    """The seal of what begins at `offset` of an open file, as of `parse_seal`."""
-    file.seek(offset)
-    return parse_seal(file.read(HEADER))
-
-
 def verify(path: str | os.PathLike[str], offset: int = 0) -> None:
     """Raise `InputError` unless every byte of a sealed file, which begins at `offset`, is as it was written."""
-    with open(path, "rb") as file:
-        seal = read_seal(file, offset)
-        if seal is None:
+    with refusing(path, "cannot be read"), open(path, "rb") as file:
+        if (sealed := _sealed(file, offset)) is None:
             raise InputError("it has no seal")
-        blocks = _Sealed(file, seal, offset)
-        for start in range(0, seal.size, _BLOCK):
-            blocks.body(start, min(start + _BLOCK, seal.size))
+        sealed.check()
 
 
 @contextmanager
-def opened(path: str | os.PathLike[str], offset: int = 0) -> Iterator[Any]:
+def opened(path: str | os.PathLike[str], offset: int = 0, *, whole: bool = False) -> Iterator[Any]:
     """An HDF5 file, open for reading: an ``h5py.File`` whose bytes are checked as they are read, where it has a seal.
+
+    With `whole`, all are checked before. Else HDF5 reads zeros for what was changed, and leaving the context raises.
 
     `InputError`, which names the file, whatever is wrong with it: it cannot be read, was changed, reads other files
     (external and virtual storage, links), or holds types that are no numbers and no text.
@@ -127,28 +123,30 @@ def opened(path: str | os.PathLike[str], offset: int = 0) -> Iterator[Any]:
     import h5py
 
     path = require_file(path)
-    with naming(path):
+    with reading(path, "HDF5"), open(path, "rb") as file:
+        sealed = _sealed(file, offset)
+        if sealed is None and offset:
+            raise InputError(f"damaged: nothing of mphDRR begins at its byte {offset}")
+        if sealed is not None and whole:
+            sealed.check()
+        if sealed is None:
+            _probe(path)
+        is_checked = sealed is None or (whole and not offset)
         try:
-            with open(path, "rb") as file:
-                seal = read_seal(file, offset)
-                sealed = None if seal is None else _Sealed(file, seal, offset)
-                if sealed is None:
-                    _probe(path)
-                with h5py.File(path if sealed is None else sealed, "r") as content:
-                    _refuse_foreign(content)
-                    yield content
-        except (InputError, MemoryError, Cancelled):
-            raise
-        except Exception as error:  # whatever HDF5 raises on a damaged file
-            lines = (str(error) or type(error).__name__).splitlines()
-            raise InputError(f"cannot be read as HDF5 ({lines[0]})") from error
+            with h5py.File(path if is_checked else sealed, "r") as content:
+                _refuse_foreign(content)
+                yield content
+        except Exception:  # dropped here: its traceback keeps what crashes Python when it ends
+            if sealed is None or sealed.wrong is None:
+                raise
+        if sealed is not None and sealed.wrong is not None:
+            raise sealed.wrong
 
 
 def numbers(dataset: Any) -> NDArray[Any]:
-    """All of a dataset, which has to fit into memory."""
-    require(
-        math.prod(dataset.shape) * dataset.dtype.itemsize, f"{dataset.name} of {' x '.join(map(str, dataset.shape))}"
-    )
+    """All of a dataset, which has to fit into memory, as has each of its chunks."""
+    count = max(math.prod(dataset.shape), math.prod(dataset.chunks or ()))
+    require(count * dataset.dtype.itemsize, f"{dataset.name} of {' x '.join(map(str, dataset.shape))}")
     return np.asarray(dataset[()])
 
 
@@ -162,9 +160,10 @@ class _Sealed(io.RawIOBase):
             raise InputError(f"cut: {size} of {seal.file_size} bytes")
         file.seek(self._start + seal.size)
         self._table = file.read(seal.file_size - HEADER - seal.size) if seal.version > 1 else self._table_of_old()
-        if seal.version > 1 and seal.digest(self._table) != seal.sha256:
-            raise InputError("changed: its last bytes are not those that were written")
+        if seal.version > 1 and seal.signed(self._table) != seal:
+            raise InputError("changed: its first or last bytes are not those that were written")
         self._at, self._read, self._from, self._kept = 0, set[int](), 0, b""
+        self.wrong: Exception | None = None  # found while HDF5 was reading, which then reads zeros
 
     def _table_of_old(self) -> bytes:
         """Of version 1, which has none: made of the content, which is read at once."""
@@ -173,6 +172,11 @@ class _Sealed(io.RawIOBase):
         if hashlib.sha256(content).hexdigest() != self._seal.sha256:
             raise InputError("changed: its bytes are not those that were written")
         return digests(content)
+
+    def check(self) -> None:
+        """Raise `InputError` unless every block is as it was written."""
+        for start in range(0, self._seal.size, _BLOCK):
+            self.body(start, min(start + _BLOCK, self._seal.size))
 
     def body(self, start: int, stop: int) -> bytes:
         """The HDF5's bytes from `start` to `stop`."""
@@ -205,12 +209,23 @@ class _Sealed(io.RawIOBase):
 
     def readinto(self, memory: Any) -> int:
         """Of a raw file."""
-        stop = min(self._at + len(memory), HEADER + self._seal.size)
+        stop = max(self._at, min(self._at + len(memory), HEADER + self._seal.size))
         text = self._seal.text()[self._at : stop]
-        data = text + self.body(max(0, self._at - HEADER), stop - HEADER) if stop > HEADER else text
-        memory[: len(data)] = data
-        self._at += len(data)
-        return len(data)
+        if stop > max(self._at, HEADER):
+            try:
+                text += self.body(max(0, self._at - HEADER), stop - HEADER)
+            except Exception as error:  # raised here, h5py would lose it; its traceback crashes Python when it ends
+                self.wrong = self.wrong or error.with_traceback(None)
+                text += bytes(stop - self._at - len(text))
+        memory[: len(text)] = text
+        self._at += len(text)
+        return len(text)
+
+
+def _sealed(file: BinaryIO, offset: int) -> _Sealed | None:
+    file.seek(offset)
+    seal = parse_seal(file.read(HEADER))
+    return None if seal is None else _Sealed(file, seal, offset)
 
 
 def digests(content: bytes | memoryview) -> bytes:
@@ -220,13 +235,21 @@ def digests(content: bytes | memoryview) -> bytes:
 
 def _probe(path: Path) -> None:
     """Raise `InputError` where looking through a file that has no seal crashes HDF5 or does not end."""
+    if "python" not in Path(sys.executable or "").name.lower():  # a program that has Python in it
+        return
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-    command = [sys.executable, "-c", _PROBE, str(path)]
+    window = getattr(subprocess, "CREATE_NO_WINDOW", 0)
+    command = [sys.executable, "-P", "-c", _PROBE, str(path.absolute())]
     try:
-        status = subprocess.run(command, env=environment, capture_output=True, timeout=_PROBE_SECONDS).returncode
+        status = subprocess.run(
+            command, env=environment, stdin=subprocess.DEVNULL, capture_output=True, timeout=_PROBE_SECONDS,
+            creationflags=window,
+        ).returncode  # fmt: skip
     except subprocess.TimeoutExpired:
         raise InputError("damaged: HDF5 finds no end of it") from None
-    if status < 0:
+    except OSError:  # it cannot be started
+        return
+    if status not in (0, 1):  # 1: an error, which is raised here, too
         raise InputError("damaged: HDF5 crashes on it")
 
 
@@ -234,19 +257,21 @@ def _refuse_foreign(file: Any) -> None:
     """Raise `InputError` for what leads out of the file, before any data is touched."""
     import h5py
 
-    links: dict[str, Any] = {}
-    file.visititems_links(lambda name, link: links.update({name: link}))  # nothing may be raised within
-    for name, link in links.items():
+    def wrong(name: str, link: Any) -> str | None:
         if isinstance(link, h5py.ExternalLink):
-            raise InputError(f"{name}: a link to another file, {link.filename!r}, which is not followed")
+            return f"{name}: a link to another file, {link.filename!r}, which is not followed"
         if not isinstance(link, h5py.HardLink):  # a soft link leads to what has a name of its own, or nowhere
-            continue
+            return None
         item = h5py.h5o.open(file.id, name.encode())
         if not isinstance(item, h5py.h5d.DatasetID):
-            continue
+            return None
         storage = item.get_create_plist()
         if storage.get_layout() == h5py.h5d.VIRTUAL or storage.get_external_count():
-            raise InputError(f"{name}: its numbers are in other files, which are not read")
+            return f"{name}: its numbers are in other files, which are not read"
         kind = item.dtype
         if kind.hasobject and h5py.check_string_dtype(kind) is None:
-            raise InputError(f"{name}: expected numbers or text, found objects")
+            return f"{name}: expected numbers or text, found objects"
+        return None
+
+    if (found := file.visititems_links(wrong)) is not None:  # h5py loses what is raised there
+        raise InputError(found)

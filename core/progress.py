@@ -2,8 +2,9 @@
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, TypeVar
+from typing import TypeVar
 
+from .errors import Cancelled as Cancelled
 from .memory import cores
 
 Part = TypeVar("Part")
@@ -12,13 +13,6 @@ Progress = Callable[[int, int], None]
 """Called as ``progress(done, total)`` between steps; may raise `Cancelled` to stop the work."""
 Stages = Callable[[str], Progress | None]
 """Begins a stage of the work, such as "projecting", and gives its progress callback."""
-
-
-class Cancelled(Exception):
-    """Raised by a progress callback to stop the work. Nothing half-done is left behind."""
-
-    reconstruction: Any = None
-    """Of an iterative reconstruction: the `Reconstruction` after its last whole iteration, which can be resumed."""
 
 
 class StagedProgress:

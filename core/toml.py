@@ -4,10 +4,10 @@ import json
 import os
 import tomllib
 from collections.abc import Iterable
-from pathlib import Path
 from typing import Any
 
 from .errors import InputError
+from .files import read_bytes
 
 
 def read_toml(path: str | os.PathLike[str]) -> dict[str, Any]:
@@ -18,11 +18,9 @@ def read_toml(path: str | os.PathLike[str]) -> dict[str, Any]:
 def toml_text(path: str | os.PathLike[str]) -> str:
     """The text of a TOML file, every line's end as it is; `InputError` if it cannot be read."""
     try:
-        return Path(path).read_bytes().decode("utf-8-sig")
+        return read_bytes(path).decode("utf-8-sig")
     except UnicodeDecodeError:
         raise InputError(f"{path}: expected TOML, a text in UTF-8") from None
-    except (OSError, ValueError) as error:  # an impossible path is a ValueError
-        raise InputError(f"{path}: {getattr(error, 'strerror', None) or error}") from None
 
 
 def parse_toml(text: str, name: str) -> dict[str, Any]:

@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import InputError
-from ..files import replacing
+from ..files import new_folder, replacing
 from ..geometry.system import PinholeSystem
 from ..geometry.views import Views
 from ..validation import instance, one_of
 from .cameras import ASTRA, KORNIA, LEAP, NERF, OPENCV, PYTORCH3D, RTK
-from .format import Format, new_folder
+from .format import Format
 from .gate9 import GATE9
 from .gate10 import GATE10
 from .mphdrr_json import MPHDRR, read_geometry

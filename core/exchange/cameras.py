@@ -3,6 +3,7 @@
 All but NeRF's describe the images' arrays as they are; pictures of `mosaic.as_seen` are turned by 180 degrees.
 """
 
+import io
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -26,14 +27,15 @@ _TOLERANCE = 1e-3
 def _array_format(name: str, title: str, arrays: Callable[..., dict[str, Any]]) -> Format:
     """A format of ``arrays(views, **options)``, the arguments of the program's own function: NumPy's .npz, or JSON."""
 
-    def write(system: PinholeSystem, views: Views, path: Path, **options: Any) -> None:
+    def write(system: PinholeSystem, views: Views, temporary: Path, **options: Any) -> None:
         named = arrays(views, **options)
-        if path.name.lower().endswith(".json"):
+        if temporary.name.lower().endswith(".json"):
             lists = {key: np.asarray(value).tolist() for key, value in named.items()}
-            path.write_text(json.dumps(lists, indent=1) + "\n", encoding="utf-8")
+            temporary.write_text(json.dumps(lists, indent=1) + "\n", encoding="utf-8")
             return
-        with open(path, "wb") as file:  # given a name, NumPy would add .npz to .NPZ
-            np.savez(file, **named)
+        memory = io.BytesIO()  # given a name, NumPy would add .npz to .NPZ
+        np.savez(memory, **named)
+        temporary.write_bytes(memory.getbuffer())
 
     return Format(name, title, (".npz", ".json"), write, options_of=arrays)
 
@@ -124,7 +126,7 @@ _RTK_PARAMETERS = (
 )
 
 
-def _rtk(system: PinholeSystem, views: Views, path: Path) -> None:
+def _rtk(system: PinholeSystem, views: Views, temporary: Path) -> None:
     """ThreeDCircularProjectionGeometry, XML version 3 (https://docs.openrtk.org, "3D projection geometry").
 
     Nine parameters a view, and the matrix from world mm to detector mm that follows from them.
@@ -159,7 +161,7 @@ def _rtk(system: PinholeSystem, views: Views, path: Path) -> None:
         lines += ["      " + " ".join(repr(float(x)) for x in row) for row in matrix]
         lines += ["    </Matrix>", "  </Projection>"]
     lines.append("</RTKThreeDCircularGeometry>")
-    path.write_text("\n".join(lines) + "\n", encoding="ascii")
+    temporary.write_text("\n".join(lines) + "\n", encoding="ascii")
 
 
 def _euler_angles(rotation: NDArray[np.float64]) -> tuple[float, float, float]:
@@ -177,7 +179,7 @@ def _euler_angles(rotation: NDArray[np.float64]) -> tuple[float, float, float]:
     return float(gantry), float(out), float(-np.arctan2(rest[1, 0], rest[0, 0]))
 
 
-def _nerf(system: PinholeSystem, views: Views, path: Path, *, pictures: str = "images/view_{}.png") -> None:
+def _nerf(system: PinholeSystem, views: Views, temporary: Path, *, pictures: str = "images/view_{}.png") -> None:
     """``transforms.json`` of nerfstudio (https://docs.nerf.studio/quickstart/data_conventions.html) and instant-ngp.
 
     Cameras +X right, +Y up, looking along -Z, of pictures as the pinhole sees them (`mosaic.as_seen`).
@@ -207,7 +209,7 @@ def _nerf(system: PinholeSystem, views: Views, path: Path, *, pictures: str = "i
         for m, number in enumerate(numbers)
     ]
     document = {"camera_model": "PINHOLE", "w": n_u, "h": n_v, **common, "frames": frames}
-    path.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+    temporary.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
 
 
 def _camera_matrices(views: Views, format: str, mirrored: bool = True) -> tuple[NDArray[np.float64], ...]:

@@ -1,18 +1,10 @@
-"""What an export format is, and how its file or folder is written: completely or not at all."""
+"""What an export format is."""
 
 import inspect
-import os
-import shutil
 import typing
-import uuid
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
-
-from ..errors import InputError
-from ..files import ensure_folder, folder_path
 
 
 @dataclass(frozen=True)
@@ -22,7 +14,7 @@ class Format:
     name: str  # on the command line
     title: str  # what it holds, in one line
     suffixes: tuple[str, ...]  # endings of the file's name, the default first; empty for a folder
-    write: Callable[..., None]  # write(system, views, path, **options) writes the file, or fills the empty folder
+    write: Callable[..., None]  # write(system, views, temporary, **options) writes the file, or fills the empty folder
     options_of: Callable[..., Any] | None = None  # has the options as keyword-only parameters; None: `write` has them
 
     @property
@@ -32,22 +24,3 @@ class Format:
         types = typing.get_type_hints(source)
         parameters = inspect.signature(source).parameters.values()
         return {p.name: (types[p.name], p.default) for p in parameters if p.kind is p.KEYWORD_ONLY}
-
-
-@contextmanager
-def new_folder(path: Path) -> Iterator[Path]:
-    """Give a temporary folder beside `path`; rename it to `path` on success, remove it on failure."""
-    path = folder_path(path)
-    if path.exists() and (not path.is_dir() or any(path.iterdir())):
-        raise InputError(f"{path}: expected a new folder or an empty one")
-    temporary = ensure_folder(path.parent) / f".{uuid.uuid4().hex[:8]}-{path.name}"
-    try:
-        temporary.mkdir()
-        yield temporary
-        if path.exists():
-            path.rmdir()
-        os.replace(temporary, path)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror or error})") from error
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)

@@ -28,13 +28,13 @@ class Gate10Simulation(Simulation):
         whole_number(self.threads, "threads")
 
 
-def _write(system: PinholeSystem, views: Views, path: Path, **options: Any) -> None:
-    """Write script, numbers and materials into the folder `path`; the shape of the views is that of the images."""
+def _write(system: PinholeSystem, views: Views, temporary: Path, **options: Any) -> None:
+    """Write script, numbers and materials into the folder `temporary`; the shape of the views is that of the images."""
     simulation = Gate10Simulation(**options)
     record = _record(system, build_setup(system, simulation), simulation) | {"image_shape": list(views.shape)}
-    (path / "simulation.py").write_text(_SCRIPT.read_text(encoding="utf-8"), encoding="utf-8")
-    (path / "simulation.json").write_text(json.dumps(record, indent=1), encoding="utf-8")
-    (path / "GateMaterials.db").write_text(material_database(), encoding="ascii", newline="\n")
+    (temporary / "simulation.py").write_text(_SCRIPT.read_text(encoding="utf-8"), encoding="utf-8")
+    (temporary / "simulation.json").write_text(json.dumps(record, indent=1), encoding="utf-8")
+    (temporary / "GateMaterials.db").write_text(material_database(), encoding="ascii", newline="\n")
 
 
 _TITLE = "GATE 10 (opengate) script: a folder, to run by python simulation.py"

@@ -29,11 +29,11 @@ _MARGIN = 0.1  # mm by which a head's box is larger than its crystal, at the sid
 _IN_DEGREES = {"Theta", "Phi", "Alp1", "Alp2", "PhiStart", "DeltaPhi"}  # of the settings of shapes
 
 
-def _write(system: PinholeSystem, views: Views, path: Path, **options: Any) -> None:
-    """Write the macros into the folder `path`; the shape of the views is that of the projections."""
+def _write(system: PinholeSystem, views: Views, temporary: Path, **options: Any) -> None:
+    """Write the macros into the folder `temporary`; the shape of the views is that of the projections."""
     simulation = Simulation(**options)
     setup = build_setup(system, simulation)
-    folder = _Folder(path)
+    folder = _Folder(temporary)
     folder.write("GateMaterials.db", material_database())
     one = len(setup.crystals) == 1
     heads = [_head(folder, c, "SPECThead" if one else f"head{i + 1}") for i, (c, _) in enumerate(setup.crystals)]
@@ -88,13 +88,13 @@ GATE9 = Format("gate9", "GATE 9.3 macros: a folder, to run by Gate main.mac", ()
 class _Folder:
     """Writes text files; macros are named by their path without the ending."""
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
+    def __init__(self, temporary: Path) -> None:
+        self.folder = temporary
 
     def write(self, name: str, text: str) -> str:
-        path = self.path / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text, encoding="ascii", newline="\n")
+        temporary = self.folder / name
+        temporary.parent.mkdir(parents=True, exist_ok=True)
+        temporary.write_text(text, encoding="ascii", newline="\n")
         return name
 
     def macro(self, name: str, lines: Iterable[str]) -> str:

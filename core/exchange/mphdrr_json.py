@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import InputError
+from ..files import read_bytes
 from ..geometry.system import LATER_LENGTHS, LENGTHS, PinholeSystem
 from ..geometry.views import Views
 from .format import Format
@@ -29,7 +30,7 @@ def _rows(columns: dict[str, Any]) -> list[dict[str, Any]]:
     return [dict(zip(columns, row, strict=True)) for row in zip(*lists, strict=True)]
 
 
-def _write(system: PinholeSystem, views: Views, path: Path) -> None:
+def _write(system: PinholeSystem, views: Views, temporary: Path) -> None:
     modules = {name: getattr(system, field) for name, field in _MODULE.items()} | {"frame": system.frames()}
     images = {name: getattr(views, field) for name, field in _VIEW.items()}
     images["projection_matrix"] = views.projection_matrices()
@@ -42,13 +43,14 @@ def _write(system: PinholeSystem, views: Views, path: Path) -> None:
         "columns": views.shape[1],
         "views": _rows(images),
     }
-    path.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+    temporary.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
 
 
 def read_geometry(path: str | os.PathLike[str]) -> tuple[PinholeSystem, Views]:
     """Read what `write_geometry` wrote in the format ``"mphdrr"``, bit for bit; `InputError` for any other file."""
+    content = read_bytes(path)
     try:
-        document = json.loads(Path(path).read_text(encoding="utf-8"))
+        document = json.loads(content)
         if not isinstance(document, dict) or document.get("kind") != _KIND:
             raise InputError(f"not a file of the format mphdrr ({_KIND})")
         if document.get("version") != _VERSION:
@@ -60,9 +62,7 @@ def read_geometry(path: str | os.PathLike[str]) -> tuple[PinholeSystem, Views]:
         return PinholeSystem(**system), Views(**views, shape=(document["rows"], document["columns"]))
     except InputError as error:
         reason = str(error)
-    except OSError as error:
-        reason = f"cannot be read ({error.strerror or error})"
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         reason = f"not JSON ({error})"
     except KeyError as error:
         reason = f"incomplete, {error} is missing"

@@ -4,6 +4,7 @@ Every part is a closed surface of its own in world mm: origin at the isocentre, 
 colour the parts ("Module 07 collimator"). STL can do neither, so there is also a folder with one file for each part.
 """
 
+import io
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -30,7 +31,7 @@ def _solid_format(name: str, title: str, suffixes: tuple[str, ...], save: _Save)
     def write(
         system: PinholeSystem,
         views: Views,
-        path: Path,
+        temporary: Path,
         *,
         part: Literal["all", "collimators", "crystals"] = "all",
         plate_thickness: float = 2.0,
@@ -40,21 +41,21 @@ def _solid_format(name: str, title: str, suffixes: tuple[str, ...], save: _Save)
     ) -> None:
         one_of(part, _KINDS, "part")
         construction = Construction(plate_thickness, wall_thickness, angle_from_degrees(opening_degrees), edge_at)
-        save(path, [p for p in module_parts(system, construction) if p.kind in _KINDS[part]])
+        save(temporary, [p for p in module_parts(system, construction) if p.kind in _KINDS[part]])
 
     return Format(name, title, suffixes, write)
 
 
-def _save_stl(path: Path, parts: list[ModulePart]) -> None:
+def _save_stl(temporary: Path, parts: list[ModulePart]) -> None:
     import trimesh
 
     meshes = [trimesh.Trimesh(p.vertices, p.triangles, process=False) for p in parts]
-    path.write_bytes(trimesh.util.concatenate(meshes).export(file_type="stl"))
+    temporary.write_bytes(trimesh.util.concatenate(meshes).export(file_type="stl"))
 
 
-def _save_stl_parts(path: Path, parts: list[ModulePart]) -> None:
+def _save_stl_parts(temporary: Path, parts: list[ModulePart]) -> None:
     for p in parts:
-        _save_stl(path / f"{p.name}.stl", [p])
+        _save_stl(temporary / f"{p.name}.stl", [p])
 
 
 _CONTENT_TYPES = """<?xml version="1.0" encoding="UTF-8"?>
@@ -70,7 +71,7 @@ _RELATIONSHIPS = """<?xml version="1.0" encoding="UTF-8"?>
 """
 
 
-def _save_3mf(path: Path, parts: list[ModulePart]) -> None:
+def _save_3mf(temporary: Path, parts: list[ModulePart]) -> None:
     """3MF (Core Specification 1.2) in millimetres, a named object for each part."""
     bases = []
     for kind, look in LOOKS.items():  # whose colours are linear, while 3MF's are sRGB
@@ -92,13 +93,14 @@ def _save_3mf(path: Path, parts: list[ModulePart]) -> None:
         lines += [f'<triangle v1="{a}" v2="{b}" v3="{c}"/>' for a, b, c in p.triangles.tolist()]
         lines.append("</triangles></mesh></object>")
     lines += ["</resources><build>", *(f'<item objectid="{number}"/>' for number, _ in numbered), "</build></model>\n"]
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as package:
+    with zipfile.ZipFile(memory := io.BytesIO(), "w", zipfile.ZIP_DEFLATED) as package:
         package.writestr("[Content_Types].xml", _CONTENT_TYPES)
         package.writestr("_rels/.rels", _RELATIONSHIPS)
         package.writestr("3D/3dmodel.model", "\n".join(lines))
+    temporary.write_bytes(memory.getbuffer())
 
 
-def _save_glb(path: Path, parts: list[ModulePart]) -> None:
+def _save_glb(temporary: Path, parts: list[ModulePart]) -> None:
     """Binary glTF 2.0, a named mesh for each part.
 
     The meshes are in world mm. glTF's unit is the metre and its +y points up, so they hang on one node that scales by 0.001
@@ -121,7 +123,7 @@ def _save_glb(path: Path, parts: list[ModulePart]) -> None:
         visual = TextureVisuals(material=materials[p.kind])
         mesh = trimesh.Trimesh(p.vertices, p.triangles, process=False, visual=visual)
         scene.add_geometry(mesh, node_name=p.name, geom_name=p.name, parent_node_name="Scanner in mm")
-    path.write_bytes(scene.export(file_type="glb"))
+    temporary.write_bytes(scene.export(file_type="glb"))
 
 
 STL = _solid_format("stl", "binary STL of the solids, one file, mm", (".stl",), _save_stl)

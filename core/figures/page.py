@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InputError
-from ..files import replacing
+from ..files import write_bytes
 from ..runs import letters
 from ..runs.mosaic import png, write_png
 from ..runs.resizing import resized
@@ -118,8 +118,7 @@ class Page:
             return
         size = f'width="{self.width}" height="{self.height}" viewBox="0 0 {self.width} {self.height}"'
         head = f'<svg xmlns="http://www.w3.org/2000/svg" {size} font-family="{_FONTS}" xml:space="preserve">'
-        with replacing(path) as temporary:
-            temporary.write_text("\n".join([head, *self._marks, "</svg>"]) + "\n", encoding="utf-8")
+        write_bytes(path, "\n".join([head, *self._marks, "</svg>\n"]).encode())
 
     def _around(self, points: NDArray[np.float64], margin: float) -> tuple[int, int, NDArray, NDArray]:
         """The part of the page that holds points: its first row and column, and its pixels' x and y."""

@@ -32,7 +32,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputError, naming
-from ..files import replacing
+from ..files import write_bytes
 from ..toml import parse_toml, read_toml, toml_value
 from ..validation import instance
 from .derenzo import DerenzoRods
@@ -72,8 +72,7 @@ def write_phantom(phantom: Phantom, path: str | os.PathLike[str]) -> None:
                 lines.append(f"{_EULER} = {toml_value(map(_degrees, value))}")
             elif field.init and value != field.default:
                 lines.append(f"{field.name} = {toml_value(value)}")
-    with replacing(path) as temporary:
-        temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    write_bytes(path, "\n".join([*lines, ""]).encode())
 
 
 def _phantom(table: dict[str, Any], name: str) -> ShapePhantom:

@@ -3,14 +3,15 @@
 import json
 import os
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from ..errors import InputError
-from ..files import replacing
+from ..errors import InputError, reading
+from ..files import write_bytes
+from ..hdf5 import numbers, opened, pack
 from ..validation import instance, require_finite
 from ..volumes.formats import hdf5
-from ..volumes.formats.contents import reading
 from ..volumes.volume_files import read_volume
 from .result import Reconstruction
 
@@ -25,18 +26,18 @@ def write_reconstruction(result: Reconstruction, path: str | os.PathLike[str]) -
     `read_volume` reads the volume of such a file. Raises InputError for another ending, or where it cannot be written: an
     older file then stays.
     """
-    import h5py
-
     path = _named(path)
     instance(result, Reconstruction, "write_reconstruction")
-    with replacing(path) as temporary:
-        hdf5.write(result.volume, temporary)
-        with h5py.File(temporary, "a") as file:
-            group = file.create_group(_GROUP)
-            group.attrs.update(format_version=_FORMAT_VERSION, settings=json.dumps(dict(result.settings)))
-            group["objective"] = result.objective
-            for name, array in result.state.items():
-                group[f"state/{name}"] = array
+
+    def fill(file: Any) -> None:
+        hdf5.fill(result.volume, file)
+        group = file.create_group(_GROUP)
+        group.attrs.update(format_version=_FORMAT_VERSION, settings=json.dumps(dict(result.settings)))
+        group["objective"] = result.objective
+        for name, array in result.state.items():
+            group[f"state/{name}"] = array
+
+    write_bytes(path, pack("mphDRR reconstruction", {}, fill))
 
 
 def read_reconstruction(path: str | os.PathLike[str]) -> Reconstruction:
@@ -45,14 +46,14 @@ def read_reconstruction(path: str | os.PathLike[str]) -> Reconstruction:
 
     path = _named(path)
     volume = read_volume(path)
-    with reading(path, "a reconstruction"), h5py.File(path, "r") as file:
+    with reading(path, "a reconstruction"), opened(path, whole=True) as file:
         group = file.get(_GROUP)
         if not isinstance(group, h5py.Group):
             raise InputError("it holds a volume, but no reconstruction: use it as start with read_volume")
         if int(group.attrs["format_version"]) > _FORMAT_VERSION:
             raise InputError(f"written by a newer mphDRR (format {group.attrs['format_version']}); update to read it")
-        objective = np.asarray(group["objective"][()], np.float64)
-        state = {name: np.asarray(array[()]) for name, array in group.get("state", {}).items()}
+        objective = np.asarray(numbers(group["objective"]), np.float64)
+        state = {name: numbers(array) for name, array in group.get("state", {}).items()}
         if objective.ndim != 1:
             raise InputError(f"objective: expected one number for each iteration, got {objective.ndim} axes")
         for name, array in (("objective", objective), *state.items()):

@@ -3,6 +3,8 @@
 Whatever the format, a file holds arrays by name (``"geometry/center"``) with units, and attributes (text or whole numbers).
 """
 
+import hashlib
+import io
 import json
 import os
 from collections.abc import Callable
@@ -13,11 +15,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError
-from ..files import replacing
+from ..errors import InputError, reading
+from ..files import require_file, write_bytes
 from ..geometry.grid import Grid
 from ..geometry.system import LATER_LENGTHS, LENGTHS, PinholeSystem
 from ..geometry.views import Views
+from ..hdf5 import numbers, opened, pack
+from ..volumes.formats import numpy_files
 from ..volumes.volume import Volume
 from .run import ProjectionRun
 
@@ -50,7 +54,7 @@ _ARRAYS: dict[str, tuple[str, Callable[[ProjectionRun], Any]]] = {
 _VOLUME = ("volume/array", "volume/affine")
 """Which a measured run does not have."""
 _BACKGROUND = "background"  # in the unit of the projections; where there is none, nothing but the volume was projected
-_ATTRIBUTES = "attributes"
+_ATTRIBUTES, _SHA256 = "attributes", "sha256"
 _COMPRESS_FROM = 1 << 16  # bytes: below, compressing costs more than it saves
 
 _Contents = tuple[dict[str, NDArray[Any]], dict[str, Any]]
@@ -62,7 +66,7 @@ def write_run(run: ProjectionRun, path: str | os.PathLike[str]) -> None:
 
     `InputError` for another suffix, where torch is missing for .pt, or the file cannot be written: the old one then stays.
     """
-    write, _ = _format(Path(path))
+    packed, _ = _format(Path(path))
     arrays = {"projections": run.projections} | {name: get(run) for name, (_, get) in _ARRAYS.items()}
     of_volume: dict[str, Any] = {}
     if run.volume is not None:
@@ -76,23 +80,14 @@ def write_run(run: ProjectionRun, path: str | os.PathLike[str]) -> None:
         "workbook": run.workbook, "workbook_sha256": run.workbook_sha256,
         "settings": json.dumps(dict(run.settings)), "versions": json.dumps(dict(run.versions)),
     }  # fmt: skip
-    with replacing(path) as temporary:
-        write(arrays, attributes, temporary)
+    write_bytes(path, packed(arrays, attributes))
 
 
 def read_run(path: str | os.PathLike[str]) -> ProjectionRun:
     """Read a run written by `write_run`; `InputError` where there is no such file, or no whole run in it."""
-    path = Path(path)
-    _, read = _format(path)
-    if not path.is_file():
-        raise InputError(f"{path}: no such file")
-    try:
-        return _run_of(*read(path))
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
-    except Exception as error:  # whatever the format's library raises on a damaged file
-        reason = (str(error) or type(error).__name__).splitlines()[0]
-        raise InputError(f"{path}: cannot be read as a projection run ({reason})") from error
+    _, read = _format(Path(path))
+    with reading(require_file(path), "a projection run"):
+        return _run_of(*read(Path(path)))
 
 
 def _run_of(arrays: dict[str, NDArray[Any]], attributes: dict[str, Any]) -> ProjectionRun:
@@ -100,6 +95,9 @@ def _run_of(arrays: dict[str, NDArray[Any]], attributes: dict[str, Any]) -> Proj
         raise InputError(f"expected a file marked {_FORMAT!r}, found {attributes.get('format', 'no mark')!r}")
     if int(attributes["format_version"]) > _FORMAT_VERSION:
         raise InputError(f"written by a newer mphDRR (format {attributes['format_version']}); update to read it")
+    sha256 = attributes.pop(_SHA256, None)
+    if sha256 not in (None, _sha256(arrays, attributes)):
+        raise InputError("changed: its arrays or attributes are not those that were written")
     is_measured = int(attributes["format_version"]) == _FORMAT_VERSION
     for name in ("projections", *(() if is_measured else _VOLUME), *_ARRAYS):
         if name not in arrays and name.removeprefix("geometry/") not in LATER_LENGTHS:
@@ -127,15 +125,23 @@ def _run_of(arrays: dict[str, NDArray[Any]], attributes: dict[str, Any]) -> Proj
     )
 
 
-def _write_hdf5(arrays: dict[str, NDArray[Any]], attributes: dict[str, Any], path: Path) -> None:
-    """Arrays as datasets with a `unit`, in chunks of one view each, so that one view reads alone; attributes on the root."""
-    import h5py
+def _sha256(arrays: dict[str, NDArray[Any]], attributes: dict[str, Any]) -> str:
+    """Of all that a run's file holds."""
+    digest = hashlib.sha256(json.dumps(attributes, sort_keys=True).encode())
+    for name, array in sorted(arrays.items()):
+        digest.update(f"{name} {array.dtype.str} {array.shape}".encode())
+        digest.update(np.asarray(array, order="C").data)
+    return digest.hexdigest()
 
+
+def _packed_hdf5(arrays: dict[str, NDArray[Any]], attributes: dict[str, Any]) -> memoryview:
+    """Arrays as datasets with a `unit`, in chunks of one view each, so that one view reads alone; attributes on the root."""
     unit = attributes["projections_unit"]
     units = {"projections": unit, _BACKGROUND: unit}
     units |= dict(zip(_VOLUME, (attributes.get("volume_unit"), "mm"), strict=True))
     units |= {name: unit for name, (unit, _) in _ARRAYS.items()}
-    with h5py.File(path, "w") as file:
+
+    def fill(file: Any) -> None:
         file.attrs.update(attributes)
         for name, array in arrays.items():
             packed: dict[str, Any] = {}
@@ -143,6 +149,8 @@ def _write_hdf5(arrays: dict[str, NDArray[Any]], attributes: dict[str, Any], pat
                 packed = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
                 packed["chunks"] = (1, *array.shape[1:])
             file.create_dataset(name, data=array, **packed).attrs["unit"] = units[name]
+
+    return pack(_FORMAT, {}, fill)
 
 
 def _read_hdf5(path: Path) -> _Contents:
@@ -152,9 +160,9 @@ def _read_hdf5(path: Path) -> _Contents:
 
     def take(name: str, item: h5py.Dataset | h5py.Group) -> None:
         if isinstance(item, h5py.Dataset):
-            arrays[name] = item[()]
+            arrays[name] = numbers(item)
 
-    with h5py.File(path, "r") as file:
+    with opened(path, whole=True) as file:
         file.visititems(take)
         attributes = {
             name: value.item() if isinstance(value, np.generic) else value for name, value in file.attrs.items()
@@ -162,24 +170,23 @@ def _read_hdf5(path: Path) -> _Contents:
     return arrays, attributes
 
 
-def _write_npz(arrays: dict[str, NDArray[Any]], attributes: dict[str, Any], path: Path) -> None:
+def _packed_npz(arrays: dict[str, NDArray[Any]], attributes: dict[str, Any]) -> memoryview:
     """Arrays by name, attributes as JSON text."""
-    contents: dict[str, Any] = {**arrays, _ATTRIBUTES: np.array(json.dumps(attributes))}
-    with open(path, "wb") as file:
-        np.savez_compressed(file, **contents)
+    text = json.dumps({**attributes, _SHA256: _sha256(arrays, attributes)})
+    return numpy_files.packed({**arrays, _ATTRIBUTES: np.array(text)})
 
 
 def _read_npz(path: Path) -> _Contents:
-    with open(path, "rb") as opened:  # not by numpy, which leaves a damaged archive open
-        arrays = dict(np.load(opened, allow_pickle=False))
+    arrays = numpy_files.load(path)
     return arrays, json.loads(str(arrays.pop(_ATTRIBUTES, "{}")))
 
 
-def _write_pt(arrays: dict[str, NDArray[Any]], attributes: dict[str, Any], path: Path) -> None:
+def _packed_pt(arrays: dict[str, NDArray[Any]], attributes: dict[str, Any]) -> memoryview:
     """Only tensors, text and whole numbers: ``torch.load(path, weights_only=True)`` reads them."""
-    torch = _torch()
+    torch, memory = _torch(), io.BytesIO()
     tensors = {name: torch.from_numpy(np.array(array, order="C")) for name, array in arrays.items()}
-    torch.save({_ATTRIBUTES: attributes, **tensors}, path)
+    torch.save({_ATTRIBUTES: {**attributes, _SHA256: _sha256(arrays, attributes)}, **tensors}, memory)
+    return memory.getbuffer()
 
 
 def _read_pt(path: Path) -> _Contents:
@@ -196,12 +203,12 @@ def _torch() -> Any:
     return torch
 
 
-_Format = tuple[Callable[[dict[str, NDArray[Any]], dict[str, Any], Path], None], Callable[[Path], _Contents]]
+_Format = tuple[Callable[[dict[str, NDArray[Any]], dict[str, Any]], memoryview], Callable[[Path], _Contents]]
 _FORMATS: dict[str, _Format] = {
-    ".h5": (_write_hdf5, _read_hdf5),
-    ".hdf5": (_write_hdf5, _read_hdf5),
-    ".npz": (_write_npz, _read_npz),
-    ".pt": (_write_pt, _read_pt),
+    ".h5": (_packed_hdf5, _read_hdf5),
+    ".hdf5": (_packed_hdf5, _read_hdf5),
+    ".npz": (_packed_npz, _read_npz),
+    ".pt": (_packed_pt, _read_pt),
 }
 FORMATS = tuple(_FORMATS)
 

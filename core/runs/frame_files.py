@@ -13,13 +13,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError
+from ..errors import InputError, first_line, reading
+from ..files import require_file
+from ..hdf5 import numbers, opened
 from ..memory import require
 from ..progress import Progress, tell
 from ..recording import recorded_warnings
 from ..validation import one_of, whole_shape
-from ..volumes.formats import metaimage
-from ..volumes.formats.contents import first_line, reading
+from ..volumes.formats import metaimage, numpy_files
 from ..volumes.formats.dicom import is_dicom
 
 RAW_TYPES = ("uint8", "int8", "uint16", "int16", "uint32", "int32", "uint64", "int64", "float32", "float64")
@@ -146,10 +147,7 @@ def read_frames(
 
 
 def _read(path: Path, layout: Layout) -> Counts:
-    if not path.is_file():
-        raise InputError(
-            f"{path}: is a folder; expected a file with counts" if path.is_dir() else f"{path}: no such file"
-        )
+    require_file(path)
     ending = path.suffix.lower()
     with reading(path, ending or "counts"):
         if layout.is_raw:
@@ -222,20 +220,8 @@ def _numbers(path: Path, kind: np.dtype[Any], shape: tuple[int, ...], skip: int 
 
 
 def _numpy(path: Path, layout: Layout) -> Counts:
-    with open(path, "rb") as opened:  # not by numpy, which leaves a damaged archive open
-        if not opened.read(6).startswith((b"\x93NUMPY", b"PK")):  # numpy would take it for pickled objects
-            raise InputError("not a file of numpy")
-        opened.seek(0)
-        if path.suffix.lower() == ".npy":
-            found = np.load(opened, allow_pickle=False)
-            if not isinstance(found, np.ndarray):
-                raise InputError("expected a single array, found an npz archive")
-            return _counts(found)
-        archive = np.load(opened, allow_pickle=False)
-        if isinstance(archive, np.ndarray):
-            raise InputError("expected an npz archive, found a single array")
-        arrays = {name: archive[name] for name in archive.files}
-        return _counts(arrays[_chosen(arrays, layout)])
+    arrays = numpy_files.load(path)
+    return _counts(arrays["" if path.suffix.lower() == ".npy" else _chosen(arrays, layout)])
 
 
 def _hdf5(path: Path, layout: Layout) -> Counts:
@@ -247,11 +233,13 @@ def _hdf5(path: Path, layout: Layout) -> Counts:
         if isinstance(item, h5py.Dataset):
             arrays[name] = item
 
-    with h5py.File(path, "r") as file:
+    with opened(path, whole=True) as file:
         file.visititems(take)
+        if layout.dataset is not None and layout.dataset in file:  # of an array's names, the visit gives one
+            take(layout.dataset.strip("/"), file[layout.dataset])
         dataset = arrays[_chosen(arrays, layout)]
         _require_memory(dataset.shape, dataset.dtype.itemsize)
-        return _counts(dataset[()])
+        return _counts(numbers(dataset))
 
 
 def _chosen(arrays: dict[str, Any], layout: Layout) -> str:
@@ -336,8 +324,8 @@ def _interfile_header(path: Path) -> dict[str, list[str]]:
 def _interfile_data(path: Path, name: str) -> Path:
     """The file of numbers: where the header says, or of that name beside it, since it may have been moved with it."""
     for found in (path.parent / name, path.parent / Path(name.replace("\\", "/")).name):
-        if name and found.is_file():
-            return found
+        if name and found.exists():
+            return require_file(found)
     raise InputError(f"its numbers are in {name or 'no file that it names'}, which is not beside it")
 
 

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InputError, naming, warn
+from ..files import read_bytes
 from ..geometry.system import Detector, PinholeSystem
 from ..memory import require
 from ..progress import Stages
@@ -212,9 +213,9 @@ def _whole(values: Any) -> list[int | None]:
 
 def _read_numbers(path: Path) -> str:
     try:
-        return path.read_text(encoding="utf-8")
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: {getattr(error, 'strerror', None) or 'not a text file'}") from None
+        return read_bytes(path).decode()
+    except UnicodeDecodeError:
+        raise InputError(f"{path}: not a text file") from None
 
 
 def _words(orientation: Any, count: int) -> list[str]:

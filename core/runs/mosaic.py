@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InputError
-from ..files import replacing
+from ..files import write_bytes
 from ..validation import real_numbers
 from . import letters
 from .display import Display
@@ -229,8 +229,7 @@ def _write(picture: NDArray[np.uint8], text: str, row: int, column: int, size: f
 
 def write_png(picture: ArrayLike, path: str | os.PathLike[str]) -> None:
     """Write a picture (`png`) to a file; `InputError` where it cannot be written."""
-    with replacing(path) as temporary:
-        temporary.write_bytes(png(picture))
+    write_bytes(path, png(picture))
 
 
 def png(picture: ArrayLike, level: int = -1) -> bytes:

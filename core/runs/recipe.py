@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import InputError, naming
-from ..files import replacing
+from ..files import write_bytes
 from ..phantoms.kinds import KINDS
 from ..phantoms.settings import setting_names
 from ..toml import read_toml, toml_value
@@ -148,8 +148,7 @@ def write_recipe(recipe: Recipe, path: str | os.PathLike[str]) -> None:
             value = recipe[key]
             line = f"{key.partition('.')[2]} =" + ("" if value is None else f" {toml_value(value)}")
             lines.append(line if key in recipe.given else f"# {line}")
-    with replacing(path) as temporary:
-        temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    write_bytes(path, "\n".join([*lines, ""]).encode())
 
 
 def _with_hole(values: dict[str, Any], kept: Collection[str]) -> dict[str, Any]:

@@ -6,12 +6,12 @@ from pathlib import Path
 
 from numpy.typing import ArrayLike
 
-from ..errors import InputError, naming
-from ..files import replacing
+from ..errors import InputError, naming, reading, refusing
+from ..files import replacing, require_file
 from ..progress import Progress
 from ..validation import instance, real_array
 from .formats import dicom, hdf5, metaimage, nifti, nrrd, numpy_files
-from .formats.contents import Contents, reading
+from .formats.contents import Contents
 from .volume import UNITS, Volume
 
 _READERS = {
@@ -102,22 +102,16 @@ def write_volume(volume: Volume, path: str | os.PathLike[str]) -> None:
 
 def _contents(path: Path, series: str | None, progress: Progress | None) -> Contents:
     """What the file or folder at `path` holds."""
-    try:  # libraries say little about files that cannot be opened
-        path.stat()
-        if path.is_file():
-            path.open("rb").close()
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file") from None
-    except (OSError, ValueError) as error:  # an impossible name is a ValueError
-        raise InputError(f"{path}: {getattr(error, 'strerror', None) or error}") from None
-    if not (path.is_file() or path.is_dir()):  # reading a pipe would block
-        raise InputError(f"{path}: neither a file nor a folder")
+    with refusing(path, "cannot be read"):
+        is_folder = path.is_dir()
+    if not is_folder:
+        require_file(path)
     ending = _ending(path, READ_FORMATS)
-    is_series = path.is_dir() or ending == ".dcm" or (not ending and dicom.is_dicom(path))
+    is_series = is_folder or ending == ".dcm" or (not ending and dicom.is_dicom(path))
     with naming(path):
         if not (ending or is_series):
             raise InputError(f"expected a folder of DICOM files, or a name ending in {', '.join(READ_FORMATS)}")
-        if path.is_file() and path.stat().st_size == 0:
+        if not is_folder and path.stat().st_size == 0:
             raise InputError("it is empty")
         if series is not None and not is_series:
             raise InputError("only folders of DICOM files hold several series")

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from ..errors import InputError
+from ..files import read_bytes, require_file
 from .calculation import Calculation, Uncomputed
 from .sheet_xml import At, Cell, CellError, Reference, Unreadable
 from .workbook_xml import Place, WorkbookXml
@@ -184,20 +185,10 @@ def _same_result(stored: Any, computed: Any) -> bool:
 
 def _read(path: Path) -> bytes:
     """The bytes of a file that has the looks of an .xlsx workbook; `InputError` for any other."""
-    try:
-        folder, size = path.is_dir(), path.stat().st_size
-        if not folder and size <= MAX_FILE_BYTES:
-            content = path.read_bytes()
-    except FileNotFoundError as error:
-        raise InputError(f"{path}: no such file") from error
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
-    except ValueError as error:
-        raise InputError(f"{str(path)!r}: not a file name ({error})") from error
-    if folder:
-        raise InputError(f"{path}: is a folder, expected an .xlsx workbook")
+    size = require_file(path, "an .xlsx workbook").stat().st_size
     if size > MAX_FILE_BYTES:
         raise InputError(f"{path}: {size} bytes, expected a workbook of at most {MAX_FILE_BYTES} bytes")
+    content = read_bytes(path)
     if (other := _other_format(path.name, content)) is not None:
         raise InputError(f"{path}: {other}")
     return content

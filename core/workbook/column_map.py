@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 from ..errors import InputError
-from ..files import replacing
+from ..files import write_bytes
 from ..toml import parse_toml, read_toml, toml_value
 from .headings import unit_of
 from .quantities import DIMENSIONS, POSITION, QUANTITIES
@@ -139,8 +139,7 @@ class ColumnMap:
     def write(self, path: str | os.PathLike[str], comment: str = "") -> None:
         """Write the map to a .toml file, below the lines of a comment."""
         lines = "".join(f"# {line}\n" for line in comment.splitlines())
-        with replacing(Path(path)) as temporary:
-            temporary.write_text(lines + self.to_toml(), encoding="utf-8")
+        write_bytes(path, (lines + self.to_toml()).encode())
 
 
 def column_map(

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import InputError, warn
+from ..errors import InputError, first_line, warn
 from ..files import replacing
 from ..geometry.system import PinholeSystem
 from ..recording import recorded_warnings
@@ -199,5 +199,8 @@ def _new_workbook(system: PinholeSystem) -> bytes:
             if title == "Coordinates" and name != "number":
                 cell.number_format = "0.0000"
     content = io.BytesIO()
-    book.save(content)
+    try:
+        book.save(content)
+    except Exception as error:  # lxml's, which has no name here: of the sheets' temporary files
+        raise OSError(first_line(error)) from error
     return content.getvalue()

@@ -401,7 +401,7 @@ def test_commands_take_a_column_map(tmp_path, capsys):
     assert main(run) == 0
     capsys.readouterr()
     assert main(["geometry", "show", str(path), "--columns", str(tmp_path / "none.toml")]) == 1
-    assert "none.toml: No such file" in capsys.readouterr().err
+    assert "none.toml: no such file" in capsys.readouterr().err
 
 
 def test_a_draft_is_written_by_command(tmp_path, workbook, capsys):

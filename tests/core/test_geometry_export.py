@@ -286,7 +286,7 @@ def test_mphdrr_reads_back_bit_for_bit(system, rng, tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (None, "cannot be read"),
+        (None, "no such file"),
         ("{", "not JSON"),
         ("[]", "not a file of the format mphdrr"),
         ('{"kind": "mphDRR geometry", "version": 9}', "version 9"),

@@ -166,7 +166,7 @@ def test_a_beating_heart_is_a_run_for_each_state(workbook, tmp_path, capsys, mon
         ("nema --length -1", 1, "NEMA body phantom: length: expected more than 0 mm, got -1"),
         ("sphere", 2, "--radius"),
         ("blob", 2, "invalid choice"),
-        ("file nowhere.toml", 1, "nowhere.toml: No such file"),
+        ("file nowhere.toml", 1, "nowhere.toml: no such file"),
         ("derenzo --rods 8 6", 1, "Derenzo rod diameters: expected one for each of 6 sectors (0: empty), got 2"),
         ("sphere --radius 3 --count 2", 1, "--count and --box need --random"),
         ("sphere --radius 3 --random -1", 1, "--random: expected a seed"),

@@ -302,7 +302,7 @@ def test_texts_that_are_no_phantom_are_refused_in_one_line(text, message, tmp_pa
 
 
 def test_files_that_are_no_text_are_refused(tmp_path):
-    for path, message in ((tmp_path / "none.toml", "No such file"), (tmp_path, "directory")):
+    for path, message in ((tmp_path / "none.toml", "no such file"), (tmp_path, "is a folder")):
         with pytest.raises(mph.InputError, match=message):
             mph.read_phantom(path)
     (tmp_path / "b.toml").write_bytes(b"\xff\xfe\x00")

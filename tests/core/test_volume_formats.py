@@ -576,7 +576,7 @@ BAD = {
     "truncated gzip": (_truncated("v.nii.gz"), "not a NIfTI file"),
     "truncated npz": (_truncated("v.npz"), "cannot be read as .npz"),
     "truncated NRRD": (_truncated("v.nrrd"), "its data are damaged or end early; expected 5 x 6 x 7 voxels"),
-    "truncated HDF5": (_truncated("v.h5"), "cannot be read as .h5"),
+    "truncated HDF5": (_truncated("v.h5"), "cut: "),
     "4-D NRRD": (_nrrd((3, 4, 5, 2)), "expected a 3-D image, got shape 3 x 4 x 5 x 2"),
     "unknown space": (
         _nrrd(space="scanner-xyz", **{"space directions": np.eye(3)}),

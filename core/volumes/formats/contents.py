@@ -5,8 +5,7 @@ Those of DICOM and ITK point left, back (posterior) and to the head: LPS.
 """
 
 import math
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,10 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ... import errors
-from ...errors import InputError, naming
+from ...errors import InputError
 from ...geometry.grid import Grid
 from ...memory import require
-from ...progress import Cancelled
 from ...validation import freeze
 from ..volume import UNITS, Volume
 
@@ -76,21 +74,3 @@ def warn_of_assumed(path: Path, assumed: Sequence[str]) -> None:
     """Warn of what was `assumed` about the volume's place because the header does not say it, if anything."""
     if assumed:
         warn(path, f"it does not say how it lies; taken as: {'; '.join(assumed)}")
-
-
-@contextmanager
-def reading(name: object, kind: str) -> Iterator[None]:
-    """Make whatever a library raises on a damaged file an input error, and put the file's `name` before all of these."""
-    with naming(name):
-        try:
-            yield
-        except (InputError, MemoryError, Cancelled):
-            raise
-        except Exception as error:
-            raise InputError(f"cannot be read as {kind} ({first_line(error)})") from error
-
-
-def first_line(error: BaseException) -> str:
-    """A library's error message, as one line."""
-    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    return lines[0] if lines else type(error).__name__

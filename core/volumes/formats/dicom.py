@@ -17,10 +17,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...errors import InputError, warn
+from ...errors import InputError, first_line, reading, warn
+from ...files import require_file
 from ...geometry.frames import affine_matrix
 from ...progress import Progress, tell
-from .contents import RAS_FROM_LPS, Contents, first_line, reading, require_voxels
+from .contents import RAS_FROM_LPS, Contents, require_voxels
 
 _SAME_ORIENTATION = 1e-4  # direction cosines are written with 6 digits
 _SAME_PLACE = 1e-3  # mm
@@ -108,10 +109,10 @@ def _headers(path: Path) -> list[tuple[Path, Any]]:
     headers: dict[Path, Any] = {}
     others: dict[Path, Any] = {}
     for file in files:
-        if file in headers or not file.is_file():
+        if file in headers or file.is_dir():
             continue
         try:
-            if not (is_dicom(file) or file.suffix.lower() in (".dcm", ".ima")):
+            if not (is_dicom(require_file(file)) or file.suffix.lower() in (".dcm", ".ima")):
                 continue
             header = pydicom.dcmread(file, stop_before_pixels=True)
         except InvalidDicomError:

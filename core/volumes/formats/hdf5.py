@@ -1,10 +1,11 @@
 """HDF5: datasets ``array``, with the attributes quantity and unit, and ``affine``. Run files are read, too."""
 
+from functools import partial
 from pathlib import Path
-
-import numpy as np
+from typing import Any
 
 from ...errors import InputError
+from ...hdf5 import numbers, opened, pack
 from ..volume import Volume
 from .contents import Contents, require_voxels
 
@@ -13,7 +14,7 @@ def read(path: Path) -> Contents:
     """Read .h5 or .hdf5: the volume at the file's root, or in the group ``volume`` of a run file."""
     import h5py
 
-    with h5py.File(path, "r") as file:
+    with opened(path, whole=True) as file:
         place = file["volume"] if isinstance(file.get("volume"), h5py.Group) else file
         array, affine = place.get("array"), place.get("affine")
         for name, dataset in (("array", array), ("affine", affine)):
@@ -31,16 +32,18 @@ def read(path: Path) -> Contents:
         )
         if length not in (None, "mm"):
             raise InputError(f"its affine is in {length}: expected mm")
-        return Contents(array[()], np.asarray(affine[()]), quantity, unit)
+        return Contents(numbers(array), numbers(affine), quantity, unit)
 
 
-def write(volume: Volume, path: Path) -> None:
-    """Write the volume to the file's root."""
-    import h5py
+def write(volume: Volume, temporary: Path) -> None:
+    """Write .h5 or .hdf5."""
+    temporary.write_bytes(pack("mphDRR volume", {}, partial(fill, volume)))
 
-    with h5py.File(path, "w") as file:
-        array = file.create_dataset("array", data=volume.array, compression="gzip", compression_opts=1, shuffle=True)
-        array.attrs.update(quantity=volume.quantity, unit=volume.unit)
-        file.create_dataset("affine", data=volume.grid.affine).attrs.update(
-            unit="mm", description="index to world, on column vectors; an integer index is a voxel's centre"
-        )
+
+def fill(volume: Volume, file: Any) -> None:
+    """Put the volume into the root of an ``h5py.File``, open for writing."""
+    array = file.create_dataset("array", data=volume.array, compression="gzip", compression_opts=1, shuffle=True)
+    array.attrs.update(quantity=volume.quantity, unit=volume.unit)
+    file.create_dataset("affine", data=volume.grid.affine).attrs.update(
+        unit="mm", description="index to world, on column vectors; an integer index is a voxel's centre"
+    )

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import InputError
+from ...files import require_file
 from ...geometry.frames import affine_matrix
 from .contents import RAS_FROM_LPS, Contents, refuse_several_files, require_voxels, warn_of_assumed
 
@@ -70,9 +71,9 @@ def _data(header: dict[str, str], file: BinaryIO, path: Path, size: int) -> byte
     if where.upper() == "LOCAL":
         return _unpacked(header, file, size, "it")
     beside = path.parent / where
-    if not beside.is_file():
+    if not beside.exists():
         raise InputError(f"its voxels are in {where}, which is not beside it")
-    with open(beside, "rb") as raw:
+    with open(require_file(beside), "rb") as raw:
         return _unpacked(header, raw, size, where)
 
 
@@ -80,7 +81,10 @@ def _unpacked(header: dict[str, str], file: BinaryIO, size: int, name: str) -> b
     skip = int(header.get("HeaderSize", 0))
     if _true(header.get("CompressedData", "False")):
         # One byte more than expected, to notice too much data.
-        data = zlib.decompressobj(zlib.MAX_WBITS | 32).decompress(file.read(), size + 1)
+        packed = zlib.decompressobj(zlib.MAX_WBITS | 32)
+        data = packed.decompress(file.read(), size + 1)
+        if len(data) == size and not packed.eof:
+            raise InputError(f"{name} ends before the checksum of its voxels")
     else:
         if skip == -1:  # the voxels end the file
             file.seek(-size, 2)

@@ -1,14 +1,17 @@
 """NIfTI-1 and -2, and Analyze 7.5, by nibabel."""
 
 import contextlib
+import gzip
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from ...errors import InputError
+from ...errors import InputError, first_line
+from ...files import require_file
 from ..volume import UNITS, Volume
-from .contents import Contents, first_line, require_voxels, warn
+from .contents import Contents, require_voxels, warn
 
 _MILLIMETRES = {"unknown": 1.0, "mm": 1.0, "meter": 1000.0, "micron": 0.001}
 _ANALYZE_MILLIMETRES = {"": 1.0, "mm": 1.0, "cm": 10.0, "m": 1000.0, "um": 0.001}
@@ -17,6 +20,18 @@ _APART = 0.1  # voxels by which sform and qform may differ, because quaternions 
 
 def read(path: Path) -> Contents:
     """Read .nii, .nii.gz, or a pair .hdr and .img."""
+    pair = (".hdr", ".img") if path.suffix.lower() in (".hdr", ".img") else ()
+    for half in filter(Path.exists, map(path.with_suffix, pair)):
+        require_file(half)
+    with gzip.open(path) if path.suffix.lower() == ".gz" else contextlib.nullcontext() as packed:
+        contents = _contents(_image(path, packed), path)
+        while packed is not None and packed.read(1 << 20):  # to its end, where its checksum is
+            pass
+    return contents
+
+
+def _image(path: Path, packed: Any) -> Any:
+    """Nibabel's image, which reads its voxels from an open .nii.gz, if it is one."""
     import nibabel
     from nibabel.filebasedimages import ImageFileError
     from nibabel.imageglobals import logger
@@ -24,13 +39,20 @@ def read(path: Path) -> Contents:
     logger.disabled, before = True, logger.disabled  # nibabel prints what it raises
     try:
         image = nibabel.load(path)
+        if packed is not None:
+            image = type(image).from_file_map({"image": nibabel.FileHolder(fileobj=packed)})
     except ImageFileError as error:
         raise InputError(f"not a NIfTI file ({first_line(error)})") from None
     finally:
         logger.disabled = before
     if not isinstance(image, nibabel.AnalyzeImage):  # the base class of NIfTI's
         raise InputError(f"expected NIfTI, found {type(image).__name__}")
-    image = nibabel.squeeze_image(image)  # (x, y, z, 1) is common
+    return nibabel.squeeze_image(image)  # (x, y, z, 1) is common
+
+
+def _contents(image: Any, path: Path) -> Contents:
+    import nibabel
+
     require_voxels(image.shape, image.get_data_dtype())
     affine, header = np.array(image.affine, np.float64), image.header
     if not isinstance(image, nibabel.Nifti1Pair):
@@ -57,7 +79,7 @@ def read(path: Path) -> Contents:
     return Contents(values, affine, named if named in UNITS else None, unit)
 
 
-def write(volume: Volume, path: Path) -> None:
+def write(volume: Volume, temporary: Path) -> None:
     """Write NIfTI-1; its affine is rounded to float32."""
     import nibabel
 
@@ -65,4 +87,4 @@ def write(volume: Volume, path: Path) -> None:
     image.header.set_xyzt_units("mm")
     image.header.set_intent("none", name=volume.quantity)
     image.header["descrip"] = json.dumps({"quantity": volume.quantity, "unit": volume.unit}).encode()[:79]
-    nibabel.save(image, path)
+    nibabel.save(image, temporary)

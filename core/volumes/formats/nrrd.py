@@ -5,10 +5,11 @@ from typing import Any
 
 import numpy as np
 
-from ...errors import InputError
+from ...errors import InputError, first_line
+from ...files import require_file
 from ...geometry.frames import affine_matrix
 from ..volume import Volume
-from .contents import Contents, first_line, refuse_several_files, require_voxels, warn_of_assumed
+from .contents import Contents, refuse_several_files, require_voxels, warn_of_assumed
 
 # Signs that turn a space's axes to right, anterior, superior, which are assumed for a space without a name.
 _SPACES: dict[str | None, tuple[int, int, int]] = {
@@ -62,7 +63,10 @@ def read(path: Path) -> Contents:
     ends = [header[name] for name in ("old min", "old max") if np.isfinite(float(header.get(name, np.nan)))]
     if ends and kind not in ("float", "double"):
         raise InputError("old min and old max: quantized values are not read; unquantize them (unu unquantize)")
-    refuse_several_files("data file:", header.get("data file", ""))
+    beside = header.get("data file", "")
+    refuse_several_files("data file:", beside)
+    if beside and (path.parent / beside).exists():
+        require_file(path.parent / beside)
     affine = _affine(header, path)
     try:
         array, _ = nrrd.read(str(path))
@@ -73,7 +77,7 @@ def read(path: Path) -> Contents:
     return Contents(array, affine, header.get("quantity"), _UNITS.get(unit.lower(), unit) if unit else None)
 
 
-def write(volume: Volume, path: Path) -> None:
+def write(volume: Volume, temporary: Path) -> None:
     """Write .nrrd with the exact affine."""
     import nrrd
 
@@ -87,7 +91,7 @@ def write(volume: Volume, path: Path) -> None:
         "quantity": volume.quantity,
         "unit": volume.unit,
     }
-    nrrd.write(str(path), volume.array, header, compression_level=1)
+    nrrd.write(str(temporary), volume.array, header, compression_level=1)
 
 
 def _affine(header: dict[str, Any], path: Path) -> np.ndarray:

@@ -8,10 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...errors import InputError
-from ...files import replacing
+from ...errors import InputError, reading
+from ...files import replacing, require_file
 from ...validation import freeze, one_of, real_array
-from ..formats.contents import reading
 
 MESH_FORMATS = (".stl", ".obj", ".ply", ".glb")
 """Suffixes of mesh files."""
@@ -63,9 +62,7 @@ def read_mesh(path: str | os.PathLike[str], unit: str | None = None) -> Mesh:
     path = Path(path)
     suffix, factor = _suffix_and_factor(path, unit)
     with reading(path, suffix):
-        if not path.is_file():
-            raise InputError("no such file")
-        mesh = trimesh.load(path, process=False, force="mesh")
+        mesh = trimesh.load(require_file(path), process=False, force="mesh")
         return Mesh(np.asarray(mesh.vertices) * factor, np.asarray(mesh.faces))
 
 

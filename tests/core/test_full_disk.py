@@ -1,0 +1,225 @@
+"""A disk that is full: one line, nothing left, and the old file as it was, whatever is written."""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import importlib.util
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import mphdrr.core as mph
+from mphdrr.core.cli import main
+from mphdrr.core.figures.page import Page
+from mphdrr.core.runs.mosaic import write_png
+from mphdrr.core.volumes.meshes.mesh import Mesh, write_mesh
+from mphdrr.core.workbook.column_map import ColumnMap
+
+from .conftest import refused
+
+# What openpyxl leaves open complains when it is collected.
+pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+
+SIZE = 64 << 10
+"""Of the disk; every file below is larger."""
+
+_needs_torch = pytest.mark.skipif(importlib.util.find_spec("torch") is None, reason="torch is not installed")
+
+
+@pytest.fixture(autouse=True)
+def collected() -> Iterator[None]:
+    """Here, and not in another test; files of libraries that are still open keep their room on the disk, too."""
+    yield
+    gc.collect()
+
+
+def many_modules(count: int = 300) -> mph.PinholeSystem:
+    """So many that what describes them is larger than the disk."""
+    angles = np.linspace(0, 6.2, count)
+    centers = np.stack([200 * np.cos(angles), 200 * np.sin(angles), np.linspace(-50, 50, count)], axis=1)
+    return mph.PinholeSystem(centers, 2.0, 60.0, detector_side=40, detector_thickness=8, roi_radius=50)
+
+
+def a_volume() -> mph.Volume:
+    array = np.random.default_rng(3).random((32, 32, 32), np.float32)
+    return mph.Volume(array, mph.Grid(array.shape, np.eye(4)), "activity")
+
+
+def a_run() -> mph.ProjectionRun:
+    system = many_modules()
+    views = system.views(shape=(4, 6), detector="real", pitch=(7, 7))
+    return mph.ProjectionRun(np.ones((len(system), 4, 6), np.float32), system, views, a_volume())
+
+
+def a_page() -> Page:
+    page = Page(400, 300)
+    page.image(np.random.default_rng(3).integers(0, 255, (150, 150, 3), np.uint8), 0, 0, 400, 300)
+    return page
+
+
+def a_mesh() -> Mesh:
+    points = np.random.default_rng(3).random((9000, 3))
+    return Mesh(points, np.arange(9000).reshape(-1, 3))
+
+
+def a_reconstruction() -> Any:
+    from mphdrr.core.reconstruction.result import Reconstruction
+
+    return Reconstruction(a_volume(), np.ones(3), {"method": "mlem"}, {"previous": a_volume().array})
+
+
+def a_phantom() -> Any:
+    from mphdrr.core.phantoms.phantom import ShapePhantom
+    from mphdrr.core.phantoms.shapes import Sphere
+
+    return ShapePhantom(tuple(Sphere(radius=k + 1.0, activity=1.0) for k in range(2000)))
+
+
+WRITERS: dict[str, Callable[[Path], object]] = {
+    **{f"run{ending}": lambda path: mph.write_run(a_run(), path) for ending in (".h5", ".npz")},
+    **{
+        f"volume{ending}": lambda path: mph.write_volume(a_volume(), path)
+        for ending in (".h5", ".npz", ".nrrd", ".nii", ".nii.gz")
+    },
+    "reconstruction.h5": lambda path: mph.write_reconstruction(a_reconstruction(), path),
+    **{
+        f"geometry{ending}": lambda path, name=name: mph.write_geometry(many_modules(), path, name)
+        for name, ending in (
+            ("mphdrr", ".json"), ("opencv", ".json"), ("rtk", ".xml"), ("nerf", ".transforms.json"))
+    },
+    **{
+        f"solids.{name}": lambda path, name=name: mph.write_geometry(many_modules(120), path, name)
+        for name in ("stl", "3mf", "glb")
+    },
+    "cameras.npz": lambda path: mph.write_geometry(many_modules(1000), path, "opencv"),
+    "parts": lambda path: mph.write_geometry(many_modules(), path, "stl-parts"),
+    "gate9": lambda path: mph.write_geometry(many_modules(), path, "gate9"),
+    "gate10": lambda path: mph.write_geometry(many_modules(), path, "gate10"),
+    **{f"mesh{ending}": lambda path: write_mesh(a_mesh(), path) for ending in (".stl", ".obj", ".ply", ".glb")},
+    **{f"page{ending}": lambda path: a_page().write(path) for ending in (".png", ".svg")},
+    "mosaic.png": lambda path: write_png(np.random.default_rng(3).random((300, 300)), path),
+    "columns.toml": lambda path: ColumnMap(()).write(path, "word\n" * SIZE),
+    "phantom.toml": lambda path: mph.write_phantom(a_phantom(), path),
+    "scanner.xlsx": lambda path: mph.write_system(many_modules(), path),
+}  # fmt: skip
+"""By the name of the file or, without an ending, the folder."""
+NAMES = [*WRITERS, pytest.param("run.pt", marks=_needs_torch)]
+WRITERS["run.pt"] = lambda path: mph.write_run(a_run(), path)
+
+
+def refused_and_nothing_left(write: Callable[[Path], object], path: Path) -> None:
+    """Where there is no file yet, and where there is one."""
+    refused(lambda: write(path), str(path), "cannot be written")
+    assert list(path.parent.iterdir()) == []
+    if path.suffix:
+        gc.collect()  # closes files of libraries, which keep the room of removed ones
+        path.write_bytes(b"old")
+        refused(lambda: write(path), str(path), "cannot be written")
+        assert path.read_bytes() == b"old" and list(path.parent.iterdir()) == [path]
+
+
+@pytest.fixture(scope="module")
+def full_disk(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """A folder on a disk of `SIZE` bytes."""
+    folder = tmp_path_factory.mktemp("disk")
+    command = ["mount", "-t", "tmpfs", "-o", f"size={SIZE}", "none", str(folder)]
+    with contextlib.suppress(OSError):
+        if subprocess.run(command, capture_output=True).returncode == 0:
+            yield folder
+            subprocess.run(["umount", str(folder)], check=True)
+            return
+    pytest.skip("no small disk can be mounted here")
+
+
+@pytest.fixture
+def disk(full_disk: Path) -> Iterator[Path]:
+    yield full_disk
+    for left in full_disk.iterdir():
+        left.unlink()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_full_disk_is_one_line_and_leaves_what_was_there(disk, name):
+    refused_and_nothing_left(WRITERS[name], disk / name)
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("most", [0, 700, 20000])
+def test_a_write_that_fails_at_any_byte_is_one_line(tmp_path, name, most):
+    resource = pytest.importorskip("resource", reason="no limits of files' sizes here")
+    import signal
+
+    before, handler = resource.getrlimit(resource.RLIMIT_FSIZE), signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    try:
+        if name in ("parts", "gate10", "gate9") and most > 1000:
+            pytest.skip("each of its files is smaller")
+        write = WRITERS[name]
+        a_run(), a_mesh()  # whatever they import writes byte code
+        resource.setrlimit(resource.RLIMIT_FSIZE, (most, before[1]))
+        path = tmp_path / name
+        refused(lambda: write(path), str(path), "cannot be written")
+        assert list(path.parent.iterdir()) == []
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        signal.signal(signal.SIGXFSZ, handler)
+
+
+def test_a_disk_that_fails_when_it_is_flushed_is_one_line(tmp_path, monkeypatch):
+    """As those of other machines do, which take every byte at first."""
+
+    def fail(descriptor: int) -> None:
+        raise OSError(5, "Input/output error")
+
+    monkeypatch.setattr(os, "fsync", fail)
+    for name in ("run.h5", "volume.nii.gz", "page.png"):
+        refused_and_nothing_left(WRITERS[name], tmp_path / name)
+        (tmp_path / name).unlink()
+
+
+def test_a_device_is_not_replaced(tmp_path):
+    """Root could: /dev/full, or what a link with the right ending leads to."""
+    device = tmp_path / "run.h5"
+    try:
+        device.symlink_to("/dev/full")
+    except OSError as error:
+        pytest.skip(f"no links here ({error})")
+    if not Path("/dev/full").exists():
+        pytest.skip("no devices here")
+    refused(lambda: mph.write_run(a_run(), device), str(device), "is no file")
+    assert Path("/dev/full").is_char_device()
+
+
+def test_the_file_of_a_killed_process_of_the_same_number_does_not_stop_the_next(tmp_path, monkeypatch):
+    """In containers, every process has the number 1."""
+    monkeypatch.setattr(os, "getpid", lambda: 1)
+    code = "import os; os.getpid = lambda: 1\nfrom mphdrr.core.files import replacing\n"
+    code += f"with replacing({str(tmp_path / 'a')!r}) as temporary:\n temporary.touch()\n os._exit(0)"
+    subprocess.run([sys.executable, "-c", code], check=True)
+    assert len(list(tmp_path.iterdir())) == 1
+    mph.write_volume(a_volume(), tmp_path / "a.h5")
+
+
+COMMANDS = {
+    "project": ["project", "{workbook}", "--volume", "{volume}", "--modules", "1-4", "--size", "64", "64", "-o", "{out}.h5"],
+    "volume convert": ["volume", "convert", "{volume}", "-o", "{out}.nrrd"],
+    "export": ["export", "{run}", "-o", "{out}.npz"],
+    "phantom": ["phantom", "sphere", "--radius", "9", "--voxels", "40", "-o", "{out}.nii"],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_command_on_a_full_disk_is_one_line_and_status_1(disk, tmp_path, workbook, capsys, command):
+    mph.write_volume(a_volume(), tmp_path / "volume.h5")
+    mph.write_run(a_run(), tmp_path / "run.h5")
+    places = {"workbook": workbook, "volume": tmp_path / "volume.h5", "run": tmp_path / "run.h5", "out": disk / "out"}
+    status = main([word.format_map(places) for word in COMMANDS[command]])
+    lines = [line for line in capsys.readouterr().err.splitlines() if "warning" not in line and "[#" not in line]
+    assert status == 1 and len(lines) == 1 and "No space left on device" in lines[0], lines
+    assert list(disk.iterdir()) == []

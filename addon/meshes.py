@@ -8,7 +8,7 @@ from mathutils import Matrix
 from numpy.typing import NDArray
 
 from ..core.errors import InputError, naming
-from ..core.geometry.grid import Grid
+from ..core.geometry.grid import grid_around
 from ..core.memory import require
 from ..core.progress import Progress
 from ..core.volumes.meshes.mesh import Mesh, require_closed
@@ -40,11 +40,9 @@ def voxelizing(
         raise InputError("no mesh object is selected: select closed meshes first")
     values = [float(item.get(quantity, value)) for item in items]
     solids = meshes_of(items, bpy.context.evaluated_depsgraph_get())
-    low = np.min([solid.vertices.min(axis=0) for solid in solids], axis=0)
-    high = np.max([solid.vertices.max(axis=0) for solid in solids], axis=0)
-    spacing = voxel_size or float((high - low).max()) / max(1, voxels - 2)
-    # One voxel is kept free on every side.
-    grid = Grid.centered(tuple(int(n) for n in np.ceil((high - low) / spacing) + 2), spacing, (low + high) / 2)
+    vertices = np.concatenate([solid.vertices for solid in solids])
+    spacing = voxel_size or float(np.ptp(vertices, axis=0).max()) / max(1, voxels - 2)
+    grid = grid_around(vertices, spacing)
     shape = " x ".join(map(str, grid.shape))
     require(_BYTES * grid.n_voxels, f"a volume of {shape} voxels")
     name = name or f"{items[0].name} {quantity}"

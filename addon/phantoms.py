@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.errors import InputError
-from ..core.geometry.grid import Grid
+from ..core.geometry.grid import Grid, grid_around
 from ..core.memory import require
 from ..core.phantoms.phantom import Phantom
 from ..core.progress import Progress, part_of, stages_of
@@ -76,10 +76,7 @@ class Recipe:
                 place[:3, 3] = pose[:3, 3]
                 # A grid along the world's axes that holds the phantom, with voxels as small as its own.
                 corners = list(itertools.product(*zip(*self.phantom.box, strict=True))) @ pose[:3, :3].T + pose[:3, 3]
-                low, high = corners.min(axis=0), corners.max(axis=0)
-                spacing = min(Grid(self.grid.shape, pose @ self.grid.affine).spacing)
-                n_x, n_y, n_z = (int(n) for n in np.ceil((high - low) / spacing) + 2)
-                grid = Grid.centered((n_x, n_y, n_z), spacing, (low + high) / 2)
+                grid = grid_around(corners, min(Grid(self.grid.shape, pose @ self.grid.affine).spacing))
                 made = [phantom.voxelize(grid, pose, next(reports), quantity) for phantom in self.states]
                 settings = self.settings | {"pose": pose.tolist()}
             else:

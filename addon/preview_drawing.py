@@ -69,7 +69,8 @@ def _draw_corner(session: Any, textures: _Textures) -> None:
     lines = [piece for line in session.lines for piece in _wrapped(line, width)]
     if shown is not None:
         rows, columns = shown.picture.shape[:2]
-        width, height = _fitting(columns / rows, width, 0.6 * context.region.height)
+        aspect, most = columns / rows, 0.6 * context.region.height
+        width, height = min(width, aspect * most), min(most, width / aspect)  # as large as fits
     left, top = right - max(width, _WIDTH * unit), margin + height + (1.4 * len(lines) + 2) * size
     gpu.state.blend_set("ALPHA")
     _rectangle(left - size, margin - size, right + size, top)
@@ -98,11 +99,6 @@ def _draw_plane(session: Any, textures: _Textures) -> None:
     gpu.state.depth_test_set("LESS_EQUAL")
     _picture(textures.of(shown)[0], (corners + 1e-3 * inward).tolist())  # before the plane of the last run
     gpu.state.depth_test_set("NONE")
-
-
-def _fitting(aspect: float, width: float, height: float) -> tuple[float, float]:
-    """Width and height of a picture that is as large as fits."""
-    return min(width, aspect * height), min(height, width / aspect)
 
 
 def _box(left: float, bottom: float, right: float, top: float) -> list[tuple[float, float, float]]:

@@ -22,7 +22,6 @@ from ..core.runs.settings import SETTINGS
 from . import scanner, volumes
 from .setting_properties import (
     drawn_of,
-    given_of,
     identifier,
     material_of,
     properties_of,
@@ -130,9 +129,7 @@ def _set_time(settings: ProjectionProperties) -> None:
 
 def drawn(settings: ProjectionProperties, table: str) -> Iterator[tuple[str, bool]]:
     """The properties of a table that the chosen model and hole have, each with whether it has an effect."""
-    values = given_of(PROPERTIES, lambda name: getattr(settings, name))
-    own = {name: setting for name, setting in PROPERTIES.items() if setting.key.startswith(f"{table}.")}
-    return drawn_of(own, settings, values, lambda need: "model.kind=" in need or "model.hole=rays" in need)
+    return drawn_of(PROPERTIES, settings, lambda need: "model.kind=" in need or "model.hole=rays" in need, table)
 
 
 def makes_counts(settings: ProjectionProperties) -> bool:

@@ -13,7 +13,7 @@ from ..core.perspective.backprojection import HOW
 from ..core.runs.recipe import Recipe, fitting_recipe
 from ..core.runs.settings import SETTINGS
 from . import choices, volumes
-from .setting_properties import drawn_of, given_of, properties_of, values_of
+from .setting_properties import drawn_of, properties_of, values_of
 
 _BY_COMMAND_LINE = ("anatomy", "stop_change", "stop_noise", "stop_region", "stop_seconds")
 """Settings that the panel does not have: of files, and of ends that Finish Now is for."""
@@ -75,8 +75,7 @@ def settings_recipe(get: Callable[[str], Any], is_given: Callable[[str], bool]) 
 
 def drawn(settings: ReconstructionProperties) -> Iterator[tuple[str, bool]]:
     """The properties that the chosen method and prior have, each with whether it has an effect."""
-    values = given_of(PROPERTIES, lambda name: getattr(settings, name))
-    return drawn_of(PROPERTIES, settings, values, lambda need: True)
+    return drawn_of(PROPERTIES, settings, lambda need: True)
 
 
 class ReconstructionProperties(ReconstructionSettings, bpy.types.PropertyGroup):

@@ -86,23 +86,21 @@ def values_of(settings: Settings, get: Callable[[str], Any]) -> dict[str, Any]:
     return values
 
 
-def given_of(settings: Settings, get: Callable[[str], Any]) -> dict[str, Any]:
-    """The `values_of` settings that are not none; none at all where a choice is of a later version, which work refuses."""
-    try:
-        known = values_of(settings, get)
-    except InputError:
-        known = {}
-    return {key: value for key, value in known.items() if value is not None}
-
-
 def drawn_of(
-    settings: Settings, owner: Any, values: Mapping[str, Any], is_hidden: Callable[[str], bool]
+    settings: Settings, owner: Any, is_hidden: Callable[[str], bool], table: str = ""
 ) -> Iterator[tuple[str, bool]]:
-    """The properties of an owner to draw, each with whether it has an effect beside `values`.
+    """The properties of an owner to draw, of all tables or one, each with whether it has an effect beside the others.
 
     Those of whose unmet conditions one `is_hidden` are left out.
     """
+    try:
+        known = values_of(settings, lambda name: getattr(owner, name))
+    except InputError:  # a choice of a later version, which work refuses
+        known = {}
+    values = {key: value for key, value in known.items() if value is not None}
     for name, setting in settings.items():
+        if table and not setting.key.startswith(f"{table}."):
+            continue
         unmet = [need for need in setting.needs if not is_met(values, need)]
         if any(map(is_hidden, unmet)):
             continue

@@ -162,3 +162,9 @@ def _filled_ranges_of_tensors(volumes: tuple[Any, ...]) -> list[tuple[int, int]]
         where = np.concatenate([np.flatnonzero(flags.any(across).cpu().numpy()) for flags in rows])
         ranges.append((int(where.min()), int(where.max()) + 1) if len(where) else (0, 1))
     return ranges
+
+
+def table_rows(columns: dict[str, NDArray[Any]]) -> list[dict[str, Any]]:
+    """The rows of a table given by its columns, in Python's numbers."""
+    values = (column.tolist() for column in columns.values())
+    return [dict(zip(columns, row, strict=True)) for row in zip(*values, strict=True)]

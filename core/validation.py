@@ -151,6 +151,14 @@ def positive(value: Any, name: str, unit: str = "") -> float:
     return number
 
 
+def at_least_0(value: Any, name: str, unit: str = "") -> float:
+    """`value` as a finite number, 0 or more, or `InputError`."""
+    number = float(real_array(value, name, ()))
+    if number < 0:
+        raise InputError(f"{name}: expected 0 or more{' ' + unit if unit else ''}, got {number:g}")
+    return number
+
+
 def one_for_all(value: ArrayLike, name: str, n: int) -> NDArray[np.float64]:
     """`value` as `n` numbers, where one number stands for all, or `InputError`."""
     is_one = not isinstance(value, list | tuple) and np.ndim(value) == 0

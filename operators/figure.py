@@ -10,6 +10,7 @@ from ..addon.reports import Need, needs
 from ..core.errors import InputError
 from ..core.figures.page import LARGEST, SUFFIXES
 
+_PIXELS = {"description": "Pixels; 0: what suits the figure", "min": 0, "max": LARGEST, "subtype": "PIXEL"}
 _SHOWN: Need = (
     lambda context: scanner.active_scanner(context.scene) or volumes.volume_objects(context.scene),
     "Nothing to show: import a workbook or add a phantom first",
@@ -25,12 +26,8 @@ class MPHDRR_OT_export_figure(jobs.JobOperator, bpy.types.Operator):
     filepath: StringProperty(name="File", description="File to write", subtype="FILE_PATH", options={"SKIP_SAVE"})
     filter_glob: StringProperty(default=";".join(f"*{suffix}" for suffix in SUFFIXES), options={"HIDDEN"})
     figure: EnumProperty(name="Figure", description="What is shown", items=figures.KIND_ITEMS, default="SCANNER")
-    width: IntProperty(
-        name="Width", description="Pixels; 0: what suits the figure", min=0, max=LARGEST, subtype="PIXEL"
-    )
-    height: IntProperty(
-        name="Height", description="Pixels; 0: what suits the figure", min=0, max=LARGEST, subtype="PIXEL"
-    )
+    width: IntProperty(name="Width", **_PIXELS)
+    height: IntProperty(name="Height", **_PIXELS)
     modules: StringProperty(
         name="Modules", description="Such as 1-40 or 1-20,41; empty: all, or of figures of one module the active one"
     )

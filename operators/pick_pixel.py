@@ -11,6 +11,8 @@ from ..addon.eyedropper import Eyedropper, region_under
 from ..addon.reports import Reported, needs
 from ..core.errors import InputError
 
+_COUNTED = "Of the pixel, counted as in the arrays; 0: the centre of pixel 0"
+
 
 class MPHDRR_OT_pick_pixel(Eyedropper, Reported, bpy.types.Operator):
     """Click on a pixel of a projection, in the Image Editor or on a plane in the scene: its ray is drawn there, and on the
@@ -20,16 +22,8 @@ class MPHDRR_OT_pick_pixel(Eyedropper, Reported, bpy.types.Operator):
     bl_label = "Pick Pixel"
 
     module: IntProperty(name="Module", description="Number of the module", default=1, options={"SKIP_SAVE"})
-    column: FloatProperty(
-        name="Column",
-        description="Of the pixel, counted as in the arrays; 0: the centre of pixel 0",
-        options={"SKIP_SAVE"},
-    )
-    row: FloatProperty(
-        name="Row",
-        description="Of the pixel, counted as in the arrays; 0: the centre of pixel 0",
-        options={"SKIP_SAVE"},
-    )
+    column: FloatProperty(name="Column", description=_COUNTED, options={"SKIP_SAVE"})
+    row: FloatProperty(name="Row", description=_COUNTED, options={"SKIP_SAVE"})
     k: FloatProperty(
         name="k", description="Magnification of the marker in this module; 0: as it was, or that of the isocentre", min=0.0,
         options={"SKIP_SAVE"},

@@ -6,11 +6,11 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputError
-from ..geometry.grid import Grid
+from ..geometry.grid import Grid, grid_around
 from ..physics.ct_numbers import hu_to_mu
 from ..physics.isotopes import photon_energy
 from ..validation import positive, real_array
-from ..volumes.meshes.mesh import MESH_FORMATS, MILLIMETRES, Mesh, read_mesh, write_mesh
+from ..volumes.meshes.mesh import MESH_FORMATS, MILLIMETRES, read_mesh, write_mesh
 from ..volumes.meshes.surface import volume_to_mesh
 from ..volumes.meshes.voxelization import voxelize_mesh
 from ..volumes.rearranging import canonical, centered, crop_to_box, pad
@@ -180,18 +180,12 @@ def _from_mesh(arguments: argparse.Namespace) -> None:
     values = real_array(np.broadcast_to(arguments.value, len(arguments.mesh)), "--value", (None,))
     meshes = [read_mesh(file, arguments.unit) for file in arguments.mesh]
     spacing = positive(arguments.spacing, "--spacing", "mm")
-    grid = Grid.centered(arguments.voxels, spacing) if arguments.voxels else _grid_around(meshes, spacing)
+    vertices = np.concatenate([mesh.vertices for mesh in meshes])
+    grid = Grid.centered(arguments.voxels, spacing) if arguments.voxels else grid_around(vertices, spacing)
     volume = voxelize_mesh(meshes, grid, values, arguments.quantity, progress_bar("voxelizing"))
     write_volume(volume, path)
     covered = np.count_nonzero(volume.array) * grid.voxel_volume * 1e-3
     print(f"{path}: {' x '.join(map(str, grid.shape))} voxels, {covered:.4g} mL of them not 0")
-
-
-def _grid_around(meshes: list[Mesh], spacing: float) -> Grid:
-    """A grid around the meshes with a margin of one voxel."""
-    low = np.min([mesh.vertices.min(axis=0) for mesh in meshes], axis=0)
-    high = np.max([mesh.vertices.max(axis=0) for mesh in meshes], axis=0)
-    return Grid.centered(np.ceil((high - low) / spacing) + 2, spacing, (low + high) / 2)
 
 
 def _to_mesh(arguments: argparse.Namespace) -> None:

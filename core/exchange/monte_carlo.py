@@ -22,7 +22,7 @@ from ..geometry.system import PinholeSystem
 from ..phantoms.derenzo import DerenzoPhantom
 from ..physics.isotopes import Isotope, isotope
 from ..physics.materials import MATERIALS
-from ..validation import instance, one_of, positive, real_array
+from ..validation import at_least_0, instance, one_of, positive, real_array
 
 REFERENCE_ENERGY = 140.5
 """keV at which the energy resolution is given."""
@@ -94,8 +94,7 @@ class Simulation:
         if positive(self.window_percent, "window_percent", "%") >= 200:
             raise InputError(f"window_percent: expected less than 200, got {self.window_percent:g}")
         for name in ("intrinsic_fwhm", "energy_resolution"):
-            if (value := float(real_array(getattr(self, name), name, ()))) < 0:
-                raise InputError(f"{name}: expected 0 or more, got {value:g}")
+            at_least_0(getattr(self, name), name)
         types = get_type_hints(Simulation)
         for name in ("crystal", "collimator", "phantom_material"):
             one_of(getattr(self, name), get_args(types[name]), name)

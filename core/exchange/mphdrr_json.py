@@ -5,6 +5,7 @@ import os
 from pathlib import Path
 from typing import Any
 
+from ..arrays import table_rows
 from ..errors import InputError
 from ..files import read_bytes
 from ..geometry.system import LATER_LENGTHS, LENGTHS, PinholeSystem
@@ -25,11 +26,6 @@ _MODULE = {"number": "numbers", "pinhole_center": "centers"} | {name: name for n
 _VIEW = {"source": "sources", "detector_center": "detector_centers", "u_step": "u_steps", "v_step": "v_steps"}
 
 
-def _rows(columns: dict[str, Any]) -> list[dict[str, Any]]:
-    lists = (values.tolist() for values in columns.values())
-    return [dict(zip(columns, row, strict=True)) for row in zip(*lists, strict=True)]
-
-
 def _write(system: PinholeSystem, views: Views, temporary: Path) -> None:
     modules = {name: getattr(system, field) for name, field in _MODULE.items()} | {"frame": system.frames()}
     images = {name: getattr(views, field) for name, field in _VIEW.items()}
@@ -38,10 +34,10 @@ def _write(system: PinholeSystem, views: Views, temporary: Path) -> None:
         "kind": _KIND,
         "version": _VERSION,
         "conventions": _CONVENTIONS,
-        "modules": _rows(modules),
+        "modules": table_rows(modules),
         "rows": views.shape[0],
         "columns": views.shape[1],
-        "views": _rows(images),
+        "views": table_rows(images),
     }
     temporary.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
 

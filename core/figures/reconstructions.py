@@ -136,9 +136,7 @@ def _slice(volume: Volume, grid: Grid, axis: int) -> NDArray[np.float32]:
     index = grid.shape[axis] // 2
     shape = [*grid.shape]
     shape[axis] = 1
-    affine = grid.affine.copy()
-    affine[:3, 3] += index * grid.affine[:3, axis]
-    plane = Grid((shape[0], shape[1], shape[2]), affine)
+    plane = grid.box(index * np.eye(3)[axis], tuple(shape))
     values = volume.array.take([index], axis) if volume.grid is grid else resample(volume, plane, "mean").array
     return np.asarray(values.squeeze(axis), np.float32)
 

@@ -82,3 +82,9 @@ class Grid:
 
     def __hash__(self) -> int:
         return hash((self.shape, self.affine.tobytes()))
+
+
+def grid_around(points: NDArray[np.float64], spacing: float) -> Grid:
+    """The axis-aligned grid of cubes that holds world `points` (n, 3), mm, with at least half a voxel around them."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    return Grid.centered(np.ceil((high - low) / spacing) + 2, spacing, (low + high) / 2)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError, warn
 from ..physics.isotopes import WATER_MU
-from ..validation import freeze, positive, real_array
+from ..validation import at_least_0, freeze, positive, real_array
 from .intervals import Interval, Points, Real
 from .phantom import Phantom
 from .settings import setting
@@ -182,10 +182,7 @@ class DerenzoPhantom(Phantom):
     def __post_init__(self) -> None:
         for name in ("activity", "cylinder_radius", "cylinder_height", "background", "mu"):
             title = f"Derenzo {name.replace('_', ' ')}"
-            value = float(real_array(getattr(self, name), title, ()))
-            if value < 0:
-                raise InputError(f"{title}: expected 0 or more, got {value:g}")
-            object.__setattr__(self, name, value)
+            object.__setattr__(self, name, at_least_0(getattr(self, name), title))
         for name in ("radius", "rod_diameters", "height"):  # the rods check them
             object.__setattr__(self, name, getattr(self._rods, name))
         if self.activity == 0 and not (self.background and self.cylinder_radius):

@@ -13,7 +13,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..geometry.frames import euler_pose
-from ..validation import positive, real_array
+from ..validation import at_least_0, positive, real_array
 from .intervals import Interval, Points, Real, below, between, common, ellipse_distance, in_cone, in_unit_ball
 from .surfaces import Surface, clipped, lathe
 
@@ -280,10 +280,7 @@ class Cone(Shape):
 
     def _check(self) -> None:
         for name in ("radius", "top_radius"):
-            value = float(real_array(getattr(self, name), name, ()))
-            if value < 0:
-                raise InputError(f"{name}: expected 0 or more mm, got {value:g}")
-            self._set(name, value)
+            self._set(name, at_least_0(getattr(self, name), name, "mm"))
         r, t = self.radius, self.top_radius
         widest = positive(max(r, t), "radius", "mm")
         self._set_positive("height")

@@ -7,10 +7,11 @@ from ..memory import require
 from ..progress import Progress, tell
 from ..projector import Projector
 from ..projector.subsets import access_order
+from ..validation import at_least_0
 from .counts import LEAST, CountData
 from .expectation import sensitivities, subsets_of, usual_subsets
 from .loop import Loop, Start, waiting
-from .priors import Prior, at_least_0, penalty_of
+from .priors import Prior, penalty_of
 from .result import Array, Callback, Reconstruction
 from .stopping import StoppingRule
 

@@ -14,7 +14,7 @@ from ..geometry.grid import Grid
 from ..memory import require
 from ..projector.lattices import same_lattice
 from ..projector.parallel import run_all, thread_count
-from ..validation import instance, one_of, positive, real_array, whole_number
+from ..validation import at_least_0, instance, one_of, positive, whole_number
 from ..volumes.volume import Volume
 from .result import Array
 
@@ -396,11 +396,3 @@ def _shifted(step: int) -> tuple[slice, slice]:
 
 def _moved(box: tuple[slice, slice, slice], step: Any) -> tuple[slice, ...]:
     return tuple(slice(part.start + int(n), part.stop + int(n)) for part, n in zip(box, step, strict=True))
-
-
-def at_least_0(value: Any, name: str) -> float:
-    """`value` as a finite number, 0 or more, or `InputError`."""
-    number = float(real_array(value, name, ()))
-    if number < 0:
-        raise InputError(f"{name}: expected 0 or more, got {number:g}")
-    return number

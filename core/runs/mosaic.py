@@ -76,12 +76,6 @@ class Sheet:
     share: tuple[float, float]
     """What is shown of the images' width and height."""
 
-    def image_at(self, row: float, column: float) -> int | None:
-        """Index of the image at a place in the picture; None between images."""
-        inside = (np.array([row, column]) >= self.corners) & (np.array([row, column]) < self.corners + self.tile)
-        found = np.flatnonzero(inside.all(axis=1))
-        return int(found[0]) if len(found) else None
-
 
 def totals(projections: NDArray[np.float32], unit: str) -> tuple[str, NDArray[np.float64]]:
     """What sums up each of the images (M, n_v, n_u): "sum" of counts and photons, "mean" of line integrals; and it (M,)."""

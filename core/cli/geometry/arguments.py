@@ -3,8 +3,6 @@
 import argparse
 from typing import Any
 
-from numpy.typing import NDArray
-
 from ...geometry.collimator import angle_from_degrees
 from ...geometry.system import PinholeSystem
 from ...geometry.views import Views
@@ -39,12 +37,6 @@ def add_views(parser: argparse.ArgumentParser, pixels: str) -> None:
 def views_of(system: PinholeSystem, arguments: argparse.Namespace) -> Views:
     """The views of a scanner that the options of `add_views` ask for."""
     return system.views(tuple(arguments.size), arguments.detector, arguments.magnification, arguments.pitch)
-
-
-def table_rows(columns: dict[str, NDArray[Any]]) -> list[dict[str, Any]]:
-    """The rows of a table given by its columns, in Python's numbers."""
-    values = (column.tolist() for column in columns.values())
-    return [dict(zip(columns, row, strict=True)) for row in zip(*values, strict=True)]
 
 
 def add_materials(parser: argparse.ArgumentParser) -> None:

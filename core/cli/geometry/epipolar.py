@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ...arrays import table_rows
 from ...errors import InputError
 from ...geometry.system import PinholeSystem
 from ...geometry.views import Views
@@ -14,7 +15,7 @@ from ...perspective.epipolar import epipolar_lines, epipolar_segments, epipole
 from ...perspective.triangulation import fit_marker
 from ...perspective.view_rays import points_at_depths
 from ..options import chosen_modules, print_answer, read_workbook
-from .arguments import add_action, add_views, table_rows, views_of
+from .arguments import add_action, add_views, views_of
 
 # A module is named as one that does not fit if the chance of its misfit is below this, counted for all modules.
 _CHANCE = 0.01

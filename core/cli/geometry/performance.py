@@ -5,11 +5,12 @@ import math
 
 import numpy as np
 
+from ...arrays import table_rows
 from ...geometry.design_formulas import roi_radius_seen
 from ...physics.performance import magnification, resolution, sensitivity
 from ...physics.sampling import sampling_gaps
 from ..options import print_answer, read_workbook
-from .arguments import EDGE, add_action, add_materials, sensitivity_settings, table_rows
+from .arguments import EDGE, add_action, add_materials, sensitivity_settings
 
 
 def add_parser(actions) -> None:  # type: ignore[no-untyped-def]

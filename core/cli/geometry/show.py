@@ -3,12 +3,13 @@
 import argparse
 from typing import Any
 
+from ...arrays import table_rows
 from ...errors import InputError
 from ...geometry.system import PinholeSystem
 from ...workbook import draft_column_map
 from ...workbook.quantities import DIMENSIONS, OPTIONAL, QUANTITIES
 from ..options import chosen_modules, output_path, print_answer, read_workbook
-from .arguments import add_action, table_rows
+from .arguments import add_action
 
 
 def add_parser(actions) -> None:  # type: ignore[no-untyped-def]

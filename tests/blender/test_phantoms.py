@@ -158,7 +158,7 @@ def test_toml_becomes_a_text_that_the_phantom_follows(tmp_path):
 
 @pytest.mark.parametrize(
     ("text", "message"),
-    [("[[shape]", "not TOML"), ("name = 3", r"\[\[shape\]\]"), ('[[shape]]\nkind = "cube"', "kind"), (None, "No such")],
+    [("[[shape]", "not TOML"), ("name = 3", r"\[\[shape\]\]"), ('[[shape]]\nkind = "cube"', "kind"), (None, "no such")],
 )
 def test_toml_that_is_no_phantom_adds_nothing(text, message, tmp_path):
     file = tmp_path / "a.toml"

@@ -94,6 +94,8 @@ class SetFolder:
                 f"{self.inputs}: go on with these (mphdrr events make {self.path}), or choose another folder"
             )
         self._ask(asked)
+        if not self.index.is_current():
+            self.complete_index()
         return self._missing(mine, places)
 
     def _missing(self, mine: Sequence[int], places: dict[int, Place]) -> list[int]:

@@ -52,6 +52,10 @@ class Index:
             found = {n: _csv([row.get(name, "") for name in self.columns]) for n, row in rows.items()}
         return found
 
+    def is_current(self) -> bool:
+        """Whether rows can be added to the file: it has these columns, or is not there."""
+        return not self.path.is_file() or self.path.read_bytes().startswith(self.text({}))
+
     def line(self, number: int) -> str:
         """The row of an event, as the recipe says."""
         row = plan(self._recipe, number).row()

@@ -70,7 +70,7 @@ class Making(Iterator[Made]):
                     _pack(store)
                     unpacked = 0
         except BaseException:
-            with suppress(InputError):  # of the same full disk
+            with suppress(Exception):  # of the same full disk, or since Python ends
                 self.folder.complete_index()
             raise
         self.folder.complete_index()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+import hashlib
 import os
 import shutil
 import subprocess
@@ -141,6 +143,34 @@ def test_damage_in_a_shard_is_found_and_mended(whole, made, capsys):
     assert main(["events", "check", str(whole), "--repair"]) == 0
     assert_same_events(whole, made)
     assert events.check(whole) == []
+
+
+def test_a_set_of_an_earlier_version_opens_and_goes_on(whole, made):
+    """Its events have no table of blocks and no build; its index alone says what was asked for, in columns of its own."""
+    for path in (whole / "events").glob("*.h5"):
+        data = path.read_bytes()
+        seal = hdf5.parse_seal(data[: hdf5.HEADER])
+        body = data[hdf5.HEADER : hdf5.HEADER + seal.size]
+        fields = {name: value for name, value in seal.fields.items() if name != "build"}
+        old = hdf5.Seal(seal.kind, seal.size, fields, hashlib.sha256(body).hexdigest(), version=1)
+        path.write_bytes(old.text() + body)
+    shutil.rmtree(whole / "asked")
+    order = list(csv.reader((made / "index.csv").open()))
+    with (whole / "index.csv").open("w", newline="") as file:
+        csv.writer(file, lineterminator="\n").writerows([row[0], *reversed(row[1:])] for row in order)
+    assert_same_events(whole, made)
+    assert events.status(whole).builds == {"": COUNT}
+    (whole / "events" / "000004.h5").unlink()
+    with pytest.warns(mph.InputWarning, match=r"another build of mphDRR \(of version 0\.1"):
+        events.make(events.read_recipe(whole / "recipe.toml"), whole, COUNT + 1)
+    assert events.check(whole) == [] and SetFolder(whole).asked == [range(COUNT + 1)]
+    packed(whole)
+    assert_same_events_of_first(whole, made)
+    data = bytearray((whole / "shards" / "000000.tar").read_bytes())
+    data[3000] ^= 1
+    (whole / "shards" / "000000.tar").write_bytes(data)
+    with pytest.raises(mph.InputError, match="changed"):
+        _ = events.EventSet(whole)[0].pose
 
 
 def test_two_works_pack_one_after_the_other(whole):

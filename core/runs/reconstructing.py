@@ -182,6 +182,12 @@ def recipe_of(run: ProjectionRun, recipe: Recipe | None = None) -> Recipe:
     return Recipe(given) if "recipe" not in run.settings and "model.kind" in given else run.recipe.updated(given)
 
 
+def _same(one: Any, other: Any) -> bool:
+    """Whether two values of a model are the same, but for the last digits of another system's arithmetic."""
+    numbers = isinstance(one, float) and isinstance(other, int | float)
+    return bool(np.isclose(one, other, rtol=1e-9, atol=0)) if numbers else bool(one == other)
+
+
 def _compare_with_record(run: ProjectionRun, recipe: Recipe, has_mu: bool) -> None:
     """Warn where the model of a recipe is not what a run without a recipe says of its own."""
     model, record = recipe_model(recipe, run.system), {"photons": None, "mu": None, **run.settings}
@@ -191,7 +197,7 @@ def _compare_with_record(run: ProjectionRun, recipe: Recipe, has_mu: bool) -> No
     if not has_mu and not any(key.startswith("attenuation.") for key in recipe.given):
         asked["mu"] = None
     names = [name for name in asked if name in record and f"model.{name}" not in SAMPLING]
-    different = [f"{name} {record[name]}, not {asked[name]}" for name in names if asked[name] != record[name]]
+    different = [f"{name} {record[name]}, not {asked[name]}" for name in names if not _same(asked[name], record[name])]
     if different:
         warn(f"the run's record says of its model: {'; '.join(different)} as in the model that is given", 3)
 

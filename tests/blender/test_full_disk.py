@@ -7,6 +7,7 @@ import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
+import bpy
 import numpy as np
 import pytest
 
@@ -46,6 +47,9 @@ def test_voxels_on_a_full_disk_are_one_line_and_leave_the_old_file(disk, side):
 
 def test_a_blend_on_a_full_disk_is_one_line(disk):
     new_scene()
+    mesh = bpy.data.meshes.new("points")  # more than the disk holds, and not to be compressed
+    mesh.from_pydata(np.random.default_rng(0).random((20_000, 3)), [], [])
+    bpy.context.scene.collection.objects.link(bpy.data.objects.new("points", mesh))
     with pytest.raises(mph.InputError, match="cannot be written") as error:
         save_scene(disk / "a.blend")
     assert "\n" not in str(error.value)

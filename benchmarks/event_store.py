@@ -44,7 +44,7 @@ def many(folder: Path, count: int) -> mph.events.EventRecipe:
         fields = {"event": str(number), "recipe": target.recipe.fingerprint, "build": build()}
         seal = hdf5.Seal("mphDRR event", len(body), fields)
         table = hdf5.digests(body)
-        seal = seal._replace(sha256=seal.digest(table))
+        seal = seal.signed(table)
         target.store.event_path(number).write_bytes(seal.text() + body + table)
     target.complete_index()
     return recipe

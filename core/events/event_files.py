@@ -69,7 +69,8 @@ def header(place: Place) -> Header:
         descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_BINARY", 0))
         try:
             size = os.fstat(descriptor).st_size if size is None else size
-            os.lseek(descriptor, offset, os.SEEK_SET)
+            if offset:
+                os.lseek(descriptor, offset, os.SEEK_SET)
             start = os.read(descriptor, hdf5.HEADER)
         finally:
             os.close(descriptor)

@@ -45,8 +45,14 @@ class Store:
             found |= dict(_members(shard))
         folder = f"{self.events}{os.sep}"
         for name in _names(self.events):
-            if (match := _EVENT.fullmatch(name)) and f"{(number := int(match[1])):06d}" == match[1]:
-                found[number] = Place(folder + name)
+            stem, _, ending = name.partition(".")
+            if (
+                ending == "h5"
+                and stem.isdecimal()
+                and stem.isascii()
+                and (len(stem) == 6 or (len(stem) > 6 and stem[0] != "0"))
+            ):
+                found[int(stem)] = Place(folder + name)
         return dict(sorted(found.items()))
 
     def shard_paths(self) -> list[Path]:

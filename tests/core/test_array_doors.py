@@ -121,6 +121,8 @@ def test_runs_that_hold_no_numbers_are_refused(value, said, what, tmp_path):
         numbers[2, 3, 4] = value
         del file[what]
         file[what] = numbers
+    with open(tmp_path / "run.h5", "r+b") as file:
+        file.write(bytes(512))  # without its seal, which says that something was changed
     refused(lambda: mph.read_run(tmp_path / "run.h5"), "run.h5", said if said != "complex128" else "real numbers")
     for kind in (np.float32, np.float64):
         images = np.ones((4, *PIXELS), kind)

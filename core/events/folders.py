@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from functools import cached_property
 
 from ..errors import InputError, warn
-from ..files import ensure_folder, folder_path, is_leftover, write_bytes, written_name
+from ..files import ensure_folder, folder_path, is_leftover, write_bytes
 from ..version import build
 from .event_files import Place, header
 from .index import Index
@@ -73,7 +73,9 @@ class SetFolder:
             if is_leftover(path):
                 path.unlink(missing_ok=True)
         if not self.recipe_path.exists():
-            if others := [name for name in os.listdir(self.path) if written_name(name) is None]:
+            if others := [
+                name for name in os.listdir(self.path) if not name.startswith(".")
+            ]:  # those are begun by others
                 raise InputError(
                     f"{self.path}: holds {others[0]} and no {RECIPE}: choose a new folder for the event set"
                 )

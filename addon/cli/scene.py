@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING
 
 from ...core.cli.options import add_command, add_workbook, chosen_modules, output_path, read_workbook
 from ...core.errors import InputError
-from ...core.files import read_bytes
 from ...core.runs.files import read_run
 from ...core.volumes.volume_files import read_volume, read_volume_of
 
@@ -119,7 +118,9 @@ def save_scene(path: Path) -> None:
             bpy.ops.wm.save_as_mainfile(filepath=os.path.abspath(path), check_existing=False)
     except RuntimeError as error:
         raise InputError(f"{path}: cannot be written ({str(error).strip().splitlines()[0]})") from error
-    end = read_bytes(path)[-_BLEND_END:]
+    with open(path, "rb") as file:
+        file.seek(max(0, path.stat().st_size - _BLEND_END))
+        end = file.read()
     if not end.endswith(_PACKED_END) and b"ENDB" not in end:
         path.unlink()  # Blender 5.2 says of what it has cut that it was saved
         raise InputError(f"{path}: cannot be written (Blender left it incomplete: is the disk full?)")

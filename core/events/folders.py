@@ -73,9 +73,8 @@ class SetFolder:
             if is_leftover(path):
                 path.unlink(missing_ok=True)
         if not self.recipe_path.exists():
-            if others := [
-                name for name in os.listdir(self.path) if not name.startswith(".")
-            ]:  # those are begun by others
+            # Names with a dot are of files that other works have begun.
+            if others := [name for name in os.listdir(self.path) if not name.startswith(".")]:
                 raise InputError(
                     f"{self.path}: holds {others[0]} and no {RECIPE}: choose a new folder for the event set"
                 )
@@ -166,9 +165,9 @@ class SetFolder:
         """The numbers of the events that were asked for, in order."""
         return [number for part in self.asked for number in part]
 
-    def complete_index(self, anew: bool = False) -> None:
+    def complete_index(self) -> None:
         """Have a row of the index for each event that is there."""
-        self.index.complete(lambda: self.store.places(), frozenset(self.planned()), anew)
+        self.index.complete(self.store.places, frozenset(self.planned()))
 
 
 def _joined(ranges: Sequence[range]) -> list[range]:

@@ -7,7 +7,7 @@ for. So works that write it at once need not wait for each other; the last one t
 import csv
 import io
 import json
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,8 @@ from .planning import FIXED_COLUMNS, plan
 from .recipe import EventRecipe
 
 _TEXTS = ("phantom", "split", "file")
+_CUT = "\0"
+"""In a row that was cut when a work was killed: what is written next puts it there."""
 
 
 class Index:
@@ -37,23 +39,23 @@ class Index:
     def read(self) -> dict[int, str]:
         """The rows that are there, each a line as it is in the file; what is no row is left out."""
         try:
-            heading, *lines = _lines(self.path.read_bytes().decode())
+            heading, *lines = _lines(self.path.read_bytes().decode())[:-1]  # what no line end follows was cut
         except FileNotFoundError:
             return {}
-        except (OSError, ValueError) as error:
+        except (OSError, UnicodeError) as error:
             folder = self.path.parent
             raise InputError(
                 f"{self.path}: cannot be read ({error}): mphdrr events check {folder} --repair writes it anew"
             ) from None
-        found = {int(first): line for line in lines if (first := line.partition(",")[0]).isdigit()}
-        if heading != _csv(self.columns):  # of an earlier version: the columns of what was drawn
-            names = _cells(heading)
+        names = _cells(heading)
+        found = {int(first): line for line in lines if (first := line.partition(",")[0]).isdigit() and _CUT not in line}
+        if names != self.columns:  # of an earlier version: the columns of what was drawn
             rows = {n: dict(zip(names, _cells(line), strict=False)) for n, line in found.items()}
             found = {n: _csv([row.get(name, "") for name in self.columns]) for n, row in rows.items()}
         return found
 
     def is_current(self) -> bool:
-        """Whether rows can be added to the file: it has these columns, or is not there."""
+        """Whether rows can be added to the file: its columns are these, or it is not there."""
         return not self.path.is_file() or self.path.read_bytes().startswith(self.text({}))
 
     def line(self, number: int) -> str:
@@ -72,8 +74,14 @@ class Index:
 
     def add(self, number: int) -> None:
         """Add the row of an event that was made, at the end of the file."""
-        with refusing(self.path, "cannot be written"), open(self.path, "ab") as file:
-            file.write(f"{self.line(number)}\n".encode() if file.tell() else self.text({number: self.line(number)}))
+        row = f"{self.line(number)}\n".encode()
+        with refusing(self.path, "cannot be written"), open(self.path, "ab+") as file:
+            if end := file.tell():
+                file.seek(end - 1)
+                before = b"" if file.read(1) == b"\n" else f"{_CUT}\n".encode()
+            else:
+                before = self.text({})
+            file.write(before + row)
 
     def complete(self, made: Callable[[], Collection[int]], asked: Collection[int], anew: bool = False) -> None:
         """Have a row for each event that is made, in order; again until nobody adds others meanwhile.
@@ -89,16 +97,15 @@ class Index:
             write_bytes(self.path, content)
 
 
-def _lines(text: str) -> Iterator[str]:
-    """The rows of a table: lines, but for line ends within quotes."""
-    begun = ""
+def _lines(text: str) -> list[str]:
+    """The rows of a table: lines, but for line ends within quotes; the last one is what no line end follows."""
+    found = [""]
     for line in text.split("\n"):
-        begun += line
-        if begun.count('"') % 2 == 0:
-            yield begun
-            begun = ""
+        if found[-1].count('"') % 2:
+            found[-1] += f"\n{line}"
         else:
-            begun += "\n"
+            found.append(line)
+    return found[1:]
 
 
 def column(line: str, place: int) -> str:

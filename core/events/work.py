@@ -58,9 +58,8 @@ class Making(Iterator[Made]):
         try:
             for done, event in enumerate(written, 1):
                 for text in event.warnings:
-                    if (
-                        words := re.sub(r"[\d.]+", "", text)
-                    ) not in said:  # the same with other numbers says nothing new
+                    words = re.sub(r"[\d.]+", "", text)  # the same with other numbers says nothing new
+                    if words not in said:
                         said.add(words)
                         warn(f"event {event.number}: {text}", 3)
                 path = store.event_path(event.number)
@@ -109,7 +108,6 @@ def making(
     dask
         Address of a Dask scheduler, whose workers make the events and see `folder` under the same path; ``"local"``: as many
         workers as `workers` on this machine.
-
     pack
         Whether events go into shards; a set that has some goes on so.
 
@@ -167,9 +165,8 @@ def prepare(
     maker.require_memory()
     mine = [n for part in asked for n in range(part.start + (place - 1 - part.start) % parts, part.stop, parts)]
     end = time.monotonic() + _CHECK_SECONDS
-    for number in mine[
-        :: max(1, len(mine) // _CHECKED)
-    ]:  # what does not fit together shows before the first is computed
+    # What does not fit together shows before anything is computed.
+    for number in mine[:: max(1, len(mine) // _CHECKED)]:
         if time.monotonic() < end and not target.store.event_path(number).exists():
             _ = plan(recipe, number).phantom
     return target, target.prepare(recipe, asked, mine)

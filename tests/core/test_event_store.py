@@ -256,6 +256,21 @@ def test_works_that_grow_a_set_at_once_lose_no_rows(tmp_path):
     assert SetFolder(tmp_path / "set").asked == [range(12)] and events.check(tmp_path / "set") == []
 
 
+@pytest.mark.parametrize("kept", [1, 9, 14, 30, -40, -3, -1])
+def test_a_row_of_the_index_that_was_cut_is_drawn_anew(whole, made, kept):
+    """Alone at the end of the file, and with other rows written on behind it."""
+    path, lines = whole / "index.csv", (made / "index.csv").read_text().splitlines(keepends=True)
+    for more in (False, True):
+        path.write_text("".join([*lines[:3], lines[3][:kept]]))
+        for number in range(3, COUNT) if more else ():
+            SetFolder(whole).index.add(number)
+        assert_same_events(whole, made)
+        for name in ("train", "test"):
+            assert events.EventSet(whole).split(name).numbers == events.EventSet(made).split(name).numbers
+        events.make(events.read_recipe(whole / "recipe.toml"), whole, COUNT)
+        assert path.read_text() == "".join(lines)
+
+
 def test_another_build_is_said(whole, monkeypatch, capsys):
     monkeypatch.setattr("mphdrr.core.events.folders.build", lambda: "0123456789ab")
     monkeypatch.setattr("mphdrr.core.events.event_files.build", lambda: "0123456789ab")

@@ -118,8 +118,10 @@ class Store:
 
         Damaged events are left out: a `check` finds them missing. `InputError` where a file cannot be written.
         """
+        shards = self.shard_paths() if shards is None else shards
+        if not shards:
+            return 0
         with locked(self.shards / LOCK, f"{self.shards}: another work is packing this set; wait for its end"):
-            shards = self.shard_paths() if shards is None else shards
             packed = [(n, place) for n, place in self.places().items() if Path(place.path) in shards]
             for done, (number, place) in enumerate(packed, 1):
                 if _is_whole(place):

@@ -72,6 +72,7 @@ def test_packed_events_are_the_same_and_come_back_byte_for_byte(whole, made):
         assert tar.extractfile(name).read() == before[f"events/{name}"]
     assert main(["events", "unpack", str(whole)]) == 0
     shutil.rmtree(whole / "shards")
+    assert main(["events", "unpack", str(whole)]) == 0  # nothing is left to do
     assert tree(whole) == before
 
 
@@ -221,10 +222,10 @@ def test_writers_of_the_same_events_overlap_without_harm(tmp_path, made, monkeyp
 
 
 @pytest.mark.long
-def test_a_hundred_works_overlap_without_harm(tmp_path, made):
+def test_works_overlap_without_harm(tmp_path, made):
     """Requeued jobs and repairs beside them, as processes: each ends with status 0, and the bytes are the same."""
     small_recipe(tmp_path)
-    for turn in range(20):
+    for turn in range(4):
         folder = str(tmp_path / str(turn))
         make = ["events", "make", folder, "--recipe", str(tmp_path / "small.toml"), "-n", str(COUNT), "--quiet"]
         slow = (

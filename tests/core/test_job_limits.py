@@ -142,25 +142,17 @@ kind = "transmission"
 """
 JOBS = [
     "phantom cylinder --radius 40 --height 80 --voxels 480 --spacing 0.2 -o OUT.nrrd",
-    "project WORKBOOK --modules 1-2 --phantom nema --voxels 480 --size 16 16 -o OUT.h5",
-    "project WORKBOOK --phantom nema --voxels 16 --size 1300 1300 -o OUT.npz",
     "project WORKBOOK --volume volume.nii.gz --emission --time 1 --hole point --set model.pixel_points=1 "
     "--set model.tolerance=1e6 --noise 1 --size 600 600 -o OUT.h5",
-    "project WORKBOOK --modules 1 --volume large.nii.gz --quantity activity --size 16 16 -o OUT.h5",
-    "reconstruct run.h5 --method sirt --iterations 1 --voxels 320 --spacing 0.4 -o OUT.nii.gz",
     "reconstruct run.h5 --method cgls --iterations 1 --voxels 320 --spacing 0.4 -o OUT.nii.gz",
-    "reconstruct run.h5 --method tv --weight 0.1 --iterations 1 --voxels 200 --spacing 0.4 -o OUT.nii.gz",
     "reconstruct counts.h5 --method osem --subsets 8 --iterations 1 --voxels 256 --spacing 0.4 --hole rays "
     "--aperture-points 1 -o OUT.nii.gz",
     "reconstruct counts.h5 --method bsrem --subsets 4 --iterations 1 --voxels 224 --spacing 0.4 --hole rays "
     "--aperture-points 1 --prior relative-difference --weight 0.1 -o OUT.nii.gz",
-    "backproject run.h5 --voxels 400 --spacing 0.25 -o OUT.nii.gz",
     "backproject run.h5 --how product --voxels 400 --spacing 0.25 -o OUT.nii.gz",
-    "volume convert large.nii.gz -o OUT.nrrd",
     "volume convert volume.nii.gz --spacing 0.2 -o OUT.nii.gz",
     "geometry map WORKBOOK --modules 1 --quantity modules --voxels 448 --spacing 0.5 -o OUT.nii.gz",
     "score large.nii.gz --truth run.h5",
-    "events make OUT --recipe events.toml -n 1",
     "events make OUT --recipe events.toml -n 2 --workers 2",
 ]
 

@@ -82,7 +82,7 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.long
 @pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("example", [example for example in ALL if not example.startswith("mphdrr demo")])  # `make demo`
+@pytest.mark.parametrize("example", [one for one in ALL if not one.startswith("mphdrr demo")])  # that is `make demo`
 def test_every_example_runs(example, inputs, tmp_path):
     here = tmp_path / "here"
     shutil.copytree(inputs, here)

@@ -84,8 +84,7 @@ def lattices(grid: mph.Grid, views: mph.Views) -> list[mph.Grid | mph.Perspectiv
 
 
 @pytest.mark.parametrize("how", WAYS)
-@pytest.mark.parametrize("parallel", [False, True])
-@pytest.mark.parametrize("kernel", ["compiled", "numpy"])
+@pytest.mark.parametrize(("kernel", "parallel"), [("compiled", False), ("compiled", True), ("numpy", False)])
 def test_it_is_what_the_views_say_of_each_place(rng, grid, monkeypatch, kernel, parallel, how):
     if kernel == "numpy":
         monkeypatch.setattr(places, "_take_kernel", None)

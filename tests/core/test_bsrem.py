@@ -143,8 +143,7 @@ def even(scanner):
 
 
 @pytest.mark.parametrize("prior", [mph.Quadratic, mph.RelativeDifference, mph.TotalVariation])
-@pytest.mark.parametrize("neighbors", [pytest.param(6, marks=pytest.mark.long), 26])
-@pytest.mark.parametrize("weight", [2.0, 50.0])
+@pytest.mark.parametrize(("neighbors", "weight"), [pytest.param(6, 50.0, marks=pytest.mark.long), (26, 2.0)])
 def test_a_uniform_volume_in_its_mask_stays_so_up_to_its_edge(even, prior, neighbors, weight):
     A, mask, counts = even
     penalty = prior(weight, neighbors=neighbors)

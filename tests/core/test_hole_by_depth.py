@@ -104,8 +104,8 @@ def errors_of_voxels(rng, size, pixels, hole, near=False, voxels=1, depth=80, wo
 
 
 # Of a voxel, mm; pixels along the crystal's side; of the hole, mm.
-SIZES = [(0.2, 32, 12.0), (0.4, 256, 2.3), (0.8, 128, 6.0), (3.4, 32, 0.6), (4.4, 64, 2.3), (6.0, 128, 0.3)]
-NEAR = [(0.3, 32, 11.0), (0.5, 64, 5.0), (2.1, 64, 0.9)]
+SIZES = [(0.2, 32, 12.0), (3.4, 32, 0.6), (6.0, 128, 0.3)]
+NEAR = [(0.3, 32, 11.0), (2.1, 64, 0.9)]
 
 
 def assert_right(errors):
@@ -342,7 +342,7 @@ def worst_share_off(mu, grid, region, rng, n):
 
 @pytest.mark.parametrize(
     ("coefficient", "size", "voxel"),
-    [(0.028, 2.0, 3.0), pytest.param(0.06, 1.0, 4.0, marks=pytest.mark.long), (0.06, 2.0, 2.0)],
+    [(0.028, 2.0, 3.0), pytest.param(0.06, 2.0, 2.0, marks=pytest.mark.long)],
 )
 def test_attenuation_of_a_thin_shell_beside_air_is_within_one_per_cent(coefficient, size, voxel, rng):
     spheres = [mph.Sphere(radius=radius, mu=value) for radius, value in ((40, coefficient), (36, 0))]

@@ -25,8 +25,8 @@ METHODS = [
 
 @pytest.fixture(scope="module")
 def problem(scanner):
-    """Eight modules around 10^3 voxels: projector, counts, truth."""
-    system = scanner[::10]
+    """Five modules around 10^3 voxels: projector, counts, truth."""
+    system = scanner[::16]
     grid = mph.Grid.centered(10, 8.0)
     with pytest.warns(mph.InputWarning):
         A = mph.Projector(

@@ -12,9 +12,14 @@ from ..core.runs.files import write_run
 from ..core.runs.recipe import Recipe
 from ..core.runs.run_recipe import run_recipe
 from ..core.workbook import read_system
-from . import images, jobs, phantoms, rendering, runs, scanner, studio
+from .blender import jobs
 from .cli.demo import EULER_DEGREES, EXAMPLE
-from .phantom_properties import plain_settings
+from .figures import studio
+from .phantoms import phantoms
+from .phantoms.phantom_properties import plain_settings
+from .pictures import images
+from .runs import rendering, runs
+from .scanner import scanner
 
 _VOXELS, _PIXELS = 128, 128
 _VIEW = Euler((1.05, 0.0, 0.95))  # from above, into the opening of the rings

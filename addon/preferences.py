@@ -14,8 +14,8 @@ from bpy.props import IntProperty
 from ..core import cache
 from ..core.memory import readable_size
 from ..core.projector import backends, parallel
-from . import ids
-from .layouts import invoking
+from .blender import ids
+from .blender.layouts import invoking
 
 PACKAGE = __package__.rpartition(".")[0]  # "mphdrr", or "bl_ext.<repo>.mphdrr" when installed as an extension
 

@@ -22,19 +22,15 @@ from bpy.props import (
 )
 
 from ..core.geometry.system import LENGTHS
-from . import (
-    choices,
-    column_maps,
-    display_properties,
-    epipolar_properties,
-    event_properties,
-    ids,
-    perspective_properties,
-    phantom_properties,
-    projection_properties,
-    reconstruction_properties,
-)
-from .updates import FUNCTIONS, on_edit
+from .blender import choices, ids
+from .blender.updates import FUNCTIONS, on_edit
+from .events import event_properties
+from .perspective import epipolar_properties, perspective_properties
+from .phantoms import phantom_properties
+from .pictures import display_properties
+from .reconstruction import reconstruction_properties
+from .runs import projection_properties
+from .scanner import column_maps
 
 
 # Functions, not lambdas: Blender evaluates annotations where a lambda does not find this module's names.

@@ -7,7 +7,9 @@ import bpy
 
 from ..core.errors import InputError, warn
 from ..core.progress import Progress, part_of
-from . import jobs, maps, phantoms, storage, volumes
+from .blender import jobs, storage
+from .phantoms import phantoms
+from .volumes import maps, volumes
 
 
 def missing(scene: bpy.types.Scene) -> tuple[list[bpy.types.Object], list[bpy.types.Object]]:

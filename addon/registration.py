@@ -12,38 +12,17 @@ import bpy
 
 from .. import operators, panels
 from ..operators import add_phantom
-from . import (
-    color_bar,
-    epipolar_drawing,
-    event_notes,
-    figures,
-    following,
-    framing,
-    frustums,
-    ids,
-    jobs,
-    live_phantoms,
-    live_scanner,
-    planes,
-    plots,
-    preferences,
-    preview,
-    properties,
-    recoloring,
-    recovery,
-    rendering,
-    run_notes,
-    runs,
-    scanner,
-    selection,
-    sight_lines,
-    slices,
-    storage,
-    tiles,
-    updates,
-    volumes,
-)
-from .layouts import invoking
+from . import preferences, properties, recovery
+from .blender import ids, jobs, plots, storage, updates
+from .blender.layouts import invoking
+from .events import event_notes
+from .figures import figures
+from .perspective import epipolar_drawing, frustums
+from .phantoms import live_phantoms
+from .pictures import planes, recoloring, tiles
+from .runs import preview, rendering, run_notes, runs
+from .scanner import following, framing, live_scanner, scanner, selection, sight_lines
+from .volumes import color_bar, slices, volumes
 
 
 def _classes(module: ModuleType) -> list[Any]:
@@ -149,7 +128,7 @@ DRAWINGS = (
     (bpy.types.SpaceView3D, epipolar_drawing.draw_in_scene, "POST_VIEW"),
 )
 
-# What edited properties call (`addon/updates.py`).
+# What edited properties call (`addon/blender/updates.py`).
 UPDATES: dict[str, Callable[..., None]] = {
     "module": following.refresh_module,
     "length": following.length_typed,

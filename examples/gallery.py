@@ -159,8 +159,12 @@ def in_the_scanner(system: mph.PinholeSystem, folder: Path, ct: mph.Volume | Non
     except ImportError:
         print("no bpy: the pictures in the scanner are omitted", file=sys.stderr)
         return
-    from mphdrr.addon import cli, figures, jobs, maps, scanner, slices, volumes
+    from mphdrr.addon import cli
+    from mphdrr.addon.blender import jobs
     from mphdrr.addon.cli.scene import new_scene, quiet
+    from mphdrr.addon.figures import figures
+    from mphdrr.addon.scanner import scanner
+    from mphdrr.addon.volumes import maps, slices, volumes
 
     with tempfile.TemporaryDirectory() as demo:
         cli.main(["demo", "--output", demo])

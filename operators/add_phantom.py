@@ -5,9 +5,10 @@ from typing import Any
 import bpy
 from bpy.props import BoolProperty, FloatProperty, FloatVectorProperty, StringProperty
 
-from ..addon import jobs, phantoms, storage
-from ..addon.layouts import labelled
-from ..addon.phantom_properties import FILE, PhantomSettings, identifier, sampling, settings_class
+from ..addon.blender import jobs, storage
+from ..addon.blender.layouts import labelled
+from ..addon.phantoms import phantoms
+from ..addon.phantoms.phantom_properties import FILE, PhantomSettings, identifier, sampling, settings_class
 from ..core.geometry.frames import euler_pose
 from ..core.phantoms.kinds import KINDS
 from ..core.phantoms.language import read_phantom

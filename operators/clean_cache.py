@@ -3,7 +3,7 @@
 import bpy
 
 from ..addon import preferences
-from ..addon.reports import Reported, needs
+from ..addon.blender.reports import Reported, needs
 
 
 class MPHDRR_OT_clean_cache(Reported, bpy.types.Operator):

@@ -6,8 +6,8 @@ import textwrap
 import bpy
 from bpy.app.translations import pgettext_iface as iface
 
-from ..addon.column_maps import ColumnMapProperties, ColumnMapQuantity
-from ..addon.layouts import labelled
+from ..addon.blender.layouts import labelled
+from ..addon.scanner.column_maps import ColumnMapProperties, ColumnMapQuantity
 from ..core.workbook.quantities import DERIVED, QUANTITIES
 
 WIDTH = 1000  # of the dialog, pixels

@@ -2,9 +2,9 @@
 
 import bpy
 
-from ..addon import ids
-from ..addon.scanner_files import WORKBOOK_SUFFIXES
-from ..addon.volume_import import READ_ENDINGS
+from ..addon.blender import ids
+from ..addon.scanner.scanner_files import WORKBOOK_SUFFIXES
+from ..addon.volumes.volume_import import READ_ENDINGS
 
 
 class _Dropped:

@@ -2,8 +2,9 @@
 
 import bpy
 
-from ..addon import jobs, phantoms
-from ..addon.reports import Reported, needs
+from ..addon.blender import jobs
+from ..addon.blender.reports import Reported, needs
+from ..addon.phantoms import phantoms
 
 
 class _EditPhantom(jobs.JobOperator):

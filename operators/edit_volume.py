@@ -3,9 +3,11 @@
 import bpy
 from bpy.props import FloatProperty, StringProperty
 
-from ..addon import jobs, recovery, slices, storage, volume_import, volumes
-from ..addon.decimals import typed
-from ..addon.reports import Reported, needs
+from ..addon import recovery
+from ..addon.blender import jobs, storage
+from ..addon.blender.decimals import typed
+from ..addon.blender.reports import Reported, needs
+from ..addon.volumes import slices, volume_import, volumes
 
 
 class MPHDRR_OT_add_slices(Reported, bpy.types.Operator):

@@ -4,9 +4,10 @@ import bpy
 from bpy.props import EnumProperty, StringProperty
 from bpy_extras.io_utils import ExportHelper
 
-from ..addon import choices, event_sets, jobs
-from ..addon.event_properties import COUNT, FOLDER, MODEL, NEXT, OPENED, RECIPE
-from ..addon.reports import Reported
+from ..addon.blender import choices, jobs
+from ..addon.blender.reports import Reported
+from ..addon.events import event_sets
+from ..addon.events.event_properties import COUNT, FOLDER, MODEL, NEXT, OPENED, RECIPE
 from ..core.events.templates import TEMPLATES
 
 

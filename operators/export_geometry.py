@@ -5,10 +5,11 @@ from pathlib import Path
 import bpy
 from bpy.props import BoolProperty, EnumProperty, StringProperty
 
-from ..addon import jobs, scanner, scanner_files, selection, storage
-from ..addon.decimals import typed
-from ..addon.reports import needs
-from ..addon.scanner_files import WORKBOOK_SUFFIXES
+from ..addon.blender import jobs, storage
+from ..addon.blender.decimals import typed
+from ..addon.blender.reports import needs
+from ..addon.scanner import scanner, scanner_files, selection
+from ..addon.scanner.scanner_files import WORKBOOK_SUFFIXES
 from ..core.exchange import FORMAT_NUMBERS, FORMATS
 
 _FORMATS = tuple((f.name, f.name, f.title, FORMAT_NUMBERS[f.name]) for f in FORMATS.values())

@@ -3,9 +3,10 @@
 import bpy
 from bpy.props import StringProperty
 
-from ..addon import jobs, volumes
-from ..addon.reports import needs
-from ..addon.volume_export import WRITTEN_ENDINGS, exporting
+from ..addon.blender import jobs
+from ..addon.blender.reports import needs
+from ..addon.volumes import volumes
+from ..addon.volumes.volume_export import WRITTEN_ENDINGS, exporting
 
 
 class MPHDRR_OT_export_volume(jobs.JobOperator, bpy.types.Operator):

@@ -5,8 +5,11 @@ from pathlib import Path
 import bpy
 from bpy.props import BoolProperty, EnumProperty, IntProperty, StringProperty
 
-from ..addon import figures, jobs, scanner, volumes
-from ..addon.reports import Need, needs
+from ..addon.blender import jobs
+from ..addon.blender.reports import Need, needs
+from ..addon.figures import figures
+from ..addon.scanner import scanner
+from ..addon.volumes import volumes
 from ..core.errors import InputError
 from ..core.figures.page import LARGEST, SUFFIXES
 

@@ -12,9 +12,10 @@ from bpy.props import (
     StringProperty,
 )
 
-from ..addon import choices, counts_import, jobs, storage
-from ..addon.decimals import typed
-from ..addon.layouts import labelled
+from ..addon.blender import choices, jobs, storage
+from ..addon.blender.decimals import typed
+from ..addon.blender.layouts import labelled
+from ..addon.runs import counts_import
 from ..core.runs.frame_files import COUNTS_FORMATS, RAW_TYPES
 from ..core.runs.orientations import ORIENTATIONS
 

@@ -6,10 +6,12 @@ from typing import Literal
 import bpy
 from bpy.props import BoolProperty, FloatProperty, IntVectorProperty, StringProperty
 
-from ..addon import column_maps, ids, scanner, studio
-from ..addon.layouts import labelled
-from ..addon.reports import run_reported, warnings_reported
-from ..addon.scanner_files import WORKBOOK_SUFFIXES
+from ..addon.blender import ids
+from ..addon.blender.layouts import labelled
+from ..addon.blender.reports import run_reported, warnings_reported
+from ..addon.figures import studio
+from ..addon.scanner import column_maps, scanner
+from ..addon.scanner.scanner_files import WORKBOOK_SUFFIXES
 from ..core.errors import InputError
 from ..core.geometry.collimator import Construction
 from ..core.geometry.system import PinholeSystem

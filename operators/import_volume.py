@@ -9,10 +9,10 @@ from typing import Any
 import bpy
 from bpy.props import BoolProperty, CollectionProperty, EnumProperty, FloatProperty, IntProperty, StringProperty
 
-from ..addon import choices, jobs, storage
-from ..addon.decimals import typed
-from ..addon.layouts import labelled
-from ..addon.volume_import import READ_ENDINGS, importing, name_of
+from ..addon.blender import choices, jobs, storage
+from ..addon.blender.decimals import typed
+from ..addon.blender.layouts import labelled
+from ..addon.volumes.volume_import import READ_ENDINGS, importing, name_of
 from ..core.errors import InputError
 from ..core.volumes.volume import UNITS
 

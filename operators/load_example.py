@@ -2,9 +2,10 @@
 
 import bpy
 
-from ..addon import example, jobs
+from ..addon import example
+from ..addon.blender import jobs
+from ..addon.blender.reports import needs
 from ..addon.cli.demo import EXAMPLE
-from ..addon.reports import needs
 
 
 class MPHDRR_OT_load_example(jobs.JobOperator, bpy.types.Operator):

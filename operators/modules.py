@@ -5,10 +5,12 @@ import math
 import bpy
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty
 
-from ..addon import following, jobs, maps, module_edits, scanner, selection
-from ..addon.decimals import typed
-from ..addon.reports import needs
-from ..addon.scanner_parts import modules_text
+from ..addon.blender import jobs
+from ..addon.blender.decimals import typed
+from ..addon.blender.reports import needs
+from ..addon.scanner import following, module_edits, scanner, selection
+from ..addon.scanner.scanner_parts import modules_text
+from ..addon.volumes import maps
 
 
 class MPHDRR_OT_show_modules(selection.OnScanner, bpy.types.Operator):

@@ -2,9 +2,12 @@
 
 import bpy
 
-from ..addon import frustums, jobs, selection, volumes
-from ..addon.perspective_properties import PerspectiveSettings
-from ..addon.reports import Reported, needs
+from ..addon.blender import jobs
+from ..addon.blender.reports import Reported, needs
+from ..addon.perspective import frustums
+from ..addon.perspective.perspective_properties import PerspectiveSettings
+from ..addon.scanner import selection
+from ..addon.volumes import volumes
 
 
 class _InPerspective(PerspectiveSettings, jobs.JobOperator):

@@ -5,10 +5,11 @@ import numpy as np
 from bpy.props import FloatProperty, IntProperty
 from bpy_extras import view3d_utils
 
-from ..addon import epipolar, epipolar_drawing, images, tiles
-from ..addon.decimals import typed
-from ..addon.eyedropper import Eyedropper, region_under
-from ..addon.reports import Reported, needs
+from ..addon.blender.decimals import typed
+from ..addon.blender.eyedropper import Eyedropper, region_under
+from ..addon.blender.reports import Reported, needs
+from ..addon.perspective import epipolar, epipolar_drawing
+from ..addon.pictures import images, tiles
 from ..core.errors import InputError
 
 _COUNTED = "Of the pixel, counted as in the arrays; 0: the centre of pixel 0"

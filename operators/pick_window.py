@@ -3,9 +3,10 @@
 import bpy
 from bpy.props import EnumProperty
 
-from ..addon import choices, ids, images, tiles
-from ..addon.eyedropper import Eyedropper, region_under
-from ..addon.reports import needs
+from ..addon.blender import choices, ids
+from ..addon.blender.eyedropper import Eyedropper, region_under
+from ..addon.blender.reports import needs
+from ..addon.pictures import images, tiles
 from ..core.errors import InputError
 
 

@@ -2,8 +2,11 @@
 
 import bpy
 
-from ..addon import jobs, preview, selection, volumes
-from ..addon.reports import needs
+from ..addon.blender import jobs
+from ..addon.blender.reports import needs
+from ..addon.runs import preview
+from ..addon.scanner import selection
+from ..addon.volumes import volumes
 
 
 class MPHDRR_OT_live_preview(bpy.types.Operator):

@@ -2,14 +2,16 @@
 
 import bpy
 
-from ..addon import backprojections, ids, jobs, reconstructions, runs
-from ..addon.reconstruction_properties import (
+from ..addon.blender import ids, jobs
+from ..addon.blender.reports import Need, needs
+from ..addon.reconstruction import backprojections, reconstructions
+from ..addon.reconstruction.reconstruction_properties import (
     BackprojectionSettings,
     ReconstructionSettings,
     settings_recipe,
     voxels_recipe,
 )
-from ..addon.reports import Need, needs
+from ..addon.runs import runs
 from .render_projections import ShowPicture
 
 _DONE: Need = (lambda _: ids.RECONSTRUCTION in bpy.data.images, "No reconstruction yet: reconstruct a run first")

@@ -8,10 +8,13 @@ import bpy
 from bpy.props import EnumProperty, FloatProperty, StringProperty
 from bpy_extras.io_utils import ImportHelper
 
-from ..addon import choices, ids, images, jobs, rendering, runs, scanner, storage, tiles
-from ..addon.decimals import typed
-from ..addon.projection_properties import OPENING_ANGLE, ProjectionSettings, settings_recipe, use_preset
-from ..addon.reports import Reported, needs
+from ..addon.blender import choices, ids, jobs, storage
+from ..addon.blender.decimals import typed
+from ..addon.blender.reports import Reported, needs
+from ..addon.pictures import images, tiles
+from ..addon.runs import rendering, runs
+from ..addon.runs.projection_properties import OPENING_ANGLE, ProjectionSettings, settings_recipe, use_preset
+from ..addon.scanner import scanner
 from ..core.errors import InputError
 from ..core.runs.presets import PRESETS
 

@@ -5,8 +5,10 @@ from typing import Any
 import bpy
 from bpy.props import EnumProperty, IntProperty
 
-from ..addon import images, jobs, rendering, runs
-from ..addon.reports import Need, Reported, needs
+from ..addon.blender import jobs
+from ..addon.blender.reports import Need, Reported, needs
+from ..addon.pictures import images
+from ..addon.runs import rendering, runs
 from ..core.errors import InputError
 from ..core.progress import Progress
 from ..core.runs.comparing import difference, difference_sheet

@@ -3,9 +3,10 @@
 import bpy
 from bpy.props import EnumProperty, FloatProperty, IntProperty, StringProperty
 
-from ..addon import choices, jobs, meshes, volumes
-from ..addon.decimals import typed
-from ..addon.reports import needs
+from ..addon.blender import choices, jobs
+from ..addon.blender.decimals import typed
+from ..addon.blender.reports import needs
+from ..addon.volumes import meshes, volumes
 
 
 class MPHDRR_OT_voxelize_objects(jobs.JobOperator, bpy.types.Operator):

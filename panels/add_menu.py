@@ -3,9 +3,9 @@
 import bpy
 from bpy.app.translations import pgettext_iface as iface
 
-from ..addon import ids
-from ..addon.layouts import invoking
-from ..addon.phantom_properties import menu_entries
+from ..addon.blender import ids
+from ..addon.blender.layouts import invoking
+from ..addon.phantoms.phantom_properties import menu_entries
 
 
 class MPHDRR_MT_add(bpy.types.Menu):

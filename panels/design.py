@@ -1,4 +1,4 @@
-"""Sidebar, Geometry > Design: numbers and readouts (`addon/following.py`) of the active module, and of all modules."""
+"""Sidebar, Geometry > Design: numbers and readouts (`following.py`) of the active module, and of all modules."""
 
 import json
 from collections.abc import Sequence
@@ -6,9 +6,10 @@ from collections.abc import Sequence
 import bpy
 from bpy.app.translations import pgettext_iface as iface
 
-from ..addon import following, ids, jobs, scanner, selection
-from ..addon.layouts import invoking, labelled
+from ..addon.blender import ids, jobs
+from ..addon.blender.layouts import invoking, labelled
 from ..addon.properties import LABELS
+from ..addon.scanner import following, scanner, selection
 from .geometry import ScannerPanel, draw_facts, draw_text
 
 _MOST_FINDINGS = 8

@@ -3,8 +3,10 @@
 import bpy
 from bpy.app.translations import pgettext_iface as iface
 
-from ..addon import ids, images, selection, tiles
-from ..addon.layouts import labelled, shown_where
+from ..addon.blender import ids
+from ..addon.blender.layouts import labelled, shown_where
+from ..addon.pictures import images, tiles
+from ..addon.scanner import selection
 from .geometry import Sidebar
 
 

@@ -3,8 +3,9 @@
 import bpy
 from bpy.app.translations import pgettext_iface as iface
 
-from ..addon import epipolar, ids
-from ..addon.layouts import invoking, labelled, shown_where
+from ..addon.blender import ids
+from ..addon.blender.layouts import invoking, labelled, shown_where
+from ..addon.perspective import epipolar
 from .geometry import Sidebar, draw_facts, draw_text
 
 

@@ -2,8 +2,9 @@
 
 import bpy
 
-from ..addon import event_notes, ids, jobs
-from ..addon.layouts import invoking, labelled
+from ..addon.blender import ids, jobs
+from ..addon.blender.layouts import invoking, labelled
+from ..addon.events import event_notes
 from .geometry import Sidebar, draw_hint, draw_text
 
 

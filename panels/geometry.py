@@ -7,8 +7,9 @@ import bpy
 import numpy as np
 from bpy.app.translations import pgettext_iface as iface
 
-from ..addon import following, ids, jobs, scanner, selection
-from ..addon.layouts import invoking, shown_where
+from ..addon.blender import ids, jobs
+from ..addon.blender.layouts import invoking, shown_where
+from ..addon.scanner import following, scanner, selection
 
 _LINE = 32  # letters that fit into the sidebar at its usual width
 

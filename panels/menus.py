@@ -7,8 +7,9 @@ What adds something is under Add > mphDRR (`add_menu.py`), what reads and writes
 import bpy
 from bpy.app.translations import pgettext_iface as iface
 
-from ..addon import ids, selection
-from ..addon.layouts import invoking
+from ..addon.blender import ids
+from ..addon.blender.layouts import invoking
+from ..addon.scanner import selection
 
 
 class MPHDRR_MT_commands(bpy.types.Menu):

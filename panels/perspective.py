@@ -3,8 +3,11 @@
 import bpy
 from bpy.app.translations import pgettext_iface as iface
 
-from ..addon import frustums, ids, jobs, selection, volumes
-from ..addon.layouts import invoking, labelled
+from ..addon.blender import ids, jobs
+from ..addon.blender.layouts import invoking, labelled
+from ..addon.perspective import frustums
+from ..addon.scanner import selection
+from ..addon.volumes import volumes
 from .geometry import Sidebar, draw_hint, draw_text
 
 

@@ -5,8 +5,11 @@ from typing import Any
 import bpy
 from bpy.app.translations import pgettext_iface as iface
 
-from ..addon import ids, phantom_properties, phantoms, recovery, slices, storage, volumes
-from ..addon.layouts import invoking, labelled
+from ..addon import recovery
+from ..addon.blender import ids, storage
+from ..addon.blender.layouts import invoking, labelled
+from ..addon.phantoms import phantom_properties, phantoms
+from ..addon.volumes import slices, volumes
 from .geometry import Sidebar, draw_facts, draw_hint, draw_text
 
 

@@ -5,7 +5,8 @@ import textwrap
 import bpy
 from bpy.app.translations import pgettext_iface as iface
 
-from ..addon import ids, preview
+from ..addon.blender import ids
+from ..addon.runs import preview
 from .geometry import Sidebar
 
 _LINE = 34  # letters that fit into the sidebar at its usual width

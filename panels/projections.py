@@ -3,9 +3,12 @@
 import bpy
 from bpy.app.translations import pgettext_iface as iface
 
-from ..addon import ids, jobs, rendering, runs, scanner, volumes
-from ..addon.layouts import draw_settings, invoking, labelled, shown_where
-from ..addon.projection_properties import drawn, makes_counts
+from ..addon.blender import ids, jobs
+from ..addon.blender.layouts import draw_settings, invoking, labelled, shown_where
+from ..addon.runs import rendering, runs
+from ..addon.runs.projection_properties import drawn, makes_counts
+from ..addon.scanner import scanner
+from ..addon.volumes import volumes
 from .geometry import Sidebar, draw_hint, draw_text
 from .runs import draw_changes
 

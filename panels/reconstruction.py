@@ -3,9 +3,10 @@
 import bpy
 from bpy.app.translations import pgettext_iface as iface
 
-from ..addon import ids, jobs, plots, runs
-from ..addon.layouts import draw_settings, invoking, labelled
-from ..addon.reconstruction_properties import drawn
+from ..addon.blender import ids, jobs, plots
+from ..addon.blender.layouts import draw_settings, invoking, labelled
+from ..addon.reconstruction.reconstruction_properties import drawn
+from ..addon.runs import runs
 from .geometry import Sidebar, draw_hint, draw_text
 
 _MAIN = ("method", "iterations", "subsets", "voxels", "spacing")

@@ -3,8 +3,10 @@
 import bpy
 from bpy.app.translations import pgettext_iface as iface
 
-from ..addon import ids, images, jobs, runs
-from ..addon.layouts import invoking, shown_where
+from ..addon.blender import ids, jobs
+from ..addon.blender.layouts import invoking, shown_where
+from ..addon.pictures import images
+from ..addon.runs import runs
 from .geometry import Sidebar, draw_text
 
 

@@ -3,8 +3,8 @@
 import bpy
 from mathutils import Matrix, Vector
 
-from ..addon import slices
-from ..addon.layouts import shown_where
+from ..addon.blender.layouts import shown_where
+from ..addon.volumes import slices
 
 _COLORS = ((1.0, 0.2, 0.32), (0.55, 0.86, 0.0), (0.16, 0.56, 1.0))  # of Blender's axes
 

@@ -72,7 +72,11 @@ def _make_scene(scene: Any, run: ProjectionRun, out: Path) -> None:
     """Write the scene of a run, and pictures of it."""
     import bpy
 
-    from .. import figures, jobs, rendering, scanner, volumes
+    from ..blender import jobs
+    from ..figures import figures
+    from ..runs import rendering
+    from ..scanner import scanner
+    from ..volumes import volumes
 
     with _step("scene"):
         scanner.build_scanner(scene, run.system)

@@ -110,7 +110,8 @@ def _of_scene(arguments: argparse.Namespace, kind: FigureKind, blend: Path, path
     new_scene()
     import bpy
 
-    from .. import figures, jobs
+    from ..blender import jobs
+    from ..figures import figures
 
     with quiet():
         try:
@@ -125,7 +126,8 @@ def _of_scene(arguments: argparse.Namespace, kind: FigureKind, blend: Path, path
 def _render(arguments: argparse.Namespace, kind: FigureKind, page: Page, subject: Subject) -> None:
     """A figure that Blender renders."""
     new_scene()
-    from .. import figures, volumes
+    from ..figures import figures
+    from ..volumes import volumes
 
     assert kind.studio is not None
     item = None

@@ -51,7 +51,10 @@ def _run(arguments: argparse.Namespace) -> None:
     run = read_run(arguments.run_file) if arguments.run_file else None
 
     blender_scene = new_scene()
-    from .. import rendering, scanner, studio, volumes
+    from ..figures import studio
+    from ..runs import rendering
+    from ..scanner import scanner
+    from ..volumes import volumes
 
     scanner.build_scanner(blender_scene, system)
     studio.light(blender_scene)

@@ -1,7 +1,7 @@
 """The kinds of figures, one line each; command line and Blender follow from this table.
 
 A new kind is a line here: one that is drawn has a function of a page and a subject, one that is rendered says what is put
-into the studio (`addon.figures`).
+into the studio (`addon.figures.figures`).
 """
 
 from collections.abc import Callable

@@ -14,8 +14,8 @@ import numpy as np
 
 workbook, result_file = (Path(word) for word in sys.argv[sys.argv.index("--") + 1 :][:2])
 bpy.context.preferences.view.show_splash = False
-runs = importlib.import_module("bl_ext.user_default.mphdrr.addon.runs")
-jobs = importlib.import_module("bl_ext.user_default.mphdrr.addon.jobs")
+runs = importlib.import_module("bl_ext.user_default.mphdrr.addon.runs.runs")
+jobs = importlib.import_module("bl_ext.user_default.mphdrr.addon.blender.jobs")
 seen: dict[str, object] = {"ok": False}
 
 

@@ -18,7 +18,14 @@ from bpy_extras.view3d_utils import location_3d_to_region_2d, region_2d_to_origi
 MODULE = "bl_ext.user_default.mphdrr"
 core, epipolar, epipolar_drawing, images, planes, tiles = (
     importlib.import_module(f"{MODULE}.{name}")
-    for name in ("core", "addon.epipolar", "addon.epipolar_drawing", "addon.images", "addon.planes", "addon.tiles")
+    for name in (
+        "core",
+        "addon.perspective.epipolar",
+        "addon.perspective.epipolar_drawing",
+        "addon.pictures.images",
+        "addon.pictures.planes",
+        "addon.pictures.tiles",
+    )
 )
 
 result_file = Path(sys.argv[sys.argv.index("--") + 1])

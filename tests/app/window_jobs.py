@@ -15,7 +15,7 @@ import numpy as np
 
 result_file, workbook = Path(sys.argv[-2]), sys.argv[-1]
 bpy.context.preferences.view.show_splash = False
-jobs = next(module for name, module in sys.modules.items() if name.endswith(".addon.jobs"))
+jobs = next(module for name, module in sys.modules.items() if name.endswith(".addon.blender.jobs"))
 seen: dict = {"ok": False, "gaps": {}, "words": [], "changed": []}
 beats: list[float] = []
 

@@ -15,8 +15,8 @@ import bpy
 import numpy as np
 
 MODULE = "bl_ext.user_default.mphdrr"
-preview = importlib.import_module(f"{MODULE}.addon.preview")
-volumes = importlib.import_module(f"{MODULE}.addon.volumes")
+preview = importlib.import_module(f"{MODULE}.addon.runs.preview")
+volumes = importlib.import_module(f"{MODULE}.addon.volumes.volumes")
 core = importlib.import_module(f"{MODULE}.core")
 
 result_file = Path(sys.argv[sys.argv.index("--") + 1])
@@ -68,7 +68,9 @@ def pick_high(number):
     region = next(r for r in area.regions if r.type == "WINDOW")
     image = area.spaces.active.image
     tiles = image["mphdrr_tiles"].to_dict()
-    exact = importlib.import_module(f"{MODULE}.addon.images").projection_array(bpy.data.images[f"mphDRR {number}"])
+    exact = importlib.import_module(f"{MODULE}.addon.pictures.images").projection_array(
+        bpy.data.images[f"mphDRR {number}"]
+    )
     picture = exact[::-1, ::-1]
     place = np.array(np.unravel_index(picture.argmax(), picture.shape)) + 0.5
     row, column = np.reshape(tiles["corners"], (-1, 2))[tiles["numbers"].index(number)] + place
@@ -99,7 +101,9 @@ def steps():
     bpy.context.view_layer.objects.active = camera
     scene.mphdrr_projections.width = scene.mphdrr_projections.height = 256
     scanner = scene.mphdrr_geometry.scanner
-    importlib.import_module(f"{MODULE}.addon.scanner").show_modules(scanner, 50, 60)  # drawn in software, slowly
+    importlib.import_module(f"{MODULE}.addon.scanner.scanner").show_modules(
+        scanner, 50, 60
+    )  # drawn in software, slowly
     phantom.display_type = "BOUNDS"
     yield 4.0
     off = []
@@ -146,7 +150,7 @@ def steps():
     seen["unit"] = session.shown.run.unit
     pick_high(30)
     yield 4.0
-    exact = importlib.import_module(f"{MODULE}.addon.images").projection_array(bpy.data.images["mphDRR 30"])
+    exact = importlib.import_module(f"{MODULE}.addon.pictures.images").projection_array(bpy.data.images["mphDRR 30"])
     settings = scene.mphdrr_display
     seen["picked"] = [settings.automatic, settings.low, bool(settings.high > 0 and np.isin(settings.high, exact))]
     seen["ok"] = True

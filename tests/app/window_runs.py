@@ -14,7 +14,7 @@ import bpy
 
 result_file = Path(sys.argv[sys.argv.index("--") + 1])
 bpy.context.preferences.view.show_splash = False
-runs = importlib.import_module("bl_ext.user_default.mphdrr.addon.runs")
+runs = importlib.import_module("bl_ext.user_default.mphdrr.addon.runs.runs")
 seen: dict[str, object] = {"ok": False}
 
 

@@ -7,8 +7,11 @@ import numpy as np
 import pytest
 
 import mphdrr.core as mph
-from mphdrr.addon import backprojections, color_bar, jobs, scanner, slices, storage, volumes
-from mphdrr.addon.reconstruction_properties import voxels_recipe
+from mphdrr.addon.blender import jobs, storage
+from mphdrr.addon.reconstruction import backprojections
+from mphdrr.addon.reconstruction.reconstruction_properties import voxels_recipe
+from mphdrr.addon.scanner import scanner
+from mphdrr.addon.volumes import color_bar, slices, volumes
 from mphdrr.core.progress import Cancelled
 from mphdrr.core.runs.files import read_run
 

@@ -12,7 +12,8 @@ import bpy
 import numpy as np
 import pytest
 
-from mphdrr.addon import choices, registration
+from mphdrr.addon import registration
+from mphdrr.addon.blender import choices
 
 SAVED = Path(__file__).parent / "data" / "choices-0.1.0.blend"
 """Every choice that a scene can keep, numbered by position as version 0.1.0 did; what they are is in its text."""
@@ -128,7 +129,7 @@ def test_every_choice_has_the_number_that_files_keep():
         for prop, numbers in properties.items():
             first = FROZEN.get(name, {}).get(prop, {})
             expected = {choice: first.get(choice, zlib.crc32(choice.encode()) & 0xFFFFFF) for choice in numbers}
-            assert numbers == expected, f"{name}.{prop}: a choice was moved or renumbered: see addon/choices.py"
+            assert numbers == expected, f"{name}.{prop}: a choice was moved or renumbered: see addon/blender/choices.py"
             assert len(set(numbers.values())) == len(numbers)
             # Buttons side by side keep numbers as float32: a click would set another number.
             assert all(np.float32(number) == number for number in numbers.values()), f"{name}.{prop}"

@@ -12,7 +12,7 @@ import numpy as np
 import openpyxl
 import pytest
 
-from mphdrr.addon import column_maps, scanner
+from mphdrr.addon.scanner import column_maps, scanner
 from mphdrr.core.errors import InputError
 from mphdrr.core.geometry.system import PinholeSystem
 from mphdrr.core.workbook import ColumnMap, draft_column_map, read_system

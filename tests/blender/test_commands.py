@@ -11,7 +11,9 @@ import numpy as np
 import pytest
 
 import mphdrr.core as mph
-from mphdrr.addon import images, scanner, volumes
+from mphdrr.addon.pictures import images
+from mphdrr.addon.scanner import scanner
+from mphdrr.addon.volumes import volumes
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 

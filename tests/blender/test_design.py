@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 import mphdrr.core as mph
-from mphdrr.addon import cameras, collimators, following, live_scanner, module_edits, registration, scanner
-from mphdrr.addon.module_values import module_numbers
+from mphdrr.addon import registration
+from mphdrr.addon.scanner import cameras, collimators, following, live_scanner, module_edits, scanner
+from mphdrr.addon.scanner.module_values import module_numbers
 from mphdrr.core.errors import InputError, InputWarning
 from mphdrr.core.geometry.system import PinholeSystem
 

@@ -6,19 +6,11 @@ import pytest
 from bpy_extras.object_utils import world_to_camera_view
 from mathutils import Vector
 
-from mphdrr.addon import (
-    ids,
-    images,
-    module_edits,
-    planes,
-    recoloring,
-    rendering,
-    scanner,
-    selection,
-    tiles,
-    updates,
-    volumes,
-)
+from mphdrr.addon.blender import ids, updates
+from mphdrr.addon.pictures import images, planes, recoloring, tiles
+from mphdrr.addon.runs import rendering
+from mphdrr.addon.scanner import module_edits, scanner, selection
+from mphdrr.addon.volumes import volumes
 from mphdrr.core.errors import InputError
 from mphdrr.core.geometry.grid import Grid
 from mphdrr.core.runs.display import Display

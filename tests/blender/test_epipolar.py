@@ -7,7 +7,11 @@ import numpy as np
 import pytest
 from mathutils import Matrix
 
-from mphdrr.addon import epipolar, epipolar_drawing, ids, images, planes, scanner, tiles, volumes
+from mphdrr.addon.blender import ids
+from mphdrr.addon.perspective import epipolar, epipolar_drawing
+from mphdrr.addon.pictures import images, planes, tiles
+from mphdrr.addon.scanner import scanner
+from mphdrr.addon.volumes import volumes
 from mphdrr.core.errors import InputError
 from mphdrr.core.geometry.grid import Grid
 from mphdrr.core.perspective.perspective_grid import PerspectiveGrid

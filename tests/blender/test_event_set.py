@@ -8,7 +8,12 @@ import bpy
 import numpy as np
 import pytest
 
-from mphdrr.addon import event_notes, event_sets, jobs, phantoms, runs, scanner, storage, volumes
+from mphdrr.addon.blender import jobs, storage
+from mphdrr.addon.events import event_notes, event_sets
+from mphdrr.addon.phantoms import phantoms
+from mphdrr.addon.runs import runs
+from mphdrr.addon.scanner import scanner
+from mphdrr.addon.volumes import volumes
 from mphdrr.core import events
 from mphdrr.core.events.templates import TEMPLATES
 from mphdrr.core.progress import Cancelled

@@ -6,7 +6,8 @@ import bpy
 import numpy as np
 import pytest
 
-from mphdrr.addon import scanner, volumes
+from mphdrr.addon.scanner import scanner
+from mphdrr.addon.volumes import volumes
 from mphdrr.core.runs.files import read_run
 
 

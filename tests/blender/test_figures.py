@@ -11,9 +11,13 @@ import pytest
 from PIL import Image
 
 import mphdrr.core as mph
-from mphdrr.addon import figures, jobs, rendering, scanner, storage, volumes
+from mphdrr.addon.blender import jobs, storage
 from mphdrr.addon.cli import main
 from mphdrr.addon.cli.scene import save_scene
+from mphdrr.addon.figures import figures
+from mphdrr.addon.runs import rendering
+from mphdrr.addon.scanner import scanner
+from mphdrr.addon.volumes import volumes
 from mphdrr.core.figures.page import Page
 from mphdrr.core.recording import recorded_warnings
 

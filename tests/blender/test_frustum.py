@@ -8,7 +8,10 @@ import pytest
 from mathutils import Euler
 
 import mphdrr.core as mph
-from mphdrr.addon import cameras, frustums, ids, jobs, module_edits, scanner, slices, storage, volumes
+from mphdrr.addon.blender import ids, jobs, storage
+from mphdrr.addon.perspective import frustums
+from mphdrr.addon.scanner import cameras, module_edits, scanner
+from mphdrr.addon.volumes import slices, volumes
 from mphdrr.core.progress import Cancelled
 from mphdrr.core.runs.mosaic import as_seen
 

@@ -13,7 +13,7 @@ import pytest
 
 import mphdrr.core as mph
 from mphdrr.addon.cli.scene import new_scene, save_scene
-from mphdrr.addon.vdb import read_vdb, write_vdb
+from mphdrr.addon.volumes.vdb import read_vdb, write_vdb
 
 SIZE = 64 << 10
 

@@ -10,8 +10,9 @@ import bpy
 import numpy as np
 import pytest
 
-from mphdrr.addon import jobs, module_edits, scanner
-from mphdrr.addon.scanner_files import exporting_scanner
+from mphdrr.addon.blender import jobs
+from mphdrr.addon.scanner import module_edits, scanner
+from mphdrr.addon.scanner.scanner_files import exporting_scanner
 from mphdrr.core.errors import InputError, InputWarning
 from mphdrr.core.geometry.system import LENGTHS
 from mphdrr.core.workbook import read_system

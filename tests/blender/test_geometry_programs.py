@@ -6,7 +6,7 @@ import bpy
 import numpy as np
 import pytest
 
-from mphdrr.addon import scanner
+from mphdrr.addon.scanner import scanner
 from mphdrr.core.exchange import FORMATS, read_geometry
 
 

@@ -5,7 +5,9 @@ import numpy as np
 import pytest
 from mathutils import Euler, Matrix
 
-from mphdrr.addon import cameras, grabbing, live_scanner, planes, scanner, volumes
+from mphdrr.addon.pictures import planes
+from mphdrr.addon.scanner import cameras, grabbing, live_scanner, scanner
+from mphdrr.addon.volumes import volumes
 from mphdrr.core.geometry.grid import Grid
 from mphdrr.core.volumes.volume import Volume
 

@@ -6,7 +6,10 @@ import bpy
 import numpy as np
 import pytest
 
-from mphdrr.addon import ids, images, runs, scanner, storage
+from mphdrr.addon.blender import ids, storage
+from mphdrr.addon.pictures import images
+from mphdrr.addon.runs import runs
+from mphdrr.addon.scanner import scanner
 from mphdrr.core.geometry.system import PinholeSystem
 from mphdrr.core.runs.files import read_run
 

@@ -9,8 +9,9 @@ import bpy
 import numpy as np
 import pytest
 
-from mphdrr.addon import slices, storage, stored_volumes, volume_materials, volumes
-from mphdrr.addon.vdb import openvdb, write_vdb
+from mphdrr.addon.blender import storage
+from mphdrr.addon.volumes import slices, stored_volumes, volume_materials, volumes
+from mphdrr.addon.volumes.vdb import openvdb, write_vdb
 from mphdrr.core.errors import InputError
 from mphdrr.core.geometry.frames import euler_pose
 from mphdrr.core.geometry.grid import Grid

@@ -7,22 +7,14 @@ import bpy
 import numpy as np
 import pytest
 
-from mphdrr.addon import (
-    example,
-    ids,
-    images,
-    jobs,
-    maps,
-    phantoms,
-    planes,
-    rendering,
-    scanner,
-    scanner_files,
-    storage,
-    volume_import,
-    volumes,
-)
-from mphdrr.addon.phantom_properties import plain_settings
+from mphdrr.addon import example
+from mphdrr.addon.blender import ids, jobs, storage
+from mphdrr.addon.phantoms import phantoms
+from mphdrr.addon.phantoms.phantom_properties import plain_settings
+from mphdrr.addon.pictures import images, planes
+from mphdrr.addon.runs import rendering
+from mphdrr.addon.scanner import scanner, scanner_files
+from mphdrr.addon.volumes import maps, volume_import, volumes
 from mphdrr.core.geometry.grid import Grid
 from mphdrr.core.progress import Cancelled, StagedProgress
 from mphdrr.core.runs.recipe import Recipe

@@ -6,7 +6,9 @@ import bpy
 import numpy as np
 import pytest
 
-from mphdrr.addon import live_phantoms, phantoms, slices, storage, volumes
+from mphdrr.addon.blender import storage
+from mphdrr.addon.phantoms import live_phantoms, phantoms
+from mphdrr.addon.volumes import slices, volumes
 from mphdrr.core.errors import InputError
 
 

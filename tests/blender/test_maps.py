@@ -6,7 +6,9 @@ import bpy
 import numpy as np
 import pytest
 
-from mphdrr.addon import jobs, maps, scanner, volumes
+from mphdrr.addon.blender import jobs
+from mphdrr.addon.scanner import scanner
+from mphdrr.addon.volumes import maps, volumes
 from mphdrr.core.geometry.grid import Grid
 from mphdrr.core.physics.maps import sensitivity_map
 from mphdrr.core.physics.performance import sensitivity

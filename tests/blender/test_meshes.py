@@ -8,7 +8,7 @@ import bpy
 import numpy as np
 import pytest
 
-from mphdrr.addon import volumes
+from mphdrr.addon.volumes import volumes
 
 
 def select(*items):

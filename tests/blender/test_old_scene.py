@@ -9,7 +9,10 @@ import bpy
 import numpy as np
 import pytest
 
-from mphdrr.addon import images, scanner, storage, volumes
+from mphdrr.addon.blender import storage
+from mphdrr.addon.pictures import images
+from mphdrr.addon.scanner import scanner
+from mphdrr.addon.volumes import volumes
 from mphdrr.core.runs.files import read_run
 
 DATA = Path(__file__).parent / "data"

@@ -9,7 +9,8 @@ import blf
 import bpy
 import pytest
 
-from mphdrr.addon import registration, scanner
+from mphdrr.addon import registration
+from mphdrr.addon.scanner import scanner
 
 PANELS = [cls for cls in registration.CLASSES if issubclass(cls, bpy.types.Panel)]
 

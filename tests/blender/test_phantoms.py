@@ -10,7 +10,10 @@ import numpy as np
 import pytest
 from mathutils import Matrix
 
-from mphdrr.addon import cameras, jobs, phantom_properties, phantoms, volumes
+from mphdrr.addon.blender import jobs
+from mphdrr.addon.phantoms import phantom_properties, phantoms
+from mphdrr.addon.scanner import cameras
+from mphdrr.addon.volumes import volumes
 from mphdrr.core.errors import InputError
 from mphdrr.core.geometry.frames import euler_pose
 from mphdrr.core.geometry.grid import Grid

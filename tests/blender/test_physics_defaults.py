@@ -10,8 +10,10 @@ import bpy
 import numpy as np
 import pytest
 
-from mphdrr.addon import rendering, runs, scanner, volumes
-from mphdrr.addon.projection_properties import PROPERTIES, USUAL_TIME, _volume_chosen, recipe_values
+from mphdrr.addon.runs import rendering, runs
+from mphdrr.addon.runs.projection_properties import PROPERTIES, USUAL_TIME, _volume_chosen, recipe_values
+from mphdrr.addon.scanner import scanner
+from mphdrr.addon.volumes import volumes
 from mphdrr.core.geometry.grid import Grid
 from mphdrr.core.runs.presets import PRESETS
 from mphdrr.core.runs.recipe import Recipe, write_recipe

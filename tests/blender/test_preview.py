@@ -7,7 +7,10 @@ import numpy as np
 import pytest
 from mathutils import Vector
 
-from mphdrr.addon import phantoms, preview, scanner, selection, volumes
+from mphdrr.addon.phantoms import phantoms
+from mphdrr.addon.runs import preview
+from mphdrr.addon.scanner import scanner, selection
+from mphdrr.addon.volumes import volumes
 from mphdrr.core.errors import InputError
 from mphdrr.core.geometry.grid import Grid
 from mphdrr.core.projector import Emission, Projector

@@ -13,8 +13,11 @@ import bpy
 import numpy as np
 import pytest
 
-from mphdrr.addon import ids, images, jobs, scanner, storage, volumes
-from mphdrr.addon.projection_properties import PROPERTIES, ProjectionSettings
+from mphdrr.addon.blender import ids, jobs, storage
+from mphdrr.addon.pictures import images
+from mphdrr.addon.runs.projection_properties import PROPERTIES, ProjectionSettings
+from mphdrr.addon.scanner import scanner
+from mphdrr.addon.volumes import volumes
 from mphdrr.core import memory
 from mphdrr.core.errors import InputError
 from mphdrr.core.geometry.grid import Grid

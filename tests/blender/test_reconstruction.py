@@ -10,8 +10,12 @@ import numpy as np
 import pytest
 
 import mphdrr.core as mph
-from mphdrr.addon import ids, jobs, plots, reconstructions, registration, scanner, storage, volumes
-from mphdrr.addon.reconstruction_properties import PROPERTIES, drawn, settings_recipe
+from mphdrr.addon import registration
+from mphdrr.addon.blender import ids, jobs, plots, storage
+from mphdrr.addon.reconstruction import reconstructions
+from mphdrr.addon.reconstruction.reconstruction_properties import PROPERTIES, drawn, settings_recipe
+from mphdrr.addon.scanner import scanner
+from mphdrr.addon.volumes import volumes
 from mphdrr.core.progress import Cancelled
 from mphdrr.core.runs.files import read_run
 from mphdrr.core.runs.run_recipe import truth_of_run

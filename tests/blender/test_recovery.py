@@ -8,7 +8,10 @@ import bpy
 import numpy as np
 import pytest
 
-from mphdrr.addon import jobs, phantom_properties, phantoms, recovery, storage, volumes
+from mphdrr.addon import recovery
+from mphdrr.addon.blender import jobs, storage
+from mphdrr.addon.phantoms import phantom_properties, phantoms
+from mphdrr.addon.volumes import volumes
 from mphdrr.core.geometry.grid import Grid
 from mphdrr.core.volumes.volume import Volume
 

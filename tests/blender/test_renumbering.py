@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import mphdrr.core as mph
-from mphdrr.addon import module_edits, scanner
+from mphdrr.addon.scanner import module_edits, scanner
 from mphdrr.core.geometry.system import PinholeSystem
 
 

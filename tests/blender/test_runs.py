@@ -10,7 +10,12 @@ import bpy
 import numpy as np
 import pytest
 
-from mphdrr.addon import ids, images, planes, registration, rendering, runs, scanner, storage, volumes
+from mphdrr.addon import registration
+from mphdrr.addon.blender import ids, storage
+from mphdrr.addon.pictures import images, planes
+from mphdrr.addon.runs import rendering, runs
+from mphdrr.addon.scanner import scanner
+from mphdrr.addon.volumes import volumes
 from mphdrr.core.geometry.grid import Grid
 from mphdrr.core.runs.comparing import difference
 from mphdrr.core.runs.files import read_run, write_run

@@ -11,7 +11,8 @@ import bpy
 import numpy as np
 import pytest
 
-from mphdrr.addon import cameras, registration, scanner
+from mphdrr.addon import registration
+from mphdrr.addon.scanner import cameras, scanner
 from mphdrr.core.errors import InputError, InputWarning
 from mphdrr.core.geometry.collimator import Construction
 from mphdrr.core.geometry.system import LENGTHS, PinholeSystem

@@ -6,7 +6,7 @@ import bpy
 import numpy as np
 import pytest
 
-from mphdrr.addon import scanner
+from mphdrr.addon.scanner import scanner
 from mphdrr.core.errors import InputError
 from mphdrr.core.geometry.collimator import Collimator, Construction
 from mphdrr.core.geometry.module_parts import check_watertight, collimator_solid, crystal_solid

@@ -9,8 +9,8 @@ import bpy
 import numpy as np
 import pytest
 
-from mphdrr.addon import scanner
-from mphdrr.addon.reports import warnings_reported
+from mphdrr.addon.blender.reports import warnings_reported
+from mphdrr.addon.scanner import scanner
 from mphdrr.core.errors import InputWarning
 
 

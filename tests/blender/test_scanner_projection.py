@@ -9,7 +9,7 @@ import pytest
 from bpy_extras.object_utils import world_to_camera_view
 from mathutils import Vector
 
-from mphdrr.addon import scanner
+from mphdrr.addon.scanner import scanner
 from mphdrr.core.geometry.collimator import Construction
 from mphdrr.core.geometry.system import PinholeSystem
 from mphdrr.core.geometry.views import Views

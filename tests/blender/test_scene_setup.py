@@ -6,7 +6,9 @@ import pytest
 from bpy_extras.object_utils import world_to_camera_view
 from mathutils import Vector
 
-from mphdrr.addon import framing, planes, scanner, sight_lines, volumes
+from mphdrr.addon.pictures import planes
+from mphdrr.addon.scanner import framing, scanner, sight_lines
+from mphdrr.addon.volumes import volumes
 from mphdrr.core.geometry.grid import Grid
 from mphdrr.core.volumes.volume import Volume
 

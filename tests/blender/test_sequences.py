@@ -8,9 +8,12 @@ import bpy
 import numpy as np
 import pytest
 
-from mphdrr.addon import phantoms, scanner, storage, volumes
-from mphdrr.addon.phantom_properties import plain_settings
-from mphdrr.addon.stored_volumes import store_volume
+from mphdrr.addon.blender import storage
+from mphdrr.addon.phantoms import phantoms
+from mphdrr.addon.phantoms.phantom_properties import plain_settings
+from mphdrr.addon.scanner import scanner
+from mphdrr.addon.volumes import volumes
+from mphdrr.addon.volumes.stored_volumes import store_volume
 from mphdrr.core.geometry.grid import Grid
 from mphdrr.core.phantoms.torso import CardiacTorso
 from mphdrr.core.projector import Projector

@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 from mathutils import Vector
 
-from mphdrr.addon import ids, scanner, studio
+from mphdrr.addon.blender import ids
+from mphdrr.addon.figures import studio
+from mphdrr.addon.scanner import scanner
 
 
 def studios(scene) -> list[bpy.types.Collection]:

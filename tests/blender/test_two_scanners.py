@@ -6,7 +6,10 @@ import bpy
 import numpy as np
 import pytest
 
-from mphdrr.addon import ids, images, planes, scanner, selection, tiles, volumes
+from mphdrr.addon.blender import ids
+from mphdrr.addon.pictures import images, planes, tiles
+from mphdrr.addon.scanner import scanner, selection
+from mphdrr.addon.volumes import volumes
 from mphdrr.core.errors import InputError
 from mphdrr.core.geometry.grid import Grid
 from mphdrr.core.volumes.volume import Volume

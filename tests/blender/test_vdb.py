@@ -8,8 +8,9 @@ import bpy
 import numpy as np
 import pytest
 
-from mphdrr.addon import compat, volumes
-from mphdrr.addon.vdb import openvdb, read_vdb, write_vdb
+from mphdrr.addon.blender import compat
+from mphdrr.addon.volumes import volumes
+from mphdrr.addon.volumes.vdb import openvdb, read_vdb, write_vdb
 from mphdrr.core.errors import InputError
 from mphdrr.core.geometry.frames import euler_pose
 from mphdrr.core.geometry.grid import Grid

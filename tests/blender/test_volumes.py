@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from mathutils import Matrix
 
-from mphdrr.addon import compat, looks, storage, stored_volumes, volume_materials, volumes
+from mphdrr.addon.blender import compat, storage
+from mphdrr.addon.volumes import looks, stored_volumes, volume_materials, volumes
 from mphdrr.core.errors import InputError
 from mphdrr.core.geometry.frames import euler_pose
 from mphdrr.core.geometry.grid import Grid

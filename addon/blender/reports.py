@@ -1,0 +1,62 @@
+"""What core says to the user, as Blender's reports."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import bpy
+
+from ...core.errors import InputError
+from ...core.recording import recorded_warnings
+
+_MOST = 5  # nobody reads more lines than that
+
+Need = tuple[Callable[[bpy.types.Context], Any], str]
+"""What an operator needs of the context, and the tooltip's words where that is not so."""
+
+
+@contextmanager
+def warnings_reported(operator: bpy.types.Operator) -> Iterator[None]:
+    """Report every `InputWarning` of the block as {'WARNING'}, even if it raises; others pass through."""
+    with recorded_warnings() as caught:
+        try:
+            yield
+        finally:
+            for text in caught[:_MOST]:
+                operator.report({"WARNING"}, text)
+            if len(caught) > _MOST:
+                operator.report({"WARNING"}, f"... and {len(caught) - _MOST} more warnings of this kind")
+
+
+def needs(*every: Need) -> Any:
+    """The `poll` of an operator: whether every need is met; the tooltip shows the first that is not."""
+
+    def poll(operator: type[bpy.types.Operator], context: bpy.types.Context) -> bool:
+        unmet = next((text for is_met, text in every if not is_met(context)), None)
+        if unmet is not None:
+            operator.poll_message_set(unmet)
+        return unmet is None
+
+    return classmethod(poll)
+
+
+class Reported:
+    """Mix into an operator that does `act`, and reports the line that this returns, or what it raises."""
+
+    bl_options = {"REGISTER", "UNDO"}
+
+    def execute(self: Any, context: bpy.types.Context) -> set[str]:
+        """Act and report."""
+        return run_reported(self, lambda: self.act(context))
+
+
+def run_reported(operator: bpy.types.Operator, action: Callable[[], str]) -> set[str]:
+    """Run an operator's work; report its warnings, and the line that it returns or an `InputError` as {'ERROR'}."""
+    try:
+        with warnings_reported(operator):
+            text = action()
+    except (InputError, MemoryError) as error:
+        operator.report({"ERROR"}, str(error) or "not enough memory")
+        return {"CANCELLED"}
+    operator.report({"INFO"}, text)
+    return {"FINISHED"}

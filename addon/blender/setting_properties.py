@@ -1,0 +1,136 @@
+"""Blender properties made from the settings of `core.runs.settings`, and the values of recipes that they say."""
+
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
+
+from bpy.props import BoolProperty, EnumProperty, FloatProperty, FloatVectorProperty, IntProperty
+
+from ...core.errors import InputError
+from ...core.runs.recipe import is_met
+from ...core.runs.settings import Setting
+from . import choices
+from .decimals import typed
+
+Settings = Mapping[str, Setting]
+"""Settings by the names of their properties. A coefficient has a second property, of its material."""
+
+_NUMBERS = {
+    "model": choices.MODELS,
+    "isotope": choices.ISOTOPES,
+    "aperture_material": choices.APERTURES,
+    "edge": choices.EDGES,
+    "crystal_material": choices.CRYSTALS,
+    "detector": choices.DETECTORS,
+    "backend": choices.BACKENDS,
+}
+
+
+def material_of(name: str, setting: Setting) -> str | None:
+    """The property of a coefficient's material; None for other settings."""
+    return name.replace("_mu", "_material") if setting.kind is float and setting.words else None
+
+
+def identifier(name: str, word: str) -> str:
+    """How an enumeration calls a word: isotopes and materials by their names, others in capitals."""
+    return word if name == "isotope" or name.endswith("_material") else word.upper().replace("-", "_")
+
+
+def properties_of(settings: Settings) -> dict[str, Any]:
+    """The properties, annotations of a class, of settings."""
+    made: dict[str, Any] = {}
+    for name, setting in settings.items():
+        absent = f"; 0: {setting.absent}" if setting.default is None else ""
+        common: dict[str, Any] = {"name": setting.label, "description": setting.text + absent}
+        if setting.kind in (int, float):
+            least = setting.least if setting.above is None else 1e-6
+            limits = {"min": 0 if setting.default is None else least, "max": setting.most, "soft_max": setting.slider}
+            limits["precision"] = 3 if setting.kind is float else None
+            common |= {key: value for key, value in limits.items() if value is not None}
+        material = material_of(name, setting)
+        if material is not None:
+            none = ("NUMBER", "By Coefficient", f"By its attenuation coefficient{absent}")
+            made[material] = _enumeration(material, setting, none)
+            common["name"] = f"µ ({setting.unit})"  # below the material's menu
+        if setting.kind is bool:
+            made[name] = BoolProperty(name=setting.label, description=setting.text, default=setting.default)
+        elif setting.kind is str:
+            absent_item = ("NONE", "None", setting.absent.capitalize()) if setting.default is None else None
+            made[name] = _enumeration(name, setting, absent_item)
+        elif _is_vector(setting):
+            made[name] = FloatVectorProperty(size=setting.sizes[0], default=(0.0,) * setting.sizes[0], **common)  # type: ignore[index]
+        else:
+            make: Callable[..., Any] = IntProperty if setting.kind is int else FloatProperty
+            default = setting.default[0] if isinstance(setting.default, tuple) else setting.default or 0
+            made[name] = make(default=default, **common)
+    return made
+
+
+def values_of(settings: Settings, get: Callable[[str], Any]) -> dict[str, Any]:
+    """The values of the settings by their keys in a recipe, None for none; `get` gives a property's."""
+    values: dict[str, Any] = {}
+    for name, setting in settings.items():
+        material = material_of(name, setting)
+        value = get(name)
+        if material is not None and get(material) != "NUMBER":
+            name, value = material, get(material)
+        if isinstance(value, str):
+            words = {identifier(name, word): word for word in setting.words} | {"NONE": None}
+            if value not in words:
+                raise InputError(f"{setting.label}: {value!r} is not known to this version; choose another")
+            values[setting.key] = words[value]
+        elif _is_vector(setting):
+            values[setting.key] = tuple(map(typed, value)) if any(value) else None
+        else:
+            number = typed(value) if isinstance(value, float) else value
+            values[setting.key] = number if number or setting.default is not None else None
+    return values
+
+
+def drawn_of(
+    settings: Settings, owner: Any, is_hidden: Callable[[str], bool], table: str = ""
+) -> Iterator[tuple[str, bool]]:
+    """The properties of an owner to draw, of all tables or one, each with whether it has an effect beside the others.
+
+    Those of whose unmet conditions one `is_hidden` are left out.
+    """
+    try:
+        known = values_of(settings, lambda name: getattr(owner, name))
+    except InputError:  # a choice of a later version, which work refuses
+        known = {}
+    values = {key: value for key, value in known.items() if value is not None}
+    for name, setting in settings.items():
+        if table and not setting.key.startswith(f"{table}."):
+            continue
+        unmet = [need for need in setting.needs if not is_met(values, need)]
+        if any(map(is_hidden, unmet)):
+            continue
+        material = material_of(name, setting)
+        if material is not None:
+            yield material, not unmet
+        if material is None or getattr(owner, material) == "NUMBER":
+            yield name, not unmet
+
+
+def set_property(owner: Any, settings: Settings, name: str, value: Any) -> None:
+    """Set a property to a value of a recipe; None and "auto" are its default."""
+    setting = settings[name]
+    material = material_of(name, setting)
+    for own in filter(None, (name, material)):
+        owner.property_unset(own)
+    if isinstance(value, str) and value != "auto":
+        own = material or name
+        setattr(owner, own, identifier(own, value))
+    elif value not in (None, "auto"):
+        setattr(owner, name, value)
+
+
+def _is_vector(setting: Setting) -> bool:
+    """Whether it has several values; of one that may have one for all, the property is that one."""
+    return bool(setting.sizes) and 1 not in setting.sizes  # type: ignore[operator]
+
+
+def _enumeration(name: str, setting: Setting, none: tuple[str, str, str] | None) -> Any:
+    words = [(identifier(name, word), label, text) for word, (label, text) in setting.words.items()]
+    items = choices.items(_NUMBERS.get(name, {}), ([none] if none else []) + words)
+    default = none[0] if none else identifier(name, setting.default)
+    return EnumProperty(name=setting.label, description=setting.text, items=items, default=default)

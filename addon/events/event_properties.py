@@ -1,0 +1,63 @@
+"""The Event Set panel's settings: `Scene.mphdrr_events`."""
+
+from typing import Any
+
+import bpy
+from bpy.props import IntProperty, PointerProperty, StringProperty
+
+from ..volumes import volumes
+from . import event_notes
+
+
+def _models(self: bpy.types.PropertyGroup, context: bpy.types.Context, typed: str) -> list[str]:
+    return [name for name in event_notes.models(self.folder) if typed.lower() in name.lower()]
+
+
+RECIPE = StringProperty(
+    name="Recipe", description="Text (.toml) that says from which phantoms, poses and models events are drawn",
+    subtype="FILE_PATH", options={"SKIP_SAVE", "PATH_SUPPORTS_BLEND_RELATIVE"},
+)  # fmt: skip
+FOLDER = StringProperty(
+    name="Folder", description="Of the event set: its recipe, its index and a file for each event", subtype="DIR_PATH",
+    options={"SKIP_SAVE", "PATH_SUPPORTS_BLEND_RELATIVE"},
+)  # fmt: skip
+COUNT = IntProperty(
+    name="Events", description="Of the whole set, numbered from 0; those that are there stay as they are", default=10,
+    min=1, soft_max=10000, options={"SKIP_SAVE"},
+)  # fmt: skip
+MODEL = StringProperty(
+    name="Model", description="Whose projections are shown; empty: the recipe's first", search=_models,
+    search_options={"SUGGESTION"}, options={"SKIP_SAVE"},
+)  # fmt: skip
+
+
+def number(description: str) -> Any:
+    """A property for an event's number."""
+    return IntProperty(name="Event", description=description, min=0, soft_max=10000, options={"SKIP_SAVE"})
+
+
+NEXT = number("Number of the event that is tried next: its draws depend on it and on the recipe alone")
+OPENED = number("Number of the event to open, from 0")
+
+
+class EventProperties(bpy.types.PropertyGroup):
+    """State of the Event Set panel."""
+
+    recipe: RECIPE  # type: ignore[valid-type]
+    number: NEXT  # type: ignore[valid-type]
+    folder: FOLDER  # type: ignore[valid-type]
+    count: COUNT  # type: ignore[valid-type]
+    opened: OPENED  # type: ignore[valid-type]
+    model: MODEL  # type: ignore[valid-type]
+    phantom: PointerProperty(
+        name="Phantom", description="That events are tried on", type=bpy.types.Object,
+        poll=lambda self, item: volumes.is_volume(item), options={"HIDDEN"},
+    )  # fmt: skip
+    truth: PointerProperty(
+        name="Truth", description="Of the event that was opened last", type=bpy.types.Object,
+        poll=lambda self, item: volumes.is_volume(item), options={"HIDDEN"},
+    )  # fmt: skip
+    tried: StringProperty(name="Tried", description="What the phantom in the scene is", options={"HIDDEN"})
+
+
+CLASSES = (EventProperties,)

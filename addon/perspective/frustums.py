@@ -1,0 +1,344 @@
+"""Volumes as a module sees them, in its own coordinates: a frustum of pictures in the scene, or back on their own voxels.
+
+A frustum is a mesh of lines, a child of its module's camera, and an image empty for each layer of depth, its children, in a
+collection of their own. Layers are as far from the pinhole, and as large, as what they show: seen from the pinhole, they
+lie on one another. They go with the module; what they show was true when they were made, and `changes` says what is not.
+"""
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import bpy
+import numpy as np
+from mathutils import Matrix
+from numpy.typing import NDArray
+
+from ...core.errors import InputError
+from ...core.geometry.views import Views
+from ...core.memory import require
+from ...core.perspective.perspective_grid import PerspectiveGrid
+from ...core.perspective.resampling import from_perspective, to_perspective
+from ...core.progress import Progress, stages_of, tell
+from ...core.runs.mosaic import as_seen, png
+from ...core.runs.run_recipe import recipe_views
+from ...core.volumes.volume import Volume, outside_value
+from ..blender import ids, jobs, storage
+from ..phantoms import phantoms
+from ..runs import runs
+from ..scanner import cameras, selection
+from ..scanner.module_values import module_numbers, system_of
+from ..volumes import slices, volume_materials, volumes
+from ..volumes.stored_volumes import StoredVolume, store_volume
+
+_KEY = "mphdrr_frustum"  # custom property of the lines: what the frustum was made of, JSON
+_NEAREST = 0.1  # of the pinhole's distance from the isocentre: where layers begin at the nearest
+_BYTES = 24.0  # a pixel of a layer: its number, its colours and Blender's copies
+_PNG_LEVEL = 1  # fast
+_OPACITY_POWER = 0.5  # of the relative value: layers are thick, and what is thin in them would hardly be seen
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class _Request:
+    """What is asked for: a volume in a module's coordinates."""
+
+    item: int  # session_uid of the volume's object
+    camera: int  # and of the module's camera
+    name: str
+    module: str
+    read: Callable[[], Volume]
+    views: Views  # of this module alone
+    nearest: float  # depth, mm, at which cells may begin
+    state: dict[str, Any]
+
+
+def showing(context: bpy.types.Context, planes: int, uniform: str) -> jobs.Job:
+    """The job that shows the active volume as a frustum of the active module, in place of the one that it has.
+
+    Raises InputError where there is no volume or module, the volume is not in front of the pinhole, or memory does not
+    suffice.
+    """
+    asked = _request(context)
+    low, high = _display_range(context.object)
+    quantity, scene_uid = asked.state["quantity"], context.scene.session_uid
+    rows, columns = asked.views.shape
+    require(_BYTES * planes * rows * columns, f"{planes} pictures of {columns} x {rows} pixels")
+
+    def work(progress: Progress) -> tuple[PerspectiveGrid, list[bytes]]:
+        stages = stages_of(progress)
+        stages("reading the voxels")
+        volume = asked.read()
+        g = _grid(asked, volume, planes, uniform)
+        array = in_perspective(volume, g, stages("following the rays"))
+        packing, files = stages("packing"), list[bytes]()
+        for layer in np.moveaxis(array, 2, 0):
+            files.append(png(colored(as_seen(layer.T), quantity, low, high), _PNG_LEVEL))
+            tell(packing, len(files), planes)
+        return g, files
+
+    def finish(made: tuple[PerspectiveGrid, list[bytes]]) -> str:
+        scene, camera = jobs.found_again(bpy.data.scenes, scene_uid), jobs.found_again(bpy.data.objects, asked.camera)
+        if scene is None or camera is None:
+            raise InputError(f"{asked.module} is gone")
+        g, files = made
+        remove(scene, [camera])
+        _build(scene, camera, asked, g, files)
+        near, far = g.depths[[0, -1]]
+        words = f"{near:.4g} to {far:.4g} mm" if planes > 1 else f"{near:.4g} mm"
+        return f"{asked.name!r} as {asked.module} sees it: {planes} layers, {words} from the pinhole"
+
+    return jobs.Job(f"{asked.name} in perspective", work, finish)
+
+
+def resampling(context: bpy.types.Context, cells: int, uniform: str) -> jobs.Job:
+    """The job that takes the active volume through the cells of the active module and back, as a new volume of the scene.
+
+    Raises InputError as `showing`.
+    """
+    asked, folder = _request(context), storage.folder()
+    pose, shown = volumes.pose_of_object(context.object), _shown_range(context.object)
+    collection = context.object.users_collection[0]
+    collection_uid = collection.session_uid
+    rows, columns = asked.views.shape
+    voxels = float(np.prod(context.object.mphdrr_volume.shape))
+    require(8.0 * cells * rows * columns + 8.0 * voxels, f"{columns} x {rows} x {cells} cells")
+    provenance = {"volume": asked.name, "through": asked.module, "cells": [columns, rows, cells], "evenly_in": uniform}
+
+    def work(progress: Progress) -> StoredVolume:
+        stages = stages_of(progress)
+        stages("reading the voxels")
+        volume = asked.read()
+        g = _grid(asked, volume, cells, uniform)
+        array = in_perspective(volume, g, stages("following the rays"))
+        found = on_voxels(array, g, volume, stages("back on voxels"))
+        stages("writing the voxels")
+        return store_volume(found, folder, pose, provenance)
+
+    def finish(stored: StoredVolume) -> str:
+        home = jobs.found_again(bpy.data.collections, collection_uid)
+        item = volumes.add_stored(stored, f"{asked.name} through {asked.module}", home)
+        item.mphdrr_volume.display_low, item.mphdrr_volume.display_high = shown
+        volumes.make_active(bpy.context, item)
+        _, factor = volume_materials.shown_unit(stored.volume.quantity)
+        values = f"{factor * stored.low:.4g} to {factor * stored.high:.4g} {item.mphdrr_volume.unit}".removesuffix(" 1")
+        return f"Added {item.name!r}: {values}"
+
+    return jobs.Job(f"{asked.name} through {asked.module}", work, finish)
+
+
+def in_perspective(volume: Volume, g: PerspectiveGrid, progress: Progress | None = None) -> NDArray[np.float32]:
+    """`to_perspective`, keeping density, of a volume of any quantity; outside its grid CT numbers are those of air."""
+    outside = outside_value(volume)
+    array = volume.array - np.float32(outside) if outside else volume.array
+    found = np.asarray(to_perspective(array, g, grid=volume.grid, progress=progress))
+    return found + np.float32(outside) if outside else found
+
+
+def on_voxels(array: NDArray[np.float32], g: PerspectiveGrid, like: Volume, progress: Progress | None = None) -> Volume:
+    """The way back from `in_perspective`: `from_perspective`, keeping density, on the voxels of `like`."""
+    outside = np.float32(outside_value(like))
+    found = np.asarray(from_perspective(array - outside, g, like.grid, progress=progress))
+    return Volume(found + outside, like.grid, like.quantity)
+
+
+def colored(values: NDArray[np.float32], quantity: str, low: float, high: float) -> NDArray[np.uint8]:
+    """Colours (…, 4) of values, those of slices; the lower a value in the display range, the more transparent."""
+    relative = np.clip((values - low) / max(high - low, 1e-30), 0.0, 1.0)
+    colors = np.rint(255 * slices.colors(quantity)[:, :3]).astype(np.uint8)
+    shown = np.empty((*values.shape, 4), np.uint8)
+    shown[..., :3] = colors[np.rint(relative * (len(colors) - 1)).astype(np.intp)]
+    shown[..., 3] = np.rint(255 * relative**_OPACITY_POWER)
+    return shown
+
+
+def frustums(scene: bpy.types.Scene) -> list[bpy.types.Object]:
+    """The frustums in the scene: their lines, which have the layers as children."""
+    return sorted((o for home in _homes(scene) for o in home.objects if _KEY in o), key=lambda o: o.name)
+
+
+def layers(frustum: bpy.types.Object) -> list[bpy.types.Object]:
+    """A frustum's layers, from the pinhole outwards."""
+    return sorted(frustum.children, key=lambda layer: layer.name)
+
+
+def volume_of(frustum: bpy.types.Object) -> str:
+    """The name that the volume had of which a frustum was made."""
+    return str(json.loads(frustum[_KEY])["volume"])
+
+
+def changes(scene: bpy.types.Scene, frustum: bpy.types.Object) -> str:
+    """What is not any more as it was when a frustum was made, in words; "" where all is."""
+    was, camera = json.loads(frustum[_KEY]), frustum.parent
+    if camera is None:
+        return "its module is gone"
+    item = scene.objects.get(was["volume"])
+    if not volumes.is_volume(item):
+        return f"{was['volume']} is gone"
+    try:
+        now = _state(scene, item, camera)
+    except InputError as error:
+        return str(error)
+    words = {"voxels": "voxels", "pose": "place", "colors": "colours"}
+    found = [text for key, text in words.items() if now[key] != was[key]]
+    text = [f"other {' and '.join(found)} of {was['volume']}"] if found else []
+    if now["views"] != was["views"]:
+        text.append(f"{camera.name} has moved, or has other pixels")
+    return "; ".join(text)
+
+
+def seen_volumes(scene: bpy.types.Scene) -> list[bpy.types.Object]:
+    """The volumes of frustums that are seen, where these have the colours that the volumes have now."""
+    found = []
+    for frustum in frustums(scene):
+        was, item = json.loads(frustum[_KEY]), scene.objects.get(volume_of(frustum))
+        if frustum.visible_get() and volumes.is_volume(item) and was["colors"] == list(_shown_range(item)):
+            found.append(item)
+    return found
+
+
+def remove(scene: bpy.types.Scene, modules: list[bpy.types.Object] | None = None) -> int:
+    """Remove the frustums of modules (their cameras), or of all, with what belongs to them; returns how many."""
+    found = [frustum for frustum in frustums(scene) if modules is None or frustum.parent in modules]
+    for frustum in found:
+        cameras.remove_objects([*frustum.children, frustum])
+    for home in _homes(scene):
+        if not home.all_objects:
+            bpy.data.collections.remove(home)
+    return len(found)
+
+
+@bpy.app.handlers.persistent
+def after_update(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
+    """Modules were shown, hidden or deleted: their frustums, too."""
+    if not depsgraph.id_type_updated("SCENE") or scene != bpy.context.scene:
+        return
+    for frustum in frustums(scene):
+        hidden = frustum.parent is None or frustum.parent.hide_viewport
+        for item in (frustum, *frustum.children):
+            if item.hide_viewport != hidden:  # writing the same value would make Blender evaluate it again
+                item.hide_viewport = hidden
+
+
+def _request(context: bpy.types.Context) -> _Request:
+    item, camera = context.object, selection.active_module(context)
+    volumes.require_volume(item)
+    if camera is None:
+        raise InputError("no module is active: select its camera, or choose it in the Modules panel")
+    phantoms.require_current(item)
+    views, read = _views(context.scene, camera), volumes.reader(item)
+    nearest = _NEAREST * float(np.linalg.norm(views.sources[0]))
+    state = _state(context.scene, item, camera)
+    return _Request(item.session_uid, camera.session_uid, item.name, camera.name, read, views, nearest, state)
+
+
+def _views(scene: bpy.types.Scene, camera: bpy.types.Object) -> Views:
+    """The view of one module, with the pixels that the Projections panel asks for."""
+    return recipe_views(runs.panel_recipe(scene), system_of([module_numbers(camera)]))
+
+
+def _state(scene: bpy.types.Scene, item: bpy.types.Object, camera: bpy.types.Object) -> dict[str, Any]:
+    """What a frustum shows, as JSON holds it."""
+    path, pose = volumes.source(item)
+    views = _views(scene, camera)
+    arrays = views.sources, views.detector_centers, views.u_steps, views.v_steps
+    return {
+        "volume": item.name, "quantity": volumes.quantity_of(item), "voxels": Path(path).name, "pose": pose.tolist(),
+        "colors": list(_shown_range(item)),
+        "views": [list(views.shape), *(array[0].tolist() for array in arrays)],
+    }  # fmt: skip
+
+
+def _shown_range(item: bpy.types.Object) -> tuple[float, float]:
+    return item.mphdrr_volume.display_low, item.mphdrr_volume.display_high
+
+
+def _display_range(item: bpy.types.Object) -> tuple[float, float]:
+    """The values, in the voxels' own unit, that have the first and the last colour."""
+    factor = volume_materials.shown_unit(volumes.quantity_of(item))[1]
+    low, high = _shown_range(item)
+    return low / factor, high / factor
+
+
+def _grid(asked: _Request, volume: Volume, layers: int, uniform: str) -> PerspectiveGrid:
+    """The module's cells from where the volume begins, or at least is not too close to the pinhole, to where it ends."""
+    begin, end = _depths(asked.views, volume)
+    near = max(begin, asked.nearest)
+    if not near < end:
+        raise InputError(f"{asked.name!r} is not in front of the pinhole of {asked.module}")
+    return PerspectiveGrid(asked.views, 0, layers, near, end, uniform.lower())
+
+
+def _depths(views: Views, volume: Volume) -> tuple[float, float]:
+    """Between which depths a volume's voxels are that are not empty, or all of them if none is; mm."""
+    normal = np.cross(views.u_steps[0], views.v_steps[0])
+    normal *= np.sign(normal @ (views.detector_centers[0] - views.sources[0])) / np.linalg.norm(normal)
+    per_step, grid = normal @ volume.grid.affine[:3, :3], volume.grid
+    filled = volume.array != outside_value(volume)
+    if not filled.any():
+        filled = np.ones(grid.shape, bool)
+    across = per_step[1] * np.arange(grid.shape[1])[:, None] + per_step[2] * np.arange(grid.shape[2])
+    planes = ((n, across[plane]) for n, plane in enumerate(filled) if plane.any())  # one by one, in little memory
+    ends = np.array([[n * per_step[0] + found.min(), n * per_step[0] + found.max()] for n, found in planes])
+    first = float(normal @ (grid.affine[:3, 3] - views.sources[0]))
+    half = 0.5 * float(np.abs(per_step).sum())
+    return first + float(ends.min()) - half, first + float(ends.max()) + half
+
+
+def _build(
+    scene: bpy.types.Scene, camera: bpy.types.Object, asked: _Request, g: PerspectiveGrid, files: list[bytes]
+) -> None:
+    """Put a frustum into the scene: lines around the layers and from the pinhole, and a picture for each layer."""
+    home = next(iter(_homes(scene)), None)
+    if home is None:
+        home = bpy.data.collections.new(ids.PERSPECTIVES)
+        scene.collection.children.link(home)
+    to_camera = np.linalg.inv(cameras.world_matrix(camera))
+    corners = _corners(g) @ to_camera[:3, :3].T + to_camera[:3, 3]  # (n_k, 4, 3)
+    name = ids.part_name(camera.name, "perspective")
+    frustum = bpy.data.objects.new(name, _lines(name, corners))
+    frustum[_KEY] = json.dumps(asked.state)
+    frustum.parent, frustum.hide_select, frustum.hide_render = camera, True, True
+    frustum.lock_location = frustum.lock_rotation = frustum.lock_scale = (True, True, True)
+    home.objects.link(frustum)
+    n_v, n_u = g.views.shape
+    digits = len(str(len(files)))
+    for n, (file, (origin, along_u, _, along_v)) in enumerate(zip(files, corners, strict=True), start=1):
+        text = f"{name} layer {n:0{digits}d}"
+        picture = bpy.data.images.new(text, 1, 1, alpha=True)
+        picture.pack(data=file, data_len=len(file))
+        picture.source = "FILE"
+        layer = bpy.data.objects.new(text, None)
+        layer.empty_display_type, layer.data, layer.use_empty_image_alpha = "IMAGE", picture, True
+        layer.empty_image_side, layer.empty_display_size = "DOUBLE_SIDED", max(n_u, n_v)
+        across, up = origin - along_u, along_v - origin  # a picture's columns go against u, as the pinhole sees it
+        matrix = np.eye(4)
+        matrix[:3, 0], matrix[:3, 1] = across / n_u, up / n_v
+        matrix[:3, 2] = np.cross(across, up) / np.linalg.norm(np.cross(across, up))
+        matrix[:3, 3] = (along_u + along_v) / 2
+        layer.parent, layer.hide_select, layer.matrix_basis = frustum, True, Matrix(matrix)
+        home.objects.link(layer)
+
+
+def _corners(g: PerspectiveGrid) -> Floats:
+    """World points (n_k, 4, 3), mm, around the layers' outermost pixels: from (0, 0) along u, then along v."""
+    n_u, n_v, _ = g.shape
+    pixels = np.array([[0, 0], [n_u, 0], [n_u, n_v], [0, n_v]]) - 0.5
+    return g.to_world([[[*pixel, plane] for pixel in pixels] for plane in g.planes])
+
+
+def _lines(name: str, corners: Floats) -> bpy.types.Mesh:
+    points = [[0.0, 0.0, 0.0], *corners.reshape(-1, 3).tolist()]
+    around = [(4 * n + a, 4 * n + a % 4 + 1) for n in range(len(corners)) for a in range(1, 5)]
+    last = 4 * len(corners)
+    mesh = bpy.data.meshes.new(name)
+    mesh.from_pydata(points, [*around, *((0, last - a) for a in range(4))], [])
+    return mesh
+
+
+def _homes(scene: bpy.types.Scene) -> list[bpy.types.Collection]:
+    """The collections of frustums in the scene."""
+    return [home for home in scene.collection.children if home.name.startswith(ids.PERSPECTIVES)]

@@ -1,0 +1,296 @@
+"""Phantoms in the scene: volumes that know what they were made from, and are made again when that changes.
+
+The object's matrix is the phantom's pose. The voxels are in its own frame, so that moving the object moves the phantom. A
+phantom may have children that go with it: a volume of its other quantity, and an outline.
+"""
+
+import itertools
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import bmesh
+import bpy
+import numpy as np
+from numpy.typing import NDArray
+
+from ...core.errors import InputError
+from ...core.geometry.grid import Grid, grid_around
+from ...core.memory import require
+from ...core.phantoms.phantom import Phantom
+from ...core.progress import Progress, part_of, stages_of
+from ...core.volumes.meshes.mesh import Mesh
+from ..blender import jobs, storage
+from ..blender.reports import Need
+from ..scanner.cameras import remove_objects, set_world_matrix, world_matrix
+from ..volumes import meshes, volumes
+from ..volumes.stored_volumes import StoredVolume, moved, store_volume
+from ..volumes.vdb import provenance_of
+from .phantom_properties import FILE, PhantomSettings
+
+_OUTLINE = "mphdrr_outline"  # custom property of an outline's object
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """What a phantom's settings say, for a thread that leaves bpy alone."""
+
+    phantom: Phantom  # of one that beats, the first state
+    n_states: int  # one for each frame
+    grid: Grid  # its voxels, in its own frame
+    settings: dict[str, Any]  # as JSON can hold them
+
+    @cached_property
+    def states(self) -> Sequence[Phantom]:
+        """The phantom in each frame."""
+        phantom: Any = self.phantom
+        return (phantom,) if self.n_states == 1 else phantom.beating(self.n_states)
+
+    def voxelize(
+        self,
+        quantities: Sequence[str],
+        poses: Sequence[NDArray[np.float64]],
+        folder: Path,
+        progress: Progress | None = None,
+        baked: bool = False,
+    ) -> list[StoredVolume]:
+        """A volume of each quantity, stored in `folder`, its phantom at a world-from-phantom pose (4, 4), mm.
+
+        Its grid turns with the phantom or, if `baked`, its grid and its object are along the world's axes.
+        """
+        title, count = self.phantom.title, len(quantities) * self.n_states
+        for quantity in quantities:
+            if all(getattr(shape, quantity) is None for shape in self.phantom.shapes):
+                raise InputError(f"the {title} has no {quantity}")
+        if count > 1:
+            shape = " x ".join(map(str, self.grid.shape))
+            require(4.0 * count * self.grid.n_voxels, f"{title}: {count} volumes of {shape} voxels")
+        stages = stages_of(progress)
+        voxelizing = stages("voxelizing")
+        reports = (part_of(voxelizing, number, count) for number in range(count))
+        stored = []
+        for quantity, pose in zip(quantities, poses, strict=True):
+            if baked:
+                place = np.eye(4)
+                place[:3, 3] = pose[:3, 3]
+                # A grid along the world's axes that holds the phantom, with voxels as small as its own.
+                corners = list(itertools.product(*zip(*self.phantom.box, strict=True))) @ pose[:3, :3].T + pose[:3, 3]
+                grid = grid_around(corners, min(Grid(self.grid.shape, pose @ self.grid.affine).spacing))
+                made = [phantom.voxelize(grid, pose, next(reports), quantity) for phantom in self.states]
+                settings = self.settings | {"pose": pose.tolist()}
+            else:
+                place, settings = pose, self.settings
+                own = [phantom.voxelize(self.grid, None, next(reports), quantity) for phantom in self.states]
+                made = [moved(volume, pose) for volume in own]
+            stages("writing the voxels")
+            stored.append(store_volume(made, folder, place, settings))
+        return stored
+
+
+def recipe_of(settings: PhantomSettings) -> Recipe:
+    """What settings say; raises `InputError` where there is no such phantom."""
+    phantom = settings.phantom()
+    return Recipe(phantom, settings.n_states, settings.grid(phantom), settings.recipe())
+
+
+def settings_of(item: bpy.types.Object | None) -> Any:
+    """The settings that a volume was made from as a phantom; None where it is none."""
+    if item is None or not volumes.is_volume(item):
+        return None
+    properties = item.mphdrr_volume
+    # A kind that only a later version knows is "": its voxels stay as they are.
+    return None if properties.kind in ("VOLUME", "") else getattr(properties, properties.kind.lower())
+
+
+ACTIVE: Need = (
+    lambda context: settings_of(context.object) is not None,
+    "No phantom is active: select one that was added with its settings",
+)
+
+
+def adding(
+    settings: PhantomSettings, name: str, pose: NDArray[np.float64] | None = None, attenuation: bool = False
+) -> jobs.Job:
+    """The job that adds a phantom to the scene, of an operator's settings or `phantom_properties.plain_settings`.
+
+    The `pose` is its world-from-phantom matrix (4, 4), mm, by default the world's axes. With `attenuation`, the mu of a
+    phantom of activity is added too, as a child.
+    """
+    recipe, folder, values = recipe_of(settings), storage.folder(), settings.values()
+    kind, quantity = settings.identifier, values["quantity"]
+    quantities = ["activity", "mu"] if attenuation and quantity == "activity" else [quantity]
+    poses = [np.eye(4) if pose is None else pose] * len(quantities)
+
+    def work(progress: Progress) -> list[StoredVolume]:
+        return recipe.voxelize(quantities, poses, folder, progress)
+
+    def finish(stored: list[StoredVolume]) -> str:
+        if kind == FILE and "text" not in values:
+            values["text"] = bpy.data.texts.new(recipe.settings["file"])
+            values["text"].from_string(recipe.settings["text"])
+        collection = bpy.context.collection
+        item = volumes.add_stored(stored[0], name, collection)
+        take_settings(item, kind, values)
+        for other in stored[1:]:
+            child = volumes.add_stored(other, f"{item.name} {other.volume.quantity}", collection)
+            child.mphdrr_volume.with_parent = True
+            child.parent = item
+            child.matrix_basis.identity()
+        volumes.make_active(bpy.context, item)
+        grid = recipe.grid
+        return f"Added {item.name!r}: {grid.shape[0]}^3 voxels of {grid.spacing[0]:.3g} mm"
+
+    return jobs.Job("Making a phantom", work, finish)
+
+
+def take_settings(item: bpy.types.Object, kind: str, values: Mapping[str, Any]) -> None:
+    """Say that a volume is the phantom of a kind (`PhantomSettings.identifier`) with these settings; its voxels stay."""
+    properties = item.mphdrr_volume
+    properties.kind = "VOLUME"  # until the kind is said, no change of a setting makes the voxels again
+    for key, value in values.items():
+        setattr(getattr(properties, kind), key, value)
+    properties.kind = kind.upper()
+    properties.outdated, properties.message = False, ""
+
+
+def updating(item: bpy.types.Object, bake: bool = False) -> jobs.Job:
+    """The job that makes a phantom's voxels, and its children's, again from its settings.
+
+    With `bake`, at its pose and on a grid along the world's axes; then it is a phantom no more, but a volume like any other.
+    """
+    work, name, before = remaking(item, bake), item.name, settings_of(item).values()
+
+    def finish(stored: list[StoredVolume]) -> str:
+        item = bpy.data.objects.get(name)
+        settings = settings_of(item)
+        if item is None or settings is None:
+            raise InputError(f"the phantom {name!r} is gone")
+        has_changed = settings.values() != before
+        replace(item, stored, bake)
+        if bake:
+            return f"Applied the pose of {name!r}"
+        item.mphdrr_volume.outdated = has_changed
+        return f"Updated {name!r}" + ("; its settings have changed in the meantime" if has_changed else "")
+
+    return jobs.Job("Making a phantom", work, finish)
+
+
+def remaking(item: bpy.types.Object, bake: bool = False) -> Callable[[Progress | None], list[StoredVolume]]:
+    """The work of `updating`, whose result is for `replace`; leaves bpy alone."""
+    settings = settings_of(item)
+    if settings is None:
+        raise InputError("no phantom is active: select one that was added with its settings")
+    recipe, folder, made = recipe_of(settings), storage.folder(), with_children(item)
+    quantities = [settings.quantity, *(volumes.quantity_of(child) for child in made[1:])]
+    poses = [volumes.pose_of_object(one) for one in made]
+    return lambda progress: recipe.voxelize(quantities, poses, folder, progress, bake)
+
+
+def replace(item: bpy.types.Object, stored: Sequence[StoredVolume], baked: bool = False) -> None:
+    """Give a phantom and its children the voxels that `remaking` made; they stay where they are."""
+    made = with_children(item)
+    if len(made) != len(stored):
+        raise InputError(f"the volumes of {item.name!r} are not those of before: try again")
+    for volume_object, new in zip(made, stored, strict=True):
+        basis = volume_object.matrix_basis.copy()
+        volumes.replace_stored(volume_object, new)
+        if not baked:
+            volume_object.matrix_basis = basis  # a sheared world matrix would not set it back
+            continue
+        set_world_matrix(volume_object, new.pose)
+        if not np.allclose(world_matrix(volume_object), new.pose, rtol=1e-5, atol=1e-5):
+            volume_object.parent = None  # its shear cannot be undone by the object's own matrix
+            set_world_matrix(volume_object, new.pose)
+    properties = item.mphdrr_volume
+    properties.outdated, properties.message = False, ""
+    if not baked:
+        update_outline(item)
+        return
+    remove_outline(item)
+    properties.kind = "VOLUME"
+    for child in made[1:]:
+        child.mphdrr_volume.with_parent = False
+
+
+def with_children(item: bpy.types.Object) -> list[bpy.types.Object]:
+    """A phantom and the volumes of its other quantities."""
+    children = [child for child in item.children if volumes.is_volume(child) and child.mphdrr_volume.with_parent]
+    return [item, *sorted(children, key=lambda child: child.name)]
+
+
+def mu_energy(item: bpy.types.Object) -> float | None:
+    """The photon energy, keV, at which a volume's mu holds: of a phantom, or of a CT that was converted; else None."""
+    if (root := root_of(item)) is not None:
+        return recipe_of(settings_of(root)).phantom.mu_energy
+    path = volumes.file_of(item)
+    energy = provenance_of(path).get("energy_keV") if path.is_file() else None
+    return None if energy is None else float(energy)
+
+
+def require_current(item: bpy.types.Object) -> None:
+    """Raise `InputError` where a volume is of a phantom whose settings have changed since its voxels were made."""
+    if (phantom := outdated(item)) is not None:
+        raise InputError(f"{phantom.name!r} has changed since its voxels were made: press Update Phantom first")
+
+
+def outdated(item: bpy.types.Object) -> bpy.types.Object | None:
+    """The phantom of a volume if its settings have changed since its voxels were made; else None."""
+    phantom = root_of(item)
+    return phantom if phantom is not None and phantom.mphdrr_volume.outdated else None
+
+
+def root_of(item: bpy.types.Object) -> bpy.types.Object | None:
+    """The phantom that a volume is, or belongs to as its other quantity; None where there is none."""
+    if item.mphdrr_volume.with_parent and item.parent is not None:
+        item = item.parent
+    return None if settings_of(item) is None else item
+
+
+def toggle_outline(item: bpy.types.Object) -> str:
+    """Show the surfaces of a phantom (of one that beats, in its first state) as wires that go with it, or hide them."""
+    if outline_of(item) is not None:
+        remove_outline(item)
+        return f"Removed the outline of {item.name!r}"
+    _show_outline(item)
+    return f"Added the outline of {item.name!r}"
+
+
+def update_outline(item: bpy.types.Object) -> None:
+    """Make a phantom's outline again, where it has one."""
+    if outline_of(item) is not None:
+        _show_outline(item)
+
+
+def outline_of(item: bpy.types.Object) -> bpy.types.Object | None:
+    """A phantom's outline, if it has one."""
+    return next((child for child in item.children if _OUTLINE in child), None)
+
+
+def remove_outline(item: bpy.types.Object) -> None:
+    """Remove a phantom's outline, if it has one."""
+    outline = outline_of(item)
+    if outline is not None:
+        remove_objects([outline])
+
+
+def _show_outline(item: bpy.types.Object) -> None:
+    parts = recipe_of(settings_of(item)).phantom.meshes()
+    starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
+    vertices = np.concatenate([part.vertices for part in parts])
+    faces = np.concatenate([part.faces + start for part, start in zip(parts, starts[:-1], strict=True)])
+    remove_outline(item)
+    collection = item.users_collection[0] if item.users_collection else bpy.context.scene.collection
+    outline = meshes.add_mesh(Mesh(vertices, faces), f"{item.name} outline", np.eye(4), collection)
+    shape = bmesh.new()
+    try:  # edges inside flat faces would fill the picture with wires
+        shape.from_mesh(outline.data)
+        bmesh.ops.dissolve_limit(shape, angle_limit=0.01, verts=shape.verts, edges=shape.edges)
+        shape.to_mesh(outline.data)
+    finally:
+        shape.free()
+    outline[_OUTLINE] = True
+    outline.display_type = "WIRE"
+    outline.hide_render = outline.hide_select = True
+    outline.parent = item

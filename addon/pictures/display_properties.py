@@ -1,0 +1,87 @@
+"""How projections are shown: `Scene.mphdrr_display`."""
+
+import bpy
+from bpy.props import BoolProperty, EnumProperty, FloatProperty
+
+from ...core.errors import InputError
+from ...core.runs.display import COLORS, SCALES, Display
+from ..blender import choices
+from ..blender.updates import on_edit
+
+_SCALE_TEXTS = {
+    "linear": ("Linear", "Colours in proportion to the numbers"),
+    "sqrt": ("Square Root", "Small numbers are told apart better; noise of counts looks the same everywhere"),
+    "log": ("Logarithmic", "Colours in proportion to the numbers' logarithms, over three decades unless typed"),
+}
+_PLANES = (
+    ("NONE", "None", "No planes"),
+    ("ACTIVE", "Active", "That of the active module"),
+    ("RING", "Ring", "Those of the active module's ring"),
+    ("ALL", "All", "Those of all visible modules"),
+)
+
+
+class DisplayProperties(bpy.types.PropertyGroup):
+    """How the last run's projections are shown; the exact numbers stay."""
+
+    colors: EnumProperty(
+        name="Colors", description="Colours of the numbers; all but grey are perceptually uniform",
+        items=choices.items({}, ((name.upper(), name.capitalize(), "") for name in COLORS)),
+        default="INFERNO", update=on_edit("display"),
+    )  # fmt: skip
+    scale: EnumProperty(
+        name="Scale", description="How the colours follow the numbers",
+        items=choices.items({}, ((name.upper(), *_SCALE_TEXTS[name]) for name in SCALES)),
+        default="LINEAR", update=on_edit("display"),
+    )  # fmt: skip
+    automatic: BoolProperty(
+        name="Automatic", description="Show the numbers from 0, or from the smallest, to the largest", default=True,
+        update=on_edit("display"),
+    )  # fmt: skip
+    low: FloatProperty(
+        name="Low", description="The number that has the first colour", default=0.0, update=on_edit("display")
+    )
+    high: FloatProperty(
+        name="High", description="The number that has the last colour", default=1.0, update=on_edit("display")
+    )
+    half: BoolProperty(
+        name="Central Half", description="Show the middle half of each image, often called FOV; all of it is the wide FOV",
+        update=on_edit("display"),
+    )  # fmt: skip
+    planes: EnumProperty(
+        name="Planes", description="Whose projections stand in the scene, between pinhole and ROI",
+        items=choices.items({}, _PLANES), default="ALL", update=on_edit("planes"),
+    )  # fmt: skip
+    plane_distance: FloatProperty(
+        name="Distance", description="Of the planes from the pinholes, mm; 0: between pinhole and ROI", min=0.0,
+        soft_max=500.0, update=on_edit("planes"),
+    )  # fmt: skip
+    plane_at_detector: BoolProperty(
+        name="At Virtual Detector", description="Put the planes where the images truly are: behind the ROI",
+        update=on_edit("planes"),
+    )  # fmt: skip
+    plane_opacity: FloatProperty(
+        name="Opacity", description="Of the planes and of the pictures in the cameras' views", subtype="FACTOR", min=0.0,
+        max=1.0, default=1.0, update=on_edit("planes"),
+    )  # fmt: skip
+    backgrounds: BoolProperty(
+        name="In Camera Views", description="Lay each projection over what its module's camera sees", default=True,
+        update=on_edit("planes"),
+    )  # fmt: skip
+
+    @property
+    def problem(self) -> str:
+        """What is wrong with the window; "" where it is good."""
+        try:
+            self.display()
+        except InputError as error:
+            return str(error)
+        return ""
+
+    def display(self) -> Display:
+        """The colours, scale and window; raises `InputError` where the window is none."""
+        low, high = (None, None) if self.automatic else (self.low, self.high)
+        return Display(self.colors.lower(), self.scale.lower(), low, high, self.half)
+
+
+CLASSES = (DisplayProperties,)

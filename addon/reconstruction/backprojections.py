@@ -1,0 +1,50 @@
+"""Back-projections of the shown run in the scene, as volumes."""
+
+import time
+from typing import Any
+
+import bpy
+
+from ...core.errors import InputError
+from ...core.progress import Progress, stages_of
+from ...core.runs.backprojecting import backproject_run
+from ...core.runs.files import read_run
+from ...core.runs.recipe import Recipe
+from ...core.runs.reconstructing import reconstruction_grid
+from ..blender import jobs, storage
+from ..runs import rendering, runs
+from ..volumes import slices, volumes
+from ..volumes.stored_volumes import StoredVolume, store_volume
+from .reconstruction_properties import HOW_LABELS
+
+
+def backprojecting(context: bpy.types.Context, recipe: Recipe, how: str) -> jobs.Job:
+    """The job that back-projects the scene's shown run onto the voxels of `recipe`, as a new volume with slices.
+
+    `how` is one of those of `core.perspective.backprojection`. Raises InputError where no run is shown.
+    """
+    scene, shown = context.scene, runs.shown(context.scene)
+    if shown is None:
+        raise InputError("nothing to back-project: render the projections first, or choose a run")
+    path, name, folder, uid = rendering.file_of(shown.file), shown.name, storage.folder(), scene.session_uid
+    label, start = HOW_LABELS[how], time.perf_counter()
+
+    def work(progress: Progress) -> StoredVolume:
+        stages = stages_of(progress)
+        stages("reading the run")
+        run = read_run(path)
+        grid = reconstruction_grid(run, recipe)
+        volume = backproject_run(run, how, grid=grid, stages=stages)
+        stages("writing the voxels")
+        provenance: dict[str, Any] = {"back_projection_of": name, "how": how, **recipe.tables()}
+        return store_volume(volume, folder, None, provenance)
+
+    def finish(stored: StoredVolume) -> str:
+        scene = jobs.scene_again(uid, "the back-projection is")
+        item = volumes.add_stored(stored, f"{name} {label}", scene.collection)
+        volumes.make_active(bpy.context, item)
+        slices.add_slices(item)  # it is somewhere everywhere: as smoke, a cloud
+        seconds = time.perf_counter() - start
+        return f"Back-projected {item.name!r}: {stored.low:.4g} to {stored.high:.4g}, in {seconds:.1f} s"
+
+    return jobs.Job("Back-projecting", work, finish)

@@ -1,0 +1,99 @@
+"""The Reconstruction panel's settings: Blender properties made from `core.runs.settings`, and what they say."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
+
+import bpy
+from bpy.props import EnumProperty, PointerProperty, StringProperty
+
+from ...core.perspective.backprojection import HOW
+from ...core.runs.recipe import Recipe, fitting_recipe
+from ...core.runs.settings import SETTINGS
+from ..blender import choices
+from ..blender.setting_properties import drawn_of, properties_of, values_of
+from ..volumes import volumes
+
+_BY_COMMAND_LINE = ("anatomy", "stop_change", "stop_noise", "stop_region", "stop_seconds")
+"""Settings that the panel does not have: of files, and of ends that Finish Now is for."""
+
+PROPERTIES = {
+    key.partition(".")[2]: setting
+    for key, setting in SETTINGS.items()
+    if key.startswith("reconstruction.") and not key.endswith(_BY_COMMAND_LINE)
+}
+"""The settings by the names of their properties."""
+
+
+_OF_VOXELS = ("voxels", "spacing", "center")
+_HOW = {
+    "sum": ("Sum", "Add up the views: large wherever many rays cross something"),
+    "product": ("Geometric Mean", "Multiply the views: nothing where one view sees nothing"),
+    "minimum": ("Minimum", "The least that a view sees there"),
+}
+HOW_LABELS = {how: _HOW.get(how, (how.capitalize(), ""))[0] for how in HOW}
+"""What the ways to put views together are called."""
+
+
+class ReconstructionSettings:
+    """How to reconstruct; mixed into the scene's properties (the panel) and into the operator (scripts)."""
+
+
+ReconstructionSettings.__annotations__ = properties_of(PROPERTIES)
+
+
+_PUT_TOGETHER = EnumProperty(
+    name="Combine By", description="How the views that see a voxel are put together",
+    items=choices.items({}, ((how.upper(), HOW_LABELS[how], _HOW.get(how, ("", ""))[1]) for how in HOW)), default="SUM",
+)  # fmt: skip
+
+
+class BackprojectionSettings:
+    """How to back-project; mixed into the operator (scripts)."""
+
+
+BackprojectionSettings.__annotations__ = properties_of({name: PROPERTIES[name] for name in _OF_VOXELS})
+BackprojectionSettings.__annotations__["how"] = _PUT_TOGETHER
+
+
+def voxels_recipe(get: Callable[[str], Any]) -> Recipe:
+    """The recipe's voxels alone; `get` gives a property's value."""
+    values = values_of({name: PROPERTIES[name] for name in _OF_VOXELS}, get)
+    return Recipe({key: value for key, value in values.items() if value is not None})
+
+
+def settings_recipe(get: Callable[[str], Any], is_given: Callable[[str], bool]) -> Recipe:
+    """The recipe's [reconstruction]; `get` gives a property's value, `is_given` whether a script has set it.
+
+    Raises InputError where a setting that is given has no effect.
+    """
+    values = values_of(PROPERTIES, get)
+    given = [s.key for name, s in PROPERTIES.items() if is_given(name) and values[s.key] != s.default]
+    return fitting_recipe(values, given)
+
+
+def drawn(settings: ReconstructionProperties) -> Iterator[tuple[str, bool]]:
+    """The properties that the chosen method and prior have, each with whether it has an effect."""
+    return drawn_of(PROPERTIES, settings, lambda need: True)
+
+
+class ReconstructionProperties(ReconstructionSettings, bpy.types.PropertyGroup):
+    """State of the Reconstruction panel; `Scene.mphdrr_reconstruction`."""
+
+    volume: PointerProperty(
+        name="Reconstruction", description="The last reconstructed volume", type=bpy.types.Object,
+        poll=lambda self, item: volumes.is_volume(item), options={"HIDDEN"},
+    )  # fmt: skip
+    record: StringProperty(name="Record", description="What is known of it, JSON", options={"HIDDEN"})
+
+    @property
+    def known(self) -> Mapping[str, Any]:
+        """What is known of the last reconstruction: `title`, `objective` by iteration, its name, `scores` and `flatters`."""
+        return json.loads(self.record) if self.record else {}
+
+
+ReconstructionProperties.__annotations__["how"] = _PUT_TOGETHER
+
+CLASSES = (ReconstructionProperties,)

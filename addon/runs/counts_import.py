@@ -1,0 +1,60 @@
+"""Measured counts of a real or another simulator's scanner become a run of the scene's scanner."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import bpy
+
+from ...core.errors import InputError
+from ...core.geometry.system import chosen_modules
+from ...core.progress import Progress, stages_of
+from ...core.runs.files import write_run
+from ...core.runs.measured import recipe_counts
+from ...core.runs.mosaic import caption
+from ...core.runs.run import ProjectionRun
+from ..blender import jobs
+from ..pictures import images
+from ..scanner import scanner
+from . import rendering, runs
+
+_OF_FRAMES = ("detector.rows", "detector.columns", "detector.plane", "detector.magnification", "detector.pitch")
+
+
+def importing(context: bpy.types.Context, paths: list[Path], said: Mapping[str, Any]) -> jobs.Job:
+    """The job that reads measured counts as the run of the scene's scanner.
+
+    `said` are entries of a recipe: of its table ``counts``, the time, the pixel size, the modules. The rest of the model,
+    such as isotope and aperture, which a reconstruction needs, is the panel's. Raises InputError where there is no scanner.
+    """
+    if not paths:
+        raise InputError("no file given: set filepath to a file with counts")
+    scene = context.scene
+    collection = scanner.required_scanner(scene)
+    recipe = runs.panel_recipe(scene).updated(
+        {**dict.fromkeys(_OF_FRAMES), "model.time": None}
+        | {"model.kind": "emission", "counts.files": [str(path) for path in paths]}
+        | dict(said)
+    )
+    system = chosen_modules(scanner.read_scanner(collection), recipe["system.modules"], "modules")
+    path, display = rendering.run_path(scene), scene.mphdrr_display.display()
+    scene_uid, scanner_uid = scene.session_uid, collection.session_uid
+
+    def work(progress: Progress) -> tuple[ProjectionRun, images.Pictures]:
+        stages = stages_of(progress)
+        run = recipe_counts(recipe, system, stages)
+        stages("writing the run file")
+        write_run(run, path)
+        return run, images.pictures(run, display, stages("packing"))
+
+    def finish(result: tuple[ProjectionRun, images.Pictures]) -> jobs.Finishing:
+        run, made = result
+        scene = jobs.scene_again(scene_uid, "the projections are")
+        owner = jobs.found_again(bpy.data.collections, scanner_uid)
+        state = runs.state_of(system, run.recipe, None, None) | {"measured": caption(run)}
+        images.show((yield from rendering.storing(scene, run, path, state, owner, made)), bpy.context)
+        return (
+            f"Imported {float(run.projections.sum(dtype=float)):.6g} counts of {len(run.views)} modules: {caption(run)}"
+        )
+
+    return jobs.Job("Importing counts", work, finish, lambda: path.unlink(missing_ok=True))

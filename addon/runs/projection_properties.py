@@ -1,0 +1,211 @@
+"""The Projections panel's settings: Blender properties made from `core.runs.settings`, and the recipe that they say."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
+
+import bpy
+from bpy.props import (
+    BoolProperty,
+    CollectionProperty,
+    IntProperty,
+    PointerProperty,
+    StringProperty,
+)
+
+from ...core.errors import InputError
+from ...core.physics.maps import MAPS
+from ...core.runs.presets import PRESETS
+from ...core.runs.recipe import Recipe, fitting_recipe
+from ...core.runs.settings import SETTINGS
+from ..blender.setting_properties import drawn_of, identifier, material_of, properties_of, set_property, values_of
+from ..blender.updates import on_edit
+from ..scanner import scanner
+from ..volumes import volumes
+
+OPENING_ANGLE = "model.opening_angle_degrees"
+"""A setting of the scanner's here: its collimators are drawn with it."""
+
+USUAL_TIME = 600.0
+"""s, of a cardiac acquisition: what the panel has when a preset or a volume makes it count photons."""
+
+_NAMES = {"model.kind": "model", "detector.plane": "detector", "detector.rows": "height", "detector.columns": "width"}
+"""Names that .blend files keep, where they are not those of the settings."""
+
+PROPERTIES = {
+    _NAMES.get(key, key.partition(".")[2]): setting
+    for key, setting in SETTINGS.items()
+    if key.startswith(("model.", "detector.", "compute.")) and key != OPENING_ANGLE
+}
+"""The settings by the names of their properties. A coefficient has a second property, of its material."""
+
+
+class ProjectionSettings:
+    """How to project; mixed into the scene's properties (the panel) and into the operator (scripts)."""
+
+    noise: BoolProperty(name="Poisson Noise", description="Draw counts instead of their expected means")
+    seed: IntProperty(name="Seed", description="Of the noise: the same seed draws the same counts", default=1, min=0)
+    first: IntProperty(name="First Module", description="Its number; 0: from the first", default=0, min=0)
+    last: IntProperty(name="Last Module", description="Its number; 0: to the last", default=0, min=0)
+
+
+ProjectionSettings.__annotations__.update(properties_of(PROPERTIES))
+
+
+def recipe_values(get: Callable[[str], Any]) -> dict[str, Any]:
+    """The values of the settings by their keys in a recipe, None for none; `get` gives a property's."""
+    values = values_of(PROPERTIES, get)
+    values["noise.seed"] = get("seed") if get("noise") else None
+    return values
+
+
+def settings_recipe(get: Callable[[str], Any], is_given: Callable[[str], bool], more: Mapping[str, Any]) -> Recipe:
+    """The recipe of model, detector, noise and backend, with `more` values by their keys.
+
+    `get` gives a property's value, `is_given` whether a script has set it: InputError then says if it has no effect.
+    """
+    first, last = get("first"), get("last")
+    modules = f"{first or ''}-{last or ''}" if first or last else None
+    values = {**recipe_values(get), **more, "system.modules": modules}
+    given = [
+        setting.key
+        for name, setting in PROPERTIES.items()
+        if (is_given(name) or is_given(material_of(name, setting) or name)) and values[setting.key] != setting.default
+    ]
+    return fitting_recipe(values, given)
+
+
+def set_panel(settings: ProjectionProperties, recipe: Recipe) -> None:
+    """Set the panel as a recipe says, and the rest to its defaults; raises InputError for what the panel cannot show."""
+    if recipe["model.pixel_points"] == "auto" and recipe["model.kind"] != "emission":
+        raise InputError("model.pixel_points: the panel has no automatic number for radiographs")
+    text = recipe["system.modules"] or "-"
+    first, dash, last = text.partition("-")
+    try:
+        modules = int(first or 0), int(last or 0) if dash else int(first)
+    except ValueError:
+        raise InputError(f"system.modules: the panel has one range of modules, not {text!r}") from None
+    for name, setting in PROPERTIES.items():
+        set_property(settings, PROPERTIES, name, recipe.given.get(setting.key))
+    settings.fitted = ""  # the model is the recipe's, whatever the volume holds
+    settings.model = identifier("model", recipe["model.kind"])
+    settings.noise = recipe["noise.seed"] is not None
+    if settings.noise:
+        settings.seed = recipe["noise.seed"]
+    settings.first, settings.last = modules
+
+
+def use_preset(settings: ProjectionProperties, preset: str) -> None:
+    """Set the physics as a preset of `core.runs.presets` says; what it leaves alone stays."""
+    changes = PRESETS[preset].changes
+    for name, setting in PROPERTIES.items():
+        if setting.key in changes:
+            set_property(settings, PROPERTIES, name, changes[setting.key])
+    _set_time(settings)
+
+
+def fit_model(settings: ProjectionProperties, quantity: str) -> None:
+    """Choose the model by what a volume holds, unless the user has chosen one: counts of activity, a radiograph of mu."""
+    model = {"activity": "EMISSION", "mu": "TRANSMISSION"}.get(quantity)
+    if model is None or (settings.is_property_set("model") and settings.model != settings.fitted):
+        return
+    settings.model = settings.fitted = model
+    if model == "EMISSION":
+        _set_time(settings)
+
+
+def _set_time(settings: ProjectionProperties) -> None:
+    """Nobody acquires for the default time, 1 s, which only makes counts the sensitivity's rates."""
+    if not settings.is_property_set("time"):
+        settings.time = USUAL_TIME
+
+
+def drawn(settings: ProjectionProperties, table: str) -> Iterator[tuple[str, bool]]:
+    """The properties of a table that the chosen model and hole have, each with whether it has an effect."""
+    return drawn_of(PROPERTIES, settings, lambda need: "model.kind=" in need or "model.hole=rays" in need, table)
+
+
+def makes_counts(settings: ProjectionProperties) -> bool:
+    """Whether images hold numbers of photons, which may have noise."""
+    return settings.model == "EMISSION" or (settings.model == "TRANSMISSION" and settings.photons > 0)
+
+
+def _is_ours(self: ProjectionProperties, item: bpy.types.Object) -> bool:
+    return volumes.is_volume(item) and volumes.quantity_of(item) not in MAPS
+
+
+def _is_mu(self: ProjectionProperties, item: bpy.types.Object) -> bool:
+    return volumes.is_volume(item) and volumes.quantity_of(item) == "mu"
+
+
+class RunProperties(bpy.types.PropertyGroup):
+    """A run in the scene's list, `ProjectionProperties.runs`; `addon/runs/runs.py` writes it."""
+
+    name: StringProperty(name="Name", description="Of the run; one that is given another name is kept")
+    usual_name: StringProperty(name="Usual Name", description="That it got when it was made", options={"HIDDEN"})
+    file: StringProperty(
+        name="File", description="With its exact arrays", subtype="FILE_PATH",
+        options={"HIDDEN", "PATH_SUPPORTS_BLEND_RELATIVE"},
+    )  # fmt: skip
+    scanner: PointerProperty(name="Scanner", description="That it is of", type=bpy.types.Collection)
+    summary: StringProperty(name="Summary", description="What it is", options={"HIDDEN"})
+    state: StringProperty(name="State", description="Of the scene when it was made, float64 JSON", options={"HIDDEN"})
+    keep: BoolProperty(
+        name="Keep",
+        description="Keep this run. Of the others the last two stay, and the next render replaces the older",
+    )
+    is_saved: BoolProperty(name="Saved", description="A saved .blend may need its file", options={"HIDDEN"})
+
+    @property
+    def is_kept(self) -> bool:
+        """Whether the next render leaves it."""
+        return bool(self.keep or self.name != self.usual_name)
+
+
+def _volume_chosen(self: ProjectionProperties, context: bpy.types.Context) -> None:
+    # In the panel: to a script, a model that changes by itself would be a wrong number without a word.
+    if self.volume is not None and context.region is not None and context.region.type == "UI":
+        fit_model(self, volumes.quantity_of(self.volume))
+
+
+def _projects_all(self: ProjectionProperties) -> bool:
+    return self.first == self.last == 0
+
+
+def _project_all(self: ProjectionProperties, value: bool) -> None:
+    collection = None if value else scanner.active_scanner(self.id_data)
+    numbers = [camera.mphdrr_module.number for camera in scanner.modules(collection)] if collection else []
+    self.first, self.last = (min(numbers), max(numbers)) if numbers else (0, 0 if value else 1)
+
+
+class ProjectionProperties(ProjectionSettings, bpy.types.PropertyGroup):
+    """State of the Projections panel; `Scene.mphdrr_projections`."""
+
+    volume: PointerProperty(
+        name="Volume", description="What to project; empty: the active volume, or the only one", type=bpy.types.Object,
+        poll=_is_ours, update=_volume_chosen,
+    )  # fmt: skip
+    all_modules: BoolProperty(
+        name="All Modules", description="Project into every module, not a range of numbers",
+        get=_projects_all, set=_project_all,
+    )  # fmt: skip
+    fitted: StringProperty(
+        name="Fitted Model", description="The model that the volume's quantity has chosen", options={"HIDDEN"}
+    )
+    mu: PointerProperty(
+        name="Attenuation", description="Volume of attenuation coefficients (1/mm) before the pinhole; empty: none",
+        type=bpy.types.Object, poll=_is_mu,
+    )  # fmt: skip
+    runs: CollectionProperty(type=RunProperties, name="Runs", options={"HIDDEN"})
+    active_run: IntProperty(
+        name="Run", description="The run in the list whose images are shown", update=on_edit("active_run")
+    )
+    run_file: StringProperty(
+        name="Run", description="File with the shown run's exact arrays", subtype="FILE_PATH",
+        options={"HIDDEN", "PATH_SUPPORTS_BLEND_RELATIVE"},
+    )  # fmt: skip
+    run_summary: StringProperty(name="Shown Run", description="What the shown run is", options={"HIDDEN"})
+
+
+CLASSES = (RunProperties, ProjectionProperties)

@@ -1,0 +1,292 @@
+"""The settings of the column map dialog, on the window manager while it is open; a changed setting calls `update`."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable
+from functools import lru_cache
+from pathlib import Path
+
+import bpy
+from bpy.props import BoolProperty, CollectionProperty, EnumProperty, IntProperty, StringProperty
+
+from ...core.errors import InputError
+from ...core.recording import recorded_warnings
+from ...core.workbook import ColumnMap, MappedColumn, MappedTable, draft_column_map, preview_workbook, read_system
+from ...core.workbook.quantities import ANGLE_UNITS, LENGTH_UNITS, POSITION, QUANTITIES, TYPED
+from ..blender import choices
+
+MAX_TABLES = 9
+_FIRST = 3  # modules previewed at the top
+_SEEN = 80  # rows and columns whose texts are shown beside the settings
+_preview_at = lru_cache(maxsize=1)(lambda workbook, changed: preview_workbook(workbook, _SEEN, _SEEN))
+
+
+def _changed(self: bpy.types.PropertyGroup, context: bpy.types.Context) -> None:
+    update(context.window_manager.mphdrr_columns)
+
+
+def _number_of_tables_changed(self: ColumnMapProperties, context: bpy.types.Context) -> None:
+    if not self.filled:
+        return
+    while len(self.tables) > self.n_tables:
+        self.tables.remove(len(self.tables) - 1)
+    while len(self.tables) < self.n_tables:
+        last, new = self.tables[-1], self.tables.add()
+        for name in ("sheet", "header_row", "first_row", "last_row", "number"):
+            setattr(new, name, getattr(last, name))
+    update(self)
+
+
+def _unit_of_all_changed(self: ColumnMapProperties, context: bpy.types.Context) -> None:
+    if not self.filled:
+        return
+    self.filled = False  # until all units are set
+    for quantity in self.quantities:
+        if QUANTITIES[quantity.name].kind == "length":
+            quantity.unit = self.unit
+    self.filled = True
+    update(self)
+
+
+def _sheets(self: ColumnMapTable, context: bpy.types.Context, edit_text: str) -> list[str]:
+    return json.loads(context.window_manager.mphdrr_columns.sheets or "[]")
+
+
+def _units(*tables: Iterable[str]) -> choices.Items:
+    units = [(unit, unit, "") for table in tables for unit in table]
+    return choices.items(choices.UNITS, [("NONE", "?", "Not known"), *units])
+
+
+class ColumnMapTable(bpy.types.PropertyGroup):
+    """Rows of a sheet (`MappedTable`)."""
+
+    sheet: StringProperty(name="Sheet", description="Name of the sheet", search=_sheets, update=_changed)
+    header_row: IntProperty(
+        name="Header Row", description="Row of the headings shown below; they are not read. 0: none", min=0,
+        update=_changed,
+    )  # fmt: skip
+    first_row: IntProperty(name="First Row", description="Row of the first module", default=2, min=1, update=_changed)
+    last_row: IntProperty(name="Last Row", description="Row of the last module", default=2, min=1, update=_changed)
+    skip_rows: StringProperty(
+        name="Skip Rows", description="Rows in between that hold no module, such as 43, 50-52", update=_changed
+    )
+    number: StringProperty(
+        name="Number Column",
+        description="Letters of the column of module numbers or names. Empty: the rows are modules 1, 2, ...",
+        update=_changed,
+    )
+    rows: EnumProperty(
+        name="Rows",
+        description="Which modules of table 1 the rows belong to",
+        items=choices.items(
+            choices.JOINED,
+            (
+                ("BY_NUMBER", "By Number", "A row belongs to the module with its number or name"),
+                ("IN_ORDER", "In Order", "The first row belongs to the first module, and so on"),
+                ("ONE_FOR_ALL", "One for All", "The first row holds what all modules share"),
+            ),
+        ),
+        default="BY_NUMBER",
+        update=_changed,
+    )
+
+
+class ColumnMapQuantity(bpy.types.PropertyGroup):
+    """The column of a quantity (`MappedColumn`)."""
+
+    name: StringProperty(name="Quantity", description="Its symbol")
+    table: IntProperty(name="Table", description="Which table its column is in", default=1, min=1, max=MAX_TABLES,
+                       update=_changed)  # fmt: skip
+    column: StringProperty(name="Column", description="The column's letters. Empty: none", update=_changed)
+    unit: EnumProperty(
+        name="Unit", description="Of the numbers in the column",
+        items=_units(LENGTH_UNITS, ANGLE_UNITS), default="NONE", update=_changed,
+    )  # fmt: skip
+    seen: StringProperty(name="Seen", description="The column's heading and first number in the workbook")
+
+
+class ColumnMapProperties(bpy.types.PropertyGroup):
+    """The dialog's settings and what they give; `WindowManager.mphdrr_columns`."""
+
+    filled: BoolProperty(name="Filled", description="A changed setting updates the preview", options={"HIDDEN"})
+    workbook: StringProperty(name="Workbook", description="File that the settings are for", subtype="FILE_PATH")
+    sheets: StringProperty(name="Sheets", description="Names of its sheets, JSON", options={"HIDDEN"})
+    doubts: StringProperty(name="Doubts", description="What the reader did not understand, JSON", options={"HIDDEN"})
+    n_tables: IntProperty(
+        name="Tables", description="Ranges of rows: the first holds x1, y1 and z1, the others dimensions",
+        default=2, min=1, max=MAX_TABLES, update=_number_of_tables_changed,
+    )  # fmt: skip
+    unit: EnumProperty(
+        name="All Lengths In", description="Changing it sets the unit of every length below",
+        items=_units(LENGTH_UNITS), default="NONE", update=_unit_of_all_changed,
+    )  # fmt: skip
+    tables: CollectionProperty(type=ColumnMapTable, name="Tables")
+    quantities: CollectionProperty(type=ColumnMapQuantity, name="Quantities")
+    save_as: StringProperty(
+        name="Save Map As",
+        description="Also write the column map to this new .toml file, beside the workbook unless a folder is given",
+    )
+    refusal: StringProperty(name="Refusal", description="Why the workbook cannot be read with these settings")
+    remarks: StringProperty(name="Remarks", description="The reader's warnings, JSON", options={"HIDDEN"})
+    n_modules: IntProperty(name="Modules", description="How many are read", min=0)
+    preview: StringProperty(
+        name="Preview", description="Headings, then rows of numbers as they are read, JSON", options={"HIDDEN"}
+    )
+
+
+CLASSES = (ColumnMapTable, ColumnMapQuantity, ColumnMapProperties)
+
+
+def fill(form: ColumnMapProperties, workbook: Path, columns: ColumnMap | None = None) -> bool:
+    """Fill the settings from a column map, by default from a draft made of the workbook's headings.
+
+    Returns whether the dialog can help: the reader has questions about the workbook, or a map was given.
+    """
+    clear(form)
+    draft = draft_column_map(workbook)
+    shown = draft.columns if columns is None else columns
+    faults = draft.columns.faults()
+    form.workbook, form.sheets = str(workbook), json.dumps(list(_cells(workbook)))
+    form.doubts = json.dumps([question for question in draft.questions if question not in faults])
+    known: dict[str, tuple[int, MappedColumn]] = {}
+    for i, table in enumerate(shown.tables[:MAX_TABLES], start=1):
+        row = form.tables.add()
+        row.sheet, row.header_row, row.number = table.sheet, table.header_row or 0, table.number or ""
+        row.first_row, row.last_row = table.first_row, table.last_row
+        row.skip_rows = ", ".join(map(str, table.skip_rows))
+        if table.rows is not None:
+            row.rows = table.rows.upper().replace(" ", "_")
+        known |= {column.quantity: (i, column) for column in table.columns if column.quantity in QUANTITIES}
+    if not form.tables:
+        form.tables.add()
+    for name in dict.fromkeys((*TYPED, *known)):
+        quantity = form.quantities.add()
+        quantity.name = name
+        quantity.table = 1 if name in POSITION else len(form.tables)
+        if name in known:
+            quantity.table, column = known[name]
+            quantity.column = column.column
+            quantity.unit = column.unit if column.unit in choices.UNITS else "NONE"
+    form.n_tables = len(form.tables)
+    form.filled = True
+    update(form)
+    return bool(draft.questions) or columns is not None
+
+
+def clear(form: ColumnMapProperties) -> None:
+    """Empty the settings, so that they are for no workbook."""
+    form.filled = False
+    for prop in form.bl_rna.properties:
+        if not prop.is_readonly or prop.type == "COLLECTION":
+            form.property_unset(prop.identifier)
+
+
+def column_map(form: ColumnMapProperties) -> ColumnMap:
+    """The column map that the settings describe, complete or not; raises `InputError` where they make no sense."""
+    columns: list[list[MappedColumn]] = [[] for _ in form.tables]
+    for quantity in form.quantities:
+        letters, unit = quantity.column.strip().upper(), "" if quantity.unit == "NONE" else quantity.unit
+        if letters and quantity.table > len(columns):
+            raise InputError(f"{quantity.name} is in table {quantity.table}, expected 1 to {len(columns)}")
+        if letters:
+            columns[quantity.table - 1].append(MappedColumn(quantity.name, letters, unit))
+    tables = []
+    for i, table in enumerate(form.tables):
+        one = i > 0 and table.rows == "ONE_FOR_ALL"
+        tables.append(
+            MappedTable(
+                sheet=table.sheet,
+                first_row=table.first_row,
+                last_row=table.first_row if one else table.last_row,
+                columns=tuple(columns[i]),
+                number=None if one else table.number.strip().upper() or None,
+                rows=None if i == 0 else table.rows.lower().replace("_", " "),
+                header_row=table.header_row or None,
+                skip_rows=() if one else _rows(table.skip_rows, i),
+            )
+        )
+    return ColumnMap(tuple(tables))
+
+
+def update(form: ColumnMapProperties) -> None:
+    """Read the workbook with the settings, and show the modules' numbers or why it is refused."""
+    if not form.filled:
+        return
+    workbook = Path(form.workbook)
+    form.refusal = form.preview = form.remarks = ""
+    try:
+        for quantity in form.quantities:
+            quantity.seen = _seen(form, quantity, workbook)
+        with recorded_warnings() as warned:
+            form.n_modules, rows = _preview(workbook, column_map(form))
+        form.preview, form.remarks = json.dumps(rows), json.dumps(list(warned))
+    except InputError as error:
+        form.refusal = str(error)
+
+
+def _preview(workbook: Path, columns: ColumnMap) -> tuple[int, list[list[str]]]:
+    """How many modules the workbook has; headings, then the numbers of the first modules and the last, mm."""
+    system = read_system(workbook, columns)
+    names = [name for name in QUANTITIES if name in (*TYPED, "b")]
+    numbers = zip(*(QUANTITIES[name].of(system).tolist() for name in names), strict=True)
+    rows = [
+        [str(module), *(f"{value:.3f}" for value in values)]
+        for module, values in zip(system.numbers.tolist(), numbers, strict=True)
+    ]
+    if len(rows) > _FIRST + 2:
+        rows[_FIRST:-1] = [["..."] * len(rows[0])]
+    return len(system), [["Module", *names], *rows]
+
+
+def accept(form: ColumnMapProperties) -> ColumnMap:
+    """The column map that the settings describe, also saved where they ask for that; raises the reader's refusal."""
+    update(form)
+    if form.refusal:
+        raise InputError(form.refusal)
+    columns = column_map(form)
+    if form.save_as.strip():
+        path = Path(form.workbook).parent / bpy.path.abspath(form.save_as.strip())
+        if path.suffix.lower() != ".toml":
+            raise InputError(f"{path}: expected a name ending in .toml")
+        if path.exists():
+            raise InputError(f"{path}: exists already, expected a new name")
+        columns.write(path, f"Columns of {Path(form.workbook).name}.")
+    return columns
+
+
+def _rows(text: str, i: int) -> tuple[int, ...]:
+    """The rows that a text such as "43, 50-52" lists."""
+    rows: set[int] = set()
+    for part in filter(None, (part.strip() for part in text.split(","))):
+        first, _, last = part.partition("-")
+        try:
+            rows.update(range(int(first), int(last or first) + 1))
+        except ValueError:
+            raise InputError(f"table {i + 1}: skip rows {text!r}, expected numbers such as 43, 50-52") from None
+    return tuple(sorted(rows))
+
+
+def _cells(workbook: Path) -> dict[str, tuple[tuple[str, ...], ...]]:
+    """Sheet -> rows of texts; read again only when the file has changed."""
+    # The reader says what is wrong with a file that is not there.
+    return _preview_at(workbook, workbook.stat().st_mtime_ns if workbook.is_file() else 0)
+
+
+def _seen(form: ColumnMapProperties, quantity: ColumnMapQuantity, workbook: Path) -> str:
+    """The heading and the first number in a quantity's column."""
+    from openpyxl.utils import column_index_from_string
+
+    letters = quantity.column.strip().upper()
+    if quantity.name == "l" and not letters:
+        return "(by the design formula)"
+    if quantity.table > len(form.tables):
+        return ""
+    table = form.tables[quantity.table - 1]
+    try:
+        column = column_index_from_string(letters) - 1
+    except ValueError:
+        return ""
+    cells = _cells(workbook).get(table.sheet, ())
+    rows = [cells[row - 1] for row in (table.header_row, table.first_row) if 0 < row <= len(cells)]
+    return ": ".join(row[column] for row in rows if column < len(row) and row[column])

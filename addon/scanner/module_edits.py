@@ -1,0 +1,253 @@
+"""Modules made, removed and renumbered in the scene, by operators (undo steps), not by handlers."""
+
+import json
+import re
+from collections.abc import Sequence
+from typing import Literal
+
+import bpy
+import numpy as np
+from numpy.typing import NDArray
+
+from ...core.errors import InputError
+from ...core.geometry.ring_fits import ring_order
+from ...core.recording import recorded_warnings
+from ..blender import ids
+from ..perspective import frustums
+from ..pictures import planes
+from . import cameras, collimators, following, scanner
+from .following import PARTS
+from .module_values import add_module, module_numbers
+from .scanner_parts import clear, new_part, parts_and_others
+
+_OURS = re.compile(r"(Module|Collimator|Crystal) \d+(\.\d+)?")  # a name that the extension gave
+
+
+def copied_cameras(collection: bpy.types.Collection) -> list[bpy.types.Object]:
+    """Cameras with another camera's module number: Blender copied them. "Module 07.001" is the copy of "Module 07"."""
+    seen: set[int] = set()
+    copied = []
+    for camera in sorted(scanner.modules(collection), key=lambda o: (len(o.name), o.name)):
+        number = camera.mphdrr_module.number
+        if number in seen:
+            copied.append(camera)
+        seen.add(number)
+    return copied
+
+
+def orphan_parts(collection: bpy.types.Collection) -> list[bpy.types.Object]:
+    """Collimators and crystals whose camera was deleted."""
+    return [
+        item
+        for item in collection.all_objects
+        if item.mphdrr_module.part in PARTS
+        and not (item.parent is not None and item.parent.mphdrr_module.is_module and item.parent.users_collection)
+    ]
+
+
+def bare_cameras(collection: bpy.types.Collection) -> list[bpy.types.Object]:
+    """Modules with neither collimator nor crystal: copies whose original was deleted."""
+    parts = following.parts_of(collection, scanner.modules(collection))
+    return [camera for camera, own in parts.items() if not own]
+
+
+def untidy_text(collection: bpy.types.Collection) -> str:
+    """What `tidy` would put in order, in words; empty where all is in order."""
+    copied = copied_cameras(collection)
+    bare = [camera for camera in bare_cameras(collection) if camera not in copied]
+    found = (
+        ("copied camera{}", copied),
+        ("bare camera{}", bare),
+        ("part{} without a camera", orphan_parts(collection)),
+    )
+    return ", ".join(f"{len(items)} {text.format('s' * (len(items) > 1))}" for text, items in found if items)
+
+
+def tidy(collection: bpy.types.Collection) -> tuple[list[int], int]:
+    """Make modules of copied cameras, and remove parts without a camera.
+
+    Returns the new modules' numbers, and how many parts were removed. Where a shape cannot be built nothing is changed.
+    """
+    copied, orphans, numbers = copied_cameras(collection), orphan_parts(collection), []
+    _require_solids(collection, [*copied, *bare_cameras(collection)])
+    cameras.remove_objects(orphans)
+    for camera in copied:
+        adopt(collection, camera)
+        numbers.append(camera.mphdrr_module.number)
+    for camera in bare_cameras(collection):
+        _add_parts(collection, camera)
+    make_single_users(collection)
+    following.refresh(collection)
+    collection.mphdrr_scanner.untidy = untidy_text(collection)
+    return numbers, len(orphans)
+
+
+def adopt(
+    collection: bpy.types.Collection, camera: bpy.types.Object, center: NDArray[np.float64] | None = None
+) -> None:
+    """Make the copy of a module's camera a module of its own, with its pinhole at `center` (3,), mm, or where it stands."""
+    found = [o for o in scanner.modules(collection) if o != camera]
+    number = max(o.mphdrr_module.number for o in found) + 1
+    if not following.parts_of(collection, [camera])[camera]:
+        _add_parts(collection, camera)
+    add_module(camera, number, max(o.mphdrr_module.index for o in found) + 1, center)
+    camera.name = ids.module_name(number, len(found) + 1)
+    if camera.data.users > 1:
+        camera.data = camera.data.copy()
+    camera.data.name = camera.name
+    for part in following.parts_of(collection, [camera])[camera]:
+        part.name, part.mphdrr_module.number = ids.part_name(camera.name, part.mphdrr_module.part), number
+        if part.data.users == 1:
+            part.data.name = part.name
+
+
+def _require_solids(collection: bpy.types.Collection, modules: Sequence[bpy.types.Object]) -> None:
+    """Raise InputError where a module's parts cannot be built, before anything is changed."""
+    for camera in modules:
+        construction = following.construction(collection.mphdrr_scanner)
+        for part in PARTS:
+            collimators.part_solid(part, module_numbers(camera), construction)
+
+
+def _add_parts(collection: bpy.types.Collection, camera: bpy.types.Object) -> None:
+    construction = following.construction(collection.mphdrr_scanner)
+    for part in PARTS:
+        name = ids.part_name(camera.name, part)
+        solid = collimators.part_solid(part, module_numbers(camera), construction)
+        item = new_part(camera, part, name, collimators.new_mesh(name, solid, collimators.part_material(part)))
+        item.hide_viewport, item.hide_render = camera.hide_viewport, camera.hide_render
+        for home in camera.users_collection:
+            home.objects.link(item)
+
+
+def duplicate(
+    collection: bpy.types.Collection, modules: Sequence[bpy.types.Object], count: int, angle: float, follow_ring: bool
+) -> list[bpy.types.Object]:
+    """Make `count` copies of each module, `angle` radians apart about the world's z axis; returns their camera objects.
+
+    With `follow_ring` a copy's z and distance from the z axis are those of the ring at its azimuth, linear between
+    neighbours and constant beyond the arc's ends. Raises InputError, and leaves the scene as it was, where a module
+    already stands in a copy's place or its shapes cannot be built.
+    """
+    _require_solids(collection, modules)
+    taken = [module_numbers(o).center for o in scanner.modules(collection)]
+    places = [
+        (camera, place)
+        for camera in modules
+        for place in _along_ring(collection, camera, np.linspace(angle, count * angle, count), follow_ring)
+    ]
+    for camera, place in places:
+        if np.linalg.norm(np.array(taken) - place, axis=1).min() < 1e-3:
+            raise InputError(
+                f"a copy of module {camera.mphdrr_module.number} would stand in the place of another module: "
+                "choose another angle or count"
+            )
+        taken.append(place)
+    made = []
+    for camera, place in places:
+        copy = camera.copy()
+        copy.data = camera.data.copy()
+        copy.animation_data_clear()
+        for home in camera.users_collection:
+            home.objects.link(copy)
+        cameras.set_world_matrix(copy, cameras.camera_matrices(place[None])[0])
+        adopt(collection, copy, place)
+        made.append(copy)
+    following.refresh(collection)
+    return made
+
+
+def _along_ring(
+    collection: bpy.types.Collection, camera: bpy.types.Object, angles: NDArray[np.float64], follow_ring: bool
+) -> NDArray[np.float64]:
+    """Places (N, 3), mm, at `angles` (N,) about z from a module."""
+    x, y, height = module_numbers(camera).center
+    azimuth, radius = np.arctan2(y, x), np.hypot(x, y)
+    if follow_ring:
+        in_ring = [o for o in scanner.modules(collection) if o.mphdrr_module.ring == camera.mphdrr_module.ring]
+        ring = np.array([module_numbers(o).center for o in in_ring])
+        # Azimuths relative to the module, so that an arc across +-pi stays in one piece.
+        others = _wrapped(np.arctan2(ring[:, 1], ring[:, 0]) - azimuth)
+        order = np.argsort(others)
+        radius, height = (
+            np.interp(_wrapped(angles), others[order], values[order])
+            for values in (np.hypot(*ring[:, :2].T), ring[:, 2])
+        )
+    turned = azimuth + angles
+    return np.column_stack(np.broadcast_arrays(radius * np.cos(turned), radius * np.sin(turned), height))
+
+
+def _wrapped(angles: NDArray[np.float64]) -> NDArray[np.float64]:
+    return (angles + np.pi) % (2 * np.pi) - np.pi
+
+
+def remove(collection: bpy.types.Collection, modules: Sequence[bpy.types.Object]) -> None:
+    """Remove modules with their parts and projections in the scene; other objects parented to them stay where they are."""
+    if len(modules) >= len(scanner.modules(collection)):
+        raise InputError("a scanner needs at least one module: keep one, or press Remove Scanner")
+    for scene in bpy.data.scenes:
+        frustums.remove(scene, list(modules))
+    children = [child for camera in modules for child in camera.children]
+    parts = [child for child in children if child.mphdrr_module.part in (*PARTS, "PLANE")]
+    for child in children:
+        if child not in parts:
+            cameras.unparent(child)
+    cameras.remove_objects([*parts, *modules])
+    following.refresh(collection)
+
+
+def remove_scanner(scene: bpy.types.Scene, collection: bpy.types.Collection) -> None:
+    """Remove a scanner, with its projections in the scene; the user's objects in it move to the scene's collection."""
+    planes.remove(scene, collection)
+    frustums.remove(scene, scanner.modules(collection))
+    _, others = parts_and_others(collection)
+    cameras.remove_objects([item for item in others if item.mphdrr_module.part != "NONE"])  # copies
+    clear(scene, collection, {})
+    bpy.data.collections.remove(collection)
+    materials = [bpy.data.materials.get(name) for name, _ in collimators.LOOKS.values()]
+    bpy.data.batch_remove([material for material in materials if material is not None and material.users == 0])
+
+
+def renumber(collection: bpy.types.Collection, order: Literal["RINGS", "LIST"] = "RINGS") -> int:
+    """Number a scanner's modules 1, 2, ... in the order of `ring_order` or the present one; returns how many changed.
+
+    They are listed, projected and exported in that order from now on. Names that the user gave stay. Raises InputError
+    where the scanner is untidy, or its numbers are impossible; it stays as it was.
+    """
+    untidy = untidy_text(collection)
+    if untidy:
+        raise InputError(f"scanner '{collection.name}': {untidy}: press Tidy Modules in the Design panel first")
+    with recorded_warnings():  # where the cameras look does not matter here
+        system = scanner.read_scanner(collection)
+    found = scanner.modules(collection)
+    places = ring_order(system) if order == "RINGS" else np.arange(len(found))
+    parts = following.parts_of(collection, found)
+    names: list[tuple[bpy.types.ID, str]] = []
+    with following.writing():
+        for index, camera in enumerate(found[place] for place in places):
+            camera.mphdrr_module.number, camera.mphdrr_module.index = index + 1, index
+            name = ids.module_name(index + 1, len(found))
+            names += [(camera, name), (camera.data, name)]
+            for part in parts[camera]:
+                part.mphdrr_module.number = index + 1
+                part_name = ids.part_name(name, part.mphdrr_module.part)
+                names += [(part, part_name), (part.data, part_name)]
+        ordered = scanner.read_scanner(collection)
+        if np.any(np.diff(places) < 0):
+            collection.mphdrr_scanner.source = ""  # the workbook has another order
+        collection.mphdrr_scanner.quick_ranges = json.dumps(scanner.quick_ranges(ordered))
+    names = [(item, name) for item, name in names if item.name != name and _OURS.fullmatch(item.name)]
+    for item, name in names:
+        item.name = f"{name} renumbered"  # so that the new names are free
+    for item, name in names:
+        item.name = name
+    following.refresh(collection)
+    return int(np.count_nonzero(system.numbers[places] != ordered.numbers))
+
+
+def make_single_users(collection: bpy.types.Collection) -> None:
+    """Give every module a camera and meshes of its own, which can be reshaped."""
+    for item in collection.all_objects:
+        module = item.mphdrr_module
+        if (module.is_module or module.part in PARTS) and item.data.users > 1:
+            item.data = item.data.copy()

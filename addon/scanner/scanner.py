@@ -1,0 +1,284 @@
+"""The scanner in the scene: built from a `PinholeSystem`, found, read back and changed.
+
+A scanner is a collection with a sub-collection for each ring; a module is a camera object (`Object.mphdrr_module`) whose
+children are its collimator and its crystal.
+"""
+
+import json
+from collections.abc import Iterable
+from dataclasses import asdict
+from pathlib import Path
+
+import bpy
+import numpy as np
+from mathutils import Quaternion
+
+from ...core.errors import InputError, warn
+from ...core.geometry import checks
+from ...core.geometry.collimator import Construction
+from ...core.geometry.module_parts import module_parts
+from ...core.geometry.system import PinholeSystem
+from ...core.workbook import ColumnMap, QuantityCells, SystemSource
+from ..blender import ids
+from . import cameras, following, framing
+from .following import modules
+from .module_values import is_edited, is_moved, numbers_of, off_aim, remember, system_of
+from .scanner_parts import NewScanner, clear, losses, modules_text
+
+_DEFAULT = Construction()
+_UNIT = 0.001  # m: a millimetre
+_SMALLEST_REACH = 1.0  # mm, of a scanner without modules
+
+
+def build_scanner(
+    scene: bpy.types.Scene,
+    system: PinholeSystem,
+    name: str = "",
+    *,
+    construction: Construction = _DEFAULT,
+    shape: tuple[int, int] = (256, 256),
+    replace: bool = False,
+) -> bpy.types.Collection:
+    """Put a scanner into the scene, in place of one of the same name; returns its collection.
+
+    The scene's units become millimetres and its render resolution `shape`, pixels (n_v, n_u). The name is by default that of
+    the workbook's file. The user's objects in the old scanner move to the scene's own collection. Raises InputError, and
+    leaves the scene as it was, where a collimator cannot be built, or changes (`losses`) would be lost without `replace`.
+    """
+    name = name or default_name(system)
+    old = find_scanner(scene, name)
+    lost = losses(old) if old is not None and not replace else []
+    if lost:
+        raise InputError(
+            f"scanner '{name}' has changed since it was imported ({'; '.join(lost)}): set replace=True to drop the changes"
+        )
+    new = NewScanner(system, module_parts(system, construction))
+    hidden: set[int] = set()
+    if old is None:
+        collection = bpy.data.collections.new(name)
+        scene.collection.children.link(collection)
+    else:
+        collection = old
+        hidden = {o.mphdrr_module.number for o in modules(old) if not o.mphdrr_module.visible}
+        clear(scene, old, new.cameras)
+    new.name_and_link(collection)
+    for number in hidden & set(new.cameras):
+        set_visible(new.cameras[number], False)
+
+    properties = collection.mphdrr_scanner
+    properties.scanner_name = name
+    for setting, value in asdict(construction).items():
+        setattr(properties, setting, value.upper() if isinstance(value, str) else value)
+    properties.is_scanner = properties.parts_free = True
+    _write_source(properties, system)
+    following.refresh(collection)
+
+    n_v, n_u = shape
+    render = scene.render
+    render.resolution_x, render.resolution_y, render.resolution_percentage = n_u, n_v, 100
+    render.pixel_aspect_x, render.pixel_aspect_y = max(1.0, n_v / n_u), max(1.0, n_u / n_v)
+    if old is None or not is_set_up(scene):
+        set_up_scene(scene, collection)
+    first = next(iter(new.cameras.values()))
+    if scene.camera is None:
+        scene.camera = first
+    scene.mphdrr_geometry.scanner = collection  # and its first module becomes active
+    return collection
+
+
+def remember_source(collection: bpy.types.Collection, system: PinholeSystem) -> None:
+    """Store `system`, which has the scanner's modules in their order, as what it was imported as: it has been saved."""
+    with following.writing():
+        for m, camera in enumerate(modules(collection)):
+            remember(camera, system, m)
+    _write_source(collection.mphdrr_scanner, system)
+
+
+def source(collection: bpy.types.Collection) -> SystemSource | None:
+    """The workbook that the scanner was read from or last written to, with its column map, even if changed since."""
+    values = json.loads(collection.mphdrr_scanner.source or "{}")
+    if not values:
+        return None
+    columns = values.get("columns")  # files of earlier versions have none
+    values["path"], values["numbers"] = Path(values["path"]), tuple(values["numbers"])
+    values["cells"] = tuple(QuantityCells(**{**cells, "rows": tuple(cells["rows"])}) for cells in values["cells"])
+    values["columns"] = ColumnMap.from_toml(columns) if columns else None
+    return SystemSource(**values)
+
+
+def _write_source(properties: bpy.types.PropertyGroup, system: PinholeSystem) -> None:
+    values, known = {}, system.source
+    if known is not None:
+        columns = "" if known.columns is None else known.columns.to_toml()
+        values = {**asdict(known), "path": str(known.path), "columns": columns}
+    properties.source = json.dumps(values)
+    properties.workbook, properties.sha256 = values.get("path", ""), values.get("sha256", "")
+    properties.n_modules = len(system)
+    properties.quick_ranges = json.dumps(quick_ranges(system))
+
+
+def default_name(system: PinholeSystem) -> str:
+    """Name of a system's scanner when none is given: its workbook's, without the suffix."""
+    return ids.SCANNER if system.source is None else system.source.path.stem or ids.SCANNER
+
+
+def quick_ranges(system: PinholeSystem) -> list[tuple[int, int]]:
+    """Up to three ranges (first, last) of module numbers, each of half the rings: 1-40, 21-60, 41-80 of 4 x 20."""
+    rings, numbers = system.rings(), np.asarray(system.numbers)
+    n_rings = int(rings.max()) + 1
+    width = max(1, n_rings // 2)
+    ranges = []
+    for start in sorted({0, (n_rings - width) // 2, n_rings - width}):
+        inside = (rings >= start) & (rings < start + width)
+        first, last = int(numbers[inside].min()), int(numbers[inside].max())
+        if np.array_equal(inside, (numbers >= first) & (numbers <= last)):
+            ranges.append((first, last))
+    return ranges
+
+
+def set_up_scene(scene: bpy.types.Scene, collection: bpy.types.Collection, rotation: Quaternion | None = None) -> None:
+    """Set the scene's units for a scanner, and look at the whole of it, if given from the view's `rotation`."""
+    units = scene.unit_settings
+    units.system, units.scale_length, units.length_unit = "METRIC", _UNIT, "MILLIMETERS"
+    reaches = [o.mphdrr_module.pinhole_distance + o.mphdrr_module.collimator_length for o in modules(collection)]
+    framing.look(collection, max(reaches, default=_SMALLEST_REACH), rotation)
+
+
+def is_set_up(scene: bpy.types.Scene) -> bool:
+    """Whether the scene's units are millimetres."""
+    units = scene.unit_settings
+    return units.system == "METRIC" and abs(units.scale_length - _UNIT) < 1e-6 * _UNIT
+
+
+def scanners(scene: bpy.types.Scene) -> list[bpy.types.Collection]:
+    """The scanners in the scene."""
+    return [c for c in scene.collection.children_recursive if c.mphdrr_scanner.is_scanner]
+
+
+def find_scanner(scene: bpy.types.Scene, name: str) -> bpy.types.Collection | None:
+    """The scanner that was imported under that name, or whose collection is called so."""
+    found = scanners(scene)
+    by_name = [c for c in found if c.mphdrr_scanner.scanner_name == name] or [c for c in found if c.name == name]
+    return by_name[0] if by_name else None
+
+
+def scanner_of(scene: bpy.types.Scene, item: bpy.types.Object | None) -> bpy.types.Collection | None:
+    """The scene's scanner that an object is in, the active one first; None for other objects."""
+    if item is None:
+        return None
+    found = sorted(scanners(scene), key=lambda c: c != scene.mphdrr_geometry.scanner)
+    return next((c for c in found if c.all_objects.get(item.name) == item), None)
+
+
+def active_scanner(scene: bpy.types.Scene) -> bpy.types.Collection | None:
+    """The scanner that the panels work on: the chosen one if it is in the scene, else the first; None without one."""
+    found = scanners(scene)
+    chosen = scene.mphdrr_geometry.scanner
+    return chosen if chosen in found else next(iter(found), None)
+
+
+def required_scanner(scene: bpy.types.Scene) -> bpy.types.Collection:
+    """The scanner that the panels work on; raises `InputError` where there is none."""
+    collection = active_scanner(scene)
+    if collection is None:
+        raise InputError("no scanner in the scene: import a workbook first")
+    return collection
+
+
+def module(collection: bpy.types.Collection, number: int) -> bpy.types.Object:
+    """The camera object of a module; raises `InputError` where there is none."""
+    for camera in modules(collection):
+        if camera.mphdrr_module.number == number:
+            return camera
+    raise InputError(f"scanner '{collection.name}' has no module {number}")
+
+
+def read_scanner(collection: bpy.types.Collection, *, aimed: bool = False) -> PinholeSystem:
+    """The scanner as it stands in the scene now: the cameras' places, and the numbers in their properties.
+
+    Numbers that have not changed come back exactly, in float64. The system's modules all look at the isocentre: a camera
+    that does not is named in an `InputWarning`, or refused if `aimed`. The system has its source (the workbook) only while
+    everything is as it was imported. Raises InputError for no modules, equal module numbers and impossible lengths.
+    """
+    found = modules(collection)
+    if not found:
+        raise InputError(f"collection '{collection.name}' has no pinhole modules: import a geometry first")
+    by_number: dict[int, bpy.types.Object] = {}
+    for camera in found:
+        other = by_number.setdefault(camera.mphdrr_module.number, camera)
+        if other is not camera:
+            raise InputError(
+                f"'{other.name}' and '{camera.name}' both have module number {camera.mphdrr_module.number}: "
+                f"press Tidy Modules in the Design panel, or delete one"
+            )
+    off = off_aim(found)
+    if off:
+        text = f"scanner '{collection.name}': {modules_text(off)} not aimed at the isocentre"
+        cure = "press Aim at Isocentre in the Design panel"
+        if aimed:
+            raise InputError(f"{text}, which a geometry file cannot express: {cure}")
+        warn(f"{text}, but calculated as if aimed: {cure}")
+    as_imported = len(found) == collection.mphdrr_scanner.n_modules and not any(
+        camera.mphdrr_module.added or is_moved(camera) or is_edited(camera) for camera in found
+    )
+    numbers = numbers_of(found, cameras.world_matrices(found))
+    return system_of(numbers, source(collection) if as_imported else None)
+
+
+def check_geometry(collection: bpy.types.Collection) -> tuple[list[str], list[bpy.types.Object]]:
+    """Check the scanner for overlaps, blocked holes and ROIs that are not seen, and store the findings at its modules.
+
+    Returns the findings, and the camera objects of the modules concerned.
+    """
+    construction = following.construction(collection.mphdrr_scanner)
+    report = checks.check_geometry(read_scanner(collection), **asdict(construction))
+    found, concerned = report.messages(), []
+    with following.writing():
+        collection.mphdrr_scanner.findings = json.dumps(found)
+        for camera in modules(collection):
+            own = report.messages(camera.mphdrr_module.number)
+            camera.mphdrr_module.finding = "; ".join(own)
+            concerned += [camera] if own else []
+    return found, concerned
+
+
+def aim_modules(collection: bpy.types.Collection) -> list[int]:
+    """Turn every camera that does not look at the isocentre; returns their modules' numbers."""
+    off = off_aim(modules(collection))
+    for camera in modules(collection):
+        if camera.mphdrr_module.number in off:
+            center = cameras.world_matrix(camera)[None, :3, 3]
+            cameras.set_world_matrix(camera, cameras.camera_matrices(center)[0])
+    following.refresh(collection)
+    return sorted(off)
+
+
+def set_visible(camera: bpy.types.Object, visible: bool) -> None:
+    """Show or hide a module with its collimator and crystal, in the viewport and in renders."""
+    _set_hidden([camera, *(c for c in camera.children if c.mphdrr_module.part in following.PARTS)], not visible)
+
+
+def show_modules(collection: bpy.types.Collection, first: int, last: int, mode: str = "ONLY") -> int:
+    """Show modules by their numbers, first to last; returns how many are visible now.
+
+    `mode` is ``"SHOW"`` or ``"HIDE"``, which leave the other modules, ``"ONLY"``, or ``"ALL"``, which needs no range.
+    """
+    found = modules(collection)
+    inside = {o for o in found if mode == "ALL" or first <= o.mphdrr_module.number <= last}
+    if not inside:
+        numbers = [o.mphdrr_module.number for o in found] or [0]
+        raise InputError(
+            f"no module between {first} and {last}: '{collection.name}' has {min(numbers)} to {max(numbers)}"
+        )
+    for camera, parts in following.parts_of(collection, found).items():
+        if camera in inside or mode == "ONLY":
+            _set_hidden([camera, *parts], mode == "HIDE" or camera not in inside)
+    return sum(not camera.hide_viewport for camera in found)
+
+
+def _set_hidden(items: Iterable[bpy.types.Object], hide: bool) -> None:
+    for item in items:
+        if item.hide_viewport != hide:  # writing the same value would make Blender evaluate the object again
+            item.hide_viewport = hide
+        if item.hide_render != hide:
+            item.hide_render = hide

@@ -1,0 +1,111 @@
+"""Scanners from workbooks, and the scene's scanner as a workbook or as another program's file."""
+
+import hashlib
+import math
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import bpy
+import numpy as np
+
+from ...core.errors import InputError, warn
+from ...core.exchange import FORMATS, write_geometry
+from ...core.geometry.system import LENGTHS, Detector, PinholeSystem
+from ...core.progress import Progress, stages_of
+from ...core.recording import recorded_warnings
+from ...core.workbook import read_system, write_system
+from ..blender import jobs, storage
+from ..blender.decimals import typed
+from . import following, scanner
+
+WORKBOOK_SUFFIXES = (".xlsx", ".xlsm")
+_EQUAL = 1e-9  # mm, or share of a length above 1 mm
+
+
+def exporting_scanner(collection: bpy.types.Collection, path: Path, use_template: bool = True) -> jobs.Job:
+    """The job that writes the scanner as it stands in the scene to a workbook (.xlsx, .xlsm), which becomes its own.
+
+    With `use_template` it is written into a copy of the scanner's present workbook, by the column map that this was read
+    by; a new one is made where that workbook has gone (`InputWarning`). Raises InputError, and leaves the scanner as it was,
+    where a camera is not aimed or the file cannot be written.
+    """
+    following.refresh(collection)
+    system = scanner.read_scanner(collection, aimed=True)
+    template = _template(collection) if use_template else None
+    source = scanner.source(collection) if template is not None else None
+    columns, name = source.columns if source is not None else None, collection.name
+
+    def work(progress: Progress) -> PinholeSystem:
+        stages_of(progress)("writing the workbook")
+        own = write_system(system, path, template, columns).columns
+        with recorded_warnings():  # the writer has already warned of the template's doubts
+            written = read_system(path, own)
+        different = _difference(system, written)
+        if different:
+            raise InputError(
+                f"{path}: was written, but reads back differently ({different}); the scene keeps its numbers"
+            )
+        # The scene's own float64 numbers, which may differ in the last digit.
+        return replace(system, source=written.source)
+
+    def finish(written: PinholeSystem) -> str:
+        collection = bpy.data.collections.get(name)
+        if collection is not None:
+            scanner.remember_source(collection, written)
+        return f"Wrote {len(written)} modules to {path}"
+
+    return jobs.Job("Exporting the workbook", work, finish)
+
+
+def exporting_for_program(
+    collection: bpy.types.Collection,
+    path: Path,
+    format: str,
+    shape: tuple[int, int],
+    detector: Detector = "virtual",
+    magnification: float = 10.0,
+) -> jobs.Job:
+    """The job that writes the scanner as it stands in the scene in one of `FORMATS`, its collimators as they are built.
+
+    `path` is a new folder for formats of several files; the images described are `system.views(shape, detector, ...)`.
+    Raises InputError where a camera does not look at the isocentre or the format cannot express the scanner.
+    """
+    options = asdict(following.construction(collection.mphdrr_scanner))
+    options["opening_degrees"] = typed(math.degrees(options.pop("opening_angle")))
+    system = scanner.read_scanner(collection, aimed=True)
+    views = system.views(shape, detector, magnification=magnification)
+    known = {name: value for name, value in options.items() if name in FORMATS[format].options}
+
+    def work(progress: Progress) -> None:
+        stages_of(progress)("writing the file")
+        write_geometry(system, path, format, views=views, **known)
+
+    return jobs.Job("Exporting the geometry", work, lambda _: f"Wrote {len(system)} modules to {path}")
+
+
+def _template(collection: bpy.types.Collection) -> Path | None:
+    properties = collection.mphdrr_scanner
+    if not properties.workbook:
+        return None
+    path = storage.absolute(properties.workbook)
+    if not path.is_file():
+        warn(f"{path} has gone: made a new workbook instead of a copy of it")
+        return None
+    if properties.sha256 and hashlib.sha256(path.read_bytes()).hexdigest() != properties.sha256:
+        warn(
+            f"{path} has changed since the scanner was read from it: the modules' cells are overwritten, all else is "
+            "kept as it is now"
+        )
+    return path
+
+
+def _difference(one: PinholeSystem, other: PinholeSystem) -> str:
+    """Where two systems differ, in words."""
+    if not np.array_equal(one.numbers, other.numbers):
+        return "the modules' numbers"
+    for name in ("centers", *LENGTHS):
+        a, b = (getattr(system, name).reshape(len(one), -1) for system in (one, other))
+        wrong = (np.abs(a - b) > _EQUAL * np.maximum(1.0, np.abs(a))).any(axis=1)
+        if wrong.any():
+            return f"{name} of module {one.numbers[int(wrong.argmax())]}"
+    return ""

@@ -1,0 +1,182 @@
+"""The datablocks of a scanner: made outside the scene, so that a failure leaves nothing behind, and replaced there."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import bpy
+
+from ...core.geometry.module_parts import ModulePart
+from ...core.geometry.system import PinholeSystem
+from ..blender import ids
+from . import cameras, collimators
+from .module_values import is_edited, is_moved, off_aim, write_module
+
+
+class NewScanner:
+    """The datablocks of a scanner that is not in the scene yet: `cameras` by module number, `rings` and the `roi` sphere."""
+
+    def __init__(self, system: PinholeSystem, parts: Sequence[ModulePart]) -> None:
+        self.cameras: dict[int, bpy.types.Object] = {}
+        self.rings: list[bpy.types.Collection] = []
+        self._named: list[tuple[bpy.types.ID, str]] = []  # names are free only after the old scanner has gone
+        self._materials = {part: collimators.part_material(part) for part in collimators.LOOKS}
+        try:
+            self._make_cameras(system)
+            self._make_parts(system, parts)
+            self.roi = self._make_roi(float(system.roi_radius.max()))
+        except BaseException:
+            bpy.data.batch_remove([datablock for datablock, _ in self._named])
+            bpy.data.batch_remove([m for m in self._materials.values() if m.users == 0])
+            raise
+
+    def _make_cameras(self, system: PinholeSystem) -> None:
+        rings = system.rings()
+        for ring in range(int(rings.max()) + 1):
+            collection = self._keep(bpy.data.collections.new(ids.ring_name(ring)), ids.ring_name(ring))
+            collection.mphdrr_scanner.is_ring = True
+            self.rings.append(collection)
+        matrices = cameras.camera_matrices(system.centers)
+        for m, number in enumerate(system.numbers.tolist()):
+            name = ids.module_name(number, len(system))
+            data = self._keep(bpy.data.cameras.new(name), name)
+            cameras.set_up_camera(data, system, m)
+            camera = self._keep(bpy.data.objects.new(name, data), name)
+            self.cameras[number] = camera
+            cameras.set_world_matrix(camera, matrices[m])
+            camera.lock_scale = (True, True, True)  # or its collimator would grow with it
+            write_module(camera, system, m, int(rings[m]))
+            self.rings[rings[m]].objects.link(camera)
+
+    def _make_parts(self, system: PinholeSystem, parts: Sequence[ModulePart]) -> None:
+        for part in parts:
+            camera, kind = self.cameras[part.number], part.kind.upper()
+            name = ids.part_name(ids.module_name(part.number, len(system)), kind)
+            mesh = self._keep(collimators.new_mesh(name, part.solid, self._materials[kind]), name)
+            child = self._keep(new_part(camera, kind, name, mesh), name)
+            self.rings[camera.mphdrr_module.ring].objects.link(child)
+
+    def _make_roi(self, radius: float) -> bpy.types.Object:
+        mesh = self._keep(collimators.new_sphere("ROI", radius, self._materials["ROI"]), "ROI")
+        roi = self._keep(bpy.data.objects.new("ROI", mesh), "ROI")
+        roi.mphdrr_module.part = "ROI"
+        roi.hide_select = True
+        # Circles: the solid viewport draws no volume behind or inside a transparent surface. Renders show the sphere.
+        roi.display_type, roi.display_bounds_type = "BOUNDS", "SPHERE"
+        roi.lock_location = roi.lock_rotation = roi.lock_scale = (True, True, True)
+        roi.visible_shadow = False
+        return roi
+
+    def _keep(self, datablock: Any, name: str) -> Any:
+        self._named.append((datablock, name))
+        return datablock
+
+    def name_and_link(self, collection: bpy.types.Collection) -> None:
+        """Put everything into the scanner's collection, once the old scanner's names are free."""
+        for datablock, name in self._named:
+            if datablock.name != name:
+                datablock.name = name
+        for ring in self.rings:
+            collection.children.link(ring)
+        collection.objects.link(self.roi)
+
+
+def new_part(camera: bpy.types.Object, part: str, name: str, mesh: bpy.types.Mesh) -> bpy.types.Object:
+    """A module's collimator or crystal, parented to its camera. Its mesh is its own, so that it can be reshaped."""
+    item = bpy.data.objects.new(name, mesh)
+    item.parent = camera
+    item.lock_scale = (True, True, True)  # moving it moves the module (`grabbing.py`)
+    item.mphdrr_module.part, item.mphdrr_module.number = part, camera.mphdrr_module.number
+    return item
+
+
+def losses(collection: bpy.types.Collection) -> list[str]:
+    """The changes that replacing the scanner would undo, a phrase each; empty if it is as it was imported."""
+    parts, others = parts_and_others(collection)
+    found = [o for o in parts if o.mphdrr_module.is_module]
+    lost = []
+    for what, is_lost in (
+        ("moved or turned", lambda o: is_moved(o) or off_aim([o])),
+        ("with changed numbers", is_edited),
+        ("added", lambda o: o.mphdrr_module.added),
+        ("with animation or constraints", lambda o: o.animation_data is not None or len(o.constraints)),
+    ):
+        numbers = [o.mphdrr_module.number for o in found if is_lost(o)]
+        if numbers:
+            lost.append(f"{modules_text(numbers)} {what}")
+    gone = collection.mphdrr_scanner.n_modules - sum(not o.mphdrr_module.added for o in found)
+    if gone > 0:
+        lost.append(f"{gone} module{'s' * (gone > 1)} deleted or moved out")
+    names = [o.name for o in others] + [c.name for c in _own_collections(collection)]
+    if names:
+        lost.append(f"yours, which will move to the scene's collection: {_listed(names)}")
+    return lost
+
+
+def clear(scene: bpy.types.Scene, collection: bpy.types.Collection, replacements: dict[int, bpy.types.Object]) -> None:
+    """Remove the scanner's objects and rings; `replacements` are the new cameras by module number.
+
+    The user's objects move out of the scanner, and whatever referred to an old camera refers to the new one.
+    """
+    parts, others = parts_and_others(collection)
+    homes = [collection, *_rings(collection)]
+    for own in _own_collections(collection):
+        for home in homes:
+            if own.name in home.children:
+                home.children.unlink(own)
+        if own not in set(scene.collection.children_recursive):
+            scene.collection.children.link(own)
+    for item in others:
+        for home in homes:
+            if item.name in home.objects:
+                home.objects.unlink(item)
+        if not item.users_collection:
+            scene.collection.objects.link(item)
+
+    ours = set(parts)
+    new_of = {o: replacements.get(o.mphdrr_module.number) for o in parts if o.mphdrr_module.is_module}
+    for item in bpy.data.objects:
+        if item.parent in ours and item not in ours and new_of.get(item.parent) is None:
+            cameras.unparent(item)
+
+    datas = {o.data for o in parts if o.data is not None}
+    bpy.data.batch_remove([o for o in parts if o not in new_of])
+    rings = set(homes[1:])
+    for camera, users in bpy.data.user_map(subset=set(new_of)).items():
+        if new_of[camera] is not None and users - rings:
+            camera.user_remap(new_of[camera])
+    bpy.data.batch_remove([*new_of, *rings])
+    bpy.data.batch_remove([data for data in datas if data.users == 0])
+
+
+def parts_and_others(collection: bpy.types.Collection) -> tuple[list[bpy.types.Object], list[bpy.types.Object]]:
+    """The scanner's own objects, and the user's: other objects, and copies of the scanner's."""
+    parts, others = [], []
+    seen: set[tuple[str, int]] = set()
+    for item in sorted(collection.all_objects, key=lambda o: o.name):  # "Module 07" before its copy "Module 07.001"
+        module = item.mphdrr_module
+        key = (module.part, module.number)
+        if module.part == "NONE" or key in seen:
+            others.append(item)
+        else:
+            seen.add(key)
+            parts.append(item)
+    return parts, others
+
+
+def _rings(collection: bpy.types.Collection) -> list[bpy.types.Collection]:
+    return [c for c in collection.children if c.mphdrr_scanner.is_ring]
+
+
+def _own_collections(collection: bpy.types.Collection) -> list[bpy.types.Collection]:
+    """The user's collections directly inside the scanner or one of its rings."""
+    return [c for home in (collection, *_rings(collection)) for c in home.children if not c.mphdrr_scanner.is_ring]
+
+
+def modules_text(numbers: Sequence[int]) -> str:
+    """ "module 7", or "modules 7, 12"."""
+    return f"module{'s' * (len(numbers) > 1)} {_listed([str(n) for n in numbers])}"
+
+
+def _listed(names: Sequence[str], most: int = 6) -> str:
+    rest = len(names) - most
+    return ", ".join(names[:most]) + (f" and {rest} more" if rest > 0 else "")

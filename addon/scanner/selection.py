@@ -1,0 +1,126 @@
+"""Which modules an operator or a panel works on: the active one and the selected ones."""
+
+from collections.abc import Iterable
+
+import bpy
+
+from ..blender.reports import Need, Reported, needs
+from ..pictures import images
+from . import following, scanner
+
+SCANNER: Need = (
+    lambda context: scanner.active_scanner(context.scene) is not None,
+    "No scanner in the scene: import a geometry first",
+)
+
+
+def active_module(context: bpy.types.Context) -> bpy.types.Object | None:
+    """The camera of the active scanner's module that is active in the viewport (or a part of it is), else in the list."""
+    collection = scanner.active_scanner(context.scene)
+    if collection is None:
+        return None
+    item = module_of(context.view_layer.objects.active)
+    if item is not None and item.name in collection.all_objects:
+        return item
+    return listed_module(context.scene)
+
+
+def listed_module(scene: bpy.types.Scene) -> bpy.types.Object | None:
+    """The camera of the module that is active in the panel's list."""
+    collection, index = scanner.active_scanner(scene), scene.mphdrr_geometry.active_index
+    camera = collection.all_objects[index] if collection and 0 <= index < len(collection.all_objects) else None
+    return camera if camera is not None and camera.mphdrr_module.is_module else None
+
+
+def selected_modules(context: bpy.types.Context) -> list[bpy.types.Object]:
+    """Cameras of the active scanner's modules that are selected (or a part of them is), in order; else the active one."""
+    collection = scanner.active_scanner(context.scene)
+    if collection is None:
+        return []
+    chosen = {module_of(item) for item in context.view_layer.objects.selected}
+    active = active_module(context)
+    return [o for o in scanner.modules(collection) if o in chosen] or ([active] if active else [])
+
+
+def module_of(item: bpy.types.Object | None) -> bpy.types.Object | None:
+    """The camera of the module that an object is or belongs to; None for other objects."""
+    if item is not None and not item.mphdrr_module.is_module and item.mphdrr_module.part != "NONE":
+        item = item.parent
+    return item if item is not None and item.mphdrr_module.is_module else None
+
+
+def select(context: bpy.types.Context, modules: Iterable[bpy.types.Object]) -> None:
+    """Select those of these modules' cameras that are visible, and nothing else; the first becomes active."""
+    if context.mode != "OBJECT":
+        return
+    layer = context.view_layer
+    for item in list(layer.objects.selected):
+        item.select_set(False, view_layer=layer)
+    shown = [o for o in modules if o.name in layer.objects and o.visible_get(view_layer=layer)]
+    for camera in shown:
+        camera.select_set(True, view_layer=layer)
+    if shown:
+        layer.objects.active = shown[0]
+
+
+@bpy.app.handlers.persistent
+def after_update(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
+    """Another object was made active in the viewport: the panels' scanner, the list and the mosaic follow."""
+    if not depsgraph.id_type_updated("SCENE") or scene != bpy.context.scene:
+        return
+    item = bpy.context.view_layer.objects.active
+    camera = module_of(item)
+    collection = scanner.scanner_of(scene, camera or item)
+    if collection is None:
+        return
+    if collection != scanner.active_scanner(scene) or (camera is not None and camera != listed_module(scene)):
+        with following.writing():
+            if scene.mphdrr_geometry.scanner != collection:  # writing it makes Blender look at all objects
+                scene.mphdrr_geometry.scanner = collection
+            _list(scene, camera or next(iter(scanner.modules(collection)), None))
+        images.redraw_mosaic()
+
+
+def scanner_chosen(scene: bpy.types.Scene) -> None:
+    """Another scanner was chosen in the panel: its first module becomes active."""
+    collection = scanner.active_scanner(scene)
+    if collection is not None and not following.is_writing():
+        _list(scene, next(iter(scanner.modules(collection)), None))
+
+
+def _list(scene: bpy.types.Scene, camera: bpy.types.Object | None) -> None:
+    """Make a module active in the panel's list."""
+    collection = scanner.active_scanner(scene)
+    if camera is not None and collection is not None:
+        scene.mphdrr_geometry.active_index = collection.all_objects.find(camera.name)
+
+
+def select_active(scene: bpy.types.Scene) -> None:
+    """Select the module that is active in the panel's list, as a click on its camera would."""
+    camera, layer = listed_module(scene), bpy.context.view_layer
+    if camera is None or following.is_writing():  # the list follows the viewport
+        return
+    if camera.visible_get(view_layer=layer):
+        select(bpy.context, [camera])
+    elif camera.name in layer.objects and bpy.context.mode == "OBJECT":  # or the list would follow the viewport again
+        layer.objects.active = camera
+
+
+class OnScanner(Reported):
+    """Mix into an operator that works on the scanner of the panels."""
+
+    poll = needs(SCANNER)
+
+    def act(self, context: bpy.types.Context) -> str:
+        """Do the work on the scanner."""
+        return self.change(context, scanner.required_scanner(context.scene))
+
+    def change(self, context: bpy.types.Context, collection: bpy.types.Collection) -> str:
+        """Do the work and return the line to report; raises InputError."""
+        raise NotImplementedError
+
+
+class OnModules(OnScanner):
+    """Mix into an operator that works on the active or selected modules."""
+
+    poll = needs(SCANNER, (selected_modules, "No module is selected: select a module's camera"))

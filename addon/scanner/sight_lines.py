@@ -1,0 +1,58 @@
+"""What modules look at, drawn in the 3D views and never rendered: principal rays, fields of view, virtual detectors."""
+
+import bpy
+import gpu
+import numpy as np
+from numpy.typing import NDArray
+
+from ..blender import windows
+from . import cameras, following, scanner, selection
+
+# By the setting: the lines' colour, and which of the points of `lines` they join.
+_DRAWN = {
+    "show_rays": ((1.0, 0.75, 0.2, 0.9), [(0, 5)]),
+    "show_frustums": ((0.45, 0.8, 1.0, 0.35), [(0, 1), (0, 2), (0, 3), (0, 4)]),
+    "show_detectors": ((0.45, 0.8, 1.0, 0.9), [(1, 2), (2, 3), (3, 4), (4, 1)]),
+}
+_WIDTH = 1.5  # of the lines, in pixels of the screen
+_CORNERS = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
+
+
+def lines(context: bpy.types.Context) -> dict[str, NDArray[np.float64]]:
+    """By each setting that is on, the ends of its lines (N, 2, 3), world mm.
+
+    A ray ends at the virtual detector of the panel's magnification; a frustum's edges lead to its corners.
+    """
+    scene = context.scene
+    state, collection = scene.mphdrr_geometry, scanner.active_scanner(scene)
+    wanted = [name for name in _DRAWN if getattr(state, name)]
+    if collection is None or not wanted:
+        return {}
+    active = selection.active_module(context)
+    chosen = following.modules(collection) if state.sight_all else [active] if active else []
+    shown = [camera for camera in chosen if camera.visible_get()]
+    sizes = np.array([(o.mphdrr_module.collimator_length, o.mphdrr_module.detector_side) for o in shown]).reshape(-1, 2)
+    depth, side = (scene.mphdrr_projections.magnification * sizes).T
+    local = np.zeros((len(shown), 6, 3))  # the pinhole, the detector's corners and its middle
+    local[:, 1:5, :2], local[:, 1:, 2] = _CORNERS * side[:, None, None] / 2, -depth[:, None]
+    matrices = cameras.world_matrices(shown)
+    points = local @ matrices[:, :3, :3].transpose(0, 2, 1) + matrices[:, None, :3, 3]
+    return {name: points[:, _DRAWN[name][1]].reshape(-1, 2, 3) for name in wanted}
+
+
+def draw() -> None:
+    """Draw them; Blender calls this for every 3D view."""
+    context = bpy.context
+    if not context.space_data.overlay.show_overlays:
+        return
+    gpu.state.blend_set("ALPHA")
+    gpu.state.depth_test_set("LESS_EQUAL")
+    for name, ends in lines(context).items():
+        windows.draw_lines(ends.reshape(-1, 3).astype(np.float32), _DRAWN[name][0], _WIDTH)
+    gpu.state.depth_test_set("NONE")
+    gpu.state.blend_set("NONE")
+
+
+def redraw(*_: object) -> None:
+    """Have the 3D views drawn again: the setting was changed, perhaps by a script."""
+    windows.redraw("VIEW_3D")

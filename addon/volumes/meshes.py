@@ -1,0 +1,123 @@
+"""Mesh objects of the scene as core's meshes and back, and the jobs that make volumes of them or them of volumes."""
+
+from collections.abc import Sequence
+
+import bpy
+import numpy as np
+from mathutils import Matrix
+from numpy.typing import NDArray
+
+from ...core.errors import InputError, naming
+from ...core.geometry.grid import grid_around
+from ...core.memory import require
+from ...core.progress import Progress
+from ...core.volumes.meshes.mesh import Mesh, require_closed
+from ...core.volumes.meshes.surface import volume_to_mesh
+from ...core.volumes.meshes.voxelization import voxelize_mesh
+from ...core.volumes.volume import UNITS
+from ..blender import jobs, storage
+from ..scanner.cameras import world_matrix
+from . import volume_materials, volumes
+from .stored_volumes import StoredVolume, store_volume
+
+_BYTES = 40.0  # a voxel, while the volume is made and put into the scene
+
+
+def voxelizing(
+    items: Sequence[bpy.types.Object],
+    value: float = 100.0,
+    quantity: str = "activity",
+    voxels: int = 128,
+    voxel_size: float = 0.0,
+    name: str = "",
+) -> jobs.Job:
+    """The job that makes a volume of closed mesh objects, modifiers included: a voxel holds the share that they cover.
+
+    Later items cover earlier ones. The `value` inside is in the unit of the `quantity`, "activity" or "mu"; an object's
+    custom property of that name counts instead. `voxels` are those along the longest side; a `voxel_size` in mm, if not 0,
+    counts instead. The volume's name is by default the first mesh's.
+    """
+    if not items:
+        raise InputError("no mesh object is selected: select closed meshes first")
+    values = [float(item.get(quantity, value)) for item in items]
+    solids = meshes_of(items, bpy.context.evaluated_depsgraph_get())
+    vertices = np.concatenate([solid.vertices for solid in solids])
+    spacing = voxel_size or float(np.ptp(vertices, axis=0).max()) / max(1, voxels - 2)
+    grid = grid_around(vertices, spacing)
+    shape = " x ".join(map(str, grid.shape))
+    require(_BYTES * grid.n_voxels, f"a volume of {shape} voxels")
+    name = name or f"{items[0].name} {quantity}"
+    folder, provenance = storage.folder(), {"meshes": [item.name for item in items], "values": values}
+
+    def work(progress: Progress) -> StoredVolume:
+        return store_volume(voxelize_mesh(solids, grid, values, quantity, progress), folder, provenance=provenance)
+
+    def finish(stored: StoredVolume) -> str:
+        volumes.make_active(bpy.context, volumes.add_stored(stored, name))
+        content = float(stored.volume.array.sum(dtype=np.float64)) * grid.voxel_volume
+        total = f"{content * 1e-3:.4g} kBq" if quantity == "activity" else f"{content:.4g} {UNITS[quantity]} mm^3"
+        return f"Added {name!r}: {shape} voxels of {grid.spacing[0]:.3g} mm, {total} in all"
+
+    return jobs.Job("Voxelizing meshes", work, finish)
+
+
+def extracting(item: bpy.types.Object, level: float | None = None) -> jobs.Job:
+    """The job that makes a closed mesh of a volume's surface of one value, in the unit that the window shows.
+
+    By default it is halfway between the value outside and the largest.
+    """
+    read, pose, name = volumes.reader(item), volumes.pose_of_object(item), f"{item.name} surface"
+    if level is not None:
+        level /= volume_materials.shown_unit(volumes.quantity_of(item))[1]
+
+    def work(progress: Progress) -> Mesh:
+        return volume_to_mesh(read(), level, progress)
+
+    def finish(mesh: Mesh) -> str:
+        add_mesh(mesh, name, pose, bpy.context.collection)
+        return f"Added {name!r}: {len(mesh.faces)} triangles around {abs(mesh.volume):.4g} mm^3"
+
+    return jobs.Job("Mesh from volume", work, finish)
+
+
+def meshes_of(items: Sequence[bpy.types.Object], depsgraph: bpy.types.Depsgraph) -> list[Mesh]:
+    """What objects look like, modifiers included, in world mm; `InputError` names one that has no faces, or is open."""
+    meshes = []
+    for item in items:
+        evaluated = item.evaluated_get(depsgraph)
+        mesh = evaluated.to_mesh()
+        try:
+            mesh.calc_loop_triangles()
+            points = np.empty((len(mesh.vertices), 3), np.float32)
+            mesh.vertices.foreach_get("co", points.ravel())
+            faces = np.empty((len(mesh.loop_triangles), 3), np.int32)
+            mesh.loop_triangles.foreach_get("vertices", faces.ravel())
+        finally:
+            evaluated.to_mesh_clear()
+        pose = world_matrix(item)
+        if np.linalg.det(pose[:3, :3]) < 0:  # a mirrored object shows the other side of its faces
+            faces = faces[:, ::-1]
+        with naming(repr(item.name)):
+            meshes.append(Mesh(points.astype(np.float64) @ pose[:3, :3].T + pose[:3, 3], faces.astype(np.int64)))
+            require_closed(meshes[-1])
+    return meshes
+
+
+def add_mesh(mesh: Mesh, name: str, pose: NDArray[np.float64], collection: bpy.types.Collection) -> bpy.types.Object:
+    """A mesh object with its origin and axes at world-from-object `pose` (4, 4)."""
+    back = np.linalg.inv(pose)
+    data = bpy.data.meshes.new(name)
+    vertices = mesh.vertices @ back[:3, :3].T + back[:3, 3]
+    faces = mesh.faces if np.linalg.det(pose[:3, :3]) > 0 else mesh.faces[:, ::-1]
+    data.vertices.add(len(vertices))
+    data.vertices.foreach_set("co", vertices.astype(np.float32).ravel())
+    data.loops.add(faces.size)
+    data.loops.foreach_set("vertex_index", faces.astype(np.int32).ravel())
+    data.polygons.add(len(faces))
+    data.polygons.foreach_set("loop_start", np.arange(0, faces.size, 3, dtype=np.int32))
+    data.update(calc_edges=True)
+    data.shade_smooth()
+    item = bpy.data.objects.new(name, data)
+    collection.objects.link(item)
+    item.matrix_world = Matrix(pose)
+    return item

@@ -1,0 +1,43 @@
+"""Volumes of the scene as files for other programs."""
+
+from pathlib import Path
+from typing import Any
+
+import bpy
+
+from ...core.errors import InputError
+from ...core.progress import Progress, stages_of
+from ...core.volumes.volume_files import VOLUME_FORMATS, write_volume
+from ..blender import jobs
+from ..phantoms import phantoms
+from . import vdb, volumes
+
+WRITTEN_ENDINGS = (".vdb", *VOLUME_FORMATS)
+"""Endings of the names of files that volumes can be written to."""
+
+
+def exporting(item: bpy.types.Object, path: Path) -> jobs.Job:
+    """The job that writes every voxel of a volume, where it stands in the world; the name's ending chooses the format."""
+    if not path.name.lower().endswith(WRITTEN_ENDINGS):
+        raise InputError(f"{path}: expected a name ending in {', '.join(WRITTEN_ENDINGS)}")
+    read = volumes.reader(item)
+    if path.resolve() == volumes.file_of(item).resolve():
+        raise InputError(f"{path}: is the scene's own file of {item.name!r}; choose another name")
+    phantoms.require_current(item)
+    provenance: dict[str, Any] = {"object": item.name}
+    phantom = phantoms.settings_of(item)
+    if phantom is not None:
+        provenance |= phantom.recipe()
+    if item.data.is_sequence:
+        provenance |= {"frame": bpy.context.scene.frame_current, "state": volumes.state_text(item)}
+
+    def work(progress: Progress) -> None:
+        stages_of(progress)("reading the voxels")
+        volume = read()
+        stages_of(progress)("writing the file")
+        if path.suffix.lower() == ".vdb":
+            vdb.write_vdb(volume, path, provenance)
+        else:
+            write_volume(volume, path)
+
+    return jobs.Job("Exporting a volume", work, lambda _: f"Wrote {path}")

@@ -1,0 +1,122 @@
+"""Volumes from files, and CTs that become attenuation: jobs that add a volume to the scene."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import bpy
+
+from ...core.memory import require
+from ...core.physics.ct_numbers import hu_to_mu
+from ...core.progress import Progress, part_of, stages_of
+from ...core.volumes.rearranging import centered
+from ...core.volumes.volume import UNITS, Volume
+from ...core.volumes.volume_files import READ_FORMATS, read_volume
+from ..blender import jobs, storage
+from . import vdb, volume_materials, volumes
+from .stored_volumes import StoredVolume, store_volume
+
+READ_ENDINGS = (*READ_FORMATS, ".vdb")
+"""Endings of the names of files that can be read as volumes."""
+
+
+def importing(
+    paths: Sequence[Path],
+    name: str = "",
+    *,
+    quantity: str | None = None,
+    center: bool = True,
+    energy: float | None = None,
+    grid: str | None = None,
+    unit: float = 1.0,
+    frame_start: int = 1,
+) -> jobs.Job:
+    """The job that reads a file (or the folder of a DICOM series) as a volume, or several as the states of one.
+
+    Parameters
+    ----------
+    paths, name, frame_start
+        The files, the object's name (by default the first file's), and the frame of the first state.
+    quantity
+        What the voxels hold, one of `UNITS`. Default: what the file says, or else activity in OpenVDB, CT numbers elsewhere.
+    center
+        Move the (first) volume's middle to the isocentre; states move together.
+    energy
+        Convert CT numbers to attenuation of photons of this energy, keV.
+    grid, unit
+        Of OpenVDB files, see `vdb.read_vdb`.
+    """
+    folder, count = storage.folder(), len(paths)
+
+    def work(progress: Progress) -> StoredVolume:
+        states: list[Volume] = []
+        for k, path in enumerate(paths):
+            progress(k, count)
+            if path.suffix.lower() == ".vdb":
+                states.append(vdb.read_vdb(path, quantity, grid, unit=unit))
+            else:
+                states.append(read_volume(path, quantity, progress=part_of(progress, k, count)))
+            if k == 0 and count > 1:
+                shape = " x ".join(map(str, states[0].grid.shape))
+                require(4.0 * (count - 1) * states[0].grid.n_voxels, f"{count} volumes of {shape} voxels")
+        names = [path.name for path in paths]
+        provenance: dict[str, Any] = {"file": names[0]} if count == 1 else {"files": names}
+        provenance["read_as"] = states[0].quantity
+        if energy is not None:
+            states = [hu_to_mu(volume, energy) for volume in states]
+            provenance["energy_keV"] = energy
+        if center:
+            middle = states[0].grid.center
+            provenance["moved_mm"] = (-middle).tolist()
+            states = [centered(volume, volume.grid.center - middle) for volume in states]
+        stages_of(progress)("writing the voxels")
+        return store_volume(states, folder, None, provenance)
+
+    def finish(stored: StoredVolume) -> str:
+        item = volumes.add_stored(stored, name or name_of(paths[0]), bpy.context.collection)
+        if item.data.is_sequence:
+            item.data.frame_start = frame_start
+        volumes.make_active(bpy.context, item)
+        volume, states = stored.volume, f"{count} states of " if count > 1 else ""
+        voxels = " x ".join(map(str, volume.grid.shape))
+        shown_in, factor = volume_materials.shown_unit(volume.quantity)
+        values = f"{volume.quantity}, {factor * stored.low:.4g} to {factor * stored.high:.4g} {shown_in}"
+        moved = ", its middle moved to the isocentre" if center else ""
+        return f"Imported {item.name!r}: {states}{voxels} voxels of {values}{moved}"
+
+    return jobs.Job("Importing a volume" if count == 1 else f"Importing {count} volumes", work, finish)
+
+
+def name_of(path: Path) -> str:
+    """A file's name without the ending by which it is read."""
+    endings = sorted(READ_ENDINGS, key=len, reverse=True)
+    ending = next((e for e in endings if path.name.lower().endswith(e)), "")
+    return path.name[: len(path.name) - len(ending)] or path.name
+
+
+def converting(item: bpy.types.Object, energy: float) -> jobs.Job:
+    """The job that adds the attenuation of a CT, for photons of an energy in keV; the CT stays."""
+    volumes.require_volume(item)
+    readers = [volumes.reader(item, path) for path in storage.files_of_states(item.data)]
+    pose, folder = volumes.pose_of_object(item), storage.folder()
+    name, collection, count = f"{item.name} mu", item.users_collection[0], len(readers)
+    n_x, n_y, n_z = item.mphdrr_volume.shape
+    require(8.0 * count * n_x * n_y * n_z, f"the attenuation of {count * n_x * n_y * n_z} voxels")
+    provenance: dict[str, Any] = {"ct": item.name, "energy_keV": energy}
+    frame_start, sequence_mode = item.data.frame_start, item.data.sequence_mode
+
+    def work(progress: Progress) -> StoredVolume:
+        states: list[Volume] = []
+        for read in readers:
+            progress(len(states), count)
+            states.append(hu_to_mu(read(), energy))
+        stages_of(progress)("writing the voxels")
+        return store_volume(states, folder, pose, provenance)
+
+    def finish(stored: StoredVolume) -> str:
+        made = volumes.add_stored(stored, name, collection)
+        made.data.frame_start, made.data.sequence_mode = frame_start, sequence_mode
+        volumes.make_active(bpy.context, made)
+        return f"Added {made.name!r}: {stored.low:.4g} to {stored.high:.4g} {UNITS['mu']} at {energy:g} keV"
+
+    return jobs.Job("CT to attenuation", work, finish)

@@ -49,6 +49,7 @@ from .physics.isotopes import ISOTOPES, Isotope, isotope
 from .physics.maps import completeness_map, modules_map, resolution_map, sensitivity_map
 from .physics.materials import MATERIALS, Material, attenuation
 from .physics.noise import sample_counts
+from .physics.optics import Optics
 from .physics.performance import ModulePerformance, isocentre_performance, magnification, resolution, seen, sensitivity
 from .physics.sampling import sampling_gaps
 from .progress import Cancelled, Progress

@@ -11,7 +11,7 @@ Everything imported here is the public interface. Arguments that cannot be used 
 
 import types
 
-from . import events, moved
+from . import events
 from .errors import InputError, InputWarning
 from .exchange import read_geometry, write_geometry
 from .geometry.checks import GeometryReport, check_geometry
@@ -103,5 +103,3 @@ from .workbook import (
 __all__ = [
     name for name, value in globals().items() if not (name.startswith("_") or isinstance(value, types.ModuleType))
 ]
-
-moved.keep_old_paths()

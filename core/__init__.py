@@ -11,7 +11,7 @@ Everything imported here is the public interface. Arguments that cannot be used 
 
 import types
 
-from . import events, moved
+from . import events
 from .errors import InputError, InputWarning
 from .exchange import read_geometry, write_geometry
 from .geometry.checks import GeometryReport, check_geometry
@@ -49,6 +49,7 @@ from .physics.isotopes import ISOTOPES, Isotope, isotope
 from .physics.maps import completeness_map, modules_map, resolution_map, sensitivity_map
 from .physics.materials import MATERIALS, Material, attenuation
 from .physics.noise import sample_counts
+from .physics.optics import Optics
 from .physics.performance import ModulePerformance, isocentre_performance, magnification, resolution, seen, sensitivity
 from .physics.sampling import sampling_gaps
 from .progress import Cancelled, Progress
@@ -102,5 +103,3 @@ from .workbook import (
 __all__ = [
     name for name, value in globals().items() if not (name.startswith("_") or isinstance(value, types.ModuleType))
 ]
-
-moved.keep_old_paths()

@@ -1,5 +1,6 @@
 """Numpy arrays and torch tensors: checked on the way in, of the caller's kind on the way out."""
 
+import functools
 import sys
 from typing import Any
 
@@ -112,16 +113,16 @@ def cast_like(values: ArrayOrTensor, like: ArrayOrTensor) -> ArrayOrTensor:
     return torch.tensor(values, dtype=like.dtype, device=like.device)
 
 
-def promote(first: ArrayOrTensor, second: ArrayOrTensor) -> tuple[ArrayOrTensor, ArrayOrTensor]:
-    """Both as tensors of one type and device if either is a tensor, still part of their graphs; else as they are."""
-    if not (is_tensor(first) or is_tensor(second)):
-        return first, second
+def promote(*values: ArrayOrTensor) -> tuple[ArrayOrTensor, ...]:
+    """All as tensors of one type and device if any is a tensor, still part of their graphs; else as they are."""
+    device = next((value.device for value in values if is_tensor(value)), None)
+    if device is None:
+        return values
     import torch
 
-    one, other = (x if is_tensor(x) else torch.tensor(x) for x in (first, second))
-    kind = torch.promote_types(one.dtype, other.dtype)
-    device = one.device if is_tensor(first) else other.device
-    return one.to(device, kind), other.to(device, kind)
+    tensors = [value if is_tensor(value) else torch.tensor(value) for value in values]
+    kind = functools.reduce(torch.promote_types, (tensor.dtype for tensor in tensors))
+    return tuple(tensor.to(device, kind) for tensor in tensors)
 
 
 def cropped(*volumes: ArrayOrTensor) -> tuple[list[ArrayOrTensor], tuple[int, int, int]]:

@@ -6,7 +6,7 @@ from functools import cached_property
 
 import numpy as np
 
-from ..physics.isotopes import WATER_MU
+from ..physics.materials import WATER_MU
 from ..validation import whole_number
 from .phantom import Phantom
 from .settings import count, require_at_most, setting

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError, warn
-from ..physics.isotopes import WATER_MU
+from ..physics.materials import WATER_MU
 from ..validation import at_least_0, freeze, positive, real_array
 from .intervals import Interval, Points, Real
 from .phantom import Phantom

@@ -5,8 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
-from ..physics.isotopes import WATER_MU
-from ..physics.materials import attenuation
+from ..physics.materials import WATER_MU, attenuation
 from .derenzo import DerenzoRods
 from .phantom import Phantom
 from .settings import require_apart, require_at_most, setting

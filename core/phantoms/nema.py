@@ -7,7 +7,7 @@ from functools import cached_property
 from typing import Any
 
 from ..errors import InputError
-from ..physics.isotopes import WATER_MU
+from ..physics.materials import WATER_MU
 from .phantom import Phantom
 from .settings import require_apart, require_at_most, setting
 from .shapes import Box, Cylinder, Shape, Sphere

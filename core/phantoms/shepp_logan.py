@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 from ..errors import InputError
-from ..physics.isotopes import WATER_MU
+from ..physics.materials import WATER_MU
 from .phantom import Phantom
 from .settings import choice, setting
 from .shapes import Ellipsoid, Shape

@@ -1,6 +1,6 @@
 """The pinhole: sample points in the hole and in its knife edge, and what they transmit.
 
-Functions of slopes take arrays or tensors.
+All lengths, slopes and coefficients may be numbers, arrays or tensors that broadcast.
 """
 
 import functools
@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from ..arrays import ArrayOrTensor, namespace
 from ..errors import InputError
-from ..geometry.collimator import edge_slope
 
 Array = NDArray[np.float64]
 
@@ -97,11 +96,13 @@ def _point_images(points: Array, shadow: float, pitch: tuple[float, float], blur
 class KnifeEdge:
     """A double-cone hole in an infinitely thick plate: material fills r > radius + |z| tan(alpha / 2)."""
 
-    radius: float  # of the hole, mm
-    mu: float  # 1/mm
-    tangent: float  # tan(alpha / 2)
+    radius: ArrayOrTensor  # of the hole, mm
+    mu: ArrayOrTensor  # 1/mm
+    tangent: ArrayOrTensor  # tan(alpha / 2)
 
-    def transmission(self, x: float, y: float, slope_u: ArrayOrTensor, slope_v: ArrayOrTensor) -> ArrayOrTensor:
+    def transmission(
+        self, x: ArrayOrTensor, y: ArrayOrTensor, slope_u: ArrayOrTensor, slope_v: ArrayOrTensor
+    ) -> ArrayOrTensor:
         """Fraction exp(-mu path) of the photons that pass the edge on lines that cross z = 0 outside the hole.
 
         Such a line is inside the material between the two cones; one that is steeper than the cone never leaves it. It
@@ -119,7 +120,7 @@ class KnifeEdge:
             depth = depth + beyond / (library.sqrt(closing**2 + opens * beyond) + closing)
         return library.where(passes, library.exp(-self.mu * depth * library.sqrt(1 + slope)), 0.0)
 
-    def points(self, n: int) -> list[tuple[float, float, float]]:
+    def points(self, n: int) -> list[tuple[ArrayOrTensor, ArrayOrTensor, ArrayOrTensor]]:
         """Sample points beyond the rim: (x, y) in mm, and the area, mm^2, that each represents.
 
         They are about as dense as `n` points in the hole. The sum of area times transmission is exact along the axis.
@@ -128,7 +129,7 @@ class KnifeEdge:
         depth = self.tangent / (2 * self.mu)  # where a fraction exp(-1) of the rays along the axis pass
         # An odd number, so that no two points are opposite: opposite points transmit the same.
         angles = max(_FEWEST_EDGE_ANGLES, math.ceil(2 * math.sqrt(math.pi * n)) | 1)
-        points: list[tuple[float, float, float]] = []
+        points = []
         for ring, (node, weight) in enumerate(_EDGE_RINGS):
             radius = self.radius + depth * node
             area = 2 * math.pi * radius / angles * depth * weight * math.exp(node)
@@ -141,11 +142,11 @@ class KnifeEdge:
 class Opening:
     """A point of the pinhole's plane that rays start from, and the area that it represents."""
 
-    x: float  # mm from the hole's centre along u
-    y: float  # along v
-    hole: float  # represented area of the hole, mm^2
+    x: ArrayOrTensor  # mm from the hole's centre along u
+    y: ArrayOrTensor  # along v
+    hole: ArrayOrTensor  # represented area of the hole, mm^2
     knife: KnifeEdge | None = None  # without one the hole is open to every direction
-    beyond: Sequence[tuple[float, float, float]] = ()  # represented points of the edge: x, y, area
+    beyond: Sequence[tuple[ArrayOrTensor, ...]] = ()  # represented points of the edge: x, y, area
 
     def area(self, slope_u: ArrayOrTensor, slope_v: ArrayOrTensor) -> ArrayOrTensor:
         """Area, mm^2, open to photons with slopes in mm along u and v per mm along the axis."""
@@ -157,46 +158,17 @@ class Opening:
         return area
 
 
-def openings(n: int, diameter: float, knife: KnifeEdge | None = None) -> list[Opening]:
+def openings(n: int, diameter: ArrayOrTensor, knife: KnifeEdge | None = None) -> list[Opening]:
     """Points that represent a hole of the given diameter, mm, by `n` points, and its edge."""
-    points = diameter / 2 * disk_points(n)
     hole = math.pi / 4 * diameter**2 / n
     beyond = [] if knife is None else knife.points(n)
     if n == 1:  # all rays start from the centre
         return [Opening(0.0, 0.0, hole, knife, beyond)]
-    in_hole = [Opening(float(x), float(y), hole, knife) for x, y in points]
+    in_hole = [Opening(x * (diameter / 2), y * (diameter / 2), hole, knife) for x, y in disk_points(n).tolist()]
     return in_hole + [Opening(x, y, 0.0, knife, ((x, y, area),)) for x, y, area in beyond]
 
 
-def paix_diameter(diameter: Array, mu: float | None, opening_angle: float) -> Array:
-    """Paix's effective diameter ``sqrt(d (d + 2 / mu tan(alpha / 2)))``, mm, of knife-edge holes of diameter d, mm.
-
-    An opaque hole of this diameter transmits as many photons. `mu` is the material's coefficient, 1/mm (None: opaque,
-    so d itself), and `opening_angle` the full angle alpha of the edge's double cone, rad.
-    """
-    return diameter if mu is None else np.sqrt(diameter * (diameter + 2 / mu * edge_slope(opening_angle)))
-
-
-def half_value_diameter(diameter: Array, mu: float | None, opening_angle: float) -> Array:
-    """Diameter ``d + ln(2) / mu tan(alpha / 2)``, mm, at which a knife edge transmits half of the axial photons.
-
-    At radius r the edge is ``2 (r - d / 2) / tan(alpha / 2)`` thick. So this is the full width at half maximum of the
-    hole's shadow: Accorsi and Metzler's resolution-equivalent diameter. Parameters as in `paix_diameter`.
-    """
-    return diameter if mu is None else diameter + math.log(2) / mu * edge_slope(opening_angle)
-
-
-def within_cone(slope_u: ArrayOrTensor, slope_v: ArrayOrTensor, tangent: float) -> ArrayOrTensor:
+def within_cone(slope_u: ArrayOrTensor, slope_v: ArrayOrTensor, tangent: ArrayOrTensor) -> ArrayOrTensor:
     """1 where lines are less steep than the cone, tan(psi) < tangent, else 0."""
     slope = slope_u**2 + slope_v**2
     return namespace(slope).ones_like(slope) * (slope < tangent**2)
-
-
-def throughput(cosine: ArrayOrTensor, distance: float) -> ArrayOrTensor:
-    """Photons that cross an mm^2 of the pinhole's plane and one of a plane behind it, per photon emitted along a mm.
-
-    Both planes lie across the axis, `distance` mm apart; the photons cross them at an angle of this `cosine` to it. With
-    the hole's area pi d^2 / 4 that is ``d^2 cos^4(psi) / (16 l^2)``.
-    """
-    squared = cosine * cosine  # many times faster than a power
-    return squared * squared / (4 * math.pi * distance**2)

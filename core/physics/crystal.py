@@ -4,6 +4,7 @@ Functions of cosines and positions take arrays or tensors.
 """
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +13,7 @@ from ..arrays import ArrayOrTensor, namespace
 
 
 def absorbed_share(
-    cosine: ArrayOrTensor, mu: float, thickness: float, depths: NDArray[np.float64], layer: int
+    cosine: ArrayOrTensor, mu: ArrayOrTensor, thickness: ArrayOrTensor, depths: Sequence[ArrayOrTensor], layer: int
 ) -> ArrayOrTensor:
     """Fraction of the photons that are assigned to ``depths[layer]``: of 0 alone, or of depths from 0 to `thickness`.
 
@@ -29,13 +30,13 @@ def absorbed_share(
             return 1.0
         if first == len(depths) - 1:
             return exp(-rate * thickness)
-        start, step = float(depths[first]), float(depths[first + 1] - depths[first])
+        start, step = depths[first], depths[first + 1] - depths[first]
         return exp(-rate * start) * -expm1(-rate * step) / (rate * step)
 
     return reached(layer - 1) - reached(layer)
 
 
-def share_inside(middle: ArrayOrTensor, size: float, side: float) -> ArrayOrTensor:
+def share_inside(middle: ArrayOrTensor, size: ArrayOrTensor, side: ArrayOrTensor) -> ArrayOrTensor:
     """Fractions of intervals of length `size` around `middle` that lie within `side` / 2 of 0, all in mm."""
     first, last = (middle - size / 2).clip(min=-side / 2), (middle + size / 2).clip(max=side / 2)
     return (last - first).clip(min=0) / size
@@ -43,7 +44,8 @@ def share_inside(middle: ArrayOrTensor, size: float, side: float) -> ArrayOrTens
 
 def gaussian_blur(n: int, sigma: float) -> NDArray[np.float64]:
     """Matrix (n, n) that blurs n pixels with a Gaussian of `sigma` pixels, integrated over each receiving pixel."""
-    edges = (np.arange(n + 1) - 0.5) / (sigma * math.sqrt(2))
+    with np.errstate(divide="ignore"):  # no blur, of some modules: 1 on the diagonal
+        edges = (np.arange(n + 1) - 0.5) / (sigma * math.sqrt(2))
     kernel = np.diff([0.5 * math.erf(x) for x in edges])
     distance = np.abs(np.arange(n)[:, None] - np.arange(n))
     return kernel[distance]

@@ -15,11 +15,6 @@ from dataclasses import dataclass
 
 from ..errors import InputError
 from ..validation import one_of, positive
-from .materials import CZT_MU as CZT_MU  # coefficients that version 0.1.0 had here
-from .materials import LEAD_MU as LEAD_MU
-from .materials import NAI_MU as NAI_MU
-from .materials import TUNGSTEN_MU as TUNGSTEN_MU
-from .materials import WATER_MU as WATER_MU
 
 _HOUR = 3600.0
 _DAY = 24 * _HOUR

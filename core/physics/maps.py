@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry.collimator import OPENING_ANGLE
 from ..geometry.grid import Grid
 from ..geometry.system import PinholeSystem
 from ..memory import require
 from ..progress import Progress, in_threads
 from ..validation import freeze, instance
 from ..volumes.volume import Volume
+from .optics import Optics, chosen_optics
 from .performance import resolution, seen, sensitivity
 from .sampling import TOLERANCE, sampling_gaps
 
@@ -27,19 +27,16 @@ def sensitivity_map(
     system: PinholeSystem,
     grid: Grid,
     *,
-    aperture_mu: float | None = None,
-    opening_angle: float = OPENING_ANGLE,
-    crystal_mu: float | None = None,
-    photons_per_decay: float = 1.0,
+    optics: Optics | None = None,
     progress: Progress | None = None,
+    **settings: Any,
 ) -> Volume:
     """Sum of the modules' `sensitivity`, counts per decay; times 1e6 that is cps/MBq.
 
     Parameters are as there. ``progress(done, total)`` is called between blocks of voxels and may raise `Cancelled`.
     """
-    optics: dict[str, Any] = {"aperture_mu": aperture_mu, "opening_angle": opening_angle, "crystal_mu": crystal_mu}
-    optics["photons_per_decay"] = photons_per_decay
-    return _map(system, grid, "sensitivity", lambda points: sensitivity(system, points, **optics).sum(axis=1), progress)
+    optics = chosen_optics(optics, settings)
+    return _map(system, grid, "sensitivity", lambda points: sensitivity(system, points, optics=optics).sum(1), progress)
 
 
 def modules_map(system: PinholeSystem, grid: Grid, *, progress: Progress | None = None) -> Volume:
@@ -51,22 +48,19 @@ def resolution_map(
     system: PinholeSystem,
     grid: Grid,
     *,
-    intrinsic_fwhm: float = 0.0,
-    aperture_mu: float | None = None,
-    opening_angle: float = OPENING_ANGLE,
-    crystal_mu: float | None = None,
+    optics: Optics | None = None,
     progress: Progress | None = None,
+    **settings: Any,
 ) -> Volume:
     """Resolution of the projections, FWHM in mm: the count-weighted root mean square of the modules' `resolution`.
 
     The variance of all photons together is the mean of the modules' variances. A reconstruction that models the blur
-    may do better, and one from few counts worse. Parameters are as in `sensitivity_map` and `resolution`.
+    may do better, and one from few counts worse. Parameters are as in `sensitivity_map`.
     """
-    edge: dict[str, Any] = {"aperture_mu": aperture_mu, "opening_angle": opening_angle}
+    optics = chosen_optics(optics, settings)
 
     def combined(points: Array) -> Array:
-        fwhm = resolution(system, points, intrinsic_fwhm=intrinsic_fwhm, **edge)
-        counts = sensitivity(system, points, crystal_mu=crystal_mu, **edge)
+        fwhm, counts = (of(system, points, optics=optics) for of in (resolution, sensitivity))
         total = counts.sum(axis=1)
         return np.sqrt((counts * np.nan_to_num(fwhm) ** 2).sum(axis=1) / np.where(total > 0, total, 1))
 

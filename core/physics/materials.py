@@ -102,7 +102,6 @@ def module_coefficients(
     lines: Sequence[tuple[float, float]],
     system: PinholeSystem,
     opening_angle: float,
-    place: str = "",
 ) -> tuple[float | None, float | None]:
     """One attenuation coefficient, 1/mm, for the apertures and one for the crystals, effective over all photon energies.
 
@@ -110,16 +109,16 @@ def module_coefficients(
     ``d_e^2 = d (d + 2 / mu tan(alpha / 2))``, and are stopped by the mean crystal behind it, as of all lines together.
 
     Materials are as in `attenuation`; numbers and None are returned unchanged. Lines are energies, keV, and numbers of
-    photons, as in `Isotope.lines`, and the opening angle is alpha, rad. Messages put `place` before the argument's name.
+    photons, as in `Isotope.lines`, and the opening angle is alpha, rad.
     """
     photons = np.array([photons for _, photons in lines])
     if isinstance(aperture, str):
-        mu = _at_lines(aperture, lines, f"{place}aperture_mu")
+        mu = _at_lines(aperture, lines, "aperture_mu")
         depth = 2 / mu * edge_slope(opening_angle)
         aperture = float(mu.min() / np.average(mu.min() / mu, weights=photons))  # d_e^2 is linear in 1/mu
         photons = photons * (system.pinhole_diameter.mean() + depth)
     if isinstance(crystal, str):
-        mu, thickness = _at_lines(crystal, lines, f"{place}crystal_mu"), system.detector_thickness.mean()
+        mu, thickness = _at_lines(crystal, lines, "crystal_mu"), system.detector_thickness.mean()
         passed = np.average(np.exp((mu.min() - mu) * thickness), weights=photons)
         crystal = float(mu.min() - np.log(passed) / thickness)
     return aperture, crystal

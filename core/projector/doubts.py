@@ -31,7 +31,8 @@ def doubts(grid: Grid, views: Views, model: Model) -> Iterator[str]:
     lines = model.isotope.lines_within(*model.window) if model.isotope else ()  # type: ignore[union-attr, misc]
     bone, *metals = (max(attenuation(x, energy) for energy, _ in lines or _UNNAMED) for x in ("bone", *APERTURES))
     for name in ("aperture_mu", "crystal_mu"):
-        if (value := getattr(model, name) or 0.0) > _ABOVE_METALS * max(metals):
+        value = np.max(0.0 if getattr(model, name) is None else getattr(model, name))
+        if value > _ABOVE_METALS * max(metals):
             yield f"{name} is {value:g} 1/mm, more than any material's at its energy ({max(metals):.3g}): is it in 1/cm?"
     mu = np.zeros(1, np.float32) if model.mu is None else model.mu.array
     if (high := mu[mu > _ABOVE_BONE * bone]).sum(dtype=float) > 0.5 * mu.sum(dtype=float):

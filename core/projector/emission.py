@@ -1,5 +1,6 @@
 """SPECT: how many photons a pixel of the crystal counts."""
 
+import functools
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
@@ -9,23 +10,23 @@ from typing import Any, Literal, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import ArrayOrTensor, is_tensor, namespace
-from ..errors import InputError
-from ..geometry.collimator import OPENING_ANGLE, edge_slope
+from ..arrays import ArrayOrTensor, is_tensor
+from ..errors import InputError, naming
+from ..geometry.collimator import OPENING_ANGLE
 from ..geometry.grid import Grid
 from ..geometry.system import PinholeSystem
 from ..geometry.views import Views
-from ..physics.aperture import KnifeEdge, Opening, openings, paix_diameter, throughput, within_cone
+from ..physics.aperture import Opening
 from ..physics.aperture import points_needed as hole_points_needed
-from ..physics.crystal import absorbed_share, gaussian_blur, share_inside
+from ..physics.crystal import gaussian_blur
 from ..physics.isotopes import Isotope, isotope
-from ..physics.materials import module_coefficients
+from ..physics.optics import Edge, Optics
 from ..validation import instance, positive, real_array, strict_whole
 from ..volumes.volume import Volume, require_quantity
 from .bundles import Beam
 from .hole_response import WholeHoles
 from .models import Array, Model, checked_background, view_rays
-from .pixel_points import TOLERANCE, expected_error, lattice, offsets, points_needed, require_points, shadow_edges
+from .pixel_points import TOLERANCE, expected_error, lattices, offsets, points_needed, require_points, shadow_edges
 from .rays import Fan
 
 # Views may differ from their system by a file's rounding (mm; sine of an angle).
@@ -36,7 +37,6 @@ _FWHM_PER_SIGMA = 2 * math.sqrt(2 * math.log(2))
 # A box of this width has the same variance as a Gaussian of sigma 1.
 _BOX_PER_SIGMA = math.sqrt(12)
 
-Edge = Literal["paix", "path"]
 Hole = Literal["auto", "depth", "rays", "point"]
 
 # Rays that are not told how many points of the hole to pass keep a voxel's image this close to that of the whole hole.
@@ -94,7 +94,7 @@ class Emission(Model):
         Instead of `aperture_points`: as few points as keep the image of one voxel at the isocentre close to that of the
         whole hole. The absolute differences of the pixels sum to at most this share of the counts; so they do for any
         activity around the isocentre. None: 0.1.
-    aperture_mu : float or str, optional
+    aperture_mu : float, array (M,) or str, optional
         Attenuation coefficient of the aperture's material at the photons' energy, 1/mm, or the material's name
         (``"tungsten"``, see `MATERIALS`). Of several lines in the window the coefficient is the one that lets as many
         photons pass as all lines together (`module_coefficients`). None: no penetration, d_e = d.
@@ -108,7 +108,7 @@ class Emission(Model):
         ``d_e^2 = d^2 + 2 d / mu tan(alpha / 2) + 2 / mu^2 tan^2(alpha / 2)`` (Metzler 2001). Neither needs a correction
         for obliquity: at psi the hole's area is cos(psi) times the disk's, which is in cos^4(psi). With one aperture
         point the edge changes only the counts; with n, also the blur, with about 4 sqrt(pi n) more rays.
-    crystal_mu : float or str, optional
+    crystal_mu : float, array (M,) or str, optional
         Attenuation coefficient of the crystal at the photons' energy, 1/mm, or its name (``"NaI"``), as for the aperture.
         With it ``1 - exp(-crystal_mu Td / cos(psi))`` of the photons are counted. None: all.
     depth_layers : int
@@ -174,17 +174,11 @@ class Emission(Model):
             require_quantity(self.mu.quantity, ("mu",), "emission: mu")
             if self.mu.array.min() < 0:
                 raise InputError(f"emission: mu must not be negative, got {self.mu.array.min():g} 1/mm")
-        self._set_photons()
-        for name in ("time", "opening_angle", "tolerance"):
+        self._set_optics()
+        for name in ("time", "tolerance"):
             self._set(name, positive(getattr(self, name), f"emission: {name}"))
-        if self.opening_angle >= math.pi:
-            raise InputError(f"emission: opening_angle must be below pi, got {self.opening_angle:g} rad")
-        self._set_materials()
         if self.aperture_tolerance is not None:
             self._set("aperture_tolerance", positive(self.aperture_tolerance, "emission: aperture_tolerance"))
-        self._set("intrinsic_fwhm", float(real_array(self.intrinsic_fwhm, "emission: intrinsic_fwhm", ())))
-        if self.intrinsic_fwhm < 0:
-            raise InputError(f"emission: intrinsic_fwhm must not be negative, got {self.intrinsic_fwhm:g} mm")
         if self.aperture_points is not None:
             points = strict_whole(self.aperture_points, "emission: aperture_points", "1, 3 or more")
             self._set("aperture_points", points)
@@ -192,16 +186,7 @@ class Emission(Model):
                 raise InputError("emission: aperture_points: expected 1, 3 or more, got 2")
             if self.aperture_tolerance is not None:
                 raise InputError("emission: give aperture_points or aperture_tolerance, not both")
-        if self.edge not in ("paix", "path"):
-            raise InputError(f"emission: edge: expected 'paix' or 'path', got {self.edge!r}")
-        if self.edge == "path" and self.aperture_mu is None:
-            raise InputError("emission: edge 'path' needs aperture_mu, of the aperture's material")
         self._set("pixel_points", require_points(self.pixel_points, "emission: pixel_points"))
-        self._set("depth_layers", strict_whole(self.depth_layers, "emission: depth_layers", "1 or more"))
-        if self.depth_layers > 1 and self.crystal_mu is None:
-            raise InputError("emission: depth_layers needs crystal_mu, of the crystal's material")
-        for name in ("within_crystal", "within_walls", "within_cone"):
-            self._set(name, bool(getattr(self, name)))
         self._set("background", checked_background(self.background, "emission: background", len(self.system)))
         if self.hole not in ("auto", "depth", "rays", "point"):
             raise InputError(f"emission: hole: expected 'auto', 'depth', 'rays' or 'point', got {self.hole!r}")
@@ -230,44 +215,38 @@ class Emission(Model):
     def _set(self, name: str, value: Any) -> None:
         object.__setattr__(self, name, value)
 
-    def _set_photons(self) -> None:
-        """Make `isotope` an Isotope, and `window` and `photons_per_decay` numbers."""
+    def _set_optics(self) -> None:
+        """Make `isotope` an Isotope, `window` numbers, and the fields that are of `Optics` what those are, numbers."""
         if self.window is not None and self.isotope is None:
             raise InputError("emission: window needs an isotope")
+        lines: tuple[tuple[float, float], ...] = ()
         if self.isotope is not None:
             if not isinstance(self.isotope, Isotope):
                 self._set("isotope", isotope(self.isotope))
             known: Isotope = self.isotope  # type: ignore[assignment]
             low, high = known.window if self.window is None else real_array(self.window, "emission: window", (2,))
             self._set("window", (float(low), float(high)))
-            if self.photons_per_decay is None:
-                self._set("photons_per_decay", known.photons_per_decay(low, high))
-                if self.photons_per_decay == 0:
-                    lines = ", ".join(f"{energy:g}" for energy, _ in known.lines)
-                    raise InputError(
-                        f"emission: {known.name} has no photons from {low:g} to {high:g} keV; its lines: {lines}"
-                    )
-        elif self.photons_per_decay is None:
-            self._set("photons_per_decay", 1.0)
-        self._set("photons_per_decay", positive(self.photons_per_decay, "emission: photons_per_decay"))
-
-    def _set_materials(self) -> None:
-        """Make `aperture_mu` and `crystal_mu` numbers, also where they are materials."""
-        lines = () if self.isotope is None else self.isotope.lines_within(*self.window)  # type: ignore[union-attr, misc]
-        coefficients = module_coefficients(
-            self.aperture_mu, self.crystal_mu, lines, self.system, self.opening_angle, "emission: "
-        )
-        for name, value in zip(("aperture_mu", "crystal_mu"), coefficients, strict=True):
-            if value is not None:
-                self._set(name, positive(value, f"emission: {name}"))
+            lines = known.lines_within(low, high)
+            if not lines and self.photons_per_decay is None:
+                energies = ", ".join(f"{energy:g}" for energy, _ in known.lines)
+                raise InputError(
+                    f"emission: {known.name} has no photons from {low:g} to {high:g} keV; its lines: {energies}"
+                )
+        with naming("emission"):
+            given = {f.name: getattr(self, f.name) for f in fields(Optics)}
+            given = {name: real_array(x, name, None) if is_tensor(x) else x for name, x in given.items()}
+            optics = Optics.of(self.system, lines, **given)
+        for f in fields(Optics):
+            self._set(f.name, getattr(optics, f.name))
 
     def record(self) -> dict[str, Any]:
         """The settings, for a run's record: of mu its grid, of the isotope its name, of a background's images a word."""
         settings = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("system", "mu")}
         settings["isotope"] = None if self.isotope is None else self.isotope.name  # type: ignore[union-attr]
         settings["window"] = None if self.window is None else list(self.window)
-        if isinstance(self.background, np.ndarray):
-            settings["background"] = self.background.tolist() if self.background.ndim == 1 else "images"
+        for name, value in settings.items():
+            if isinstance(value, np.ndarray):
+                settings[name] = value.tolist() if value.ndim == 1 else "images"
         if self.mu is not None:
             settings["mu"] = {"shape": list(self.mu.grid.shape), "affine": self.mu.grid.affine.tolist()}
         return settings
@@ -283,8 +262,8 @@ class Emission(Model):
 
     def of_views(self, which: NDArray[np.integer]) -> Self:
         """The model of the modules `which` (indices) alone."""
-        background = self.background[which] if isinstance(self.background, np.ndarray) else self.background
-        return replace(self, system=self.system[which], background=background)
+        own = {f.name: getattr(self, f.name) for f in fields(self) if isinstance(getattr(self, f.name), np.ndarray)}
+        return replace(self, system=self.system[which], **{name: values[which] for name, values in own.items()})
 
     def check(self, views: Views) -> None:
         """Raise `InputError` unless `views` are of this system."""
@@ -309,18 +288,15 @@ class Emission(Model):
                 raise InputError(f"emission: view {int(np.argmax(bad))}: {why}")
         checked_background(self.background, "emission: background", len(views), views.shape)
 
+    @functools.cached_property
+    def optics(self) -> Optics:
+        """What the model says of hole, edge, walls, cone, crystal and photons, for `sensitivity`, maps and cameras."""
+        return Optics(**{f.name: getattr(self, f.name) for f in fields(Optics)})
+
     @property
     def effective_diameter(self) -> Array:
         """d_e (M,), mm: the opaque hole that lets as many photons pass along the axis."""
-        d = self.system.pinhole_diameter
-        if self.aperture_mu is None or self.edge == "paix":
-            return paix_diameter(d, self.aperture_mu, self.opening_angle)  # type: ignore[arg-type]
-        depth = 2 / self.aperture_mu * self._tangent  # type: ignore[operator]
-        return np.sqrt(d * (d + depth) + depth**2 / 2)
-
-    @property
-    def _tangent(self) -> float:
-        return edge_slope(self.opening_angle)
+        return self.optics.effective_diameter(self.system.pinhole_diameter)
 
     def beams(self, views: Views, m: int, grid: Grid) -> Iterator[Beam]:
         """Rays from the pinhole through the grid, weighted with counts per (decay / (s mm^3) mm)."""
@@ -335,9 +311,8 @@ class Emission(Model):
         along_u = (middle @ u + scale * (rays.column_step @ u) * np.arange(n_u))[None, :]
         # To the plane through the grid's farthest corner.
         depth = max(float(((grid.corners() - pinhole) @ k).max()), l)
-        holes = self.openings(m, self.hole_points(views, m, grid))
-        inside = sum(opening.hole > 0 for opening in holes)  # and the edge's points, which count less
-        starts = np.concatenate([lattice(k) for k in (inside, len(holes) - inside) if k])
+        n_hole = self.hole_points(views, m, grid)
+        holes = self.openings(m, n_hole)
         n = self._pixel_points(views, m, grid)
 
         def weigh(places: Array, opening: Opening, layer: int, rows: slice, columns: slice, which: slice) -> Array:
@@ -345,10 +320,10 @@ class Emission(Model):
             along, across = along_u[:, columns] + u_places, along_v[rows] + v_places
             return self.pixel_weights(m, along, across, (pitch_u, pitch_v), l, opening, layer, n * len(holes)) / n
 
-        for layer, z in enumerate(np.linspace(0, self.system.detector_thickness[m], self.depth_layers)):
+        for layer, z in enumerate(self.optics.depths(self.system.detector_thickness[m])):
             stretch = depth / (l + z)
             steps = stretch * scale * rays.row_step, stretch * scale * rays.column_step
-            for opening, start in zip(holes, starts, strict=True):
+            for opening, start in zip(holes, lattices(n_hole, len(holes)), strict=True):
                 point = opening.x * u + opening.y * v
                 shift = None
                 if len(holes) > 1:
@@ -393,30 +368,15 @@ class Emission(Model):
             Rays of a pixel: along each side, a ray stands for this part of it where the crystal or a wall ends.
         """
         side, thickness = self.system.detector_side[m], self.system.detector_thickness[m]
-        depths = np.linspace(0, thickness, self.depth_layers)
-        distance = length + depths[layer]
-        slope_u, slope_v = (along_u + opening.x) / distance, (along_v + opening.y) / distance
-        squared_secant = 1 + slope_u**2 + slope_v**2
-        cosine = 1 / namespace(squared_secant).sqrt(squared_secant)
-        weights = self.effective_time * self.photons_per_decay * pitch[0] * pitch[1] * throughput(cosine, distance)
-        weights = weights * opening.area(slope_u, slope_v)
-        if self.crystal_mu is not None:
-            weights = weights * absorbed_share(cosine, self.crystal_mu, thickness, depths, layer)  # type: ignore[arg-type]
-        if self.within_cone:
-            weights = weights * within_cone(slope_u, slope_v, self._tangent)
-        for along, size, start in ((along_u, pitch[0], opening.x), (along_v, pitch[1], opening.y)):
-            if self.within_crystal:
-                weights = weights * share_inside(along, size / cells, side)
-            if self.within_walls:
-                shrink = length / distance  # back to where the rays cross the crystal's front
-                weights = weights * share_inside(shrink * along - (1 - shrink) * start, shrink * size / cells, side)
-        return weights
+        of_module = length, side, thickness
+        along = along_u, along_v
+        return self.effective_time * self._optics_of(m).pixel_weights(along, pitch, *of_module, opening, layer, cells)
 
     def response(self, views: Views, m: int) -> tuple[Array, Array] | None:
         """The intrinsic blur of view m: matrices (n_v, n_v) along v and (n_u, n_u) along u."""
-        if self.intrinsic_fwhm == 0:
+        if not np.any(self.intrinsic_fwhm):
             return None
-        sigma = self.intrinsic_fwhm / _FWHM_PER_SIGMA
+        sigma = self._optics_of(m).intrinsic_fwhm / _FWHM_PER_SIGMA
         pitch_u, pitch_v = self._crystal_pitch(views, m)
         n_v, n_u = views.shape
         return gaussian_blur(n_v, sigma / pitch_v), gaussian_blur(n_u, sigma / pitch_u)
@@ -427,14 +387,14 @@ class Emission(Model):
             return None
         within = self.within_crystal or self.within_walls
         sides = self.system.detector_side if within else np.full(len(self.system), np.inf)
-        weigh = replace(self, within_crystal=False, within_walls=False)._weights_of_area
+        everywhere = replace(self, within_crystal=False, within_walls=False)
+
+        def weigh(m: int, u: Array, v: Array) -> Array:
+            (opening,) = everywhere.openings(m, 1)
+            return everywhere.pixel_weights(m, u, v, (1.0, 1.0), float(self.system.collimator_length[m]), opening)
+
         of_modules = self.system, self.effective_diameter, sides, weigh
         return WholeHoles(views, grid, *of_modules, self.mu, self.hole == "depth")
-
-    def _weights_of_area(self, m: int, u: Array, v: Array) -> Array:
-        """What a mm^2 of module m's crystal counts along lines through the hole's middle to (u, v), mm, point-inverted."""
-        l, area = float(self.system.collimator_length[m]), math.pi / 4 * float(self.effective_diameter[m]) ** 2
-        return self.pixel_weights(m, u, v, (1.0, 1.0), l, Opening(0.0, 0.0, area))  # type: ignore[return-value]
 
     def rays(self, views: Views, m: int, grid: Grid) -> int:
         """Rays of each pixel of view m."""
@@ -472,7 +432,7 @@ class Emission(Model):
             return self.aperture_points or 1
         l, b = self.system.collimator_length[m], self.system.pinhole_distance[m]
         pitch_u, pitch_v = self._crystal_pitch(views, m)
-        sigma = self.intrinsic_fwhm / _FWHM_PER_SIGMA
+        sigma = self._optics_of(m).intrinsic_fwhm / _FWHM_PER_SIGMA
         voxel = grid.voxel_volume ** (1 / 3) * l / b
         blur = math.hypot(voxel, _BOX_PER_SIGMA * sigma)
         shadow = self.effective_diameter[m] * (1 + l / b)
@@ -481,14 +441,14 @@ class Emission(Model):
 
     def openings(self, m: int, n: int) -> list[Opening]:
         """Where rays of module m cross the pinhole's plane: n points of the hole, and those of its edge."""
-        if self.edge == "paix" or self.aperture_mu is None:
-            return openings(n, self.effective_diameter[m])
-        d = self.system.pinhole_diameter[m]
-        return openings(n, d, KnifeEdge(d / 2, self.aperture_mu, self._tangent))  # type: ignore[arg-type]
+        return self._optics_of(m).openings(self.system.pinhole_diameter[m], n)
+
+    def _optics_of(self, m: int) -> Optics:
+        return self.optics.of_modules(m, len(self.system))
 
     def _crystal_scale(self, views: Views, m: int) -> float:
         """A length on the crystal, per length on view m's plane."""
-        distance = (views.detector_centers[m] - views.sources[m]) @ self.system.principal_rays[m]
+        distance = (views.detector_centers[m] - views.sources[m]) @ self.system.frames()[m, 2]
         return float(self.system.collimator_length[m] / distance)
 
     def _crystal_pitch(self, views: Views, m: int) -> tuple[float, float]:

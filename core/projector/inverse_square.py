@@ -52,7 +52,7 @@ class InverseSquareSum(Model):
 
     def beams(self, views: Views, m: int, grid: Grid) -> Iterator[Beam]:
         """The rays of `views`, weighted with ``d^2 sin^3(theta) / 16``."""
-        rays, k = view_rays(views, m), self.system.principal_rays[m]
+        rays, k = view_rays(views, m), self.system.frames()[m, 2]
         towards = rays.targets() - rays.source
         sine = (towards @ k / np.linalg.norm(towards, axis=1)).reshape(views.shape)
         weights = self.system.pinhole_diameter[m] ** 2 / 16 * sine**3
@@ -60,7 +60,7 @@ class InverseSquareSum(Model):
 
     def voxel_weights(self, views: Views, m: int, grid: Grid) -> Array:
         """``1 / h^2`` at the voxels' centres, 1/mm^2."""
-        k = self.system.principal_rays[m]
+        k = self.system.frames()[m, 2]
         along = [k @ grid.affine[:3, axis] * np.arange(n) for axis, n in enumerate(grid.shape)]
         height = k @ (grid.affine[:3, 3] - views.sources[m]) + along[0][:, None, None] + along[1][:, None] + along[2]
         return np.divide(1, height**2, out=np.zeros(grid.shape), where=height > 0)

@@ -67,6 +67,11 @@ def _generator(n: int) -> int:
     return max((g for g in range(1, n // 2 + 1) if math.gcd(g, n) == 1), key=merit)
 
 
+def lattices(n: int, n_all: int) -> Array:
+    """Where in the pixel those lattices begin (n_all, 2) that belong to n points of a hole, and to the rest, of its edge."""
+    return np.concatenate([lattice(k) for k in (n, n_all - n) if k])
+
+
 @functools.lru_cache(maxsize=256)
 def _dual(n: int) -> Array:
     """Vectors (N, 2) of the dual of `lattice(n)`, one of each pair k, -k, without 0: k . x is whole for every point x.

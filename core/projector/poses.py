@@ -5,6 +5,7 @@ the same, part of torch's graph. Needs torch.
 """
 
 import functools
+import itertools
 import math
 from typing import Any
 
@@ -15,11 +16,10 @@ from torch import Tensor
 from ..errors import InputError
 from ..geometry.grid import Grid
 from ..geometry.views import Views
-from ..physics.aperture import disk_points, throughput
-from ..physics.crystal import absorbed_share
+from ..physics.optics import Optics, chosen_optics
 from ..validation import positive, whole_shape
 from ..volumes.volume import Volume, require_quantity
-from .pixel_points import TOLERANCE, lattice, points_needed, require_points, shadow_edges
+from .pixel_points import TOLERANCE, lattice, lattices, points_needed, require_points, shadow_edges
 from .tracing import trace_fans
 
 # Rays of a camera that are traced at once.
@@ -84,7 +84,8 @@ def _cameras(positions: Tensor, rotations: Numbers, *numbers: Numbers) -> list[T
     given = (positions, rotations, *numbers)
     kinds = [x.dtype for x in given if isinstance(x, Tensor) and x.is_floating_point()]
     kind = functools.reduce(torch.promote_types, kinds)
-    tensors = [torch.as_tensor(x).to(positions.device, kind) for x in given]
+    place: Any = {"device": positions.device, "dtype": kind}
+    tensors = [x.to(**place) if isinstance(x, Tensor) else torch.tensor(x, **place) for x in given]
     if tensors[1].shape[-2:] != (3, 3):
         raise InputError(f"rotations: expected ... x 3 x 3, got {' x '.join(map(str, tensors[1].shape))}")
     tensors[-2:] = (x if x.ndim else x.expand(2) for x in tensors[-2:])  # pitch, offset: one number for both
@@ -154,14 +155,15 @@ def emission_images(
     aperture_points: int = 1,
     pixel_points: int | None = None,
     tolerance: float = TOLERANCE,
-    crystal_mu: Numbers | None = None,
     crystal_thickness: Numbers | None = None,
+    crystal_side: Numbers | None = None,
     time: Numbers = 1.0,
-    photons_per_decay: Numbers = 1.0,
     mu: Volume | Tensor | None = None,
     mu_grid: Grid | None = None,
     backend: str = "auto",
     grid: Grid | None = None,
+    optics: Optics | None = None,
+    **settings: Any,
 ) -> Tensor:
     """Expected counts (..., n_v, n_u) of pinhole cameras, by the law of `Emission`.
 
@@ -182,24 +184,25 @@ def emission_images(
     shape
         Pixels (n_v, n_u): rows, columns.
     diameter
-        The hole's effective diameter, mm, (...) or one number.
+        Of the hole, mm, (...) or one number: the effective one, unless `aperture_mu` says how photons penetrate the edge.
     aperture_points, pixel_points, tolerance
         As of `Emission`; without a number of pixel points all cameras get as many as the one that needs most. All rays of
         a camera are in the graph: many points of small images take less memory than few of large ones.
-    crystal_mu, crystal_thickness
-        Attenuation coefficient, 1/mm, and thickness, mm, of the crystal, (...) or one number: ``1 - exp(-crystal_mu
-        crystal_thickness / cos(psi))`` of the photons are counted. Without them all are.
-    time, photons_per_decay
+    crystal_thickness, crystal_side
+        Of the crystal, mm, (...) or one number: needed with `crystal_mu`, and with `within_crystal` or `within_walls`.
+    time
         As of `Emission`, (...) or one number.
     mu, mu_grid
         What attenuates, as of `trace_rays`.
     backend, grid
         As of `trace_rays`.
+    optics, settings
+        As of `sensitivity`: `crystal_mu`, `photons_per_decay` and so on, each (...) or one number, but no `intrinsic_fwhm`.
 
     Raises
     ------
     InputError
-        Shapes that do not fit, or what `trace_rays` refuses.
+        Shapes that do not fit, what `Optics` or what `trace_rays` refuses.
 
     Examples
     --------
@@ -214,13 +217,19 @@ def emission_images(
     within = volume.grid if isinstance(volume, Volume) else grid
     if not isinstance(within, Grid):
         raise InputError(f"emission images: expected a Volume, or also a grid, got {type(volume).__name__}")
-    if (crystal_mu is None) != (crystal_thickness is None):
+    optics = chosen_optics(optics, settings)
+    if (optics.crystal_mu is None) != (crystal_thickness is None):
         raise InputError("emission images: crystal_mu and crystal_thickness belong together")
+    if (optics.within_crystal or optics.within_walls) != (crystal_side is not None):
+        raise InputError("emission images: crystal_side and within_crystal or within_walls belong together")
     if aperture_points < 1 or aperture_points == 2:
         raise InputError(f"emission images: aperture_points: expected 1, 3 or more, got {aperture_points}")
-    crystal = [0.0 if x is None else x for x in (crystal_mu, crystal_thickness)]
-    positions, rotations, l, diameter, mu_c, thickness, time, photons, pitch, offset = _cameras(
-        positions, rotations, collimator_length, diameter, *crystal, time, photons_per_decay, pitch, offset
+    if not isinstance(optics.intrinsic_fwhm, float) or optics.intrinsic_fwhm > 0:
+        raise InputError("emission images: intrinsic_fwhm: expected 0; `gaussian_blur` makes the matrices of a blur")
+    given = optics.numbers
+    crystal = [0.0 if x is None else x for x in (crystal_thickness, crystal_side)]
+    positions, rotations, l, diameter, thickness, side, time, *own, pitch, offset = _cameras(
+        positions, rotations, collimator_length, diameter, *crystal, time, *given.values(), pitch, offset
     )
     for name, x in (("collimator_length", l), ("diameter", diameter), ("pitch", pitch)):
         if bool((x <= 0).any()):
@@ -236,32 +245,40 @@ def emission_images(
             points_needed(shadow_edges(views, m, within), positive(tolerance, "tolerance"), aperture_points)
             for m in range(len(views))
         )
-    area = math.pi / 4 * diameter**2 / aperture_points / n
-    counts = (time * photons * pitch.prod(dim=-1) * area)[..., None, None, None]
+    # For rays, rows and columns of each camera: (..., 1, 1, 1).
+    optics = optics.with_numbers({name: x[..., None, None, None] for name, x in zip(given, own, strict=True)})
+    length, hole, side, thickness, seconds, *pitches = (
+        x[..., None, None, None] for x in (l, diameter, side, thickness, time, *pitch.unbind(dim=-1))
+    )
+    openings = optics.openings(hole, aperture_points)
     distance = positions.norm(dim=-1)  # to the isocentre
     images: Any = 0.0
-    for point, start in zip(disk_points(aperture_points), lattice(aperture_points), strict=True):
-        hole = diameter[..., None] / 2 * diameter.new_tensor(point)
-        sources = positions + (rotations[..., :2] @ hole[..., None])[..., 0]
+    for (layer, z), (opening, start) in itertools.product(
+        enumerate(optics.depths(thickness)), zip(openings, lattices(aperture_points, len(openings)), strict=True)
+    ):
+        point = torch.stack([(place + 0 * hole)[..., 0, 0, 0] for place in (opening.x, opening.y)], dim=-1)
+        sources = positions + (rotations[..., :2] @ point[..., None])[..., 0]
         places = pitch.new_tensor(lattice(n)).expand(*pitch.shape[:-1], n, 2)
-        if aperture_points > 1:  # as in `Emission`: seen from the isocentre they fill the pixel evenly
-            shift = pitch.new_tensor(start) / math.sqrt(n) - (1 + l / distance)[..., None] * hole / pitch
+        if len(openings) > 1:  # as in `Emission`: seen from the isocentre they fill the pixel evenly
+            shift = pitch.new_tensor(start) / math.sqrt(n) - (1 + l / distance)[..., None] * point / pitch
             places = (places + shift[..., None, :] + 0.5) % 1 - 0.5
+        stretch = depth * l / (l + z[..., 0, 0, 0])
         for some in places.split(max(1, _RAYS_AT_ONCE // (n_v * n_u)), dim=-2):
-            # On the crystal, seen from where k meets it behind this point of the hole.
-            middle = (offset + hole)[..., None, :] + pitch[..., None, :] * some
-            v, u = _pixels(pitch[..., None, :], middle, (n_v, n_u))
-            along = l[..., None, None, None]
-            cosine = along / (v[..., :, None] ** 2 + u[..., None, :] ** 2 + along**2).sqrt()
-            weights = counts * throughput(cosine, along)
-            if crystal_mu is not None:
-                thick = thickness[..., None, None, None]
-                weights = weights * absorbed_share(cosine, mu_c[..., None, None, None], thick, np.zeros(1), 0)
+            ends = offset[..., None, :] + pitch[..., None, :] * some
+            v, u = _pixels(pitch[..., None, :], ends, (n_v, n_u))
+            along = u[..., None, :], v[..., :, None]
+            cells = n * len(openings)
+            weights = (
+                optics.pixel_weights(along, (pitches[0], pitches[1]), length, side, thickness, opening, layer, cells)
+                * seconds
+                / n
+            )
+            middle = ends + point[..., None, :]
             each = middle.shape[:-1]
             on_plane = (
                 (depth * l)[..., None].expand(each),
-                (depth[..., None] * pitch)[..., None, :].expand(middle.shape),
-                depth[..., None, None] * middle,
+                (stretch[..., None] * pitch)[..., None, :].expand(middle.shape),
+                stretch[..., None, None] * middle,
             )
             turned = rotations[..., None, :, :].expand(*each, 3, 3)
             vectors = _fans((n_v, n_u), sources[..., None, :].expand(*each, 3), turned, *on_plane)

@@ -521,7 +521,7 @@ def test_a_c_arm_view_is_diffdrrs_image_pixel_by_pixel(elevation, sign, system, 
             np.testing.assert_allclose(shown(image), expected, rtol=1e-4, atol=1e-4)
 
 
-def test_the_import_path_of_version_0_1_0_works():
+def test_it_has_the_import_path_that_its_page_names():
     from mphdrr.core import diffdrr
 
     assert diffdrr.DRR is DRR

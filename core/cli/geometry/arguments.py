@@ -7,13 +7,12 @@ from ...geometry.collimator import angle_from_degrees
 from ...geometry.system import PinholeSystem
 from ...geometry.views import Views
 from ...physics.isotopes import ISOTOPES, isotope
-from ...physics.materials import APERTURES, CRYSTALS, module_coefficients
+from ...physics.materials import APERTURES, CRYSTALS
+from ...physics.optics import Optics
 from ..options import add_command, add_workbook, number_or_name
 
 MATERIAL_OPTIONS = ("aperture_mu", "opening_angle", "crystal_mu", "intrinsic_fwhm", "isotope")
 """Destinations of the options of `add_materials`."""
-EDGE = MATERIAL_OPTIONS[:2]
-"""Of those of `add_edge`, which are also keywords."""
 
 
 def add_action(actions, name: str, summary: str, example: str, run: Any) -> argparse.ArgumentParser:  # type: ignore[no-untyped-def]
@@ -40,7 +39,7 @@ def views_of(system: PinholeSystem, arguments: argparse.Namespace) -> Views:
 
 
 def add_materials(parser: argparse.ArgumentParser) -> None:
-    """Add the materials and the isotope, for `sensitivity_settings` and `edge_settings`."""
+    """Add the materials and the isotope, for `optics_of`."""
     group = parser.add_argument_group("materials; without an option the module is ideal")
     add_edge(group)
     crystal = f"{', '.join(CRYSTALS)} at the isotope's photons, or the coefficient, 1/mm; without it, all photons count"
@@ -51,27 +50,18 @@ def add_materials(parser: argparse.ArgumentParser) -> None:
 
 
 def add_edge(parser: argparse._ActionsContainer) -> None:
-    """Add the knife edge's material and angle, for `edge_settings`, which needs an option ``--isotope`` too."""
+    """Add the knife edge's material and angle, for `optics_of`, which needs an option ``--isotope`` too."""
     edge = f"{', '.join(APERTURES)} at the isotope's photons, or the coefficient, 1/mm; without it, nothing penetrates"
     parser.add_argument("--aperture-mu", type=number_or_name, metavar="MATERIAL", help=edge)
     parser.add_argument("--opening-angle", type=float, default=90.0, metavar="DEG", help="full angle of the knife edge")
 
 
-def edge_settings(arguments: argparse.Namespace, system: PinholeSystem) -> dict[str, Any]:
-    """Attenuation coefficient of the aperture and angle of its knife edge, as keywords."""
-    settings = sensitivity_settings(arguments, system)
-    return {name: settings[name] for name in EDGE}
-
-
-def sensitivity_settings(arguments: argparse.Namespace, system: PinholeSystem) -> dict[str, Any]:
-    """The keywords of `sensitivity`."""
+def optics_of(arguments: argparse.Namespace, system: PinholeSystem) -> Optics:
+    """What the options of `add_materials`, or of `add_edge` and ``--isotope``, say of a scanner's modules."""
     lines: tuple[tuple[float, float], ...] = ()
-    photons = 1.0
     if arguments.isotope is not None:
         decaying = isotope(arguments.isotope)
-        lines = decaying.lines_within(*decaying.window)  # within its energy window
-        photons = sum(number for _, number in lines)
-    angle = angle_from_degrees(arguments.opening_angle, "--opening-angle")
-    crystal_mu = getattr(arguments, "crystal_mu", None)  # not every action has a crystal
-    aperture, crystal = module_coefficients(arguments.aperture_mu, crystal_mu, lines, system, angle)
-    return {"aperture_mu": aperture, "opening_angle": angle, "crystal_mu": crystal, "photons_per_decay": photons}
+        lines = decaying.lines_within(*decaying.window)
+    settings = {name: value for name, value in vars(arguments).items() if name in MATERIAL_OPTIONS[:-1]}
+    angle = angle_from_degrees(settings.pop("opening_angle"), "--opening-angle")
+    return Optics.of(system, lines, **settings, opening_angle=angle)

@@ -12,7 +12,7 @@ from ...geometry.system import PinholeSystem
 from ...physics.isotopes import ISOTOPES
 from ...recording import recorded_warnings
 from ..options import print_answer, read_workbook, refuse
-from .arguments import add_action, add_edge, edge_settings
+from .arguments import add_action, add_edge, optics_of
 
 
 def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
@@ -38,7 +38,8 @@ def _run(arguments: argparse.Namespace) -> None:
     with recorded_warnings() as messages:
         system = read_workbook(arguments)
     parts = {"plate_thickness": arguments.plate, "wall_thickness": arguments.wall, "edge_at": arguments.edge_at}
-    report = check_geometry(system, **parts, **edge_settings(arguments, system))
+    optics = optics_of(arguments, system)
+    report = check_geometry(system, **parts, aperture_mu=optics.aperture_mu, opening_angle=optics.opening_angle)
     findings = report.messages()
     warnings, found = (
         f"{len(x)} {name}{'s' * (len(x) != 1)}" for x, name in ((messages, "warning"), (findings, "finding"))

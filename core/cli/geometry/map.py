@@ -10,7 +10,7 @@ from ...physics.maps import MAPS
 from ...validation import whole_shape
 from ...volumes.volume_files import VOLUME_FORMATS, write_volume
 from ..options import chosen_modules, one_or_three, output_path, print_answer, progress_bar, read_workbook, refuse
-from .arguments import MATERIAL_OPTIONS, add_action, add_materials, sensitivity_settings
+from .arguments import MATERIAL_OPTIONS, add_action, add_materials, optics_of
 
 _OF_MATERIALS = ("sensitivity", "resolution")
 
@@ -43,10 +43,7 @@ def _run(arguments: argparse.Namespace) -> None:
     spacing = one_or_three(arguments.spacing) if arguments.spacing else 2 * system.roi_radius.max() / min(voxels)
     settings: dict[str, Any] = {}
     if arguments.quantity in _OF_MATERIALS:
-        settings = sensitivity_settings(arguments, system)
-    if arguments.quantity == "resolution":
-        del settings["photons_per_decay"]
-        settings["intrinsic_fwhm"] = arguments.intrinsic_fwhm
+        settings["optics"] = optics_of(arguments, system)
     grid = Grid.centered(voxels, spacing, arguments.center)
     volume = MAPS[arguments.quantity](system, grid, **settings, progress=progress_bar("mapping"))
     write_volume(volume, path)

@@ -10,7 +10,7 @@ from ...geometry.design_formulas import roi_radius_seen
 from ...physics.performance import magnification, resolution, sensitivity
 from ...physics.sampling import sampling_gaps
 from ..options import print_answer, read_workbook
-from .arguments import EDGE, add_action, add_materials, sensitivity_settings
+from .arguments import add_action, add_materials, optics_of
 
 
 def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
@@ -25,10 +25,9 @@ def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
 
 def _run(arguments: argparse.Namespace) -> None:
     system = read_workbook(arguments)
-    points, settings = [arguments.point], sensitivity_settings(arguments, system)
-    edge = {name: settings[name] for name in EDGE}
-    counts = 1e6 * sensitivity(system, points, **settings)[0]
-    fwhm = resolution(system, points, **edge, intrinsic_fwhm=arguments.intrinsic_fwhm)[0]
+    points, optics = [arguments.point], optics_of(arguments, system)
+    counts = 1e6 * sensitivity(system, points, optics=optics)[0]
+    fwhm = resolution(system, points, optics=optics)[0]
     b, d, l, side = system.pinhole_distance, system.pinhole_diameter, system.collimator_length, system.detector_side
     radius = roi_radius_seen(b, d, side, l)
     columns = {

@@ -7,9 +7,7 @@ photons through beside it. All others are found here.
 import math
 from collections.abc import Sequence
 
-import numpy as np
-
-from ...physics.aperture import paix_diameter
+from ...physics.optics import Optics
 from ...validation import positive
 from ..collimator import Collimator
 from ..system import PinholeSystem
@@ -59,7 +57,8 @@ def find_thin_plates(
         transmission = math.exp(-mu * built.plate_thickness)
         widest = max(body.hole_radius(built.front), body.hole_radius(built.back))
         beside = (2 * body.front_half_width) ** 2 - math.pi * widest**2
-        hole = math.pi / 4 * float(paix_diameter(np.array(body.diameter), mu, built.opening_angle)) ** 2
+        optics = Optics(aperture_mu=mu, opening_angle=built.opening_angle)
+        hole = math.pi / 4 * optics.effective_diameter(body.diameter) ** 2
         share = transmission * beside / hole
         if share > MOST_THROUGH:
             found.append(ThinPlate(number, built.plate_thickness, transmission, share))

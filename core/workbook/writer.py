@@ -22,44 +22,16 @@ from .edit import Edit, several
 from .layout import MAX_MODULES
 from .quantities import OPTIONAL, QUANTITIES, TYPED
 from .reader import read
-from .sheet_xml import MAIN, CellError
+from .sheet_xml import CellError
 from .workbook_xml import KINDS, Place, WorkbookXml
 
-_SHEETS = ("Main", "Coordinates")
+_PARTS = Path(__file__).with_name("new_workbook.txt")
+"""The XML of a new workbook, its parts one after another, with their names above them."""
+_NORMAL, _HEADING, _FOUR_DECIMALS = range(3)
+"""Its styles of cells."""
 _FIRST_ROW = 3
 _LARGEST_NUMBER = 2**53 - 1
-"""The sheets of a new workbook, its first module's row, and the largest module's number that a cell holds exactly."""
-_DECLARATION = '<?xml version="1.0" encoding="UTF-8" standalone="yes"?>\n'
-_OFFICE = "http://schemas.openxmlformats.org/officeDocument/2006/relationships"
-_PACKAGE = "http://schemas.openxmlformats.org/package/2006"
-_FORMAT = "application/vnd.openxmlformats-officedocument.spreadsheetml"
-_FRAME = {
-    "[Content_Types].xml": f'''<Types xmlns="{_PACKAGE}/content-types">
-<Default Extension="rels" ContentType="application/vnd.openxmlformats-package.relationships+xml"/>
-<Default Extension="xml" ContentType="{_FORMAT}.worksheet+xml"/>
-<Override PartName="/xl/workbook.xml" ContentType="{KINDS[".xlsx"]}"/>
-<Override PartName="/xl/styles.xml" ContentType="{_FORMAT}.styles+xml"/></Types>''',
-    "_rels/.rels": f'''<Relationships xmlns="{_PACKAGE}/relationships">
-<Relationship Id="rId1" Type="{_OFFICE}/officeDocument" Target="xl/workbook.xml"/></Relationships>''',
-    "xl/_rels/workbook.xml.rels": f'''<Relationships xmlns="{_PACKAGE}/relationships">
-<Relationship Id="rId1" Type="{_OFFICE}/worksheet" Target="worksheets/Main.xml"/>
-<Relationship Id="rId2" Type="{_OFFICE}/worksheet" Target="worksheets/Coordinates.xml"/>
-<Relationship Id="rId3" Type="{_OFFICE}/styles" Target="styles.xml"/></Relationships>''',
-    "xl/workbook.xml": f'''<workbook xmlns="{MAIN}" xmlns:r="{_OFFICE}"><bookViews><workbookView/></bookViews>
-<sheets><sheet name="Main" sheetId="1" r:id="rId1"/><sheet name="Coordinates" sheetId="2" r:id="rId2"/></sheets>
-<calcPr fullCalcOnLoad="1"/></workbook>''',
-    "xl/styles.xml": f'''<styleSheet xmlns="{MAIN}">
-<numFmts count="1"><numFmt numFmtId="164" formatCode="0.0000"/></numFmts>
-<fonts count="2"><font><sz val="11"/><name val="Calibri"/></font><font><b/><sz val="11"/><name val="Calibri"/></font></fonts>
-<fills count="2"><fill><patternFill patternType="none"/></fill><fill><patternFill patternType="gray125"/></fill></fills>
-<borders count="1"><border/></borders>
-<cellStyleXfs count="1"><xf/></cellStyleXfs>
-<cellXfs count="3"><xf xfId="0"/>
-<xf xfId="0" fontId="1" applyFont="1" applyAlignment="1"><alignment horizontal="center" vertical="top" wrapText="1"/></xf>
-<xf xfId="0" numFmtId="164" applyNumberFormat="1"/></cellXfs>
-<cellStyles count="1"><cellStyle name="Normal" xfId="0" builtinId="0"/></cellStyles></styleSheet>''',
-}
-"""The parts of a new workbook beside its sheets. Cells have style 0, as headings 1, and with four decimals 2."""
+"""The first module's row, and the largest module's number that a cell holds exactly."""
 
 
 @dataclass(frozen=True)
@@ -223,15 +195,15 @@ def _new_workbook(system: PinholeSystem) -> tuple[bytes, dict[str, Any]]:
     typed = {name: ~QUANTITIES[name].is_default(system) for name in OPTIONAL}
     columns = [
         *((name, q.place, q.titles or q.headings[:2], q.formula, q.of(system)) for name, q in QUANTITIES.items()),
-        *(("number", f"{title}!A", ("", "Definitions"), "", system.numbers) for title in _SHEETS),
+        *(("number", f"{title}!A", ("", "Definitions"), "", system.numbers) for title in ("Main", "Coordinates")),
         ("slope", "Coordinates!F", ("S", "3D slope"), "={b}/{x1}", slope),
     ]
-    cells: dict[str, dict[str, list[str]]] = {title: {} for title in _SHEETS}
+    cells: dict[str, dict[str, list[str]]] = {title: {} for title in ("Main", "Coordinates")}
     stored: dict[str, Any] = {}
     for name, place, titles, formula, values in columns:
         title, letters = place.split("!")
-        style = 2 if title == "Coordinates" and name != "number" else 0
-        column = [_cell(f"{letters}{row}", text, style=1) for row, text in enumerate(titles, start=1)]
+        style = _FOUR_DECIMALS if title == "Coordinates" and name != "number" else _NORMAL
+        column = [_cell(f"{letters}{row}", text, _HEADING) for row, text in enumerate(titles, start=1)]
         places = {other: quantity.place.removeprefix(f"{title}!") for other, quantity in QUANTITIES.items()}
         for i, value in enumerate(values.tolist()):
             row, own = _FIRST_ROW + i, ""
@@ -239,14 +211,15 @@ def _new_workbook(system: PinholeSystem) -> tuple[bytes, dict[str, Any]]:
                 own = formula.format_map({other: f"{its}{row}" for other, its in places.items()})
                 value = CellError("#DIV/0!") if name in divided_by_0 and divided_by_0[name][i] else value
                 stored[f"{place}{row}"] = value
-            column.append(_cell(f"{letters}{row}", value, own, style))
+            column.append(_cell(f"{letters}{row}", value, style, own))
         cells[title][letters] = column
-    parts = _FRAME | {f"xl/worksheets/{title}.xml": _sheet(columns) for title, columns in cells.items()}
+    parts = dict(part.split("\n", 1) for part in _PARTS.read_text(encoding="ascii").split("--- ")[1:])
     memory = io.BytesIO()
     with zipfile.ZipFile(memory, "w") as archive:
         for part, xml in parts.items():
+            rows = _rows(cells.get(Path(part).stem, {}))
             # Dated 1980, so that a system always gives the same file.
-            archive.writestr(zipfile.ZipInfo(part), _DECLARATION + xml, zipfile.ZIP_DEFLATED)
+            archive.writestr(zipfile.ZipInfo(part), xml.replace("<sheetData/>", rows), zipfile.ZIP_DEFLATED)
     return memory.getvalue(), stored
 
 
@@ -270,7 +243,7 @@ def _refuse_unreadable(system: PinholeSystem) -> None:
         )
 
 
-def _cell(place: str, value: Any, formula: str = "", style: int = 0) -> str:
+def _cell(place: str, value: Any, style: int, formula: str = "") -> str:
     """A cell's XML; an empty text is no value."""
     kind = f' t="{"e" if isinstance(value, CellError) else "str"}"' if isinstance(value, str) else ""
     shown = escape(value) if isinstance(value, str) else repr(value).removesuffix(".0")
@@ -278,13 +251,8 @@ def _cell(place: str, value: Any, formula: str = "", style: int = 0) -> str:
     return f'<c r="{place}" s="{style}"{kind}>{content}</c>'
 
 
-def _sheet(columns: dict[str, list[str]]) -> str:
-    """A sheet's XML with these cells, whose headings and first column stay when it is scrolled."""
-    ordered = [columns[letters] for letters in sorted(columns, key=lambda letters: (len(letters), letters))]
-    rows = (f'<row r="{row}">{"".join(cells)}</row>' for row, cells in enumerate(zip(*ordered, strict=True), start=1))
-    return (
-        f'<worksheet xmlns="{MAIN}"><sheetViews><sheetView workbookViewId="0"><pane xSplit="1" ySplit="2" '
-        'topLeftCell="B3" activePane="bottomRight" state="frozen"/></sheetView></sheetViews>'
-        '<sheetFormatPr defaultColWidth="13" defaultRowHeight="15"/>'
-        f"<sheetData>{''.join(rows)}</sheetData></worksheet>"
-    )
+def _rows(columns: dict[str, list[str]]) -> str:
+    """The XML of a sheet's cells, given by the letters of their columns."""
+    in_order = [columns[letters] for letters in sorted(columns, key=lambda letters: (len(letters), letters))]
+    rows = (f'<row r="{row}">{"".join(cells)}</row>' for row, cells in enumerate(zip(*in_order, strict=True), start=1))
+    return f"<sheetData>{''.join(rows)}</sheetData>"

@@ -85,22 +85,12 @@ def write_system(
     suffix = target.suffix.lower()
     if suffix not in KINDS:
         raise InputError(f"{target}: expected a name ending in {' or '.join(KINDS)}")
-    if template is not None:
-        return _write_copy(system, target, template, columns)
-    if suffix != ".xlsx":
-        raise InputError(f"{target}: a workbook without a template has no macros, expected a name ending in .xlsx")
-    content, values = _new_workbook(system)
-    write_bytes(target, content)
-    return WrittenWorkbook(target.absolute(), (), values, ())
-
-
-def _write_copy(
-    system: PinholeSystem,
-    target: Path,
-    template: str | os.PathLike[str],
-    columns: ColumnMap | str | os.PathLike[str] | None,
-) -> WrittenWorkbook:
-    """Write a copy of a template, which is read, edited and recalculated, and then read back."""
+    if template is None:
+        if suffix != ".xlsx":
+            raise InputError(f"{target}: a workbook without a template has no macros, expected a name ending in .xlsx")
+        content, values = _new_workbook(system)
+        write_bytes(target, content)
+        return WrittenWorkbook(target.absolute(), (), values, ())
     read_by = None if system.source is None else system.source.columns
     if columns is not None:
         read_by = column_map(columns, template)
@@ -111,7 +101,7 @@ def _write_copy(
             raise InputError(
                 f"{workbook.name}: is neither an .xlsx nor an .xlsm workbook inside, expected it saved as one"
             )
-        if workbook.suffix != target.suffix.lower():
+        if workbook.suffix != suffix:
             has = "has macros" if workbook.suffix == ".xlsm" else "is a workbook without macros"
             raise InputError(
                 f"{target}: the template {workbook.name} {has}, expected a name ending in {workbook.suffix}"
@@ -163,23 +153,20 @@ def _refuse_other_system(
 
 
 def _warn_of_formulas(workbook: WorkbookXml, recalculated: Recalculation) -> None:
-    by_column: dict[tuple[str, int], list[Place]] = defaultdict(list)
+    replaced: dict[tuple[str, int], list[Place]] = defaultdict(list)
     for place in sorted(recalculated.replaced):
-        by_column[place[0], place[2]].append(place)
-    messages = [
-        f"{several(map(workbook.text, places), shown=1)}: the formula was replaced by the system's number "
-        f"({recalculated.replaced[places[0]]})"
-        for places in by_column.values()
-    ]
-    if recalculated.cleared:
-        places = list(recalculated.cleared)
-        messages.append(
-            f"{several(map(workbook.text, places), shown=1)}: the formula's new value could not be calculated "
-            f"({recalculated.cleared[places[0]]}); opening the workbook in Excel or LibreOffice and saving it stores the "
-            "value"
+        replaced[place[0], place[2]].append(place)
+    for places in replaced.values():
+        warn(
+            f"{workbook.name}: {several(map(workbook.text, places), shown=1)}: the formula was replaced by the system's "
+            f"number ({recalculated.replaced[places[0]]})"
         )
-    for message in messages:
-        warn(f"{workbook.name}: {message}")
+    if recalculated.cleared:
+        first = next(iter(recalculated.cleared.values()))
+        warn(
+            f"{workbook.name}: {several(map(workbook.text, recalculated.cleared), shown=1)}: the formula's new value could "
+            f"not be calculated ({first}); opening the workbook in Excel or LibreOffice and saving it stores the value"
+        )
 
 
 def _new_workbook(system: PinholeSystem) -> tuple[bytes, dict[str, Any]]:

@@ -529,13 +529,13 @@ def test_every_layout_that_is_read_can_be_written(edit, tmp_path, rng):
     book.save(template)
     system = read_quietly(template)
     other = by_design(replace(system, centers=random_centers(rng, 4), pinhole_diameter=rng.uniform(1, 3, 4)))
-    for wanted in (other[[3, 0, 1]], more_of(other, 2)):
-        if edit.__name__ == "_blank_rows_and_notes" and len(wanted) > 4:
-            with pytest.raises(mph.InputError, match="Coordinates!A11 is not blank"):  # a note
-                mph.write_system(wanted, tmp_path / "o.xlsx", template)
-            continue
-        mph.write_system(wanted, tmp_path / "o.xlsx", template)
-        assert_same(read_quietly(tmp_path / "o.xlsx"), wanted)
+    wanted = more_of(other[[3, 0, 1]], 2)
+    if edit.__name__ == "_blank_rows_and_notes":
+        with pytest.raises(mph.InputError, match="Coordinates!A11 is not blank"):  # a note
+            mph.write_system(wanted, tmp_path / "o.xlsx", template)
+        wanted = wanted[:4]
+    mph.write_system(wanted, tmp_path / "o.xlsx", template)
+    assert_same(read_quietly(tmp_path / "o.xlsx"), wanted)
 
 
 def test_formulas_filled_down_are_taken_for_added_modules(template, tmp_path):

@@ -626,7 +626,7 @@ def _in_the_file() -> None:
     CASES.add("wrong spans", ordered(lambda rows: [r.replace("<row ", '<row spans="1:2" ') for r in rows]), BIG, RIGHT)
     twice = one_sheet(BIG)
     twice.sheets[0]["B3"] = Raw('<c r="B3"><v>315</v></c><c r="B3"><v>215</v></c>')
-    CASES.add("a cell stored twice", twice, None, REFUSED, place=odd["place"])
+    CASES.add("a cell stored twice", twice, None, REFUSED, place="Geometry!B3 is stored twice")
     same = one_sheet(BIG)
     same.sheets[0]["B3"] = Raw('<c r="B3"><v>315</v></c><c r="B3"><v>315</v></c>')
     CASES.add("a cell stored twice alike", same, BIG, RIGHT, REFUSED, **odd)

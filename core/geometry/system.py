@@ -28,6 +28,8 @@ LENGTHS = {
 
 # Pinholes that differ in z by less than this fraction of the crystal's side belong to one ring.
 _RING_GAP = 0.2
+_SAME_PLACE = 1e-6
+"""mm; two pinholes closer than this are one in a workbook."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,6 +169,14 @@ def warn_of_size(pixels: tuple[int, int], pitches: NDArray[np.float64], sides: N
     for m, axis in np.argwhere((covered < 0.45 * sides) | (covered > 1.1 * sides))[:1]:
         said = f"{pixels[axis]} pixels of {covered[m, axis] / pixels[axis]:g} mm are {covered[m, axis]:g} mm"
         warn(f"{said}, but the {name} is {sides[m, 0]:g} mm")
+
+
+def same_place(centers: NDArray[np.float64]) -> tuple[int, int] | None:
+    """The first module whose pinhole, of `centers` (M, 3), is that of an earlier one, after this one; None if none is."""
+    _, first, inverse = np.unique(np.round(centers / _SAME_PLACE), axis=0, return_index=True, return_inverse=True)
+    earlier = first[inverse.reshape(-1)]
+    later = np.flatnonzero(earlier < np.arange(len(centers)))
+    return (int(earlier[later[0]]), int(later[0])) if len(later) else None
 
 
 LATER_LENGTHS = tuple(f.name for f in fields(PinholeSystem) if f.name in LENGTHS and f.default is not MISSING)

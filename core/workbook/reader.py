@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError, warn
-from ..geometry.system import PinholeSystem
+from ..geometry.system import PinholeSystem, same_place
 from ..system_source import QuantityCells, SystemSource
 from .book import Book
 from .column_map import ColumnMap, column_map
@@ -18,8 +18,6 @@ from .layout import Column, Layout, mapped_layout
 from .quantities import DERIVED, DIMENSIONS, NEEDED, OPTIONAL, POSITION, QUANTITIES, TYPED, Numbers, tolerance
 from .recognition import recognized_layout
 
-_SAME_PLACE = 1e-6
-"""mm; two pinholes closer than this are one."""
 _SHOWN = 5
 """Warnings of one column; the last one counts the rest."""
 
@@ -156,14 +154,12 @@ def _refuse_impossible(columns: dict[str, Column], values: Numbers) -> None:
     x1.refuse(np.isinf(b), lambda i: f"{puts[i]} too far away to compute, expected millimetres")
     outside = "mm from the isocentre, expected outside the ROI of"
     x1.refuse(b <= roi, lambda i: f"{puts[i]} {b[i]:g} {outside} {roi[i]:g} mm in {roi_column.place(i)}")
-    first: dict[tuple[int, ...], int] = {}
-    for i, position in enumerate(zip(*(values[name] for name in POSITION), strict=True)):
-        j = first.setdefault(tuple(round(x / _SAME_PLACE) for x in position), i)
-        if j != i:
-            raise InputError(
-                f"{x1.where(i)} {puts[i]} at the place of module {x1.modules.module_numbers[j]} ({x1.place(j)}), expected "
-                "another place"
-            )
+    if (same := same_place(np.stack([values[name] for name in POSITION], axis=1))) is not None:
+        j, i = same
+        raise InputError(
+            f"{x1.where(i)} {puts[i]} at the place of module {x1.modules.module_numbers[j]} ({x1.place(j)}), expected "
+            "another place"
+        )
 
 
 def _refuse_not_positive(column: Column, values: NDArray[np.float64]) -> None:

@@ -21,15 +21,8 @@ At = tuple[int, int]
 
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 
-_SHEET = r"(?:(?P<sheet>'(?:[^'\[\]]|'')+'|[^'!\[\]()\s]+)!)?"
-_AREAS = tuple(
-    re.compile(_SHEET + area, re.IGNORECASE)
-    for area in (
-        r"\$?(?P<left>[A-Z]{1,3})\$?(?P<top>\d{1,7})(?::\$?(?P<right>[A-Z]{1,3})\$?(?P<bottom>\d{1,7}))?",
-        r"\$?(?P<left>[A-Z]{1,3}):\$?(?P<right>[A-Z]{1,3})",
-        r"\$?(?P<top>\d{1,7}):\$?(?P<bottom>\d{1,7})",
-    )
-)
+_SHEET = re.compile(r"'((?:[^'\[\]]|'')+)'|[^'!\[\]()\s]+")
+"""A sheet's name in a formula; that of another file has brackets."""
 
 
 class CellError(str):
@@ -74,18 +67,19 @@ def cell_name(at: At) -> str:
 @lru_cache(maxsize=2**15)
 def reference(text: str) -> Reference | None:
     """What ``B3``, ``'My sheet'!$B$3:$B$82``, ``A:C`` or ``3:5`` refers to; None for a name or another file's cell."""
-    from openpyxl.utils import column_index_from_string as column
+    from openpyxl.utils import range_boundaries
 
-    match = next((found for area in _AREAS if (found := area.fullmatch(text))), None)
-    if match is None:
+    sheet, of_sheet, cells = text.rpartition("!")
+    named = _SHEET.fullmatch(sheet)
+    try:
+        left, top, right, bottom = range_boundaries(cells)
+    except ValueError:
         return None
-    parts = match.groupdict()
-    sheet = parts["sheet"]
-    if sheet is not None and sheet.startswith("'"):
-        sheet = sheet[1:-1].replace("''", "'")
-    left, top, right, bottom = (parts.get(side) for side in ("left", "top", "right", "bottom"))
-    columns = [1, MAX_COLUMN] if left is None else sorted([column(left.upper()), column((right or left).upper())])
-    rows = [1, MAX_ROW] if top is None else sorted([int(top), int(bottom or top)])
+    if (of_sheet and named is None) or (":" not in cells and None in (left, top)):
+        return None
+    sheet = named[1].replace("''", "'") if named and named[1] else sheet or None
+    columns = sorted([left or 1, right or MAX_COLUMN])
+    rows = sorted([1 if top is None else top, MAX_ROW if bottom is None else bottom])
     if rows[0] < 1 or rows[1] > MAX_ROW or columns[1] > MAX_COLUMN:
         return None
     return Reference(sheet, rows[0], columns[0], rows[1], columns[1])

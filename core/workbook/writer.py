@@ -2,29 +2,36 @@
 
 import io
 import os
+import zipfile
 from collections import defaultdict
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from xml.sax.saxutils import escape
 
 import numpy as np
 
-from ..errors import InputError, first_line, warn
-from ..files import replacing
-from ..geometry.system import PinholeSystem
+from ..errors import InputError, warn
+from ..files import replacing, write_bytes
+from ..geometry.system import PinholeSystem, same_place
 from ..recording import recorded_warnings
-from ..validation import instance
 from .book import Book
 from .calculation import Recalculation
 from .column_map import ColumnMap, column_map
 from .edit import Edit, several
+from .layout import MAX_MODULES
 from .quantities import OPTIONAL, QUANTITIES, TYPED
-from .reader import Reading, read
+from .reader import read
+from .sheet_xml import CellError
 from .workbook_xml import KINDS, Place, WorkbookXml
 
-_WIDTH = 13
+_PARTS = Path(__file__).with_name("new_workbook.txt")
+"""The XML of a new workbook, its parts one after another, with their names above them."""
+_NORMAL, _HEADING, _FOUR_DECIMALS = range(3)
+"""Its styles of cells."""
 _FIRST_ROW = 3
-"""Column widths and the first module's row in a new workbook."""
+_LARGEST_NUMBER = 2**53 - 1
+"""The first module's row, and the largest module's number that a cell holds exactly."""
 
 
 @dataclass(frozen=True)
@@ -72,40 +79,41 @@ def write_system(
         at `path` is then as it was. An `InputWarning` is given of formulas that had to be replaced by numbers or store no
         value, and of ranges that leave added modules out.
     """
-    instance(system, PinholeSystem, "write_system")
+    if not isinstance(system, PinholeSystem):
+        raise InputError(f"write_system: expected a PinholeSystem, got {type(system).__name__}")
     target = Path(path)
     suffix = target.suffix.lower()
     if suffix not in KINDS:
         raise InputError(f"{target}: expected a name ending in {' or '.join(KINDS)}")
-    if template is None and suffix != ".xlsx":
-        raise InputError(f"{target}: a workbook without a template has no macros, expected a name ending in .xlsx")
-    said = None if template is None or system.source is None else system.source.columns
-    if template is not None and columns is not None:
-        said = column_map(columns, template)
+    if template is None:
+        if suffix != ".xlsx":
+            raise InputError(f"{target}: a workbook without a template has no macros, expected a name ending in .xlsx")
+        content, values = _new_workbook(system)
+        write_bytes(target, content)
+        return WrittenWorkbook(target.absolute(), (), values, ())
+    read_by = None if system.source is None else system.source.columns
+    if columns is not None:
+        read_by = column_map(columns, template)
     with replacing(target) as temporary:
-        if template is None:
-            temporary.write_bytes(_new_workbook(system))
-        book = Book(temporary if template is None else template)
+        book = Book(template)
         workbook = book.workbook
         if workbook.suffix is None:
             raise InputError(
                 f"{workbook.name}: is neither an .xlsx nor an .xlsm workbook inside, expected it saved as one"
             )
         if workbook.suffix != suffix:
-            has = "has macros" if suffix == ".xlsx" else "is a workbook without macros"
+            has = "has macros" if workbook.suffix == ".xlsm" else "is a workbook without macros"
             raise InputError(
                 f"{target}: the template {workbook.name} {has}, expected a name ending in {workbook.suffix}"
             )
-        name = "the new workbook" if template is None else workbook.name
         with recorded_warnings():  # they were given when the system was read
-            reading = read(book, said) if template is not None else _read_written(temporary, name, None)
+            reading = read(book, read_by)
         edit = Edit(system, reading, workbook)
-        edited = [] if template is None else workbook.changed
-        to_recalculate = workbook.formulas if template is None else {*edited, *edit.unsettled}
-        recalculated = Recalculation(workbook, to_recalculate, edit.required, edit.expected)
+        edited = workbook.changed
+        recalculated = Recalculation(workbook, {*edited, *edit.unsettled}, edit.required, edit.expected)
         temporary.write_bytes(workbook.to_bytes())
         own = edit.column_map()
-        _refuse_other_system(_read_written(temporary, name, own), name, system, edit.numbered)
+        _refuse_other_system(temporary, workbook.name, own, system, edit.numbered)
     _warn_of_formulas(workbook, recalculated)
     return WrittenWorkbook(
         path=target.absolute(),
@@ -116,18 +124,16 @@ def write_system(
     )
 
 
-def _read_written(path: Path, name: str, columns: ColumnMap | None) -> Reading:
-    """A written workbook as it will be read; messages call it `name`."""
+def _refuse_other_system(
+    path: Path, name: str, columns: ColumnMap | None, system: PinholeSystem, numbered: bool
+) -> None:
+    """Refuse a workbook that would be read as another system: a template may be laid out so that it cannot hold it."""
     try:
         with recorded_warnings():
-            return read(Book(path), columns)
+            back = read(Book(path), columns)
     except InputError as error:
         why = str(error).replace(str(path), name).replace(path.name, name)
         raise InputError(f"{name} cannot hold this system, with it: {why}") from error
-
-
-def _refuse_other_system(back: Reading, name: str, system: PinholeSystem, numbered: bool) -> None:
-    """Refuse a workbook that would be read as another system: a template may be laid out so that it cannot hold it."""
     if len(back.system) != len(system) or (numbered and not np.array_equal(back.system.numbers, system.numbers)):
         raise InputError(
             f"{name} cannot hold this system: its modules {several(system.numbers)} would be read as "
@@ -147,60 +153,93 @@ def _refuse_other_system(back: Reading, name: str, system: PinholeSystem, number
 
 
 def _warn_of_formulas(workbook: WorkbookXml, recalculated: Recalculation) -> None:
-    by_column: dict[tuple[str, int], list[Place]] = defaultdict(list)
+    replaced: dict[tuple[str, int], list[Place]] = defaultdict(list)
     for place in sorted(recalculated.replaced):
-        by_column[place[0], place[2]].append(place)
-    messages = [
-        f"{several(map(workbook.text, places), shown=1)}: the formula was replaced by the system's number "
-        f"({recalculated.replaced[places[0]]})"
-        for places in by_column.values()
-    ]
-    if recalculated.cleared:
-        places = list(recalculated.cleared)
-        messages.append(
-            f"{several(map(workbook.text, places), shown=1)}: the formula's new value could not be calculated "
-            f"({recalculated.cleared[places[0]]}); opening the workbook in Excel or LibreOffice and saving it stores the "
-            "value"
+        replaced[place[0], place[2]].append(place)
+    for places in replaced.values():
+        warn(
+            f"{workbook.name}: {several(map(workbook.text, places), shown=1)}: the formula was replaced by the system's "
+            f"number ({recalculated.replaced[places[0]]})"
         )
-    for message in messages:
-        warn(f"{workbook.name}: {message}")
+    if recalculated.cleared:
+        first = next(iter(recalculated.cleared.values()))
+        warn(
+            f"{workbook.name}: {several(map(workbook.text, recalculated.cleared), shown=1)}: the formula's new value could "
+            f"not be calculated ({first}); opening the workbook in Excel or LibreOffice and saving it stores the value"
+        )
 
 
-def _new_workbook(system: PinholeSystem) -> bytes:
-    """A workbook in the users' layout, its formulas without values; l is a number where it is not that of the formula."""
-    import openpyxl
-    from openpyxl.styles import Alignment, Font
+def _new_workbook(system: PinholeSystem) -> tuple[bytes, dict[str, Any]]:
+    """A workbook in the users' layout, and the value that each formula stores: the system's own.
 
-    book = openpyxl.Workbook()
-    book.active.title = "Main"
-    book.create_sheet("Coordinates")
+    l is a number where it is not that of the formula.
+    """
+    _refuse_unreadable(system)
+    x1, y1 = system.centers[:, :2].T
+    with np.errstate(divide="ignore", over="ignore"):
+        slope = system.pinhole_distance / x1
+    divided_by_0 = {"slope": np.isinf(slope), "azimuth": np.hypot(x1, y1) == 0}
     typed = {name: ~QUANTITIES[name].is_default(system) for name in OPTIONAL}
     columns = [
         *((name, q.place, q.titles or q.headings[:2], q.formula, q.of(system)) for name, q in QUANTITIES.items()),
-        *(("number", f"{title}!A", ("", "Definitions"), "", system.numbers) for title in book.sheetnames),
-        ("slope", "Coordinates!F", ("S", "3D slope"), "={b}/{x1}", system.numbers),
+        *(("number", f"{title}!A", ("", "Definitions"), "", system.numbers) for title in ("Main", "Coordinates")),
+        ("slope", "Coordinates!F", ("S", "3D slope"), "={b}/{x1}", slope),
     ]
-    for name, place, titles, formula, numbers in columns:
-        title, letter = place.split("!")
-        sheet = book[title]
-        sheet.freeze_panes = "B3"
-        sheet.column_dimensions[letter].width = _WIDTH
-        for row, text in enumerate(titles, start=1):
-            cell = sheet[f"{letter}{row}"]
-            cell.value, cell.font = text or None, Font(bold=True)
-            cell.alignment = Alignment(wrap_text=True, vertical="top", horizontal="center")
+    cells: dict[str, dict[str, list[str]]] = {title: {} for title in ("Main", "Coordinates")}
+    stored: dict[str, Any] = {}
+    for name, place, titles, formula, values in columns:
+        title, letters = place.split("!")
+        style = _FOUR_DECIMALS if title == "Coordinates" and name != "number" else _NORMAL
+        column = [_cell(f"{letters}{row}", text, _HEADING) for row, text in enumerate(titles, start=1)]
         places = {other: quantity.place.removeprefix(f"{title}!") for other, quantity in QUANTITIES.items()}
-        for i, number in enumerate(numbers):
-            row = _FIRST_ROW + i
-            cell = sheet[f"{letter}{row}"]
-            cell.value = number.item()
+        for i, value in enumerate(values.tolist()):
+            row, own = _FIRST_ROW + i, ""
             if formula and not (name in typed and typed[name][i]):
-                cell.value = formula.format_map({other: f"{column}{row}" for other, column in places.items()})
-            if title == "Coordinates" and name != "number":
-                cell.number_format = "0.0000"
-    content = io.BytesIO()
-    try:
-        book.save(content)
-    except Exception as error:  # lxml's, which has no name here: of the sheets' temporary files
-        raise OSError(first_line(error)) from error
-    return content.getvalue()
+                own = formula.format_map({other: f"{its}{row}" for other, its in places.items()})
+                value = CellError("#DIV/0!") if name in divided_by_0 and divided_by_0[name][i] else value
+                stored[f"{place}{row}"] = value
+            column.append(_cell(f"{letters}{row}", value, style, own))
+        cells[title][letters] = column
+    parts = dict(part.split("\n", 1) for part in _PARTS.read_text(encoding="ascii").split("--- ")[1:])
+    memory = io.BytesIO()
+    with zipfile.ZipFile(memory, "w") as archive:
+        for part, xml in parts.items():
+            rows = _rows(cells.get(Path(part).stem, {}))
+            # Dated 1980, so that a system always gives the same file.
+            archive.writestr(zipfile.ZipInfo(part), xml.replace("<sheetData/>", rows), zipfile.ZIP_DEFLATED)
+    return memory.getvalue(), stored
+
+
+def _refuse_unreadable(system: PinholeSystem) -> None:
+    """Refuse a system that `read_system` would refuse in any workbook, or read as another."""
+    cannot, numbers = "the new workbook cannot hold this system", system.numbers
+    if len(numbers) > MAX_MODULES:
+        raise InputError(f"{cannot}: it has {len(numbers)} modules, expected at most {MAX_MODULES}")
+    with np.errstate(over="ignore"):
+        held = {"number": numbers.astype(np.float64), **{name: q.of(system) for name, q in QUANTITIES.items()}}
+    for name, values in held.items():
+        most = _LARGEST_NUMBER if name == "number" else np.finfo(np.float64).max
+        if values.dtype.kind == "f" and np.any(bad := ~(np.abs(values) <= most)):
+            i = int(np.argmax(bad))
+            raise InputError(f"{cannot}: {name} of module {numbers[i]} is {values[i]:g}, expected at most {most:g}")
+    if (same := same_place(system.centers)) is not None:
+        first, second = (f"Coordinates!B{_FIRST_ROW + i}" for i in same)
+        raise InputError(
+            f"{cannot}, with it: the new workbook: {second} and y1, z1 put the pinhole of module {numbers[same[1]]} at "
+            f"the place of module {numbers[same[0]]} ({first}), expected another place"
+        )
+
+
+def _cell(place: str, value: Any, style: int, formula: str = "") -> str:
+    """A cell's XML; an empty text is no value."""
+    kind = f' t="{"e" if isinstance(value, CellError) else "str"}"' if isinstance(value, str) else ""
+    shown = escape(value) if isinstance(value, str) else repr(value).removesuffix(".0")
+    content = (f"<f>{escape(formula[1:])}</f>" if formula else "") + (f"<v>{shown}</v>" if shown else "")
+    return f'<c r="{place}" s="{style}"{kind}>{content}</c>'
+
+
+def _rows(columns: dict[str, list[str]]) -> str:
+    """The XML of a sheet's cells, given by the letters of their columns."""
+    in_order = [columns[letters] for letters in sorted(columns, key=lambda letters: (len(letters), letters))]
+    rows = (f'<row r="{row}">{"".join(cells)}</row>' for row, cells in enumerate(zip(*in_order, strict=True), start=1))
+    return f"<sheetData>{''.join(rows)}</sheetData>"

@@ -160,11 +160,11 @@ REFUSED: dict[str, tuple[Edit, str]] = {
     # Units
     **{
         f"unit {unit}": (_heading("CB2", f"x1 ({unit})"), "Coordinates!B2")
-        for unit in ("dm", "mil", "Zoll", "0.1 mm", "cm, from isocentre", "cm nominal", "km", "ft", '"', "mm?", "m m")
+        for unit in ("dm", "Zoll", "0.1 mm", "cm nominal", "mm?")
     },
     **{
         f"heading {text}": (_heading("CB2", text), "Coordinates!B2")
-        for text in ("x1 cm", "x1_cm", "cm x1", "(cm) x1", "x1 (old)", "x1 (nominal)", "x1 = cm", "x1*10", "x1'", "-x1")
+        for text in ("x1 cm", "(cm) x1", "x1 (nominal)", "x1*10", "-x1")
     },
     "unit beside the symbol": (_set(Coordinates_B1="x1 (Zoll)"), "Coordinates!B1 holds 'x1 (Zoll)'"),
     "two units": (_set(Coordinates_B1="x1 (cm)", Coordinates_B2="x coordinate at pinhole (mm)"), "says cm but"),
@@ -328,7 +328,7 @@ BESIDE = [
 
 @pytest.mark.parametrize("with_length", [True, False])
 @pytest.mark.parametrize(
-    "titles", [*([title] for title in BESIDE), BESIDE, ["sensitivity", "y axis", "z axis"]], ids=str
+    "titles", [BESIDE[:1], BESIDE, ["sensitivity", "y axis", "z axis"]], ids=["one", "many", "axes"]
 )
 def test_exact_headings_are_read_whatever_stands_beside_them(titles, with_length, tmp_path):
     """One warning names all columns that are not understood, also those that say nothing of the scanner's."""
@@ -356,10 +356,8 @@ def test_exact_headings_are_read_whatever_stands_beside_them(titles, with_length
 @pytest.mark.parametrize(
     ("cell", "title"),
     [
-        *(("Coordinates!T2", title) for title in ("x1 nominal", "x1_new", "x1.2", "y1 (CMM)", "z", "x (cm)", "measured y")),
-        *(("Coordinates!T2", title) for title in ("pinhole x", "z coordinate of crystal", "l as built", "effective length")),
-        *(("Main!T2", title) for title in ("d (new)", "outer diameter", "half diameter of pinhole", "R old", "roi radius*")),
-        *(("Main!T2", title) for title in ("Ld 2", "inner side of crystal", "crystal side, used", "Td (2022)", "thickness")),
+        *(("Coordinates!T2", title) for title in ("x1 nominal", "y1 (CMM)", "z", "x (cm)", "pinhole x", "effective length")),
+        *(("Main!T2", title) for title in ("half diameter of pinhole", "roi radius*", "inner side of crystal", "thickness")),
     ],
 )  # fmt: skip
 @pytest.mark.parametrize("with_length", [True, False])
@@ -388,9 +386,9 @@ def test_what_is_understood_is_read(kind, tmp_path):
 
 
 @pytest.mark.parametrize("form", ["{} ({})", "{} [{}]", "{}, {}", "{}/{}", "{} / {}", "{} in {}", "{} (in {})"])
-@pytest.mark.parametrize("unit", ["mm", "cm", "m", "in", "um", "µm", "μm", "CM", "inches", "centimetres", "millimeter"])
+@pytest.mark.parametrize("unit", ["mm", "cm", "m", "in", "μm", "CM", "inches", "centimetres"])
 def test_units_are_understood_in_every_form(form, unit):
-    named = {"CM": "cm", "inches": "in", "centimetres": "cm", "millimeter": "mm", "um": "µm", "μm": "µm"}
+    named = {"CM": "cm", "inches": "in", "centimetres": "cm", "μm": "µm"}
     for name in ("x1", "Ld", "R", "l"):
         assert heading_of(form.format(name, unit)) == Heading(name, named.get(unit, unit))
     assert heading_of(form.format("pinhole azimuth", unit)) is None
@@ -420,7 +418,7 @@ def in_units(units: dict[str, str]):
 @pytest.mark.parametrize(
     "units",
     [
-        *({"": unit} for unit in ("mm", "cm", "m", "in", "µm")),
+        *({"": unit} for unit in ("cm", "in", "µm")),
         {"": "cm", "d": "mm", "z1": "in", "l": "m"},
         {"": "mm", "Td": "µm"},
     ],
@@ -470,7 +468,7 @@ def assert_plain_but_rounded(system) -> None:
     np.testing.assert_allclose(system.detector_side, 50, rtol=1e-14)
 
 
-@pytest.mark.parametrize("factor", [0.1, 0.001, 1 / 25.4, 1000 / 25.4])
+@pytest.mark.parametrize("factor", [0.1, 1000 / 25.4])
 def test_a_scanner_in_units_that_nothing_states_is_warned_of(factor, tmp_path):
     def edit(main, coordinates):
         typed(main, coordinates)
@@ -523,16 +521,14 @@ def typed_xml(folder: Path, change: Callable[[str], str], settings: str = "") ->
     return edited_xml(book, path, lambda name, xml: change(xml) if name == "Coordinates" else xml, settings)
 
 
-def right_values(folder: Path) -> dict[tuple[str, str], object]:
-    system = mph.read_system(saved(plain(), folder, "right.xlsx"))
-    written = mph.write_system(system[[0, 1, 2, 3]], folder / "new.xlsx")
+def right_values(folder: Path, book: Workbook | None = None) -> dict[tuple[str, str], object]:
+    """What the formulas of the plain workbook, or of a `book` in its layout, give: (sheet, cell) -> number."""
+    system = mph.read_system(saved(book or plain(), folder, "right.xlsx"))
+    written = mph.write_system(system, folder / "new.xlsx")
     cells = openpyxl.load_workbook(written.path, data_only=True)["Coordinates"]
-    own = {5: "E", 6: "F", 7: "G", 8: "H", 9: "I", 10: "J", 11: "K", 12: "U", 13: "V", 14: "W"}
-    return {
-        ("Coordinates", f"{get_column_letter(column)}{row}"): cells[f"{letter}{row}"].value
-        for column, letter in own.items()
-        for row in range(3, 7)
-    }
+    columns = zip("DEFGHIJKLMN", "DEFGHIJKUVW", strict=True)
+    rows = range(3, 3 + len(system))
+    return {("Coordinates", f"{own}{row}"): cells[f"{new}{row}"].value for own, new in columns for row in rows}
 
 
 @pytest.mark.parametrize("settings", ["", 'fullCalcOnLoad="1"', 'calcCompleted="0"', 'calcMode="manual"'])
@@ -570,24 +566,7 @@ def test_zeros_of_formulas_that_are_zero_are_read_in_either_case(tmp_path):
         book = plain(np.array([[277.0, 70.3, 0.0], [155.0, 158.4, 0.0], [-63.1, -245.8, 0.0]]))
         for row in (3, 4, 5):
             book["Coordinates"][f"D{row}"] = f"=B{row}-B{row}"
-        system = mph.read_system(saved(book, tmp_path, "right.xlsx"))
-        cells = openpyxl.load_workbook(mph.write_system(system, tmp_path / "new.xlsx").path, data_only=True)[
-            "Coordinates"
-        ]
-        own = {
-            "E": "E",
-            "F": "F",
-            "G": "G",
-            "H": "H",
-            "I": "I",
-            "J": "J",
-            "K": "K",
-            "L": "U",
-            "M": "V",
-            "N": "W",
-            "D": "D",
-        }
-        stored = {("Coordinates", f"{at}{r}"): cells[f"{own[at]}{r}"].value for at in own for r in (3, 4, 5)}
+        stored = right_values(tmp_path, book)
         path = with_values(tmp_path, lambda *at, store=store, stored=stored: store(stored[at], at), "", book)
         read = mph.read_system(path)
         expected = read if expected is None else expected
@@ -676,39 +655,6 @@ def test_a_number_of_a_formula_beyond_us_is_used_and_warned_of_where_the_file_as
 
 
 # The file
-
-
-def test_rows_stored_out_of_order_are_all_read(tmp_path):
-    def change(xml: str) -> str:
-        rows = re.findall(r"<row .*?</row>", xml)
-        return xml.replace("".join(rows), "".join([rows[4], rows[0], rows[3], rows[1], rows[5], rows[2]]))
-
-    path = typed_xml(tmp_path, change)
-    assert_plain(mph.read_system(path))
-
-
-def test_a_cell_stored_twice_is_refused(tmp_path):
-    def change(xml: str) -> str:
-        cell = re.search(r'<c r="B4"[^>]*>.*?</c>', xml)[0]
-        return xml.replace(cell, cell + cell.replace("155", "555"))
-
-    with pytest.raises(InputError, match=r"Coordinates!B4 is stored twice"):
-        mph.read_system(typed_xml(tmp_path, change))
-
-
-def test_strict_open_xml_is_refused_by_its_name(tmp_path, workbook):
-    path = tmp_path / "strict.xlsx"
-    with zipfile.ZipFile(workbook) as old, zipfile.ZipFile(path, "w") as new:
-        for member in old.namelist():
-            data = old.read(member)
-            for name in (b"spreadsheetml/2006/main", b"officeDocument/2006/relationships"):
-                strict = name.replace(b"/2006", b"")
-                data = data.replace(
-                    b"http://schemas.openxmlformats.org/" + name, b"http://purl.oclc.org/ooxml/" + strict
-                )
-            new.writestr(member, data)
-    with pytest.raises(InputError, match=r"strict\.xlsx: a 'Strict Open XML Spreadsheet', expected it saved as"):
-        mph.read_system(path)
 
 
 def test_another_sheet_that_speaks_of_another_unit_is_warned_of(tmp_path):

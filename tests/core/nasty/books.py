@@ -39,11 +39,8 @@ def _copies(first: str, second: str, hidden: str = "", state: str = "hidden") ->
 
 def _sheets() -> None:
     for first, second in (
-        *(("Geometry", "Geometry (2)"), ("Geometry", "Geometry old"), ("Geometry", "old"), ("A", "B"), ("v1", "v2")),
-        *(("Coordinates", "Coordinates (2)"), ("Coordinates", "Coordinates old"), ("Coordinates", "Main")),
-        *(("nominal", "measured"), ("Ring 1", "Ring 2"), ("Sheet1", "Sheet2"), ("Coordinates", "MDSL cloud import")),
-        *(("2021", "2022"), ("Coordinates ", "Coordinates_"), ("Final", "Final final"), ("Geometry", "Values")),
-        ("Lage", "Theta"),
+        *(("Geometry", "Geometry (2)"), ("Coordinates", "Coordinates old"), ("nominal", "measured")),
+        *(("Coordinates", "MDSL cloud import"), ("Geometry", "Values")),
     ):
         # The users' own sheet beside their Coordinates: a person knows which is meant.
         known = (RIGHT,) if second == "MDSL cloud import" else ()
@@ -102,7 +99,7 @@ def _sheets() -> None:
             made.sheets.append(copied)
             CASES.add(f"a {state} older {name} as well", made, SCANNER, REFUSED, place=(name,), columns=users_map())
     for name in ("Main", "Coordinates"):
-        for other in (f"{name} (2)", f"{name} old", f"{name}_backup", "Values"):
+        for other in (f"{name} (2)", "Values"):
             made = users()
             copied = users(scanner(SCANNER.centers * 1.02, 2.4, 76.0, 51.0, 11.0))[name]
             copied.name = other
@@ -193,10 +190,8 @@ def _sheets() -> None:
         {"Main": "Größen", "Coordinates": "Lage"},
         {"Main": "main", "Coordinates": "COORDINATES"},
         {"Main": " Main ", "Coordinates": "Coordinates "},
-        {"Main": "Sheet1", "Coordinates": "Sheet2"},
         {"Main": "Coordinates", "Coordinates": "Main"},
         {"Main": "a" * 31, "Coordinates": "b" * 31},
-        {"Main": "1", "Coordinates": "2"},
     ):
         made = _named(typed(users()), names)
         mapped = users_map(position={"sheet": names["Coordinates"]}, dimensions={"sheet": names["Main"]})
@@ -420,10 +415,7 @@ def _files() -> None:
     for file in (
         "scanner.xlsm",
         "scanner.XLSX",
-        "a b.xlsx",
         "größe.xlsx",
-        "scanner.v2.xlsx",
-        "scanner (1).xlsx",
         "scanner.tmp",
         "scanner",
         "scanner.xltx",
@@ -513,34 +505,25 @@ def _files() -> None:
     for name, content in {
         "an empty file": b"",
         "a csv file": csv.encode(),
-        "a csv file with semicolons": csv.replace(",", ";").replace(".", ",").encode("utf-8-sig"),
-        "a csv file in UTF-16": csv.encode("utf-16"),
         "an HTML page": b"<html><table><tr><td>x1</td></tr></table></html>",
-        "a log-in page": b"<!DOCTYPE html><html><head><title>Sign in</title></head></html>",
         "SpreadsheetML 2003": b'<?xml version="1.0"?><Workbook xmlns="urn:schemas-microsoft-com:office:spreadsheet"/>',
         "a flat OpenDocument": b'<o:document xmlns:o="urn:oasis:names:tc:opendocument:xmlns:office:1.0"/>',
         "an old .xls": ole + bytes(600),
         "a protected workbook": ole + bytes(600) + "EncryptedPackage".encode("utf-16-le"),
-        "a BIFF5 stream": bytes.fromhex("0908080000050500"),
         "zeros": bytes(5000),
-        "a PDF": b"%PDF-1.4\n",
         "a picture": b"\x89PNG\r\n\x1a\n" + bytes(100),
-        "a gzip file": b"\x1f\x8b\x08" + bytes(100),
-        "JSON": b'{"x1": [1, 2]}',
         "a Git LFS pointer": b"version https://git-lfs.github.com/spec/v1\noid sha256:00\nsize 25732\n",
         "a zip's first bytes": b"PK\x03\x04" + bytes(50),
         "an empty zip": zipped({}),
-        "another zip": zipped({"a.txt": b"hello"}),
         "a Word document": zipped({"[Content_Types].xml": b"<Types/>", "word/document.xml": b"<w/>"}),
         "OpenDocument": zipped({"mimetype": b"application/vnd.oasis.opendocument.spreadsheet", "content.xml": b"<a/>"}),
         "a binary .xlsb": zipped({"[Content_Types].xml": b"<Types/>", "xl/workbook.bin": b""}),
-        "Numbers": zipped({"Index/Document.iwa": b"", "Metadata/Properties.plist": b""}),
         "a zip of the workbook": zipped({"scanner.xlsx": b"PK\x03\x04"}),
     }.items():
         CASES.add(
             f"no workbook: {name}", lambda path, content=content: path.write_bytes(content), None, REFUSED, place=FILE
         )
-    for part in (0.02, 0.3, 0.6, 0.9, 0.99):
+    for part in (0.02, 0.6, 0.99):
         CASES.add(
             f"cut off after {part:.0%}", _bytes(lambda b, part=part: b[: int(len(b) * part)]), None, REFUSED, place=FILE
         )
@@ -558,9 +541,7 @@ def _files() -> None:
         "the workbook part missing": lambda m: {k: v for k, v in m.items() if k != "xl/workbook.xml"},
         "the relations missing": lambda m: {k: v for k, v in m.items() if k != "xl/_rels/workbook.xml.rels"},
         "a sheet cut off": lambda m: {**m, sheet: m[sheet][: len(m[sheet]) // 2]},
-        "a sheet empty": lambda m: {**m, sheet: b""},
         "a sheet of zeros": lambda m: {**m, sheet: bytes(len(m[sheet]))},
-        "a sheet that is HTML": lambda m: {**m, sheet: b"<html/>"},
         "a stray &": lambda m: {**m, sheet: m[sheet].replace(b"<sheetData>", b"& <sheetData>")},
         "a control character": lambda m: {**m, sheet: m[sheet].replace(b"<v>155.0</v>", b"<v>155.0\x01</v>")},
         "the texts cut short": lambda m: {

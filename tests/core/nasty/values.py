@@ -41,25 +41,21 @@ def _with_length(length: np.ndarray) -> object:
 
 def _cells() -> None:
     at = ("Geometry!B3",)
-    for text in ("315", " 315 ", "315.0", "3.15e2", "+315", "315.", "0315", "315\N{NO-BREAK SPACE}", "３１５"):
+    for text in ("315", " 315 ", "3.15e2", "315\N{NO-BREAK SPACE}", "３１５"):
         CASES.add(f"text {text!r}", _cell("B3", text), BIG, RIGHT, REFUSED, place=at, unmappable=NO_NUMBER)
     for text in (
-        *("315,0", "3,15", "1,315", "1.315,0", "1 315", "1'315", "315 mm", "31.5 cm", "12.4 in", "315mm"),
-        *("≈315", "~315"),
-        *("315 ± 0.1", "315(2)", "315*", "315?", "(315)", "<315", "315-316", "315/316", "−315", "3l5", "31S", "O", "x"),
-        *("n/a", "N/A", "-", "—", "TBD", "?", "none", "NaN", "nan", "inf", "Infinity", "1.#INF"),
+        *("315,0", "1,315", "1.315,0", "1 315", "315 mm", "12.4 in", "315mm"),
+        *("315 ± 0.1", "315(2)", "(315)", "315-316", "−315", "3l5", "x"),
+        *("n/a", "-", "TBD", "NaN", "inf", "1.#INF"),
         *("#N/A", "#REF!", "''", '"'),
-        *("same", "idem", "see above", "=315", "=B2", "0x13B", "3_1_5", "1e3", "TRUE", "12.05.2021", "5-Dec", "true"),
+        *("same", "=315", "=B2", "0x13B", "3_1_5", "1e3", "TRUE", "12.05.2021", "5-Dec"),
     ):
         CASES.add(f"text {text!r}", _cell("B3", text), None, REFUSED, place=at)
     for name, value in {
         "blank text": " ",
         "TRUE": True,
-        "FALSE": False,
         "#N/A": Error("#N/A"),
         "#DIV/0!": Error("#DIV/0!"),
-        "#REF!": Error("#REF!"),
-        "#VALUE!": Error("#VALUE!"),
         "#SPILL!": Error("#SPILL!"),
         "nothing": None,
         "a date of ISO": Raw('<c r="B3" t="d"><v>2021-12-05</v></c>'),
@@ -69,14 +65,10 @@ def _cells() -> None:
         "1e300": 1e300,
         "1e999": Raw('<c r="B3"><v>1e999</v></c>'),
         "NaN": Raw('<c r="B3"><v>NaN</v></c>'),
-        "INF": Raw('<c r="B3"><v>INF</v></c>'),
         "a comma": Raw('<c r="B3"><v>315,0</v></c>'),
-        "a comma of thousands": Raw('<c r="B3"><v>1,315</v></c>'),
         "hexadecimal": Raw('<c r="B3"><v>0x13B</v></c>'),
-        "underscores": Raw('<c r="B3"><v>3_15</v></c>'),
         "a unit in the value": Raw('<c r="B3"><v>315mm</v></c>'),
         "a text's index out of range": Raw('<c r="B3" t="s"><v>9999</v></c>'),
-        "a negative index": Raw('<c r="B3" t="s"><v>-1</v></c>'),
         "a kind that is none": Raw('<c r="B3" t="zz"><v>315</v></c>'),
     }.items():
         CASES.add(f"value: {name}", _cell("B3", value), None, REFUSED, place=("Geometry",))
@@ -84,16 +76,13 @@ def _cells() -> None:
         "an exponent": '<c r="B3"><v>3.15E2</v></c>',
         "a leading plus": '<c r="B3"><v>+315</v></c>',
         "17 digits": '<c r="B3"><v>315.00000000000006</v></c>',
-        "many zeros": '<c r="B3"><v>00315.000000000000000000000000</v></c>',
         "t=n": '<c r="B3" t="n"><v>315</v></c>',
         "a cell's metadata": '<c r="B3" cm="1" vm="1"><v>315</v></c>',
         "an extension": '<c r="B3"><v>315</v><extLst><ext uri="x"/></extLst></c>',
-        "phonetic": '<c r="B3" ph="1"><v>315</v></c>',
         "a style that is none": '<c r="B3" s="99"><v>315</v></c>',
         "blanks in the value": '<c r="B3"><v> 315 </v></c>',
         "an XML comment": '<c r="B3"><v><!-- x -->315</v></c>',
         "CDATA": '<c r="B3"><v><![CDATA[315]]></v></c>',
-        "a character reference": '<c r="B3"><v>&#51;15</v></c>',
         "an XML comment between digits": '<c r="B3"><v>3<!-- x -->15</v></c>',
     }.items():
         allowed = (RIGHT,) if name in ("an exponent", "17 digits", "t=n") else (RIGHT, REFUSED)
@@ -113,14 +102,9 @@ def _cells() -> None:
         )
     for quantity_name, factor in (
         ("d", 0.1),
-        ("d", 10.0),
-        ("R", 2.0),
         ("R", 0.1),
-        ("Ld", 0.1),
         ("Ld", 10.0),
-        ("Td", 10.0),
         ("l", 0.1),
-        ("l", 10.0),
     ):
 
         def odd(name: str = quantity_name, factor: float = factor) -> Book:
@@ -129,9 +113,7 @@ def _cells() -> None:
                 made.sheets[0][f"{ONE_SHEET_COLUMNS[name]}{row}"] *= factor
             return made
 
-        CASES.add(
-            f"{quantity_name} times {factor:g}, l says so", odd, None, REFUSED, WARNED_OF, place=("Geometry!",)
-        ) if quantity_name != "Td" else None
+        CASES.add(f"{quantity_name} times {factor:g}, l says so", odd, None, REFUSED, WARNED_OF, place=("Geometry!",))
     for row, name in ((2, "the first"), (4, "one")):
 
         def one(row: int = row) -> Book:
@@ -214,10 +196,6 @@ def _stored_values() -> None:
         ("G", "l"),
         ("E", "b"),
         ("H", "l + b+Td"),
-        ("I", "x2"),
-        ("K", "z2"),
-        ("U", "range"),
-        ("V", "azimuth"),
         ("W", "elevation"),
     ):
         for wrong in (0, 1.0):
@@ -238,9 +216,7 @@ def _stored_values() -> None:
                 )
     for stored, name in (
         (0, "0"),
-        (1.0, "1"),
         ("", "empty text"),
-        ("x", "a text"),
         (Error("#NAME?"), "an error"),
         (True, "TRUE"),
         (None, "none"),
@@ -315,13 +291,8 @@ def _stored_values() -> None:
         ('INDIRECT("AB4")', "INDIRECT"),
         ("OFFSET(AB1,3,0)", "OFFSET"),
         ("RAND()*300", "RAND"),
-        ("NOW()/300", "NOW"),
         ('IFERROR(__xludf.DUMMYFUNCTION("IMPORTRANGE()"),155)', "Google's stand-in"),
         ("myFunction(A4)", "a macro's function"),
-        ("_xlfn.LET(_xlpm.a,155,_xlpm.a)", "LET"),
-        ("Scanner[@x]", "a table that is not there"),
-        ("TABLE(,AA1)", "a data table"),
-        ('CUBEVALUE("a","b")', "a cube"),
         ('WEBSERVICE("http://a")', "the web"),
         ("SQRT(-1)", "an error, of which the stored value is none"),
         ("1/0", "a division by zero"),
@@ -337,8 +308,8 @@ def _stored_values() -> None:
             made["Coordinates"]["AA2"] = "x"
             made.calculation = RECALCULATE if flagged else made.calculation
             allowed = (RIGHT, WARNED, REFUSED)
-            if name in ("an error, of which the stored value is none", "a division by zero", "itself", "RAND", "NOW"):
-                allowed = (WARNED, REFUSED, *((RIGHT,) if not flagged or name in ("RAND", "NOW") else ()))
+            if name in ("an error, of which the stored value is none", "a division by zero", "itself", "RAND"):
+                allowed = (WARNED, REFUSED, *((RIGHT,) if not flagged or name == "RAND" else ()))
             CASES.add(
                 f"x1 is a formula of {name}{', calculation asked for' if flagged else ''}",
                 made,

@@ -11,9 +11,10 @@ import bpy
 from bpy.props import BoolProperty, CollectionProperty, EnumProperty, IntProperty, StringProperty
 
 from ...core.errors import InputError
+from ...core.geometry.columns import ANGLE_UNITS, LENGTH_UNITS
 from ...core.recording import recorded_warnings
 from ...core.workbook import ColumnMap, MappedColumn, MappedTable, draft_column_map, preview_workbook, read_system
-from ...core.workbook.quantities import ANGLE_UNITS, LENGTH_UNITS, POSITION, QUANTITIES, TYPED
+from ...core.workbook.quantities import POSITION, QUANTITIES, TYPED
 from ..blender import choices
 
 MAX_TABLES = 9

@@ -35,6 +35,56 @@ def module_frames(centers: ArrayLike) -> NDArray[np.float64]:
     return np.stack([u, np.cross(k, u), k], axis=1)
 
 
+def tilted(frames: NDArray[np.float64], tilt: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Frames (M, 3, 3), rows u, v, k, turned by rotation vectors `tilt` (M, 3), rad, about their own u, v and k."""
+    turned = np.any(tilt, axis=1)
+    if not turned.any():  # to the last digit
+        return frames
+    found = frames.copy()
+    # A vector a of the frame becomes R a, of which the world coordinates are F^T R a: the rows turn by R^T F.
+    found[turned] = rotations(tilt[turned]).transpose(0, 2, 1) @ frames[turned]
+    return found
+
+
+def tilts(frames: NDArray[np.float64], turned: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Rotation vectors (M, 3), rad, about u, v and k of `frames` (M, 3, 3) that make them `turned`."""
+    return rotation_vectors((turned @ frames.transpose(0, 2, 1)).transpose(0, 2, 1))
+
+
+def rotations(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Rotation matrices (N, 3, 3) of rotation vectors (N, 3), rad, by Rodrigues' formula."""
+    angle = np.linalg.norm(vectors, axis=1)[:, None, None]
+    x, y, z = vectors.T
+    zero = np.zeros_like(x)
+    cross = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)
+    # sin(a)/a and (1 - cos(a))/a^2 by sinc, which is exact at 0; numpy's is sin(pi x)/(pi x).
+    return np.eye(3) + np.sinc(angle / np.pi) * cross + 0.5 * np.sinc(angle / (2 * np.pi)) ** 2 * (cross @ cross)
+
+
+def rotation_vectors(matrices: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Rotation vectors (N, 3), rad, of rotation matrices (N, 3, 3); of half a turn, either of the two.
+
+    By unit quaternions: the candidate with the largest divisor, so that no angle loses digits.
+    """
+    r = matrices
+    trace = np.trace(r, axis1=1, axis2=2)
+    diagonal = np.diagonal(r, axis1=1, axis2=2)
+    odd = np.stack([r[:, 2, 1] - r[:, 1, 2], r[:, 0, 2] - r[:, 2, 0], r[:, 1, 0] - r[:, 0, 1]], axis=1)
+    # Rows of q q^T, times 4: (w, x, y, z) times each of its own components.
+    rows = np.empty((len(r), 4, 4))
+    rows[:, 0, 0], rows[:, 0, 1:], rows[:, 1:, 0] = 1 + trace, odd, odd
+    rows[:, 1:, 1:] = r + r.transpose(0, 2, 1)
+    for i in range(3):
+        rows[:, i + 1, i + 1] = 1 + 2 * diagonal[:, i] - trace
+    largest = np.argmax(np.diagonal(rows, axis1=1, axis2=2), axis=1)
+    q = rows[np.arange(len(r)), largest]
+    q /= np.linalg.norm(q, axis=1, keepdims=True)
+    q *= np.where(q[:, :1] < 0, -1.0, 1.0)
+    sine = np.linalg.norm(q[:, 1:], axis=1, keepdims=True)
+    angle = 2 * np.arctan2(sine, q[:, :1])
+    return q[:, 1:] * np.where(sine > 0, angle / np.where(sine > 0, sine, 1.0), 2.0)
+
+
 def module_poses(centers: ArrayLike) -> NDArray[np.float64]:
     """World-from-module poses (M, 4, 4) of pinholes at `centers` (M, 3), mm: columns u, v, k and the centre."""
     return affine_matrix(module_frames(centers).transpose(0, 2, 1), centers)

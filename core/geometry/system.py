@@ -2,29 +2,30 @@
 
 from __future__ import annotations
 
-import re
-from dataclasses import MISSING, dataclass, fields
-from typing import Literal
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InputError, warn
 from ..system_source import SystemSource
-from ..validation import freeze, lengths, one_for_all, positive, real_array, whole_shape
-from .frames import module_frames, module_poses, principal_rays
+from ..validation import lengths, positive, real_array, whole_shape
+from .columns import ColumnTable
+from .frames import affine_matrix, module_frames, tilted, tilts
+from .pinhole_columns import PINHOLE_COLUMNS
+from .scanner import Scanner, repeated
 from .views import Views
+
+if TYPE_CHECKING:
+    from .module_parts import ModulePart
 
 Detector = Literal["virtual", "real"]
 
-LENGTHS = {
-    "pinhole_diameter": "d: diameter of the hole",
-    "collimator_length": "l: from the pinhole to the crystal's front face",
-    "detector_side": "Ld: side of the square crystal",
-    "detector_thickness": "Td: thickness of the crystal",
-    "roi_radius": "R: radius of the sphere that the module must see",
-}
-"""The modules' dimensions: fields of `PinholeSystem`, with their symbols and what they are."""
+LENGTHS = {name: column.help for name, column in PINHOLE_COLUMNS.scalars.items() if column.kind == "length"}
+"""The modules' dimensions: fields of `PinholeSystem`, with what they are."""
+LATER_LENGTHS = ()
 
 # Pinholes that differ in z by less than this fraction of the crystal's side belong to one ring.
 _RING_GAP = 0.2
@@ -33,15 +34,19 @@ _SAME_PLACE = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
-class PinholeSystem:
-    """M pinhole modules aimed at the isocentre, which is the world's origin.
+class PinholeSystem(Scanner):
+    """M pinhole modules around the isocentre, which is the world's origin.
 
     `centers` (M, 3) are the pinholes' centres, world mm. Each of d, l, Ld, Td and R (M,) is in mm, and one number stands for
     all modules. `numbers` (M,) are those of the users' workbook (default 1, 2, ...), and `source` is the workbook that the
-    system was read from.
+    system was read from. A module looks at the isocentre, but for its `tilt` (M, 3), rad: a rotation vector about its
+    nominal u, v and k. `crystal_material` (M,) names the crystals' materials; "" leaves it to the model.
 
     d must be below Ld, pinholes must be outside the ROI, and no two modules may have the same number or place.
     """
+
+    kind: ClassVar[str] = "pinhole"
+    columns: ClassVar[ColumnTable] = PINHOLE_COLUMNS
 
     centers: NDArray[np.float64]
     pinhole_diameter: NDArray[np.float64]  # d
@@ -51,20 +56,13 @@ class PinholeSystem:
     roi_radius: NDArray[np.float64]  # R
     numbers: NDArray[np.int64] = None  # type: ignore[assignment]  # always an array once made
     source: SystemSource | None = None
+    tilt: NDArray[np.float64] = 0.0  # type: ignore[assignment]  # likewise
+    crystal_material: NDArray[np.str_] = ""  # type: ignore[assignment]
+    more: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        centers = real_array(self.centers, "pinhole centres", (None, 3))
-        n = len(centers)
-        if n == 0:
-            raise InputError("a pinhole system needs at least one module, got none")
-        numbers = np.arange(1, n + 1) if self.numbers is None else real_array(self.numbers, "numbers", (n,), np.int64)
-        if self.numbers is not None and not np.array_equal(numbers, self.numbers):
-            raise InputError("numbers: expected whole numbers")
-        object.__setattr__(self, "centers", freeze(centers))
-        object.__setattr__(self, "numbers", freeze(numbers))
-        for name in LENGTHS:
-            object.__setattr__(self, name, freeze(one_for_all(getattr(self, name), name, n)))
-            self._refuse(getattr(self, name) <= 0, f"{name} must be more than 0 mm, got {{{name}:g}}")
+        object.__setattr__(self, "centers", real_array(self.centers, "pinhole centres", (None, 3)))
+        super().__post_init__()
         self._refuse(
             self.pinhole_diameter >= self.detector_side,
             "pinhole_diameter {pinhole_diameter:g} mm must be less than detector_side {detector_side:g} mm",
@@ -73,27 +71,7 @@ class PinholeSystem:
             self.pinhole_distance <= self.roi_radius,
             "its pinhole is {pinhole_distance:g} mm from the isocentre, inside the ROI of {roi_radius:g} mm",
         )
-        for what, values in (("number", numbers[:, None]), ("pinhole centre", centers)):
-            _, first, inverse = np.unique(values, axis=0, return_index=True, return_inverse=True)
-            self._refuse(first[inverse.reshape(-1)] != np.arange(n), f"another module has the same {what}")
-
-    def _refuse(self, bad: NDArray[np.bool_], message: str) -> None:
-        """Refuse the first module that is `bad`; `message` is a template of its dimensions."""
-        if bad.any():
-            i = int(np.argmax(bad))
-            own = {name: np.ravel(getattr(self, name))[i] for name in re.findall(r"{(\w+)", message)}
-            raise InputError(f"module {self.numbers[i]}: {message.format(**own)}")
-
-    def __len__(self) -> int:
-        return len(self.centers)
-
-    def __getitem__(self, which: int | slice | NDArray) -> PinholeSystem:
-        """The modules `which` (an index from 0, a slice, or an array of indices or booleans) as a system."""
-        index = np.atleast_1d(np.arange(len(self))[which])
-        if len(index) == 0:
-            raise InputError(f"no module chosen: there are {len(self)}")
-        arrays = {f.name: getattr(self, f.name)[index] for f in fields(self) if f.name != "source"}
-        return PinholeSystem(**arrays, source=self.source)
+        self._refuse(repeated(self.centers), "another module has the same pinhole centre")
 
     @property
     def pinhole_distance(self) -> NDArray[np.float64]:
@@ -102,16 +80,27 @@ class PinholeSystem:
 
     @property
     def principal_rays(self) -> NDArray[np.float64]:
-        """k (M, 3): unit vectors from pinhole to isocentre."""
-        return principal_rays(self.centers)
+        """k (M, 3): the modules' axes, unit vectors from pinhole to isocentre where there is no tilt."""
+        return self.frames()[:, 2]
 
     def frames(self) -> NDArray[np.float64]:
-        """Module frames (M, 3, 3), rows u, v, k (see `core.geometry.frames.module_frames`)."""
-        return module_frames(self.centers)
+        """Module frames (M, 3, 3), rows u, v, k: those of `core.geometry.frames.module_frames`, tilted."""
+        return tilted(module_frames(self.centers), self.tilt)
 
     def poses(self) -> NDArray[np.float64]:
         """World-from-module poses (M, 4, 4): columns u, v, k and the pinhole centre, mm."""
-        return module_poses(self.centers)
+        return affine_matrix(self.frames().transpose(0, 2, 1), self.centers)
+
+    def at_poses(self, poses: NDArray[np.float64]) -> Self:
+        """The system with its pinholes, and their modules turned with them, at these poses (M, 4, 4)."""
+        centers = poses[:, :3, 3]
+        return self.replace(centers=centers, tilt=tilts(module_frames(centers), poses[:, :3, :3].transpose(0, 2, 1)))
+
+    def parts(self) -> Sequence[ModulePart]:
+        """The collimators, built as by default, and the crystals."""
+        from .module_parts import module_parts
+
+        return module_parts(self)
 
     def rings(self) -> NDArray[np.int64]:
         """Index (M,) of each module's ring, from 0 along +z. Pinholes at about the same z form a ring."""
@@ -177,10 +166,6 @@ def same_place(centers: NDArray[np.float64]) -> tuple[int, int] | None:
     earlier = first[inverse.reshape(-1)]
     later = np.flatnonzero(earlier < np.arange(len(centers)))
     return (int(earlier[later[0]]), int(later[0])) if len(later) else None
-
-
-LATER_LENGTHS = tuple(f.name for f in fields(PinholeSystem) if f.name in LENGTHS and f.default is not MISSING)
-"""Dimensions that have a default, since files of earlier versions lack them."""
 
 
 def chosen_modules(system: PinholeSystem, text: str | None, name: str = "--modules") -> PinholeSystem:

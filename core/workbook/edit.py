@@ -202,7 +202,7 @@ class Edit:
                 i, quantity = np.argmin(is_default), QUANTITIES[name]
                 raise InputError(
                     f"{file}: sheet {sheet} has no column headed {name} for the {quantity.title} of module {numbers[i]}, "
-                    f"{quantity.said(quantity.of(self.system)[i])}, which is not {quantity.blank_is}"
+                    f"{quantity.text_of(quantity.of(self.system)[i])}, which is not {quantity.blank_is}"
                 )
 
     def _rows_after(self, table: Table, old: tuple[int, ...]) -> Rows:

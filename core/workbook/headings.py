@@ -9,7 +9,8 @@ import unicodedata
 from collections.abc import Iterable
 from typing import NamedTuple
 
-from .quantities import ANGLE_UNITS, QUANTITIES, TYPED
+from ..geometry.columns import ANGLE_UNITS
+from .quantities import QUANTITIES, TYPED
 
 _NUMBER_HEADINGS = (
     "definitions, number, no, no., nr, nr., #, module, modules, module number, module no, module no., module #, "

@@ -4,7 +4,6 @@ import math
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +14,7 @@ from ..system_source import QuantityCells, SystemSource
 from .book import Book
 from .column_map import ColumnMap, column_map
 from .layout import Column, Layout, mapped_layout
-from .quantities import DERIVED, DIMENSIONS, NEEDED, OPTIONAL, POSITION, QUANTITIES, TYPED, Numbers, tolerance
+from .quantities import DERIVED, DIMENSIONS, NEEDED, OPTIONAL, POSITION, QUANTITIES, Numbers, tolerance
 from .recognition import recognized_layout
 
 _SHOWN = 5
@@ -81,13 +80,8 @@ def read(book: Book, columns: ColumnMap | None = None) -> Reading:
             in_sheet = given[name] * cells[name].factor
             _refuse_not_positive(cells[name], in_sheet)
             values[name] = np.where(np.isnan(in_sheet), defaults[name], in_sheet)
-    fields: dict[str, Any] = {str(QUANTITIES[name].source): values[name] for name in TYPED if name not in POSITION}
-    system = PinholeSystem(
-        centers=np.stack([values[name] for name in POSITION], axis=1),
-        numbers=np.array(layout.modules.module_numbers),
-        source=_source(book, layout, columns),
-        **fields,
-    )
+    source = _source(book, layout, columns)
+    system = PinholeSystem.from_values(values, np.array(layout.modules.module_numbers), source)
     for doubtful in _doubtful(book, cells, given, defaults, system):
         warn(doubtful)
     return Reading(layout, given, system)
@@ -166,13 +160,15 @@ def _refuse_not_positive(column: Column, values: NDArray[np.float64]) -> None:
     """Raise `InputError` if a number (M,), mm or rad, is not positive but plausible ones are."""
     quantity = QUANTITIES[column.quantity]
     bad = (values <= 0) & (quantity.plausible[0] > 0)
-    column.refuse(bad, lambda i: f"has {quantity.name} = {quantity.said(values[i])}, expected more than 0")
+    column.refuse(bad, lambda i: f"has {quantity.name} = {quantity.text_of(values[i])}, expected more than 0")
 
 
 def _implausible(system: PinholeSystem, columns: dict[str, Column]) -> Iterator[str]:
     """For each quantity, the first module whose number is unlike that of any scanner."""
     for name, quantity in QUANTITIES.items():
         low, high = quantity.plausible
+        if quantity.is_text:
+            continue
         values = quantity.of(system)
         column = columns[name if name in columns and quantity.role != "derived" else "x1"]
         odd = np.flatnonzero((values < low) | (values > high))
@@ -180,8 +176,8 @@ def _implausible(system: PinholeSystem, columns: dict[str, Column]) -> Iterator[
             several = len(set(column.rows)) > 1 and len(odd) > 1
             more = f" (so it is for {len(odd) - 1} more modules)" if several else ""
             yield (
-                f"{column.where(int(odd[0]))} makes {name} = {quantity.said(values[odd[0]])}{more}, which is unlikely, "
-                f"expected {low:g} to {quantity.said(high)}: are the units right?"
+                f"{column.where(int(odd[0]))} makes {name} = {quantity.text_of(values[odd[0]])}{more}, which is unlikely, "
+                f"expected {low:g} to {quantity.text_of(high)}: are the units right?"
             )
 
 

@@ -140,6 +140,8 @@ def _refuse_other_system(
             f"{several(back.system.numbers)}"
         )
     for quantity in [QUANTITIES[name] for name in TYPED]:
+        if quantity.is_text:
+            continue
         wanted, got = quantity.of(system), quantity.of(back.system)
         differing = np.flatnonzero(np.abs(got - wanted) > 2e-9 * np.abs(wanted))
         if len(differing):
@@ -147,8 +149,8 @@ def _refuse_other_system(
             column = back.layout.columns.get(quantity.name)
             why = f": {column.place(i)} is read for all modules" if column is not None and column.shared else ""
             raise InputError(
-                f"{name} cannot hold this system: {quantity.name} = {quantity.said(wanted[i], 9)} of module "
-                f"{system.numbers[i]} would be read as {quantity.said(got[i], 9)}{why}"
+                f"{name} cannot hold this system: {quantity.name} = {quantity.text_of(wanted[i], 9)} of module "
+                f"{system.numbers[i]} would be read as {quantity.text_of(got[i], 9)}{why}"
             )
 
 
@@ -180,8 +182,9 @@ def _new_workbook(system: PinholeSystem) -> tuple[bytes, dict[str, Any]]:
         slope = system.pinhole_distance / x1
     divided_by_0 = {"slope": np.isinf(slope), "azimuth": np.hypot(x1, y1) == 0}
     typed = {name: ~QUANTITIES[name].is_default(system) for name in OPTIONAL}
+    held = {name: q for name, q in QUANTITIES.items() if q.formula or name not in typed or typed[name].any()}
     columns = [
-        *((name, q.place, q.titles or q.headings[:2], q.formula, q.of(system)) for name, q in QUANTITIES.items()),
+        *((name, q.place, q.titles or q.headings[:2], q.formula, q.of(system)) for name, q in held.items()),
         *(("number", f"{title}!A", ("", "Definitions"), "", system.numbers) for title in ("Main", "Coordinates")),
         ("slope", "Coordinates!F", ("S", "3D slope"), "={b}/{x1}", slope),
     ]

@@ -1,0 +1,232 @@
+"""The columns of a scanner's table: each is declared once, and all that reads, shows or keeps its values follows.
+
+Workbook, column maps, run files, JSON, the command line, Blender's panels and the comparison with the scene take names,
+units, limits and help from here.
+"""
+
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError
+from ..validation import one_for_all, radians, real_array
+
+MAP_UNITS = {"dm": 100.0, "ft": 304.8, "mil": 0.0254, "0.1 mm": 0.1}
+"""Unit -> mm, of units that only a column map may name."""
+LENGTH_UNITS = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "in": 25.4, "µm": 1e-3, **MAP_UNITS}
+"""Unit -> mm."""
+ANGLE_UNITS = {"rad": 1.0, "deg": math.pi / 180}
+"""Unit -> rad."""
+
+AGREEING = 1e-9
+"""Relative: a formula's result nearer to a number than this gives that number."""
+
+Kind = Literal["length", "angle", "number", "whole", "choice", "text"]
+Values = Mapping[str, NDArray[Any]]
+"""Column -> its values (M,), lengths in mm and angles in rad."""
+
+
+@dataclass(frozen=True)
+class Column:
+    """One column of a scanner's table: a number, a word or a text for each module."""
+
+    name: str
+    """Its symbol, which is also its name in messages and column maps."""
+    field: str = ""
+    """The scanner's attribute that holds its values, (M,), or (M, 3) where it is one of three; "" if only derived."""
+    axis: int | None = None
+    """Which coordinate of a vector it is."""
+    kind: Kind = "length"
+    derived: Callable[[Any], NDArray[np.float64]] | None = None
+    """A function of the scanner that gives its values (M,), mm or rad, of a column that follows from the others."""
+    headings: tuple[str, ...] = ()
+    """The texts that head it. Texts of one letter are case-sensitive, others are not."""
+    place: str = ""
+    """Sheet and column in a new workbook."""
+    titles: tuple[str, str] | None = None
+    """The symbol and the description that head it in a new workbook; by default the first two headings."""
+    unit: str = ""
+    """That of a heading without one, and of a new workbook; by default mm or rad."""
+    formula: str = ""
+    """Its formula in a spreadsheet, with other columns in braces; "" for one that is typed."""
+    hints: str = ""
+    """Words that suggest this column in a heading that is not understood."""
+    plausible: tuple[float, float] = (-math.inf, math.inf)
+    """mm or rad; a warning is given of numbers outside. If all of them are above 0, a typed one that is not is refused."""
+    blank: float | str | Callable[[Values], NDArray[np.float64]] | None = None
+    """The value of a blank cell, or a function of the needed columns that gives it (M,); None: each must be given."""
+    choices: tuple[str, ...] = ()
+    """The words that a choice may be."""
+    help: str = ""
+    """What it is, for help texts and tooltips."""
+    depends_on_length: bool = False
+    """Whether it is derived from l, and hence from all the digits of an l that is shown rounded."""
+
+    @property
+    def role(self) -> Literal["needed", "optional", "derived"]:
+        """Whether it must be there, may be, or only repeats what follows from the others and is compared."""
+        return "derived" if self.derived else "needed" if self.blank is None else "optional"
+
+    @property
+    def is_text(self) -> bool:
+        """Whether its values are texts, not numbers."""
+        return self.kind in ("choice", "text")
+
+    @property
+    def units(self) -> dict[str, float]:
+        """Unit -> mm or rad; the first is that of a heading without one. "" is that of a plain number."""
+        known = {"length": LENGTH_UNITS, "angle": ANGLE_UNITS}.get(self.kind, {"": 1.0})
+        return {self.unit: known[self.unit], **known} if self.unit else known
+
+    @property
+    def title(self) -> str:
+        """Its name in messages: "collimator length"."""
+        return (self.field or self.name).replace("_", " ") if self.axis is None else self.name
+
+    @property
+    def blank_is(self) -> str:
+        """Whose number messages say that of a blank cell is."""
+        return "the design formula's" if callable(self.blank) else self.text_of(self.blank)
+
+    def text_of(self, value: Any, digits: int = 6) -> str:
+        """A value of it, in mm or rad, as messages show it, in the unit of a heading without one."""
+        if self.is_text:
+            return repr(str(value))
+        unit, factor = next(iter(self.units.items()))
+        return f"{value / factor:.{digits}g} {unit}".rstrip()
+
+    def of(self, scanner: Any) -> NDArray[Any]:
+        """Its values (M,) in a scanner, mm or rad."""
+        if self.derived is not None:
+            return self.derived(scanner)
+        values = getattr(scanner, self.field)
+        return values if self.axis is None else values[:, self.axis]
+
+    def default(self, needed: Values) -> NDArray[Any]:
+        """The values (M,) of an optional one where its cells are blank, by the `needed` ones, mm."""
+        return self.blank(needed) if callable(self.blank) else np.full(len(next(iter(needed.values()))), self.blank)
+
+    def is_default(self, scanner: Any) -> NDArray[np.bool_]:
+        """Which modules (M,) have the value of a blank cell."""
+        return self.same(self.default(scanner.columns.needed_values(scanner)), self.of(scanner))
+
+    def same(self, one: NDArray[Any], other: NDArray[Any]) -> NDArray[np.bool_]:
+        """Where values (M,) are equal: numbers to 1e-9, relative, texts letter by letter."""
+        if self.is_text:
+            return np.asarray(one, np.str_) == other
+        return np.abs(one - other) <= AGREEING * np.abs(other)
+
+    def checked(self, values: Any, n: int | None) -> NDArray[Any]:
+        """`values`, one for each of `n` modules or one for all, as an array of its kind, or `InputError`."""
+        if self.is_text:
+            return self._texts(values, n or 1)
+        if self.kind == "angle":
+            radians(values, self.field, None)
+        numbers = one_for_all(values, self.field, n or 1)
+        if self.kind == "whole":
+            whole = numbers.astype(np.int64)
+            if not np.array_equal(whole, numbers):
+                raise InputError(f"{self.field}: expected whole numbers")
+            return whole
+        return numbers
+
+    def _texts(self, values: Any, n: int) -> NDArray[np.str_]:
+        texts = np.asarray(values)
+        if texts.dtype.kind != "U" and not (texts.dtype == object and all(isinstance(x, str) for x in texts.flat)):
+            raise InputError(f"{self.field}: expected texts, got {values!r:.60}")
+        if texts.shape not in ((), (n,)):
+            raise InputError(f"{self.field}: expected one text, or one for each of {n} modules, got {texts.size}")
+        for text in map(str, texts.flat):
+            self.require_choice(text)
+        return np.array(np.broadcast_to(texts, (n,)), np.str_)
+
+    def require_choice(self, text: str) -> None:
+        """Raise `InputError` unless a choice is one of its words, or "" if a cell may be blank."""
+        if self.kind == "choice" and text not in self.choices and text != self.blank:
+            raise InputError(f"{self.field} {text!r}: expected one of {', '.join(self.choices)}")
+
+
+class ColumnTable(Mapping[str, Column]):
+    """A kind of scanner's columns by name; causes stand before their effects, so that the cause of an error is refused."""
+
+    def __init__(self, columns: Iterable[Column]) -> None:
+        self._columns = {column.name: column for column in columns}
+
+    def __getitem__(self, name: str) -> Column:
+        return self._columns[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._columns)
+
+    def __len__(self) -> int:
+        return len(self._columns)
+
+    __hash__ = object.__hash__
+    __eq__ = object.__eq__
+
+    def with_columns(self, *columns: Column) -> "ColumnTable":
+        """A table that has these, too."""
+        return ColumnTable([*self.values(), *columns])
+
+    def _names(self, *roles: str) -> tuple[str, ...]:
+        return tuple(column.name for column in self.values() if column.role in roles)
+
+    @cached_property
+    def needed(self) -> tuple[str, ...]:
+        """What a workbook must have."""
+        return self._names("needed")
+
+    @cached_property
+    def optional(self) -> tuple[str, ...]:
+        """What has a value where its cells are blank."""
+        return self._names("optional")
+
+    @cached_property
+    def derived(self) -> tuple[str, ...]:
+        """What follows from the others and is compared."""
+        return self._names("derived")
+
+    @cached_property
+    def typed(self) -> tuple[str, ...]:
+        """What a scanner is made of: the needed, then the optional ones."""
+        return (*self.needed, *self.optional)
+
+    @cached_property
+    def position(self) -> tuple[str, ...]:
+        """The needed coordinates, x1, y1, z1 of pinholes: they stand in one table, which has a row for each module."""
+        return tuple(name for name in self.needed if self[name].axis is not None)
+
+    @cached_property
+    def dimensions(self) -> tuple[str, ...]:
+        """The other needed ones, which may be given once for all modules."""
+        return tuple(name for name in self.needed if self[name].axis is None)
+
+    @cached_property
+    def fields(self) -> dict[str, tuple[Column, ...]]:
+        """Attribute of the scanner -> its column, or those of its three coordinates."""
+        found: dict[str, tuple[Column, ...]] = {}
+        for name in self.typed:
+            found[self[name].field] = (*found.get(self[name].field, ()), self[name])
+        return found
+
+    @cached_property
+    def scalars(self) -> dict[str, Column]:
+        """Attribute of the scanner -> its column, of those that are no coordinates."""
+        return {name: columns[0] for name, columns in self.fields.items() if columns[0].axis is None}
+
+    def needed_values(self, scanner: Any) -> Values:
+        """The values of a scanner that a workbook must have."""
+        return {name: self[name].of(scanner) for name in self.needed}
+
+
+def vector(values: Any, name: str, n: int | None) -> NDArray[np.float64]:
+    """`values` (M, 3), or one triple for all `n` modules, or `InputError`."""
+    array = real_array(values, name, None)
+    if n is not None and array.shape in ((), (3,)):
+        array = np.array(np.broadcast_to(array, (n, 3)))
+    return real_array(array, name, (n, 3))

@@ -1,0 +1,159 @@
+"""What any scanner offers: a table of typed columns with a row for each module, its views, its solids, its source file.
+
+`PinholeSystem` is the first kind. A new kind is a class here derived from `Scanner`, its columns, and a row of `SCANNERS`.
+"""
+
+from __future__ import annotations
+
+import re
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import fields, replace
+from typing import TYPE_CHECKING, Any, ClassVar, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..errors import InputError
+from ..validation import freeze, real_array
+from .columns import ColumnTable, Values, vector
+from .views import Views
+
+if TYPE_CHECKING:
+    from ..system_source import SystemSource
+    from .module_parts import ModulePart
+
+SCANNERS: dict[str, type[Scanner]] = {}
+"""Name -> class, of the kinds of scanners; each enters itself when it is defined."""
+
+
+class Scanner(ABC):
+    """M modules of one kind; a subclass is a frozen dataclass of what its table's columns hold.
+
+    Its fields are attributes that columns name (`Column.field`), and ``numbers``, ``source`` and ``more``: `numbers` (M,)
+    are the modules' own, by default 1, 2, ...; `source` is the workbook that it was read from; `more` has the values of
+    columns of the table that are no field of the class, by their attribute's name, and is read as an attribute, too.
+    """
+
+    kind: ClassVar[str]
+    """Its name in run files and in the scene: "pinhole"."""
+    sheet: ClassVar[str] = ""
+    """The one sheet of a workbook that holds it; "": those whose headings say so."""
+    columns: ClassVar[ColumnTable]
+    numbers: NDArray[np.int64]
+    source: SystemSource | None
+    more: Mapping[str, Any]
+
+    def __init_subclass__(cls, **settings: Any) -> None:
+        super().__init_subclass__(**settings)
+        if "kind" in vars(cls):
+            SCANNERS[cls.kind] = cls
+
+    def __post_init__(self) -> None:
+        known = {f.name for f in fields(self)}  # type: ignore[arg-type]
+        more: dict[str, Any] = {}
+        n: int | None = None
+        if unknown := self.more.keys() - self.columns.fields.keys():
+            raise InputError(f"{sorted(unknown)[0]}: is no column of a {self.kind} scanner")
+        for name, columns in self.columns.fields.items():
+            absent = (
+                columns[0].default(self.columns.needed_values(self)) if name not in known | self.more.keys() else None
+            )
+            given = getattr(self, name) if name in known else self.more.get(name, absent)
+            values = columns[0].checked(given, n) if columns[0].axis is None else vector(given, name, n)
+            n = len(values)
+            if name in known:
+                object.__setattr__(self, name, freeze(values))
+            else:
+                more[name] = freeze(values)
+            if n == 0:
+                raise InputError(f"a {self.kind} system needs at least one module, got none")
+        object.__setattr__(self, "more", more)
+        numbers = (
+            np.arange(1, (n or 0) + 1) if self.numbers is None else real_array(self.numbers, "numbers", (n,), np.int64)
+        )
+        if self.numbers is not None and not np.array_equal(numbers, self.numbers):
+            raise InputError("numbers: expected whole numbers")
+        object.__setattr__(self, "numbers", freeze(numbers))
+        for name, column in self.columns.scalars.items():
+            if column.plausible[0] > 0:
+                unit = next(iter(column.units))
+                self._refuse(getattr(self, name) <= 0, f"{name} must be more than 0 {unit}, got {{{name}:g}}")
+        self._refuse(repeated(numbers[:, None]), "another module has the same number")
+
+    def __getattr__(self, name: str) -> Any:
+        if name != "more" and name in self.more:
+            return self.more[name]
+        raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+
+    def __len__(self) -> int:
+        return len(self.numbers)
+
+    def __getitem__(self, which: int | slice | NDArray[Any]) -> Self:
+        """The modules `which` (an index from 0, a slice, or an array of indices or booleans) as a scanner."""
+        index = np.atleast_1d(np.arange(len(self))[which])
+        if len(index) == 0:
+            raise InputError(f"no module chosen: there are {len(self)}")
+        changes = {name: getattr(self, name)[index] for name in self.columns.fields}
+        return self.replace(**changes, numbers=self.numbers[index])
+
+    def replace(self, **changes: Any) -> Self:
+        """The same with other values of these attributes, those of `more` among them."""
+        own = {f.name for f in fields(self)}  # type: ignore[arg-type]
+        more = {**self.more, **{name: value for name, value in changes.items() if name not in own}}
+        return replace(self, **{n: v for n, v in changes.items() if n in own}, more=more)  # type: ignore[type-var]
+
+    @classmethod
+    def from_values(cls, values: Values, numbers: ArrayLike | None = None, source: SystemSource | None = None) -> Self:
+        """The scanner whose typed columns hold `values` (M,), mm, rad or texts; blank ones may be left out."""
+        own = {f.name for f in fields(cls)}  # type: ignore[arg-type]
+        given: dict[str, Any] = {}
+        for name, columns in cls.columns.fields.items():
+            if columns[0].axis is None and columns[0].name in values:
+                given[name] = values[columns[0].name]
+            elif any(column.name in values for column in columns):
+                n = len(next(values[c.name] for c in columns if c.name in values))
+                given[name] = np.stack([values.get(c.name, np.zeros(n)) for c in columns], axis=1)
+        more = {name: given.pop(name) for name in list(given) if name not in own}
+        return cls(**given, numbers=numbers, source=source, more=more)
+
+    def values(self) -> dict[str, NDArray[Any]]:
+        """The values (M,) of the typed columns by name, mm, rad or texts."""
+        return {name: self.columns[name].of(self) for name in self.columns.typed}
+
+    def _refuse(self, bad: NDArray[np.bool_], message: str) -> None:
+        """Refuse the first module that is `bad`; `message` is a template of its attributes."""
+        if bad.any():
+            i = int(np.argmax(bad))
+            own = {name: np.ravel(getattr(self, name))[i] for name in re.findall(r"{(\w+)", message)}
+            raise InputError(f"module {self.numbers[i]}: {message.format(**own)}")
+
+    @abstractmethod
+    def poses(self) -> NDArray[np.float64]:
+        """World-from-module poses (M, 4, 4): columns u, v, k and the source's place, mm."""
+
+    @abstractmethod
+    def at_poses(self, poses: NDArray[np.float64]) -> Self:
+        """The scanner with its modules moved and turned as rigid bodies to these poses (M, 4, 4)."""
+
+    @abstractmethod
+    def views(self, shape: tuple[int, int]) -> Views:
+        """The modules' images, of n_v rows and n_u columns."""
+
+    def parts(self) -> Sequence[ModulePart]:
+        """The modules' solids for the scene and for files; none by default."""
+        return ()
+
+    def rings(self) -> NDArray[np.int64]:
+        """Index (M,) of each module's group, from 0; all are one by default."""
+        return np.zeros(len(self), dtype=np.int64)
+
+    def reach(self) -> float:
+        """Radius, mm, of a sphere around the isocentre with the modules' sources in it."""
+        return float(np.linalg.norm(self.poses()[:, :3, 3], axis=1).max())
+
+
+def repeated(rows: NDArray[Any]) -> NDArray[np.bool_]:
+    """Which rows (M,) of an array (M, ...) stand there before."""
+    _, first, inverse = np.unique(rows, axis=0, return_index=True, return_inverse=True)
+    return first[inverse.reshape(-1)] != np.arange(len(rows))

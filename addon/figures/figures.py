@@ -24,7 +24,6 @@ from ...core.figures.page import SUFFIXES, Page, box
 from ...core.figures.parts import heading, heading_height
 from ...core.figures.subject import Subject, require
 from ...core.geometry.collimator import Construction
-from ...core.geometry.module_parts import module_parts
 from ...core.geometry.system import PinholeSystem
 from ...core.progress import Cancelled, Progress
 from ...core.recording import recorded_warnings
@@ -218,7 +217,7 @@ def _put(scene: bpy.types.Scene, data: bpy.types.ID) -> bpy.types.Object:
 
 def _put_modules(scene: bpy.types.Scene, system: PinholeSystem, construction: Construction) -> None:
     """All collimators as one object, and all crystals."""
-    parts = module_parts(system, construction)
+    parts = system.parts(construction)
     for kind in ("collimator", "crystal"):
         solids = [(part.vertices, part.solid[1]) for part in parts if part.kind == kind]
         firsts = np.cumsum([0, *(len(vertices) for vertices, _ in solids)])
@@ -246,7 +245,7 @@ def _rays(system: PinholeSystem) -> bpy.types.Curve:
 
 def _corners(system: PinholeSystem, radius: float) -> NDArray[np.float64]:
     """Points (N, 3), mm, around all modules and the ROI."""
-    parts = module_parts(system)
+    parts = system.parts()
     return np.concatenate([radius * _BALL, *(part.vertices for part in parts)])
 
 

@@ -40,7 +40,7 @@ class ModuleNumbers(_Fields):
 
 def system_of(modules: Sequence[ModuleNumbers], source: Any = None) -> PinholeSystem:
     """A system of these modules; raises `InputError` where their numbers are impossible."""
-    lengths = {name: np.array([getattr(numbers, name) for numbers in modules]) for name in LENGTHS}
+    lengths: Any = {name: np.array([getattr(numbers, name) for numbers in modules]) for name in LENGTHS}
     centers, own = np.array([numbers.center for numbers in modules]), np.array([numbers.number for numbers in modules])
     return PinholeSystem(centers, **lengths, numbers=own, source=source)
 

@@ -16,7 +16,6 @@ from mathutils import Quaternion
 from ...core.errors import InputError, warn
 from ...core.geometry import checks
 from ...core.geometry.collimator import Construction
-from ...core.geometry.module_parts import module_parts
 from ...core.geometry.system import PinholeSystem
 from ...core.workbook import ColumnMap, QuantityCells, SystemSource
 from ..blender import ids
@@ -52,7 +51,7 @@ def build_scanner(
         raise InputError(
             f"scanner '{name}' has changed since it was imported ({'; '.join(lost)}): set replace=True to drop the changes"
         )
-    new = NewScanner(system, module_parts(system, construction))
+    new = NewScanner(system, system.parts(construction))
     hidden: set[int] = set()
     if old is None:
         collection = bpy.data.collections.new(name)

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from ..geometry.collimator import Collimator, Construction, EdgePlace, angle_from_degrees
 from ..geometry.frames import checked_affine, euler_pose
-from ..geometry.module_parts import module_collimators
 from ..geometry.system import PinholeSystem
 from ..phantoms.derenzo import DerenzoPhantom
 from ..physics.isotopes import Isotope, isotope
@@ -188,7 +187,7 @@ def build_setup(system: PinholeSystem, simulation: Simulation) -> Setup:
     cannot be built, or begins inside the phantom.
     """
     poses = system.poses()
-    bodies = module_collimators(system, simulation.construction)
+    bodies = system.collimators(simulation.construction)
     l, side, thickness = system.collimator_length, system.detector_side, system.detector_thickness
     collimators = [
         _collimator(f"collimator_{i + 1}", poses[modules], bodies[modules[0]], simulation.collimator)

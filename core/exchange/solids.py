@@ -13,7 +13,7 @@ from typing import Any, Literal
 import numpy as np
 
 from ..geometry.collimator import Construction, EdgePlace, angle_from_degrees
-from ..geometry.module_parts import ModulePart, module_parts
+from ..geometry.module_parts import ModulePart
 from ..geometry.part_colors import LOOKS
 from ..geometry.system import PinholeSystem
 from ..geometry.views import Views
@@ -41,7 +41,7 @@ def _solid_format(name: str, title: str, suffixes: tuple[str, ...], save: _Save)
     ) -> None:
         one_of(part, _KINDS, "part")
         construction = Construction(plate_thickness, wall_thickness, angle_from_degrees(opening_degrees), edge_at)
-        save(temporary, [p for p in module_parts(system, construction) if p.kind in _KINDS[part]])
+        save(temporary, [p for p in system.parts(construction) if p.kind in _KINDS[part]])
 
     return Format(name, title, suffixes, write)
 

@@ -10,11 +10,10 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError, naming
+from ..errors import InputError
 from ..validation import freeze
-from .collimator import Collimator, Construction
+from .collimator import Collimator
 from .part_colors import PartKind
-from .system import PinholeSystem
 
 Solid = tuple[NDArray[np.float64], NDArray[np.int32]]
 """Vertices (V, 3), mm, and quads (F, 4), counter-clockwise seen from outside."""
@@ -55,33 +54,6 @@ class ModulePart:
     def to_world(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """World mm of points (N, 3) of camera space."""
         return points @ self.pose[:3, :3].T + self.pose[:3, 3]
-
-
-def module_collimators(system: PinholeSystem, construction: Construction) -> list[Collimator]:
-    """Each module's collimator; `InputError` names a module whose collimator cannot be built like that."""
-    made = []
-    sizes = (system.pinhole_diameter, system.collimator_length, system.detector_side)
-    for number, d, l, side in zip(system.numbers.tolist(), *(size.tolist() for size in sizes), strict=True):
-        with naming(f"module {number}"):
-            made.append(Collimator(d, l, side, construction))
-    return made
-
-
-def module_parts(system: PinholeSystem, construction: Construction | None = None) -> list[ModulePart]:
-    """Collimator and crystal of each module, module by module. Errors as in `module_collimators`."""
-    collimators = module_collimators(system, construction or Construction())
-    poses = system.poses()
-    poses[:, :3, [0, 2]] *= -1  # camera space is X = -u, Y = v, Z = -k
-    width = max(2, len(str(system.numbers.max())))
-    parts = []
-    for number, pose, built, thickness in zip(
-        system.numbers.tolist(), poses, collimators, system.detector_thickness.tolist(), strict=True
-    ):
-        name = f"Module {number:0{width}d}"
-        crystal = crystal_solid(built.length, built.detector_side, thickness)
-        parts.append(ModulePart(number, "collimator", f"{name} collimator", collimator_solid(built), pose))
-        parts.append(ModulePart(number, "crystal", f"{name} crystal", crystal, pose))
-    return parts
 
 
 def collimator_solid(collimator: Collimator) -> Solid:

@@ -9,19 +9,17 @@ import re
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
-from typing import TYPE_CHECKING, Any, ClassVar, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InputError
+from ..system_source import SystemSource
 from ..validation import freeze, real_array
 from .columns import ColumnTable, Values, vector
+from .module_parts import ModulePart
 from .views import Views
-
-if TYPE_CHECKING:
-    from ..system_source import SystemSource
-    from .module_parts import ModulePart
 
 SCANNERS: dict[str, type[Scanner]] = {}
 """Name -> class, of the kinds of scanners; each enters itself when it is defined."""
@@ -115,7 +113,7 @@ class Scanner(ABC):
                 n = len(next(values[c.name] for c in columns if c.name in values))
                 given[name] = np.stack([values.get(c.name, np.zeros(n)) for c in columns], axis=1)
         more = {name: given.pop(name) for name in list(given) if name not in own}
-        return cls(**given, numbers=numbers, source=source, more=more)
+        return cls(**given, numbers=numbers, source=source, more=more)  # type: ignore[call-arg]
 
     def values(self) -> dict[str, NDArray[Any]]:
         """The values (M,) of the typed columns by name, mm, rad or texts."""
@@ -140,8 +138,8 @@ class Scanner(ABC):
     def views(self, shape: tuple[int, int]) -> Views:
         """The modules' images, of n_v rows and n_u columns."""
 
-    def parts(self) -> Sequence[ModulePart]:
-        """The modules' solids for the scene and for files; none by default."""
+    def parts(self, construction: Any = None) -> Sequence[ModulePart]:
+        """The modules' solids for the scene and for files, built as a kind's `construction` says; none by default."""
         return ()
 
     def rings(self) -> NDArray[np.int64]:

@@ -2,30 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..errors import InputError, warn
+from ..errors import InputError, naming, warn
 from ..system_source import SystemSource
 from ..validation import lengths, positive, real_array, whole_shape
+from .collimator import Collimator, Construction
 from .columns import ColumnTable
 from .frames import affine_matrix, module_frames, tilted, tilts
+from .module_parts import ModulePart, collimator_solid, crystal_solid
 from .pinhole_columns import PINHOLE_COLUMNS
 from .scanner import Scanner, repeated
 from .views import Views
-
-if TYPE_CHECKING:
-    from .module_parts import ModulePart
 
 Detector = Literal["virtual", "real"]
 
 LENGTHS = {name: column.help for name, column in PINHOLE_COLUMNS.scalars.items() if column.kind == "length"}
 """The modules' dimensions: fields of `PinholeSystem`, with what they are."""
-LATER_LENGTHS = ()
+LATER_LENGTHS: tuple[str, ...] = ()
 
 # Pinholes that differ in z by less than this fraction of the crystal's side belong to one ring.
 _RING_GAP = 0.2
@@ -96,11 +95,29 @@ class PinholeSystem(Scanner):
         centers = poses[:, :3, 3]
         return self.replace(centers=centers, tilt=tilts(module_frames(centers), poses[:, :3, :3].transpose(0, 2, 1)))
 
-    def parts(self) -> Sequence[ModulePart]:
-        """The collimators, built as by default, and the crystals."""
-        from .module_parts import module_parts
+    def collimators(self, construction: Construction | None = None) -> list[Collimator]:
+        """Each module's collimator; `InputError` names a module whose collimator cannot be built like that."""
+        made = []
+        sizes = (self.pinhole_diameter, self.collimator_length, self.detector_side)
+        for number, d, l, side in zip(self.numbers.tolist(), *(size.tolist() for size in sizes), strict=True):
+            with naming(f"module {number}"):
+                made.append(Collimator(d, l, side, construction or Construction()))
+        return made
 
-        return module_parts(self)
+    def parts(self, construction: Construction | None = None) -> list[ModulePart]:
+        """Collimator and crystal of each module, module by module. Errors as in `collimators`."""
+        collimators, poses = self.collimators(construction), self.poses()
+        poses[:, :3, [0, 2]] *= -1  # camera space is X = -u, Y = v, Z = -k
+        width = max(2, len(str(self.numbers.max())))
+        parts = []
+        for number, pose, built, thickness in zip(
+            self.numbers.tolist(), poses, collimators, self.detector_thickness.tolist(), strict=True
+        ):
+            name = f"Module {number:0{width}d}"
+            crystal = crystal_solid(built.length, built.detector_side, thickness)
+            parts.append(ModulePart(number, "collimator", f"{name} collimator", collimator_solid(built), pose))
+            parts.append(ModulePart(number, "crystal", f"{name} crystal", crystal, pose))
+        return parts
 
     def rings(self) -> NDArray[np.int64]:
         """Index (M,) of each module's ring, from 0 along +z. Pinholes at about the same z form a ring."""

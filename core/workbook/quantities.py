@@ -1,8 +1,9 @@
 """How numbers in cells are compared, and the names of the pinholes' columns."""
 
 from ..geometry.columns import AGREEING, LENGTH_UNITS, Values
-from ..geometry.pinhole_columns import PINHOLE_COLUMNS as QUANTITIES
+from ..geometry.pinhole_columns import PINHOLE_COLUMNS
 
+QUANTITIES = PINHOLE_COLUMNS
 Numbers = Values
 NEEDED, OPTIONAL, DERIVED, TYPED = QUANTITIES.needed, QUANTITIES.optional, QUANTITIES.derived, QUANTITIES.typed
 POSITION, DIMENSIONS = QUANTITIES.position, QUANTITIES.dimensions

@@ -11,11 +11,12 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 from ..errors import InputError, warn
+from ..geometry.columns import LENGTH_UNITS
 from .book import HEADING_ROWS, Book, Sheet
 from .headed_table import HeadedTable, headed_table, headed_tables, is_number
 from .headings import UNIT_WORDS, heading_of, may_mean, quoted, rivals, shows_as_stored, unit_of, units_mentioned
 from .layout import Column, Layout, Table, by_label, in_order
-from .quantities import DERIVED, LENGTH_UNITS, NEEDED, OPTIONAL, POSITION, QUANTITIES, TYPED
+from .quantities import DERIVED, NEEDED, OPTIONAL, POSITION, QUANTITIES, TYPED
 from .sheet_xml import At
 
 _HELP = "a column map can say what is meant (columns='map.toml', --columns map.toml; docs/workbook.md)"

@@ -69,15 +69,15 @@ def reference(text: str) -> Reference | None:
     """What ``B3``, ``'My sheet'!$B$3:$B$82``, ``A:C`` or ``3:5`` refers to; None for a name or another file's cell."""
     from openpyxl.utils import range_boundaries
 
-    sheet, of_sheet, cells = text.rpartition("!")
-    named = _SHEET.fullmatch(sheet)
+    before, of_sheet, cells = text.rpartition("!")
+    named = _SHEET.fullmatch(before)
     try:
         left, top, right, bottom = range_boundaries(cells)
     except ValueError:
         return None
     if (of_sheet and named is None) or (":" not in cells and None in (left, top)):
         return None
-    sheet = named[1].replace("''", "'") if named and named[1] else sheet or None
+    sheet = named[1].replace("''", "'") if named and named[1] else before or None
     columns = sorted([left or 1, right or MAX_COLUMN])
     rows = sorted([1 if top is None else top, MAX_ROW if bottom is None else bottom])
     if rows[0] < 1 or rows[1] > MAX_ROW or columns[1] > MAX_COLUMN:

@@ -17,7 +17,6 @@ import mphdrr.core as mph
 from mphdrr.core.exchange import write_geometry
 from mphdrr.core.geometry.checks.plates import needed_angle
 from mphdrr.core.geometry.collimator import Collimator, Construction
-from mphdrr.core.geometry.module_parts import module_parts
 from mphdrr.core.physics.aperture import KnifeEdge
 
 from .test_monte_carlo import Macros
@@ -117,7 +116,7 @@ def test_every_roi_ray_passes_the_mesh_and_the_stl_file_through_the_hole_alone(s
     trimesh = pytest.importorskip("trimesh")
     chosen = scanner[::9]
     write_geometry(chosen, tmp_path / "stl", "stl-parts", part="collimators", edge_at=place)
-    parts = [p for p in module_parts(chosen, Construction(edge_at=place)) if p.kind == "collimator"]
+    parts = [p for p in chosen.parts(Construction(edge_at=place)) if p.kind == "collimator"]
     for m, part in enumerate(parts):
         read = trimesh.load(tmp_path / "stl" / f"{part.name}.stl")
         assert read.is_watertight and read.is_winding_consistent and read.volume > 0
@@ -268,7 +267,7 @@ def test_open_share_is_that_of_rays(scanner, rng, place):
     d, l = scanner.pinhole_diameter[m], scanner.collimator_length[m]
     for degrees in (2.0, 30.0, 50.0):
         construction = Construction(2.0, 2.0, math.radians(degrees), place)
-        part = module_parts(scanner[m : m + 1], construction)[0]
+        part = scanner[m : m + 1].parts(construction)[0]
         corners = world_to_module(scanner, m, part.vertices[part.triangles])
         for slope in (0.0, 0.3, 0.5):
             hole = np.concatenate([disc(rng, 3000, 0, d / 2), np.zeros((1, 3000))])

@@ -13,7 +13,7 @@ from mphdrr.core.geometry.checks.field_of_view import cone_directions, hits, uns
 from mphdrr.core.geometry.checks.hulls import Hulls
 from mphdrr.core.geometry.checks.overlaps import penetration_depths
 from mphdrr.core.geometry.collimator import Collimator, Construction
-from mphdrr.core.geometry.module_parts import module_parts, surface_fault
+from mphdrr.core.geometry.module_parts import surface_fault
 
 
 def system_of(centers, d=2.0, length=60.0, side=50.0, thickness=10.0, radius=40.0, **more) -> mph.PinholeSystem:
@@ -88,7 +88,7 @@ def test_depth_is_the_distance_to_the_minkowski_difference(rng):
     """The shortest translation that separates two bodies, by the convex hull of all differences of their corners."""
     spatial = pytest.importorskip("scipy.spatial")
     system = crowd(rng)
-    parts = module_parts(system)
+    parts = system.parts()
     hulls = Hulls.of(parts)
     for p, part in enumerate(parts):
         assert spatial.ConvexHull(part.vertices).volume == pytest.approx(spatial.ConvexHull(hulls.vertices[p]).volume)
@@ -152,7 +152,7 @@ def test_a_sliver_of_a_thousandth_is_found(rng):
         # The cone's half-angle is 30 degrees; at the depth of 60 mm its radius is 34.64 mm.
         offset = (34.64 + beyond) * np.array([np.cos(angle), np.sin(angle)])
         system = system_of([[200.0, 0, 0], [140, *offset]], 0.5, 5.0, [50.0, 2.0], 1.0, 100.0)
-        hulls = Hulls.of(module_parts(system, Construction(0.5, 1.0)))
+        hulls = Hulls.of(system.parts(Construction(0.5, 1.0)))
         directions = cone_directions(200_000, np.sqrt(0.75)) @ system.frames()[0]
         fine = np.zeros(200_000, dtype=bool)
         for p in (2, 3):
@@ -165,7 +165,7 @@ def test_a_sliver_of_a_thousandth_is_found(rng):
 
 
 def test_rays_meet_hulls_where_points_along_them_are_inside(rng):
-    hulls = Hulls.of(module_parts(crowd(rng, 4)))
+    hulls = Hulls.of(crowd(rng, 4).parts())
     origin = np.array([10.0, -20.0, 5.0])
     directions = cone_directions(1000, -1.0)
     lengths = rng.uniform(100, 250, 1000)
@@ -202,7 +202,7 @@ def test_pinholes_at_impossible_places():
 
 
 def test_open_and_inverted_surfaces_are_found(system):
-    for part in module_parts(system)[:4]:
+    for part in system.parts()[:4]:
         vertices, faces = part.solid
         assert surface_fault(part.solid) is None
         assert surface_fault((vertices, faces[1:])).startswith("is not closed")

@@ -9,7 +9,6 @@ import pytest
 
 import mphdrr.core as mph
 from mphdrr.core.geometry.collimator import Construction
-from mphdrr.core.geometry.module_parts import module_parts
 
 from .test_geometry_export import arrays, fiducials, general_views, project
 
@@ -121,7 +120,7 @@ def test_lib3mf_reads_the_solids_in_strict_mode(scanner, tmp_path):
     reader.ReadFromFile(str(tmp_path / "a.3mf"))
     assert reader.GetWarningCount() == 0
     assert model.GetUnit().name == "MilliMeter"
-    expected = {part.name: part for part in module_parts(system, Construction(edge_at="front"))}
+    expected = {part.name: part for part in system.parts(Construction(edge_at="front"))}
     objects = model.GetMeshObjects()
     while objects.MoveNext():
         seen = objects.GetCurrentMeshObject()

@@ -12,7 +12,6 @@ import pytest
 import mphdrr.core as mph
 from mphdrr.core.exchange import write_geometry
 from mphdrr.core.geometry.collimator import Construction
-from mphdrr.core.geometry.module_parts import module_parts
 
 trimesh = pytest.importorskip("trimesh")
 
@@ -121,7 +120,7 @@ FILES = [
 def test_parts_come_back_whole_and_in_their_place(system, tmp_path, format, name, read):
     write_geometry(system, tmp_path / name, format, plate_thickness=PLATE, wall_thickness=WALL, edge_at="back")
     meshes = read(tmp_path / name)
-    expected = {part.name: part for part in module_parts(system, Construction(PLATE, WALL, edge_at="back"))}
+    expected = {part.name: part for part in system.parts(Construction(PLATE, WALL, edge_at="back"))}
     assert set(meshes) == set(expected) and len(expected) == 24
     for key, mesh in meshes.items():
         original = trimesh.Trimesh(expected[key].vertices, expected[key].triangles, process=False)
@@ -151,7 +150,7 @@ def test_one_stl_file_holds_the_parts_chosen(system, tmp_path, part, kinds):
     write_geometry(system, path, "stl", part=part)
     assert not path.read_bytes().startswith(b"solid")  # with "solid" at the start it would be a text file
     mesh = trimesh.load(path, file_type="stl")
-    wanted = [p for p in module_parts(system) if part == "all" or p.kind == part[:-1]]
+    wanted = [p for p in system.parts() if part == "all" or p.kind == part[:-1]]
     assert len(wanted) == 12 * kinds
     assert mesh.is_watertight and mesh.is_winding_consistent
     total = sum(trimesh.Trimesh(p.vertices, p.triangles, process=False).volume for p in wanted)

@@ -9,7 +9,7 @@ report.py         the findings
 
 from ...validation import instance
 from ..collimator import OPENING_ANGLE, Construction, EdgePlace
-from ..module_parts import module_collimators, module_parts, surface_fault
+from ..module_parts import surface_fault
 from ..system import PinholeSystem
 from .field_of_view import find_blocked, find_uncovered
 from .hulls import Hulls
@@ -40,8 +40,8 @@ def check_geometry(
     """
     instance(system, PinholeSystem, "check_geometry")
     construction = Construction(plate_thickness, wall_thickness, opening_angle, edge_at)
-    collimators = module_collimators(system, construction)
-    parts = module_parts(system, construction)
+    collimators = system.collimators(construction)
+    parts = system.parts(construction)
     hulls = Hulls.of(parts)
     faults = [(part, surface_fault(part.solid)) for part in parts]
     return GeometryReport(

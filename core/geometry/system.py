@@ -14,6 +14,7 @@ from ..system_source import SystemSource
 from ..validation import lengths, positive, real_array, whole_shape
 from .collimator import Collimator, Construction
 from .columns import ColumnTable
+from .design_formulas import roi_radius_seen
 from .frames import affine_matrix, module_frames, tilted, tilts
 from .module_parts import ModulePart, collimator_solid, crystal_solid
 from .pinhole_columns import PINHOLE_COLUMNS
@@ -85,6 +86,19 @@ class PinholeSystem(Scanner):
     def frames(self) -> NDArray[np.float64]:
         """Module frames (M, 3, 3), rows u, v, k: those of `core.geometry.frames.module_frames`, tilted."""
         return tilted(module_frames(self.centers), self.tilt)
+
+    def isocentres(self) -> NDArray[np.float64]:
+        """The isocentre in each module's frame (M, 3), mm from its pinhole along u, v and k: (0, 0, b) without tilt."""
+        turned = np.any(self.tilt, axis=1)[:, None]
+        aimed = self.pinhole_distance[:, None] * [0.0, 0.0, 1.0]
+        return np.where(turned, -np.einsum("mij,mj->mi", self.frames(), self.centers), aimed)
+
+    def roi_radius_seen(self) -> NDArray[np.float64]:
+        """Radius (M,), mm, of the largest sphere at the isocentre that each module's field of view holds, or 0."""
+        u, v, height = self.isocentres().T
+        sizes = self.pinhole_diameter, self.detector_side, self.collimator_length
+        seen = roi_radius_seen(np.where(height > 0, height, 1.0), *sizes, aside=np.maximum(abs(u), abs(v)))
+        return np.where(height > 0, seen, 0.0)
 
     def poses(self) -> NDArray[np.float64]:
         """World-from-module poses (M, 4, 4): columns u, v, k and the pinhole centre, mm."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Literal, Self
+from typing import Any, ClassVar, Self, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,10 +18,8 @@ from .design_formulas import roi_radius_seen
 from .frames import affine_matrix, module_frames, tilted, tilts
 from .module_parts import ModulePart, collimator_solid, crystal_solid
 from .pinhole_columns import PINHOLE_COLUMNS
-from .scanner import Scanner, repeated
+from .scanner import Detector, Scanner, repeated
 from .views import Views
-
-Detector = Literal["virtual", "real"]
 
 LENGTHS = {name: column.help for name, column in PINHOLE_COLUMNS.scalars.items() if column.kind == "length"}
 """The modules' dimensions: fields of `PinholeSystem`, with what they are."""
@@ -31,6 +29,9 @@ LATER_LENGTHS: tuple[str, ...] = ()
 _RING_GAP = 0.2
 _SAME_PLACE = 1e-6
 """mm; two pinholes closer than this are one in a workbook."""
+
+
+AnyScanner = TypeVar("AnyScanner", bound=Scanner)
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,6 +134,10 @@ class PinholeSystem(Scanner):
             parts.append(ModulePart(number, "crystal", f"{name} crystal", crystal, pose))
         return parts
 
+    def region_radius(self) -> float:
+        """R, mm, the largest one."""
+        return float(self.roi_radius.max())
+
     def rings(self) -> NDArray[np.int64]:
         """Index (M,) of each module's ring, from 0 along +z. Pinholes at about the same z form a ring."""
         z = self.centers[:, 2]
@@ -199,7 +204,7 @@ def same_place(centers: NDArray[np.float64]) -> tuple[int, int] | None:
     return (int(earlier[later[0]]), int(later[0])) if len(later) else None
 
 
-def chosen_modules(system: PinholeSystem, text: str | None, name: str = "--modules") -> PinholeSystem:
+def chosen_modules(system: AnyScanner, text: str | None, name: str = "--modules") -> AnyScanner:
     """The modules of `system` whose numbers `text` lists ("1-40", "1-20,41", "60-"); all for None.
 
     `name` is what messages call the text.

@@ -3,9 +3,9 @@
 A material's coefficient at any energy is the sum of its elements' `mass_attenuation` coefficients, weighted by mass.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -130,7 +130,7 @@ def module_coefficients(
         crystal = stopping(crystal, system.detector_thickness.mean(), "crystal_mu")
     own = system.crystal_material
     named = own != ""
-    if not named.any() or is_tensor(crystal) or np.ndim(crystal) > 0:
+    if not named.any() or is_tensor(crystal) or isinstance(crystal, np.ndarray):
         return aperture, crystal
     if not lines:
         warn("the modules' crystal materials are not used: without an isotope their photons have no energy")
@@ -140,9 +140,9 @@ def module_coefficients(
         raise InputError(
             f"module {number} has no crystal material, others have: expected one for each, or crystal_mu for the rest"
         )
-    known: Callable[[str, float], float] = lru_cache(maxsize=None)(lambda *one: stopping(*one, "crystal_material"))
+    stopping_own = lru_cache(maxsize=None)(partial(stopping, name="crystal_material"))
     each = zip(own.tolist(), system.detector_thickness.tolist(), strict=True)
-    return aperture, np.array([known(*one) if one[0] else crystal for one in each], np.float64)
+    return aperture, np.array([stopping_own(*one) if one[0] else crystal for one in each], np.float64)
 
 
 def _known(material: str) -> Material:

@@ -19,7 +19,10 @@ from mphdrr.core.runs.projecting import project_run
 NEW = {
     "text": (Column("serial", "serial", kind="text", blank=""), [f"S/N {n}, µ" for n in range(12)]),
     "length": (Column("g", "guard_ring", plausible=(0.1, 9), blank=1.5, help="g: guard ring"), np.linspace(1, 2, 12)),
-    "choice": (Column("side", "fan_side", kind="choice", choices=("left", "right"), blank="left"), ["left", "right"] * 6),
+    "choice": (
+        Column("side", "fan_side", kind="choice", choices=("left", "right"), blank="left"),
+        ["left", "right"] * 6,
+    ),
     "whole": (Column("row", "asic_row", kind="whole", blank=0), np.arange(12)),
 }
 
@@ -51,7 +54,10 @@ def test_a_column_is_one_row(kind, system, tmp_path, monkeypatch):
     ("change", "message"),
     [
         ({"crystal_material": [1] * 12}, "crystal_material: expected texts"),
-        ({"crystal_material": ["NaI"] * 3}, "crystal_material: expected one text, or one for each of 12 modules, got 3"),
+        (
+            {"crystal_material": ["NaI"] * 3},
+            "crystal_material: expected one text, or one for each of 12 modules, got 3",
+        ),
         ({"tilt": np.zeros((3, 3))}, "tilt: expected shape 12 x 3, got 3 x 3"),
         ({"tilt": [0, np.nan, 0]}, "tilt: nan is not a finite number"),
         ({"more": {"weight": 3.0}}, "weight: is no column of a pinhole scanner"),
@@ -143,7 +149,9 @@ def test_modules_have_the_crystals_that_they_say(system):
                 assert mixed.crystal_mu[m] == mph.Emission(system, isotope="I-123", crystal_mu="BGO").crystal_mu
     part = mixed.of_views(np.array([1, 3]))
     np.testing.assert_array_equal(part.crystal_mu, mixed.crystal_mu[[1, 3]])
-    with pytest.raises(InputError, match=r"module 103 has no crystal material, others have: .* crystal_mu for the rest"):
+    with pytest.raises(
+        InputError, match=r"module 103 has no crystal material, others have: .* crystal_mu for the rest"
+    ):
         mph.Emission(system.replace(crystal_material=named), isotope="I-123")
     with pytest.raises(InputError, match="material 'glass': expected one of"):
         mph.Emission(system.replace(crystal_material="glass"), isotope="I-123")

@@ -6,6 +6,7 @@ import bpy
 import numpy as np
 from mathutils import Euler
 
+from ..core.example import EULER_DEGREES, EXAMPLE
 from ..core.geometry.frames import euler_pose
 from ..core.progress import Progress, stages_of
 from ..core.runs.files import write_run
@@ -13,7 +14,6 @@ from ..core.runs.recipe import Recipe
 from ..core.runs.run_recipe import run_recipe
 from ..core.workbook import read_system
 from .blender import jobs
-from .cli.demo import EULER_DEGREES, EXAMPLE
 from .figures import studio
 from .phantoms import phantoms
 from .phantoms.phantom_properties import plain_settings

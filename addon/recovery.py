@@ -9,7 +9,8 @@ from ..core.errors import InputError, warn
 from ..core.progress import Progress, part_of
 from .blender import jobs, storage
 from .phantoms import phantoms
-from .volumes import maps, volumes
+from .scanner import maps
+from .volumes import volumes
 
 
 def missing(scene: bpy.types.Scene) -> tuple[list[bpy.types.Object], list[bpy.types.Object]]:

@@ -17,12 +17,12 @@ from .blender import ids, jobs, plots, storage, updates
 from .blender.layouts import invoking
 from .events import event_notes
 from .figures import figures
-from .perspective import epipolar_drawing, frustums
+from .perspective import color_bar, epipolar_drawing, frustums
 from .phantoms import live_phantoms
 from .pictures import planes, recoloring, tiles
 from .runs import preview, rendering, run_notes, runs
 from .scanner import following, framing, live_scanner, scanner, selection, sight_lines
-from .volumes import color_bar, slices, volumes
+from .volumes import slices, volumes
 
 
 def _classes(module: ModuleType) -> list[Any]:
@@ -128,7 +128,14 @@ DRAWINGS = (
     (bpy.types.SpaceView3D, epipolar_drawing.draw_in_scene, "POST_VIEW"),
 )
 
-# What edited properties call (`addon/blender/updates.py`).
+
+def _modules_removed(scene: bpy.types.Scene, modules: list[bpy.types.Object]) -> None:
+    """Remove what a scene shows of modules: their projections, and the volumes as they see them."""
+    planes.remove(scene, modules)
+    frustums.remove(scene, modules)
+
+
+# What edited properties and rooms below call (`addon/blender/updates.py`).
 UPDATES: dict[str, Callable[..., None]] = {
     "module": following.refresh_module,
     "length": following.length_typed,
@@ -146,6 +153,7 @@ UPDATES: dict[str, Callable[..., None]] = {
     "planes": planes.update,
     "epipolar": epipolar_drawing.redraw,
     "active_run": rendering.active_run_changed,
+    "modules_removed": _modules_removed,
 }
 
 _registered = ExitStack()  # takes back what was registered, in reverse order

@@ -5,8 +5,8 @@ from bpy.props import StringProperty
 
 from ..addon.blender import jobs
 from ..addon.blender.reports import needs
+from ..addon.phantoms.volume_export import WRITTEN_ENDINGS, exporting
 from ..addon.volumes import volumes
-from ..addon.volumes.volume_export import WRITTEN_ENDINGS, exporting
 
 
 class MPHDRR_OT_export_volume(jobs.JobOperator, bpy.types.Operator):

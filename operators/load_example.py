@@ -5,7 +5,7 @@ import bpy
 from ..addon import example
 from ..addon.blender import jobs
 from ..addon.blender.reports import needs
-from ..addon.cli.demo import EXAMPLE
+from ..core.example import EXAMPLE
 
 
 class MPHDRR_OT_load_example(jobs.JobOperator, bpy.types.Operator):

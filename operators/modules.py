@@ -8,9 +8,8 @@ from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty
 from ..addon.blender import jobs
 from ..addon.blender.decimals import typed
 from ..addon.blender.reports import needs
-from ..addon.scanner import following, module_edits, scanner, selection
+from ..addon.scanner import following, maps, module_edits, scanner, selection
 from ..addon.scanner.scanner_parts import modules_text
-from ..addon.volumes import maps
 
 
 class MPHDRR_OT_show_modules(selection.OnScanner, bpy.types.Operator):

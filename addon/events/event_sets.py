@@ -15,13 +15,13 @@ from ...core import events
 from ...core.errors import InputError
 from ...core.events.folders import SetFolder
 from ...core.events.templates import template_text
+from ...core.example import EXAMPLE
 from ...core.files import write_bytes
 from ...core.memory import readable_size
 from ...core.progress import Progress, stages_of
 from ...core.runs.files import write_run
 from ...core.runs.run import ProjectionRun
 from ..blender import jobs, storage
-from ..cli.demo import EXAMPLE
 from ..figures import studio
 from ..phantoms import phantoms
 from ..phantoms.phantom_properties import KindSettings, plain_settings

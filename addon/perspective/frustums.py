@@ -25,10 +25,10 @@ from ...core.progress import Progress, stages_of, tell
 from ...core.runs.mosaic import as_seen, png
 from ...core.runs.run_recipe import recipe_views
 from ...core.volumes.volume import Volume, outside_value
-from ..blender import ids, jobs, storage
+from ..blender import ids, jobs, objects, storage
 from ..phantoms import phantoms
 from ..runs import runs
-from ..scanner import cameras, selection
+from ..scanner import selection
 from ..scanner.module_values import module_numbers, system_of
 from ..volumes import slices, volume_materials, volumes
 from ..volumes.stored_volumes import StoredVolume, store_volume
@@ -204,7 +204,7 @@ def remove(scene: bpy.types.Scene, modules: list[bpy.types.Object] | None = None
     """Remove the frustums of modules (their cameras), or of all, with what belongs to them; returns how many."""
     found = [frustum for frustum in frustums(scene) if modules is None or frustum.parent in modules]
     for frustum in found:
-        cameras.remove_objects([*frustum.children, frustum])
+        objects.remove_objects([*frustum.children, frustum])
     for home in _homes(scene):
         if not home.all_objects:
             bpy.data.collections.remove(home)
@@ -296,7 +296,7 @@ def _build(
     if home is None:
         home = bpy.data.collections.new(ids.PERSPECTIVES)
         scene.collection.children.link(home)
-    to_camera = np.linalg.inv(cameras.world_matrix(camera))
+    to_camera = np.linalg.inv(objects.world_matrix(camera))
     corners = _corners(g) @ to_camera[:3, :3].T + to_camera[:3, 3]  # (n_k, 4, 3)
     name = ids.part_name(camera.name, "perspective")
     frustum = bpy.data.objects.new(name, _lines(name, corners))

@@ -23,8 +23,8 @@ from ...core.phantoms.phantom import Phantom
 from ...core.progress import Progress, part_of, stages_of
 from ...core.volumes.meshes.mesh import Mesh
 from ..blender import jobs, storage
+from ..blender.objects import remove_objects, set_world_matrix, world_matrix
 from ..blender.reports import Need
-from ..scanner.cameras import remove_objects, set_world_matrix, world_matrix
 from ..volumes import meshes, volumes
 from ..volumes.stored_volumes import StoredVolume, moved, store_volume
 from ..volumes.vdb import provenance_of

@@ -296,13 +296,6 @@ def projection_array(image: bpy.types.Image) -> NDArray[np.float32]:
     return np.ascontiguousarray(pixels.reshape(height, width, 4)[:, ::-1, 0])
 
 
-def redraw_mosaic() -> None:
-    """Have the Image Editors that show the mosaic drawn again: another module is active."""
-    for area in areas("IMAGE_EDITOR"):
-        if tiles(area.spaces.active.image) is not None:
-            area.tag_redraw()
-
-
 def show(image: bpy.types.Image, context: bpy.types.Context) -> bool:
     """Show an image in the Image Editors that show none or one of ours; False if no such editor is open."""
     shown = False

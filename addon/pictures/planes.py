@@ -71,10 +71,10 @@ def planes(scene: bpy.types.Scene) -> list[bpy.types.Object]:
     return [o for home in _homes(scene) for o in home.objects if _KEY in o]
 
 
-def remove(scene: bpy.types.Scene, collection: bpy.types.Collection | None = None) -> None:
-    """Remove the planes and the cameras' backgrounds, of one scanner or of all."""
+def remove(scene: bpy.types.Scene, modules: list[bpy.types.Object] | None = None) -> None:
+    """Remove the planes and the backgrounds of modules (their cameras), or of all."""
     for plane in planes(scene):
-        if collection is None or plane.parent in scanner.modules(collection):
+        if modules is None or plane.parent in modules:
             _remove(plane)
     for home in _homes(scene):
         if not home.all_objects:

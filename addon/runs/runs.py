@@ -19,10 +19,10 @@ from ...core.memory import readable_size
 from ...core.runs.recipe import Recipe, fitting_recipe
 from ...core.runs.run import ProjectionRun
 from ...core.runs.settings import SAMPLING, SETTINGS, Setting
-from ..blender import ids, storage, windows
+from ..blender import ids, objects, storage, windows
 from ..blender.decimals import typed
 from ..phantoms import phantoms
-from ..scanner import cameras, following, scanner
+from ..scanner import following, scanner
 from ..scanner.module_values import FROM_ROI, numbers_of
 from ..scanner.scanner_parts import modules_text
 from ..volumes import volumes
@@ -240,7 +240,7 @@ def _of_modules(collection: bpy.types.Collection | None, old: Mapping[str, Any])
         yield "the scanner is gone"
         return
     found = scanner.modules(collection)
-    now_all = numbers_of(found, cameras.world_matrices(found))
+    now_all = numbers_of(found, objects.world_matrices(found))
     modules = {str(now.number): (camera, now) for camera, now in zip(found, now_all, strict=True)}
     moved: list[int] = []
     changed: dict[int, dict[str, tuple[float, float]]] = {}

@@ -10,7 +10,7 @@ import bpy
 from mathutils import Vector
 
 from ..blender import compat
-from ..scanner.cameras import remove_objects
+from ..blender.objects import remove_objects
 from . import volume_materials
 from .volume_materials import Cut, change
 

@@ -16,7 +16,7 @@ from ...core.volumes.meshes.surface import volume_to_mesh
 from ...core.volumes.meshes.voxelization import voxelize_mesh
 from ...core.volumes.volume import UNITS
 from ..blender import jobs, storage
-from ..scanner.cameras import world_matrix
+from ..blender.objects import world_matrix
 from . import volume_materials, volumes
 from .stored_volumes import StoredVolume, store_volume
 

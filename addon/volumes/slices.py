@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ...core.errors import InputError
 from ...core.volumes.volume import Volume
 from ..blender.compat import add_node, blank_material
-from ..scanner.cameras import remove_objects
+from ..blender.objects import remove_objects
 from . import looks, vdb, volume_materials, volumes
 
 _PLANES = ("Sagittal", "Coronal", "Axial")  # across world x, y, z

@@ -19,8 +19,8 @@ from ...core.geometry.frames import checked_affine
 from ...core.memory import readable_size
 from ...core.volumes.volume import Volume
 from ..blender import compat, ids, storage
+from ..blender.objects import world_matrix
 from ..blender.reports import Need
-from ..scanner.cameras import world_matrix
 from . import volume_materials
 from .stored_volumes import StoredVolume, moved, store_volume, write_states
 from .vdb import SMOKE, read_vdb

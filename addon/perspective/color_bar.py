@@ -6,8 +6,8 @@ import gpu
 import numpy as np
 from gpu_extras.batch import batch_for_shader
 
-from ..perspective import frustums
-from . import slices, volumes
+from ..volumes import slices, volumes
+from . import frustums
 
 _LEFT, _BOTTOM, _WIDTH, _HEIGHT, _LETTERS = 90, 60, 14, 180, 12  # at a resolution scale of 1, pixels
 _MARKS = (0.0, 0.25, 0.5, 0.75, 1.0)

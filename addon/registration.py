@@ -13,7 +13,7 @@ import bpy
 from .. import operators, panels
 from ..operators import add_phantom
 from . import preferences, properties, recovery
-from .blender import ids, jobs, plots, storage, updates
+from .blender import ids, jobs, plots, storage, timers, updates
 from .blender.layouts import invoking
 from .events import event_notes
 from .figures import figures
@@ -201,7 +201,7 @@ def register(command: Callable[..., int] | None = None) -> None:
 def unregister() -> None:
     """Take back what `register` did."""
     atexit.unregister(unregister)
-    for module in (jobs, preview, live_scanner, live_phantoms, runs, plots, recoloring, event_notes):
+    for module in (jobs, preview, live_scanner, plots, recoloring, event_notes, timers):
         module.stop()
     _registered.close()
 

@@ -6,6 +6,7 @@ import bpy
 from bpy.props import BoolProperty, FloatProperty, FloatVectorProperty, StringProperty
 
 from ..addon.blender import jobs, storage
+from ..addon.blender.file_properties import file_property, shown_files
 from ..addon.blender.layouts import labelled
 from ..addon.phantoms import phantoms
 from ..addon.phantoms.phantom_properties import FILE, PhantomSettings, identifier, sampling, settings_class
@@ -72,8 +73,8 @@ class MPHDRR_OT_import_phantom(PhantomSettings, AddPhantom, bpy.types.Operator):
     bl_label = "Import Phantom"
 
     __annotations__ = {
-        "filepath": StringProperty(description="Phantom to read", subtype="FILE_PATH", options={"SKIP_SAVE"}),
-        "filter_glob": StringProperty(default="*.toml", options={"HIDDEN"}),
+        "filepath": file_property("Phantom to read"),
+        "filter_glob": shown_files((".toml",)),
         "name": StringProperty(name="Name", description="Of the object; empty: the phantom's", options={"SKIP_SAVE"}),
         **sampling(),
     }

@@ -1,10 +1,11 @@
 """Event sets: a recipe written and tried on the phantom in the scene, a set made as a job, an event opened in the scene."""
 
 import bpy
-from bpy.props import EnumProperty, StringProperty
+from bpy.props import EnumProperty
 from bpy_extras.io_utils import ExportHelper
 
 from ..addon.blender import choices, jobs
+from ..addon.blender.file_properties import shown_files
 from ..addon.blender.reports import Reported
 from ..addon.events import event_sets
 from ..addon.events.event_properties import COUNT, FOLDER, MODEL, NEXT, OPENED, RECIPE
@@ -19,7 +20,7 @@ class MPHDRR_OT_new_event_recipe(Reported, ExportHelper, bpy.types.Operator):
     bl_label = "New Event Recipe"
 
     filename_ext = ".toml"
-    filter_glob: StringProperty(default="*.toml", options={"HIDDEN"})
+    filter_glob: shown_files((".toml",))
     like: EnumProperty(
         name="Like", description="What the recipe begins with",
         items=choices.items({}, ((name, name.capitalize(), text) for name, text in TEMPLATES.items())),

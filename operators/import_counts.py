@@ -5,7 +5,6 @@ from typing import Any
 import bpy
 from bpy.props import (
     BoolProperty,
-    CollectionProperty,
     EnumProperty,
     FloatProperty,
     IntVectorProperty,
@@ -14,6 +13,7 @@ from bpy.props import (
 
 from ..addon.blender import choices, jobs, storage
 from ..addon.blender.decimals import typed
+from ..addon.blender.file_properties import DIRECTORY, file_property, files_property, shown_files
 from ..addon.blender.layouts import labelled
 from ..addon.runs import counts_import
 from ..core.runs.frame_files import COUNTS_FORMATS, RAW_TYPES
@@ -34,13 +34,10 @@ class MPHDRR_OT_import_counts(jobs.JobOperator, bpy.types.Operator):
     bl_label = "Import Measured Counts"
     asks_for = "filepath"
 
-    filepath: StringProperty(name="File", description="With the counts", subtype="FILE_PATH", options={"SKIP_SAVE"})
-    directory: StringProperty(description="Where the files are", subtype="DIR_PATH", options={"SKIP_SAVE"})
-    files: CollectionProperty(
-        description="With counts, if several: their frames follow each other in the order of the names",
-        type=bpy.types.OperatorFileListElement, options={"SKIP_SAVE"},
-    )  # fmt: skip
-    filter_glob: StringProperty(default=";".join(f"*{ending}" for ending in COUNTS_FORMATS), options={"HIDDEN"})
+    filepath: file_property("With the counts")
+    directory: DIRECTORY  # type: ignore[valid-type]
+    files: files_property("With counts, if several: their frames follow each other in the order of the names")
+    filter_glob: shown_files(COUNTS_FORMATS)
     frames: StringProperty(
         name="Frames", description="Which module each frame is of: the modules' numbers in the frames' order, such as 1-80, "
         "80-1 or 3,1,2; none for a frame that is not used, none*80 for 80 of them",

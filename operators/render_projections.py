@@ -10,12 +10,14 @@ from bpy_extras.io_utils import ImportHelper
 
 from ..addon.blender import choices, ids, jobs, storage
 from ..addon.blender.decimals import typed
+from ..addon.blender.file_properties import shown_files
 from ..addon.blender.reports import Reported, needs
 from ..addon.pictures import images, tiles
 from ..addon.runs import rendering, runs
 from ..addon.runs.projection_properties import OPENING_ANGLE, ProjectionSettings, settings_recipe, use_preset
 from ..addon.scanner import scanner
 from ..core.errors import InputError
+from ..core.runs.files import FORMATS
 from ..core.runs.presets import PRESETS
 
 
@@ -80,7 +82,7 @@ class MPHDRR_OT_load_recipe(Reported, ImportHelper, bpy.types.Operator):
 
     bl_label = "Load Recipe"
 
-    filter_glob: StringProperty(default="*.toml;*.h5;*.hdf5;*.npz;*.pt", options={"HIDDEN"})
+    filter_glob: shown_files((".toml", *FORMATS))
 
     def act(self, context: bpy.types.Context) -> str:
         filepath = self.filepath or context.scene.mphdrr_projections.run_file
@@ -138,20 +140,13 @@ class MPHDRR_OT_export_dataset(jobs.ExportJob, bpy.types.Operator):
     bl_label = "Export mphDRR Dataset"
     bl_options = set()
 
-    filename_ext = ".h5"
-    filter_glob: StringProperty(default="*.h5;*.hdf5;*.npz;*.pt", options={"HIDDEN"})
+    endings = FORMATS
+    filter_glob: shown_files(FORMATS)
 
     def draw(self, context: bpy.types.Context) -> None:
         """Beside the file browser: where the run is not of the scene as it is now."""
         for line in runs.change_lines(context.scene):
             self.layout.label(text=line, icon="ERROR")
-
-    def check(self, context: bpy.types.Context) -> bool:
-        """Give a name without suffix the default one; the other formats' suffixes stay."""
-        if Path(self.filepath).suffix:
-            return False
-        self.filepath += self.filename_ext
-        return True
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
         return rendering.exporting(context.scene, self.filepath)

@@ -401,11 +401,25 @@ class JobOperator:
 
 
 class ExportJob(JobOperator, ExportHelper):
-    """Mix into an operator whose job writes the file that the user chooses."""
+    """Mix into an operator whose job writes the file that the user chooses, with one of the `endings` in its name."""
+
+    endings: tuple[str, ...] = ()
+
+    @property
+    def filename_ext(self) -> str:
+        """What Blender adds to the .blend's name."""
+        return self.endings[0]
 
     def ask(self, context: bpy.types.Context) -> set[str] | None:
         """Open the file browser."""
         return ExportHelper.invoke(self, context, None)
+
+    def check(self, context: bpy.types.Context) -> bool:
+        """Give a name without one of the endings the first."""
+        if self.filepath.lower().endswith(self.endings):
+            return False
+        self.filepath += self.endings[0]
+        return True
 
 
 class MPHDRR_OT_cancel_job(bpy.types.Operator):

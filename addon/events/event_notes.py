@@ -16,7 +16,7 @@ from ...core.events.folders import INDEX, RECIPE, SetFolder
 from ...core.events.store import EVENTS, SHARDS, size_of
 from ...core.memory import readable_size
 from ...core.recording import recorded_warnings
-from ..blender import storage
+from ..blender import storage, timers
 from ..blender.windows import redraw_sidebars
 
 _INTERVAL = 0.1  # s between two looks at a thread that reads
@@ -62,8 +62,6 @@ def stop() -> None:
     """Forget everything: the extension is disabled."""
     for known in (_known, _stamps, _readers):
         known.clear()
-    if bpy.app.timers.is_registered(_watch):
-        bpy.app.timers.unregister(_watch)
 
 
 def _recipe_note(path: Path) -> Note:
@@ -101,8 +99,7 @@ def _note(path: Path, read: Callable[[Path], Note]) -> Note:
             return _known[path][1]
         _readers[path] = reader
         reader.start()
-        if not bpy.app.timers.is_registered(_watch):
-            bpy.app.timers.register(_watch, first_interval=_INTERVAL)
+        timers.soon(_watch, _INTERVAL)
     return _READING if known is None else known[1]
 
 

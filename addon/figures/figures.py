@@ -30,7 +30,7 @@ from ...core.progress import Cancelled, Progress
 from ...core.recording import recorded_warnings
 from ...core.runs.files import read_run
 from ...core.runs.resizing import resized
-from ..blender import compat, ids, jobs, storage
+from ..blender import compat, ids, jobs, storage, timers
 from ..blender.choices import items
 from ..phantoms import phantoms
 from ..scanner import collimators, following, scanner, selection
@@ -311,10 +311,12 @@ def _leave_a_trace(scene: bpy.types.Scene, drawn: list[bpy.types.Object]) -> Gen
 @bpy.app.handlers.persistent
 def before_render(scene: bpy.types.Scene, *_: Any) -> None:
     """Blender's own Render: say which volumes of the 3D views the picture lacks; in the window, when it is done."""
-    if bpy.app.background and not scene.name.startswith(ids.STUDIO):
+    if scene.name.startswith(ids.STUDIO):
+        return
+    if bpy.app.background:
         _say_what_is_unseen()
-    elif not (scene.name.startswith(ids.STUDIO) or bpy.app.timers.is_registered(_say_what_is_unseen)):
-        bpy.app.timers.register(_say_what_is_unseen, first_interval=_REST)
+    else:
+        timers.soon(_say_what_is_unseen, _REST)
 
 
 def _say_what_is_unseen() -> float | None:

@@ -26,7 +26,7 @@ from ...core.runs.recipe import Recipe
 from ...core.runs.run import ProjectionRun
 from ...core.runs.run_recipe import recipe_model, recipe_views, run_recipe
 from ...core.volumes.volume import Volume
-from ..blender import jobs, windows
+from ..blender import jobs, timers, windows
 from ..phantoms import phantoms
 from ..pictures import planes
 from ..scanner import scanner, selection
@@ -290,8 +290,7 @@ def start() -> None:
 def stop(*_: Any) -> None:
     """Switch the preview off: also before a file is loaded, or the extension is disabled."""
     global _session, _drawing
-    if bpy.app.timers.is_registered(_look):
-        bpy.app.timers.unregister(_look)
+    timers.forget(_look)
     if _drawing is not None:
         _drawing()
         windows.redraw("VIEW_3D")
@@ -304,8 +303,7 @@ def after_update(scene: bpy.types.Scene | None = None, depsgraph: bpy.types.Deps
     if _session is None or (depsgraph is not None and depsgraph.mode != "VIEWPORT"):
         return
     _session.has_changed = True
-    if not bpy.app.timers.is_registered(_look):
-        bpy.app.timers.register(_look)
+    timers.soon(_look)
 
 
 def _look() -> float | None:

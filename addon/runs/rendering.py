@@ -25,7 +25,7 @@ from ...core.runs.recipe import Recipe, read_recipe
 from ...core.runs.run import ProjectionRun
 from ...core.runs.run_recipe import recipe_model, run_recipe, with_phantom
 from ...core.volumes.volume import require_quantity
-from ..blender import ids, jobs, storage
+from ..blender import ids, jobs, storage, timers
 from ..phantoms import phantoms
 from ..pictures import images, planes, recoloring
 from ..scanner import following, scanner
@@ -250,8 +250,8 @@ def active_run_changed(scene: bpy.types.Scene) -> None:
         return
     if bpy.app.background:
         _show_chosen()
-    elif not bpy.app.timers.is_registered(_show_chosen):
-        bpy.app.timers.register(_show_chosen, first_interval=_REST)
+    else:
+        timers.soon(_show_chosen, _REST)
 
 
 def _show_chosen() -> float | None:

@@ -19,7 +19,7 @@ from ...core.memory import readable_size
 from ...core.runs.recipe import Recipe, fitting_recipe
 from ...core.runs.run import ProjectionRun
 from ...core.runs.settings import SAMPLING, SETTINGS, Setting
-from ..blender import ids, objects, storage, windows
+from ..blender import ids, objects, storage, timers, windows
 from ..blender.decimals import typed
 from ..phantoms import phantoms
 from ..scanner import following, scanner
@@ -180,14 +180,8 @@ def after_load(*_: Any) -> None:
 @bpy.app.handlers.persistent
 def after_update(*_: Any) -> None:
     """Something has changed: compare the runs with the scene once it rests. Costs next to nothing itself."""
-    if not bpy.app.background and not bpy.app.timers.is_registered(_look):
-        bpy.app.timers.register(_look, first_interval=_REST)
-
-
-def stop() -> None:
-    """Forget what waits: the extension is disabled."""
-    if bpy.app.timers.is_registered(_look):
-        bpy.app.timers.unregister(_look)
+    if not bpy.app.background:
+        timers.soon(_look, _REST)
 
 
 def _look() -> None:

@@ -55,7 +55,6 @@ def what_to_do(others: list[bpy.types.Object]) -> str:
     return f"{', '.join(item.name for item in others)}: find the voxel files in a folder, or import again"
 
 
-@bpy.app.handlers.persistent
 def after_load(*_: Any) -> None:
     """Say which files are missing, and what to do."""
     for scene in bpy.data.scenes:

@@ -101,7 +101,7 @@ _UNDONE = (recoloring.check, runs.after_update, live_scanner.after_undo, slices.
 _UPDATED = (live_scanner.after_update, selection.after_update, planes.after_update, frustums.after_update)
 _LOADED = (volumes.after_load, recovery.after_load, live_scanner.after_load, runs.after_load, recoloring.check)
 _FRAME = (runs.after_update, live_scanner.after_frame, preview.after_update, slices.after_frame_change)
-# By lists of bpy.app.handlers: decorate the functions with @bpy.app.handlers.persistent.
+# By lists of bpy.app.handlers; all of them stay when a file is loaded.
 _HANDLERS: dict[str, tuple[Any, ...]] = {
     "load_pre": (jobs.stop, slices.before_load, preview.stop, framing.forget),
     "load_post": _LOADED,
@@ -116,7 +116,11 @@ _HANDLERS: dict[str, tuple[Any, ...]] = {
     "save_post": (storage.after_save,),
     "save_post_fail": (storage.restore_paths,),
 }
-HANDLERS = tuple((getattr(bpy.app.handlers, name), each) for name, group in _HANDLERS.items() for each in group)
+HANDLERS = tuple(
+    (getattr(bpy.app.handlers, name), bpy.app.handlers.persistent(each))
+    for name, group in _HANDLERS.items()
+    for each in group
+)
 
 # What is drawn over Blender's editors, in a window.
 DRAWINGS = (
@@ -164,10 +168,7 @@ def register(command: Callable[..., int] | None = None) -> None:
     updates.FUNCTIONS.update(UPDATES)
     try:
         for cls in CLASSES:
-            if issubclass(cls, bpy.types.Operator):
-                cls.bl_idname = vars(cls).get("bl_idname", ids.operator_name(cls.__name__))
-                if cls.__doc__ is not None:
-                    cls.bl_description = " ".join(cls.__doc__.split())  # Blender would keep line breaks and indentation
+            _complete(cls)
             bpy.utils.register_class(cls)
             _registered.callback(bpy.utils.unregister_class, cls)
         for owner, name, group in properties.POINTERS:
@@ -196,6 +197,16 @@ def register(command: Callable[..., int] | None = None) -> None:
     if bpy.app.module:
         # Registered classes keep Python's bpy module alive: Blender 4.5 would wait for ever when Python ends.
         atexit.register(unregister)
+
+
+def _complete(cls: Any) -> None:
+    """Give a class what follows from its name and its docstring, where it does not say another."""
+    if cls.__name__.startswith("MPHDRR_"):
+        cls.bl_label = getattr(cls, "bl_label", ids.label(cls.__name__))
+    if issubclass(cls, bpy.types.Operator):
+        cls.bl_idname = vars(cls).get("bl_idname", ids.operator_name(cls.__name__))
+        if cls.__doc__ is not None:
+            cls.bl_description = " ".join(cls.__doc__.split())  # Blender would keep line breaks and indentation
 
 
 def unregister() -> None:

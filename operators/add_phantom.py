@@ -70,8 +70,6 @@ ADD_KINDS = tuple(
 class MPHDRR_OT_import_phantom(PhantomSettings, AddPhantom, bpy.types.Operator):
     """Add the phantom that a TOML file describes as a volume; its text becomes one of the .blend"""
 
-    bl_label = "Import Phantom"
-
     __annotations__ = {
         "filepath": file_property("Phantom to read"),
         "filter_glob": shown_files((".toml",)),

@@ -13,8 +13,6 @@ from ..addon.volumes import slices, volume_import, volumes
 class MPHDRR_OT_add_slices(Reported, bpy.types.Operator):
     """Show an axial, a coronal and a sagittal slice of the active volume as planes that go with it"""
 
-    bl_label = "Add Slices"
-
     poll = needs(volumes.ACTIVE)
 
     def act(self, context: bpy.types.Context) -> str:
@@ -24,7 +22,6 @@ class MPHDRR_OT_add_slices(Reported, bpy.types.Operator):
 class MPHDRR_OT_remove_slices(bpy.types.Operator):
     """Remove the active volume's slice planes"""
 
-    bl_label = "Remove Slices"
     bl_options = {"REGISTER", "UNDO"}
 
     poll = needs(volumes.ACTIVE)

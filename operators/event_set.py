@@ -17,8 +17,6 @@ class MPHDRR_OT_new_event_recipe(Reported, ExportHelper, bpy.types.Operator):
     example's where there is none
     """
 
-    bl_label = "New Event Recipe"
-
     filename_ext = ".toml"
     filter_glob: shown_files((".toml",))
     like: EnumProperty(
@@ -52,8 +50,6 @@ class MPHDRR_OT_make_event_set(jobs.JobOperator, bpy.types.Operator):
     on from there the next time
     """
 
-    bl_label = "Make Event Set"
-
     recipe: RECIPE  # type: ignore[valid-type]
     folder: FOLDER  # type: ignore[valid-type]
     count: COUNT  # type: ignore[valid-type]
@@ -66,8 +62,6 @@ class MPHDRR_OT_open_event(jobs.JobOperator, bpy.types.Operator):
     """Open an event of a set in the scene, in place of the one opened before: its truth as a volume, its phantom at its pose
     with its settings, hidden, and its projections as a run
     """
-
-    bl_label = "Open Event"
 
     folder: FOLDER  # type: ignore[valid-type]
     opened: OPENED  # type: ignore[valid-type]

@@ -10,7 +10,6 @@ from ..addon.volumes import volumes
 
 
 class MPHDRR_OT_export_volume(jobs.ExportJob, bpy.types.Operator):
-    bl_label = "Export Volume"
     bl_description = (
         f"Write every voxel of the active volume, where it stands in the world; endings: {', '.join(WRITTEN_ENDINGS)}"
     )

@@ -22,7 +22,6 @@ _SHOWN: Need = (
 class MPHDRR_OT_export_figure(jobs.ExportJob, bpy.types.Operator):
     """Draw a figure of the scanner, the volume or the last projections as PNG, or as SVG whose labels are text"""
 
-    bl_label = "Export Figure"
     bl_options = set()
 
     endings = SUFFIXES

@@ -86,7 +86,6 @@ class ReadVolumes(jobs.JobOperator):
 class MPHDRR_OT_import_volume(ReadVolumes, bpy.types.Operator):
     """Read a CT, an image or an OpenVDB grid as a volume to project; of a DICOM series choose the folder"""
 
-    bl_label = "Import Volume"
     asks_for = "filepath"
 
     filepath: file_property("Or folder of a DICOM series")
@@ -101,7 +100,6 @@ class MPHDRR_OT_import_volume(ReadVolumes, bpy.types.Operator):
 class MPHDRR_OT_import_volume_sequence(ReadVolumes, bpy.types.Operator):
     """Read several files, in the order of their numbers, as one volume that plays over the frames"""
 
-    bl_label = "Import Volume Sequence"
     asks_for = "files"
 
     directory: DIRECTORY  # type: ignore[valid-type]

@@ -11,8 +11,6 @@ from ..core.example import EXAMPLE
 class MPHDRR_OT_load_example(jobs.JobOperator, bpy.types.Operator):
     """Load the bundled scanner of 80 modules with a Derenzo phantom, and show what every module sees of it"""
 
-    bl_label = "Load Example"
-
     poll = needs((lambda context: not jobs.is_running(), "Another job is running: wait for it or cancel it"))
 
     def job(self, context: bpy.types.Context) -> jobs.Job:

@@ -22,8 +22,6 @@ class MPHDRR_OT_show_in_perspective(_InPerspective, bpy.types.Operator):
     the module; the settings are what the panel says now, unless a script gives others
     """
 
-    bl_label = "Show in Perspective"
-
     def job(self, context: bpy.types.Context) -> jobs.Job:
         return frustums.showing(context, *map(self.given_or(context.scene.mphdrr_perspective), ("planes", "uniform")))
 
@@ -41,8 +39,6 @@ class MPHDRR_OT_resample_in_perspective(_InPerspective, bpy.types.Operator):
 
 class MPHDRR_OT_clear_perspective(Reported, bpy.types.Operator):
     """Remove all volumes in perspective, of all modules"""
-
-    bl_label = "Clear Perspective"
 
     poll = needs((lambda context: frustums.frustums(context.scene), "No volume is shown in perspective"))
 

@@ -20,8 +20,6 @@ class MPHDRR_OT_pick_pixel(Eyedropper, Reported, bpy.types.Operator):
     other modules' projections its epipolar lines. Esc or a right click leaves all as it was
     """
 
-    bl_label = "Pick Pixel"
-
     module: IntProperty(name="Module", description="Number of the module", default=1, options={"SKIP_SAVE"})
     column: FloatProperty(name="Column", description=_COUNTED, options={"SKIP_SAVE"})
     row: FloatProperty(name="Row", description=_COUNTED, options={"SKIP_SAVE"})

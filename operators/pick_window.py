@@ -19,7 +19,6 @@ class MPHDRR_OT_pick_window(Eyedropper, bpy.types.Operator):
     the mouse stands in the status bar; Esc or a right click leaves all as it was
     """
 
-    bl_label = "Pick Window"
     bl_options = {"REGISTER", "UNDO"}
 
     end: EnumProperty(

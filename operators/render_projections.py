@@ -26,8 +26,6 @@ class MPHDRR_OT_render_projections(ProjectionSettings, jobs.JobOperator, bpy.typ
     the .blend. The settings are what the panel says now, unless a script gives others
     """
 
-    bl_label = "Render Projections"
-
     volume: StringProperty(name="Volume", description="Name of the volume object to project", options={"SKIP_SAVE"})
     mu: StringProperty(
         name="Attenuation", description="Name of the volume object of attenuation coefficients", options={"SKIP_SAVE"}
@@ -80,8 +78,6 @@ class MPHDRR_OT_load_recipe(Reported, ImportHelper, bpy.types.Operator):
     scene has objects of their names, volumes. By default the recipe of the last run
     """
 
-    bl_label = "Load Recipe"
-
     filter_glob: shown_files((".toml", *FORMATS))
 
     def act(self, context: bpy.types.Context) -> str:
@@ -107,8 +103,6 @@ class ShowPicture:
 class MPHDRR_OT_show_projections(ShowPicture, bpy.types.Operator):
     """Show the mosaic of the last run in an Image Editor, opened below the 3D view if there is none"""
 
-    bl_label = "Show Projections"
-
     poll = needs(images.PROJECTED)
 
 
@@ -120,7 +114,6 @@ def _shows_mosaic(context: bpy.types.Context) -> bool:
 class MPHDRR_OT_pick_module(bpy.types.Operator):
     """Make the module active whose image in the mosaic is clicked"""
 
-    bl_label = "Pick Module"
     bl_options = {"UNDO", "INTERNAL"}
 
     poll = needs((_shows_mosaic, "Only in an Image Editor that shows the mosaic"))

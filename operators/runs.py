@@ -30,7 +30,6 @@ _LISTED: Need = (lambda context: context.scene.mphdrr_projections.runs, "No runs
 class MPHDRR_OT_show_run(jobs.JobOperator, bpy.types.Operator):
     """Show a run of the list: its images, the mosaic and the planes in the scene. Modules and volumes stay as they are"""
 
-    bl_label = "Show Run"
     bl_options = {"REGISTER", "UNDO", "INTERNAL"}  # a click in the list
 
     poll = needs(_LISTED)
@@ -44,8 +43,6 @@ class MPHDRR_OT_show_run(jobs.JobOperator, bpy.types.Operator):
 
 class MPHDRR_OT_remove_run(Reported, bpy.types.Operator):
     """Remove a run from the list, and its file from the disk if it is in this .blend's own folder"""
-
-    bl_label = "Remove Run"
 
     poll = needs(_LISTED)
 
@@ -75,8 +72,6 @@ class MPHDRR_OT_compare_runs(jobs.JobOperator, bpy.types.Operator):
     """Draw the shown run minus another one, of the same modules, pixels and unit, as a mosaic: white where they are equal,
     red where the shown one has more, blue where it has less
     """
-
-    bl_label = "Compare Runs"
 
     poll = needs(_LISTED)
 

@@ -9,7 +9,6 @@ from .geometry import Sidebar, draw_hint, draw_text
 
 
 class MPHDRR_PT_event_set(Sidebar, bpy.types.Panel):
-    bl_label = "Event Set"
     bl_order = ids.ORDER_EVENTS
     bl_options = {"DEFAULT_CLOSED"}
 

@@ -84,8 +84,6 @@ class MPHDRR_MT_volumes(bpy.types.Menu):
 
 
 class MPHDRR_MT_projections(bpy.types.Menu):
-    bl_label = "Projections"
-
     def draw(self, context: bpy.types.Context) -> None:
         layout = invoking(self.layout)
         layout.operator(ids.RENDER_PROJECTIONS, icon="RENDER_STILL")

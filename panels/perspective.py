@@ -12,7 +12,6 @@ from .geometry import Sidebar, draw_hint, draw_text
 
 
 class MPHDRR_PT_perspective(Sidebar, bpy.types.Panel):
-    bl_label = "Perspective"
     bl_parent_id = "MPHDRR_PT_phantom"
     bl_options = {"DEFAULT_CLOSED"}
 

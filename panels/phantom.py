@@ -14,7 +14,6 @@ from .geometry import Sidebar, draw_facts, draw_hint, draw_text
 
 
 class MPHDRR_PT_phantom(Sidebar, bpy.types.Panel):
-    bl_label = "Phantom"
     bl_order = ids.ORDER_PHANTOM
 
     def draw(self, context: bpy.types.Context) -> None:

@@ -17,7 +17,6 @@ _MAIN = ("time", "photons", "hole", "aperture_points", "pixel_points")
 
 
 class MPHDRR_PT_projections(Sidebar, bpy.types.Panel):
-    bl_label = "Projections"
     bl_order = ids.ORDER_PROJECTIONS
 
     def draw(self, context: bpy.types.Context) -> None:
@@ -54,7 +53,6 @@ class MPHDRR_PT_projections(Sidebar, bpy.types.Panel):
 
 
 class MPHDRR_PT_physics(Sidebar, bpy.types.Panel):
-    bl_label = "Physics"
     bl_parent_id = "MPHDRR_PT_projections"
     bl_options = {"DEFAULT_CLOSED"}
 
@@ -83,7 +81,6 @@ class MPHDRR_PT_physics(Sidebar, bpy.types.Panel):
 
 
 class MPHDRR_PT_export(Sidebar, bpy.types.Panel):
-    bl_label = "Export"
     bl_order = ids.ORDER_EXPORT
 
     def draw(self, context: bpy.types.Context) -> None:

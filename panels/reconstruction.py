@@ -15,7 +15,6 @@ _PLOT = 6.0  # of a button's heights
 
 
 class MPHDRR_PT_reconstruction(Sidebar, bpy.types.Panel):
-    bl_label = "Reconstruction"
     bl_order = ids.ORDER_RECONSTRUCTION
 
     def draw(self, context: bpy.types.Context) -> None:

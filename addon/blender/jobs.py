@@ -182,7 +182,6 @@ def is_running() -> bool:
     return _current is not None or bool(_waiting)
 
 
-@bpy.app.handlers.persistent
 def stop(*_: Any) -> None:
     """Stop all jobs and wait for the running one's thread: before a file is loaded, or the extension is disabled."""
     global _current

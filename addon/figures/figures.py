@@ -308,7 +308,6 @@ def _leave_a_trace(scene: bpy.types.Scene, drawn: list[bpy.types.Object]) -> Gen
     return bool(np.abs(resized(pictures[0] - pictures[1], rows, columns)).max() > _TRACE)
 
 
-@bpy.app.handlers.persistent
 def before_render(scene: bpy.types.Scene, *_: Any) -> None:
     """Blender's own Render: say which volumes of the 3D views the picture lacks; in the window, when it is done."""
     if scene.name.startswith(ids.STUDIO):

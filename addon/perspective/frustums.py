@@ -211,7 +211,6 @@ def remove(scene: bpy.types.Scene, modules: list[bpy.types.Object] | None = None
     return len(found)
 
 
-@bpy.app.handlers.persistent
 def after_update(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
     """Modules were shown, hidden or deleted: their frustums, too."""
     if not depsgraph.id_type_updated("SCENE") or scene != bpy.context.scene:

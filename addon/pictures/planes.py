@@ -146,7 +146,6 @@ def share_of_way(settings: bpy.types.PropertyGroup, module: bpy.types.PropertyGr
     return (settings.plane_distance or _BETWEEN * (module.pinhole_distance - module.roi_radius)) / distance
 
 
-@bpy.app.handlers.persistent
 def after_update(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
     """Another module is active, modules were shown or hidden, or `l` was edited: planes and backgrounds follow."""
     if depsgraph.id_type_updated("SCENE") and scene == bpy.context.scene:

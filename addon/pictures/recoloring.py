@@ -32,7 +32,6 @@ def display_changed(*_: Any) -> None:
         timers.soon(_turn, _REST)
 
 
-@bpy.app.handlers.persistent
 def check(*_: Any) -> None:
     """Make the pictures anew where they are not as the display says: Undo, or a file, may have them of different times."""
     scene = bpy.context.scene

@@ -286,7 +286,6 @@ def start() -> None:
     after_update()
 
 
-@bpy.app.handlers.persistent
 def stop(*_: Any) -> None:
     """Switch the preview off: also before a file is loaded, or the extension is disabled."""
     global _session, _drawing
@@ -297,7 +296,6 @@ def stop(*_: Any) -> None:
     _session = _drawing = None
 
 
-@bpy.app.handlers.persistent
 def after_update(scene: bpy.types.Scene | None = None, depsgraph: bpy.types.Depsgraph | None = None) -> None:
     """Something in the scene has changed: look at it as soon as Blender has time."""
     if _session is None or (depsgraph is not None and depsgraph.mode != "VIEWPORT"):

@@ -164,7 +164,6 @@ def remove_file(item: bpy.types.PropertyGroup) -> bool:
     return True
 
 
-@bpy.app.handlers.persistent
 def after_load(*_: Any) -> None:
     """A file was opened; one of an earlier version has one run, and no list."""
     _looked.clear()
@@ -177,7 +176,6 @@ def after_load(*_: Any) -> None:
     after_update()
 
 
-@bpy.app.handlers.persistent
 def after_update(*_: Any) -> None:
     """Something has changed: compare the runs with the scene once it rests. Costs next to nothing itself."""
     if not bpy.app.background:

@@ -63,7 +63,6 @@ def select(context: bpy.types.Context, modules: Iterable[bpy.types.Object]) -> N
         layer.objects.active = shown[0]
 
 
-@bpy.app.handlers.persistent
 def after_update(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
     """Another object was made active in the viewport: the panels' scanner, the list and the mosaic follow."""
     if not depsgraph.id_type_updated("SCENE") or scene != bpy.context.scene:

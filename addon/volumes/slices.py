@@ -157,7 +157,6 @@ def _paint(item: bpy.types.Object, plane: bpy.types.Object) -> None:
     _painted[image.session_uid] = wanted
 
 
-@bpy.app.handlers.persistent
 def after_undo(*_: object) -> None:
     """Undo and redo restore planes and their settings, but not what was painted."""
     for gone in _painted.keys() - {image.session_uid for image in bpy.data.images}:
@@ -170,7 +169,6 @@ def after_undo(*_: object) -> None:
                 print(f"mphDRR: {plane.name} is not painted: {error}")
 
 
-@bpy.app.handlers.persistent
 def before_load(*_: object) -> None:
     """Another file has other volumes."""
     global _last
@@ -178,7 +176,6 @@ def before_load(*_: object) -> None:
     _painted.clear()
 
 
-@bpy.app.handlers.persistent
 def before_save(*_: object) -> None:
     """Pack the planes' images: Blender does not save what was painted."""
     for item in bpy.data.objects:
@@ -188,7 +185,6 @@ def before_save(*_: object) -> None:
                 image.pack()
 
 
-@bpy.app.handlers.persistent
 def after_frame_change(scene: bpy.types.Scene, *_: object) -> None:
     """The planes of a sequence show the current frame's state."""
     for item in volumes.volume_objects(scene):

@@ -184,7 +184,6 @@ def volume_objects(scene: bpy.types.Scene) -> list[bpy.types.Object]:
     return sorted((item for item in scene.objects if is_volume(item)), key=lambda item: item.name)
 
 
-@bpy.app.handlers.persistent
 def after_load(*_: Any) -> None:
     """Rewrite volumes of a .blend whose Blender draws voxels half a voxel elsewhere."""
     missing = storage.missing_volumes()

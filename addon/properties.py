@@ -221,20 +221,12 @@ class GeometryProperties(bpy.types.PropertyGroup):
     )  # fmt: skip
 
 
+_ROOMS = (
+    phantom_properties, projection_properties, reconstruction_properties, display_properties, epipolar_properties,
+    perspective_properties, event_properties, column_maps,
+)  # fmt: skip
 # Every property group; a group comes after those that it points to.
-CLASSES = (
-    ModuleProperties,
-    ScannerProperties,
-    GeometryProperties,
-    *phantom_properties.CLASSES,
-    *projection_properties.CLASSES,
-    *reconstruction_properties.CLASSES,
-    *display_properties.CLASSES,
-    *epipolar_properties.CLASSES,
-    *perspective_properties.CLASSES,
-    *event_properties.CLASSES,
-    *column_maps.CLASSES,
-)
+CLASSES = (ModuleProperties, ScannerProperties, GeometryProperties, *(cls for room in _ROOMS for cls in room.CLASSES))
 
 # (Blender type, attribute name, group): `registration.py` attaches a `PointerProperty` of the group to the type.
 POINTERS = (

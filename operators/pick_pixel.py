@@ -28,6 +28,7 @@ class MPHDRR_OT_pick_pixel(Eyedropper, Reported, bpy.types.Operator):
         options={"SKIP_SAVE"},
     )  # fmt: skip
 
+    asks = "a pixel of a projection"
     poll = needs(images.PROJECTED)
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
@@ -44,47 +45,39 @@ class MPHDRR_OT_pick_pixel(Eyedropper, Reported, bpy.types.Operator):
         column, row = found.pixel
         return f"Module {self.module}, column {column:g}, row {row:g}: {found.seen_by} modules see the marker"
 
-    def says(self, context: bpy.types.Context, event: bpy.types.Event) -> str:
-        found = _under(context, event)
+    def under(self, context: bpy.types.Context, event: bpy.types.Event) -> tuple[int, int, int] | None:
+        """The module's number, and column and row, of the pixel under the mouse."""
+        found, run = region_under(context, event), epipolar.run_views(context.scene)
+        if found is None or run is None:
+            return None
+        area, region, place = found
+        if area.type == "IMAGE_EDITOR":
+            at = tiles.picture_at(area.spaces.active.image, *region.view2d.region_to_view(*place))
+            return None if at is None else (at[0].number, *at[0].pixel(at[1], run.views.shape))
+        if area.type != "VIEW_3D":
+            return None
+        origin, direction = (
+            np.array(function(region, region.data, place), np.float64)
+            for function in (view3d_utils.region_2d_to_origin_3d, view3d_utils.region_2d_to_vector_3d)
+        )
+        return epipolar_drawing.plane_pixel(context, run, origin, direction)
+
+    def says(self, found: tuple[int, int, int] | None) -> str:
         if found is None:
-            return "Click on a pixel of a projection, in the Image Editor or on a plane   (Esc: cancel)"
+            return f"Click on {self.asks}, in the Image Editor or on a plane   (Esc: cancel)"
         return "Module {}, column {}, row {}   (click: pick; Esc: cancel)".format(*found)
 
-    def takes(self, context: bpy.types.Context, event: bpy.types.Event) -> bool:
-        found = _under(context, event)
-        if found is None:
-            self.report({"WARNING"}, "Click on a pixel of a projection, or press Esc")
-            return False
+    def takes(self, context: bpy.types.Context, found: tuple[int, int, int]) -> bool:
         self.module, self.column, self.row = found
         return self.execute(context) == {"FINISHED"}
 
 
-class MPHDRR_OT_clear_pixel(bpy.types.Operator):
+class MPHDRR_OT_clear_pixel(Reported, bpy.types.Operator):
     """Draw no ray and no epipolar lines any more"""
 
     bl_label = "Clear Picked Pixel"
-    bl_options = {"REGISTER", "UNDO"}
 
     poll = needs((lambda context: context.scene.mphdrr_epipolar.views, "No pixel is picked"))
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
+    def act(self, context: bpy.types.Context) -> None:
         epipolar.clear(context.scene)
-        return {"FINISHED"}
-
-
-def _under(context: bpy.types.Context, event: bpy.types.Event) -> tuple[int, int, int] | None:
-    """The module's number, and column and row, of the pixel under the mouse; None where there is none."""
-    found, run = region_under(context, event), epipolar.run_views(context.scene)
-    if found is None or run is None:
-        return None
-    area, region, place = found
-    if area.type == "IMAGE_EDITOR":
-        at = tiles.picture_at(area.spaces.active.image, *region.view2d.region_to_view(*place))
-        return None if at is None else (at[0].number, *at[0].pixel(at[1], run.views.shape))
-    if area.type != "VIEW_3D":
-        return None
-    origin, direction = (
-        np.array(function(region, region.data, place), np.float64)
-        for function in (view3d_utils.region_2d_to_origin_3d, view3d_utils.region_2d_to_vector_3d)
-    )
-    return epipolar_drawing.plane_pixel(context, run, origin, direction)

@@ -28,16 +28,21 @@ class MPHDRR_OT_pick_window(Eyedropper, bpy.types.Operator):
         default="HIGH", options={"SKIP_SAVE"},
     )  # fmt: skip
 
+    asks = "a picture of the projections"
     poll = needs(
         (lambda context: images.tiles(bpy.data.images.get(ids.MOSAIC)), images.PROJECTED[1]),
         (_has_image_editor, "No Image Editor is open: press Show Mosaic"),
     )
 
-    def takes(self, context: bpy.types.Context, event: bpy.types.Event) -> bool:
-        found = _under(context, event)
-        if found is None:
-            self.report({"WARNING"}, "Click on a picture of the projections, or press Esc")
-            return False
+    def under(self, context: bpy.types.Context, event: bpy.types.Event) -> tuple[str, float] | None:
+        """The exact number under the mouse, and what it is."""
+        found = region_under(context, event)
+        if found is None or found[0].type != "IMAGE_EDITOR":
+            return None
+        area, region, place = found
+        return tiles.value_at(area.spaces.active.image, *region.view2d.region_to_view(*place))
+
+    def takes(self, context: bpy.types.Context, found: tuple[str, float]) -> bool:
         shown = images.tiles(bpy.data.images[ids.MOSAIC]) or {}
         settings = context.scene.mphdrr_display
         window = shown.get("window", (settings.low, settings.high))
@@ -49,17 +54,7 @@ class MPHDRR_OT_pick_window(Eyedropper, bpy.types.Operator):
         self.report({"INFO"}, f"Window {self.end.lower()} is {found[1]:g} {shown['unit']}: {found[0]}")
         return True
 
-    def says(self, context: bpy.types.Context, event: bpy.types.Event) -> str:
-        found = _under(context, event)
+    def says(self, found: tuple[str, float] | None) -> str:
         unit = (images.tiles(bpy.data.images.get(ids.MOSAIC)) or {}).get("unit", "")
-        text = f"{found[0]}: {found[1]:g} {unit}" if found else "Click on a picture of the projections"
+        text = f"{found[0]}: {found[1]:g} {unit}" if found else f"Click on {self.asks}"
         return f"{text}   (click: window {self.end.lower()}; Esc: cancel)"
-
-
-def _under(context: bpy.types.Context, event: bpy.types.Event) -> tuple[str, float] | None:
-    """The exact number under the mouse, and what it is; None where there is none."""
-    found = region_under(context, event)
-    if found is None or found[0].type != "IMAGE_EDITOR":
-        return None
-    area, region, place = found
-    return tiles.value_at(area.spaces.active.image, *region.view2d.region_to_view(*place))

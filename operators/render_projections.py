@@ -54,13 +54,12 @@ class MPHDRR_OT_render_projections(ProjectionSettings, jobs.JobOperator, bpy.typ
         return self.given_or(scene.mphdrr_projections)(name)
 
 
-class MPHDRR_OT_use_preset(bpy.types.Operator):
+class MPHDRR_OT_use_preset(Reported, bpy.types.Operator):
     """Count photons, with isotope, aperture and crystal chosen together; time, noise, attenuation and the detector's own
     blur stay as they are
     """
 
     bl_label = "Physics Preset"
-    bl_options = {"REGISTER", "UNDO"}
 
     preset: EnumProperty(
         name="Preset",
@@ -68,9 +67,8 @@ class MPHDRR_OT_use_preset(bpy.types.Operator):
         items=choices.items({}, ((each.name, each.label, each.text) for each in PRESETS.values())),
     )
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
+    def act(self, context: bpy.types.Context) -> None:
         use_preset(context.scene.mphdrr_projections, self.preset)
-        return {"FINISHED"}
 
 
 class MPHDRR_OT_load_recipe(Reported, ImportHelper, bpy.types.Operator):

@@ -6,7 +6,7 @@ import bpy
 from bpy.props import EnumProperty, IntProperty
 
 from ..addon.blender import jobs
-from ..addon.blender.reports import Need, Reported, needs
+from ..addon.blender.reports import Need, Reported, ask_to_remove, needs
 from ..addon.pictures import images
 from ..addon.runs import rendering, runs
 from ..core.errors import InputError
@@ -50,10 +50,8 @@ class MPHDRR_OT_remove_run(Reported, bpy.types.Operator):
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         item = _required_run(context.scene, self.index)
-        return context.window_manager.invoke_confirm(
-            self, event, title=f"Remove {item.name!r} ({runs.size_text([item])})?", confirm_text="Remove", icon="WARNING",
-            message="Neither Undo nor the .blend as it was saved will find its file again.",
-        )  # fmt: skip
+        message = "Neither Undo nor the .blend as it was saved will find its file again."
+        return ask_to_remove(self, context, event, f"Remove {item.name!r} ({runs.size_text([item])})?", message)
 
     def act(self, context: bpy.types.Context) -> str:
         _required_run(context.scene, self.index)

@@ -60,3 +60,35 @@ def euler_angles(matrix: NDArray[np.float64]) -> tuple[float, float, float]:
         0.0 if abs(y) < 1e-12 else float(y),
         float(np.arctan2(r[1, 0], r[0, 0])),
     )
+
+
+def homes(scene: bpy.types.Scene, name: str) -> list[bpy.types.Collection]:
+    """A scene's collections of that name, which Blender may have numbered."""
+    return [home for home in scene.collection.children if home.name.startswith(name)]
+
+
+def home(scene: bpy.types.Scene, name: str) -> bpy.types.Collection:
+    """The first of a scene's `homes`, made if need be."""
+    found = homes(scene, name) or [bpy.data.collections.new(name)]
+    if found[0].name not in scene.collection.children:
+        scene.collection.children.link(found[0])
+    return found[0]
+
+
+def remove_empty_homes(scene: bpy.types.Scene, name: str) -> None:
+    """Remove those of a scene's `homes` that hold nothing any more."""
+    bpy.data.batch_remove([home for home in homes(scene, name) if not home.all_objects])
+
+
+def link_beside(item: bpy.types.Object, other: bpy.types.Object) -> None:
+    """Put a new object into the collections of another one."""
+    for collection in other.users_collection:
+        collection.objects.link(item)
+
+
+def picture_empty(name: str, parent: bpy.types.Object, picture: bpy.types.Image | None, side: str) -> bpy.types.Object:
+    """A new empty that shows a picture on a side of it, a child of another object; in no collection yet."""
+    item = bpy.data.objects.new(name, None)
+    item.empty_display_type, item.data, item.use_empty_image_alpha, item.empty_image_side = "IMAGE", picture, True, side
+    item.parent = parent
+    return item

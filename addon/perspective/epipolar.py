@@ -3,6 +3,7 @@
 All of it is that of the run's own views: where modules have moved since, the run is not of the scene as it is now.
 """
 
+import functools
 import hashlib
 from dataclasses import dataclass
 
@@ -21,7 +22,6 @@ from ..pictures import images
 Floats = NDArray[np.float64]
 
 _LEAST = 0.01  # of the isocentre's depth: where a ROI begins that reaches behind the pinhole
-_last: dict[tuple[object, ...], "Picked"] = {}  # what was asked for last
 _runs: dict[int, "RunViews"] = {}  # by the mosaic's session_uid: that of the shown run
 
 
@@ -124,13 +124,7 @@ def picked(scene: bpy.types.Scene) -> Picked | None:
     settings, run = scene.mphdrr_epipolar, run_views(scene)
     if run is None or settings.views != run.name:
         return None
-    numbers = settings.module, typed(settings.column), typed(settings.row), typed(settings.k)
-    key = (id(run), *numbers)
-    if key not in _last:
-        made = _picked(run, *numbers)
-        _last.clear()
-        _last[key] = made
-    return _last[key]
+    return _picked(run, settings.module, typed(settings.column), typed(settings.row), typed(settings.k))
 
 
 def shown(scene: bpy.types.Scene) -> tuple[Picked | None, str]:
@@ -164,6 +158,7 @@ def clear(scene: bpy.types.Scene) -> None:
     scene.mphdrr_epipolar.views = ""
 
 
+@functools.lru_cache(maxsize=1)
 def _picked(run: RunViews, module: int, column: float, row: float, k: float) -> Picked:
     views, index = run.views, run.index(module)
     n_v, n_u = views.shape

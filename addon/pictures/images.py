@@ -71,7 +71,7 @@ def storing(run: ProjectionRun, made: Pictures) -> Generator[tuple[str, int, int
             yield "storing", k, len(numbers)
             name = projection_name(number, numbers)
             new[name] = bpy.data.images.new(name, 1, 1, float_buffer=True, is_data=True)
-            _fill(new[name], exact)
+            filled(new[name], exact)
             new[ids.picture_name(name)] = _new_picture(ids.picture_name(name), colored)
         yield "storing", len(numbers), len(numbers)
         new[ids.MOSAIC] = _new_picture(ids.MOSAIC, made.mosaic)  # as large as all: it has a turn of its own
@@ -113,13 +113,13 @@ def showing_again(display: Display, kept: dict[int, NDArray[np.float32]]) -> Gen
         del found
     projections = kept[uid]
     file, drawn = yield from _in_thread(lambda progress: _mosaic(projections, texts, rings, unit, display), False)
-    mosaic = _fill(bpy.data.images[ids.MOSAIC], file)
+    mosaic = filled(bpy.data.images[ids.MOSAIC], file)
     _describe(_read_now(mosaic), drawn, numbers, rings, unit, None)
     files = yield from _in_thread(lambda progress: _colored(projections, display, progress), True)
     for name, file in zip(names, files, strict=True):
         picture = bpy.data.images.get(ids.picture_name(name))
         if picture is not None:
-            _read_now(_fill(picture, file))
+            _read_now(filled(picture, file))
             yield True
     _describe(bpy.data.images[ids.MOSAIC], drawn, numbers, rings, unit, display)
 
@@ -259,7 +259,7 @@ def store_reconstruction(file: bytes) -> bpy.types.Image:
 def _store(name: str, file: bytes) -> bpy.types.Image:
     """One of our images of that name, showing a PNG; saved while nothing shows it."""
     old = bpy.data.images.get(name)
-    image = _new_picture(name, file) if old is None else _fill(old, file)
+    image = _new_picture(name, file) if old is None else filled(old, file)
     image.use_fake_user, image[_KEY] = True, True
     return image
 
@@ -348,7 +348,7 @@ def _fit(context: bpy.types.Context, window: bpy.types.Window, area: bpy.types.A
 
 
 def _new_picture(name: str, png: bytes) -> bpy.types.Image:
-    return _read_now(_fill(bpy.data.images.new(name, 1, 1), png))
+    return _read_now(filled(bpy.data.images.new(name, 1, 1), png))
 
 
 def _read_now(image: bpy.types.Image) -> bpy.types.Image:
@@ -357,7 +357,7 @@ def _read_now(image: bpy.types.Image) -> bpy.types.Image:
     return image
 
 
-def _fill(image: bpy.types.Image, file: bytes) -> bpy.types.Image:
+def filled(image: bpy.types.Image, file: bytes) -> bpy.types.Image:
     """Pack the contents of a file into an image, which shows it from now on."""
     image.pack(data=file, data_len=len(file))
     if image.source != "FILE":

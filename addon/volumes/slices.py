@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ...core.errors import InputError
 from ...core.volumes.volume import Volume
 from ..blender.compat import add_node, blank_material
-from ..blender.objects import remove_objects
+from ..blender.objects import link_beside, remove_objects
 from . import looks, vdb, volume_materials, volumes
 
 _PLANES = ("Sagittal", "Coronal", "Axial")  # across world x, y, z
@@ -221,8 +221,7 @@ def _plane(item: bpy.types.Object, volume: Volume, axis: int, name: str) -> bpy.
     plane = bpy.data.objects.new(name, mesh)
     plane[_KEY], plane[_LATTICE] = axis, _lattice(volume)
     plane.parent = item
-    for collection in item.users_collection:
-        collection.objects.link(plane)
+    link_beside(plane, item)
     return plane
 
 

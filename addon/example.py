@@ -9,7 +9,6 @@ from mathutils import Euler
 from ..core.example import EULER_DEGREES, EXAMPLE
 from ..core.geometry.frames import euler_pose
 from ..core.progress import Progress, stages_of
-from ..core.runs.files import write_run
 from ..core.runs.recipe import Recipe
 from ..core.runs.run_recipe import run_recipe
 from ..core.workbook import read_system
@@ -40,9 +39,7 @@ def example_job(context: bpy.types.Context) -> jobs.Job:
         stages = stages_of(progress)
         stored = adding.work(progress)
         (run,) = run_recipe(recipe, system, stored[0].volume, stages=stages)
-        stages("writing the run file")
-        write_run(run, path)
-        return stored, run, images.pictures(run, display, stages("packing"))
+        return stored, run, rendering.kept(run, path, display, stages)
 
     def finish(result: Any) -> jobs.Finishing:
         stored, run, made = result

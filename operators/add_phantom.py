@@ -7,7 +7,7 @@ from bpy.props import BoolProperty, FloatProperty, FloatVectorProperty, StringPr
 
 from ..addon.blender import jobs, storage
 from ..addon.blender.file_properties import file_property, shown_files
-from ..addon.blender.layouts import labelled
+from ..addon.blender.layouts import draw_all, labelled
 from ..addon.phantoms import phantoms
 from ..addon.phantoms.phantom_properties import FILE, PhantomSettings, identifier, sampling, settings_class
 from ..core.geometry.frames import euler_pose
@@ -35,9 +35,7 @@ class AddPhantom(jobs.JobOperator):
         row.enabled = self.quantity == "activity"
         row.prop(self, "attenuation")
         layout.column(align=True).prop(self, "location")
-        column = layout.column(align=True)
-        for angle in ("phi", "theta", "psi"):
-            column.prop(self, angle)
+        draw_all(layout.column(align=True), self, "phi", "theta", "psi")
 
     def adding(self: Any, name: str) -> jobs.Job:
         pose = euler_pose(self.phi, self.theta, self.psi, self.location)

@@ -14,7 +14,7 @@ from bpy.props import (
 from ..addon.blender import choices, jobs, storage
 from ..addon.blender.decimals import typed
 from ..addon.blender.file_properties import DIRECTORY, file_property, files_property, shown_files
-from ..addon.blender.layouts import labelled
+from ..addon.blender.layouts import draw_all, labelled
 from ..addon.runs import counts_import
 from ..core.runs.frame_files import COUNTS_FORMATS, RAW_TYPES
 from ..core.runs.orientations import ORIENTATIONS
@@ -72,14 +72,9 @@ class MPHDRR_OT_import_counts(jobs.JobOperator, bpy.types.Operator):
 
     def draw(self, context: bpy.types.Context) -> None:
         layout = labelled(self.layout)
-        for name in ("frames", "orientation", "time"):
-            layout.prop(self, name)
-        column = layout.column(heading="If Needed")
-        for name in ("modules", "pixel", "expected", "dataset"):
-            column.prop(self, name)
-        column = layout.column(heading="Raw File")
-        for name in ("raw_type", "raw_shape", "raw_big_endian"):
-            column.prop(self, name)
+        draw_all(layout, self, "frames", "orientation", "time")
+        draw_all(layout.column(heading="If Needed"), self, "modules", "pixel", "expected", "dataset")
+        draw_all(layout.column(heading="Raw File"), self, "raw_type", "raw_shape", "raw_big_endian")
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
         names = sorted({item.name for item in self.files if item.name})

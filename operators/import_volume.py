@@ -12,7 +12,7 @@ from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, St
 from ..addon.blender import choices, jobs, storage
 from ..addon.blender.decimals import typed
 from ..addon.blender.file_properties import DIRECTORY, file_property, files_property, shown_files
-from ..addon.blender.layouts import labelled
+from ..addon.blender.layouts import draw_all, labelled
 from ..addon.volumes.volume_import import READ_ENDINGS, importing, name_of
 from ..core.errors import InputError
 from ..core.volumes.volume import UNITS
@@ -61,14 +61,11 @@ class ReadVolumes(jobs.JobOperator):
 
     def draw(self: Any, context: bpy.types.Context) -> None:
         layout = labelled(self.layout)
-        for name in (*self.own_names, "quantity", "center", "attenuation"):
-            layout.prop(self, name)
+        draw_all(layout, self, *self.own_names, "quantity", "center", "attenuation")
         row = layout.row()
         row.enabled = self.attenuation
         row.prop(self, "energy")
-        column = layout.column(heading="OpenVDB", align=True)
-        column.prop(self, "grid")
-        column.prop(self, "unit")
+        draw_all(layout.column(heading="OpenVDB", align=True), self, "grid", "unit")
 
     def importing(self, paths: Sequence[Path], name: str, frame_start: int = 1) -> jobs.Job:
         return importing(

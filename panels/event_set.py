@@ -3,7 +3,7 @@
 import bpy
 
 from ..addon.blender import ids, jobs
-from ..addon.blender.layouts import invoking, labelled
+from ..addon.blender.layouts import draw_all, invoking, labelled
 from ..addon.events import event_notes
 from .geometry import Sidebar, draw_hint, draw_text
 
@@ -31,8 +31,7 @@ class MPHDRR_PT_event_set(Sidebar, bpy.types.Panel):
         if settings.tried:
             draw_text(layout, settings.tried[:1].upper() + settings.tried[1:], "OUTLINER_DATA_VOLUME")
         column = layout.column(align=True)
-        column.prop(settings, "folder")
-        column.prop(settings, "count")
+        draw_all(column, settings, "folder", "count")
         column.operator(ids.MAKE_EVENT_SET, icon="FILE_CACHE")
         if made is not None:
             _draw_note(layout, made)

@@ -4,7 +4,7 @@ import bpy
 from bpy.app.translations import pgettext_iface as iface
 
 from ..addon.blender import ids, jobs
-from ..addon.blender.layouts import invoking, labelled
+from ..addon.blender.layouts import draw_all, invoking, labelled
 from ..addon.perspective import frustums
 from ..addon.scanner import selection
 from ..addon.volumes import volumes
@@ -25,9 +25,7 @@ class MPHDRR_PT_perspective(Sidebar, bpy.types.Panel):
         name = context.object.name if volumes.is_volume(context.object) else iface("no volume is selected")
         text = iface("{volume}, by {module}").format(volume=name, module=camera.name)
         layout.label(text=text, translate=False, icon="VIEW_PERSPECTIVE")
-        column = layout.column(align=True)
-        column.prop(settings, "uniform")
-        column.prop(settings, "planes")
+        draw_all(layout.column(align=True), settings, "uniform", "planes")
         row = layout.row(align=True)
         row.operator(ids.SHOW_IN_PERSPECTIVE)
         row.operator(ids.CLEAR_PERSPECTIVE, text="", icon="X")

@@ -4,7 +4,7 @@ import bpy
 from bpy.app.translations import pgettext_iface as iface
 
 from ..addon.blender import ids, jobs
-from ..addon.blender.layouts import draw_settings, invoking, labelled, shown_where
+from ..addon.blender.layouts import draw_all, draw_settings, invoking, labelled, shown_where
 from ..addon.runs import rendering, runs
 from ..addon.runs.projection_properties import drawn, makes_counts
 from ..addon.scanner import scanner
@@ -31,8 +31,7 @@ class MPHDRR_PT_projections(Sidebar, bpy.types.Panel):
         modules = column.column(align=True)
         modules.prop(settings, "all_modules")
         if not settings.all_modules:
-            modules.prop(settings, "first")
-            modules.prop(settings, "last")
+            draw_all(modules, settings, "first", "last")
         draw_settings(column, settings, drawn(settings, "compute"))
         row = invoking(layout.row())
         row.scale_y = 1.4

@@ -26,6 +26,7 @@ from ...core.phantoms.phantom import Phantom
 from ...core.volumes.volume import UNITS
 from ..blender import choices
 from ..blender.decimals import typed
+from ..blender.layouts import draw_all
 from ..blender.updates import on_edit
 
 FILE = "file"  # beside the names of `KINDS`: a phantom that a text in TOML describes
@@ -87,9 +88,7 @@ class PhantomSettings:
                         row.prop(self, name, index=k, text="")
             else:
                 own.prop(self, name)
-        column = layout.column(align=True)
-        for name in sampling():
-            column.prop(self, name)
+        draw_all(layout.column(align=True), self, *sampling())
 
 
 class KindSettings(PhantomSettings):

@@ -9,7 +9,6 @@ import bpy
 from ...core.errors import InputError
 from ...core.geometry.system import chosen_modules
 from ...core.progress import Progress, stages_of
-from ...core.runs.files import write_run
 from ...core.runs.measured import recipe_counts
 from ...core.runs.mosaic import caption
 from ...core.runs.run import ProjectionRun
@@ -43,9 +42,7 @@ def importing(context: bpy.types.Context, paths: list[Path], said: Mapping[str, 
     def work(progress: Progress) -> tuple[ProjectionRun, images.Pictures]:
         stages = stages_of(progress)
         run = recipe_counts(recipe, system, stages)
-        stages("writing the run file")
-        write_run(run, path)
-        return run, images.pictures(run, display, stages("packing"))
+        return run, rendering.kept(run, path, display, stages)
 
     def finish(result: tuple[ProjectionRun, images.Pictures]) -> jobs.Finishing:
         run, made = result

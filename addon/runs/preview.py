@@ -45,6 +45,9 @@ _REST = 0.3  # s without a change before the picture is made with all pixels
 _SHOWN_PIXELS = 512**2
 _MOST_CAUTIONS = 2
 _PATIENCE = 0.5  # s, after which it is said that a picture takes long
+_OF_MODULE = (
+    "numbers", "centers", "pinhole_diameter", "collimator_length", "detector_side", "detector_thickness",
+)  # fmt: skip
 
 Source = tuple[Path, NDArray[np.float64]]
 """File and pose (4, 4) of a volume, mm."""
@@ -173,12 +176,9 @@ def _corners(views: Views, shape: tuple[int, ...], share: float) -> NDArray[np.f
 
 def _told(asked: Request) -> tuple[str, ...]:
     """A request in words that two have in common exactly if they ask for the same."""
-    module = [asked.system.numbers, asked.system.centers]
-    module += [asked.system.pinhole_diameter, asked.system.collimator_length, asked.system.detector_side]
-    module += [asked.system.detector_thickness]
+    module = [getattr(asked.system, name).tolist() for name in _OF_MODULE]
     sources = [(str(path), pose.tolist()) for path, pose in filter(None, (asked.volume, asked.mu))]
-    values = [array.tolist() for array in module]
-    return tuple(map(repr, (dict(asked.recipe.given), values, sources, asked.display, asked.share, asked.lines)))
+    return tuple(map(repr, (dict(asked.recipe.given), module, sources, asked.display, asked.share, asked.lines)))
 
 
 class Session:

@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 from ...core.errors import InputError, warn
 from ...core.geometry.system import chosen_modules
 from ...core.memory import require
-from ...core.progress import Progress, stages_of
+from ...core.progress import Progress, Stages, stages_of
 from ...core.projector import Model
+from ...core.runs.display import Display
 from ...core.runs.files import read_run, write_run
 from ...core.runs.mosaic import caption
 from ...core.runs.projecting import warn_of_energy
@@ -66,9 +67,7 @@ def render_job(context: bpy.types.Context, recipe: Recipe, volume: str = "", mu:
             warn_of_energy(model, energy, f"the mu of {recipe['attenuation.object']!r}")
         stages("reading")
         (run,) = run_recipe(recipe, system, read_volume(), read_mu and read_mu(), stages)
-        stages("writing the run file")
-        write_run(run, path)
-        return run, images.pictures(run, display, stages("packing"))
+        return run, kept(run, path, display, stages)
 
     def finish(result: tuple[ProjectionRun, images.Pictures]) -> jobs.Finishing:
         run, made = result
@@ -80,6 +79,13 @@ def render_job(context: bpy.types.Context, recipe: Recipe, volume: str = "", mu:
         return f"Projected {recipe['volume.object']!r} into {len(run.views)} modules in {seconds:.1f} s: {where}"
 
     return jobs.Job("Projecting", work, finish, lambda: path.unlink(missing_ok=True))
+
+
+def kept(run: ProjectionRun, path: Path, display: Display, stages: Stages) -> images.Pictures:
+    """Write a run's file, in a job's thread, and make what its images hold."""
+    stages("writing the run file")
+    write_run(run, path)
+    return images.pictures(run, display, stages("packing"))
 
 
 def sources(

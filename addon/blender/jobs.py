@@ -380,22 +380,20 @@ class JobOperator:
         _redraw(context)
 
     def _failed(self, error: BaseException) -> set[str]:
+        if not isinstance(error, Exception):
+            raise error  # KeyboardInterrupt and the like
+        level, text = "ERROR", str(error)
         if isinstance(error, Cancelled):
             left = "nothing was changed" if self._job is None else self._job.left()
-            self.report({"WARNING"}, f"{self.bl_label}: cancelled, {left}")
-        elif isinstance(error, InputError):
-            self.report({"ERROR"}, str(error))
+            level, text = "WARNING", f"{self.bl_label}: cancelled, {left}"
         elif isinstance(error, ReferenceError):  # a datablock that the job had made or found
-            self.report(
-                {"ERROR"}, f"{self.bl_label}: stopped, since Undo has taken back what it works on; start it again"
-            )
+            text = f"{self.bl_label}: stopped, since Undo has taken back what it works on; start it again"
         elif isinstance(error, MemoryError):
-            self.report({"ERROR"}, f"{self.bl_label}: not enough memory; choose fewer voxels or pixels")
-        elif isinstance(error, Exception):
+            text = f"{self.bl_label}: not enough memory; choose fewer voxels or pixels"
+        elif not isinstance(error, InputError):
             traceback.print_exception(error)
-            self.report({"ERROR"}, f"{self.bl_label} failed: {type(error).__name__}: {error} (details in the console)")
-        else:
-            raise error  # KeyboardInterrupt and the like
+            text = f"{self.bl_label} failed: {type(error).__name__}: {error} (details in the console)"
+        self.report({level}, text)
         return {"CANCELLED"}
 
 

@@ -34,7 +34,7 @@ class Note:
 
 _Stamp = tuple[Any, ...]  # by which a file that has changed is read again
 NOTHING = Note("")
-_READING = Note("Reading …")
+_UNKNOWN: tuple[_Stamp | None, Note] = None, Note("Reading …")
 _known: dict[Path, tuple[_Stamp, Note]] = {}
 _stamps: dict[Path, tuple[float, _Stamp]] = {}
 _readers: dict[Path, threading.Thread] = {}
@@ -89,18 +89,14 @@ def _set_note(path: Path) -> Note:
 def _note(path: Path, read: Callable[[Path], Note]) -> Note:
     """The note on a file or folder as it is now; in a window, what was known before while a thread reads it."""
     stamp = _stamp(path)
-    known = _known.get(path)
-    if known is not None and known[0] == stamp:
-        return known[1]
-    if path not in _readers:
-        reader = threading.Thread(target=_read, args=(path, stamp, read), name="mphDRR: reading", daemon=True)
-        if bpy.app.background:
-            reader.run()
-            return _known[path][1]
-        _readers[path] = reader
-        reader.start()
+    if bpy.app.background and _known.get(path, _UNKNOWN)[0] != stamp:
+        _read(path, stamp, read)
+    known, note = _known.get(path, _UNKNOWN)
+    if known != stamp and path not in _readers:
+        _readers[path] = threading.Thread(target=_read, args=(path, stamp, read), name="mphDRR: reading", daemon=True)
+        _readers[path].start()
         timers.soon(_watch, _INTERVAL)
-    return _READING if known is None else known[1]
+    return note
 
 
 def _read(path: Path, stamp: _Stamp, read: Callable[[Path], Note]) -> None:

@@ -25,7 +25,7 @@ from ..core.geometry.system import LENGTHS
 from .blender import choices, ids
 from .blender.updates import FUNCTIONS, on_edit
 from .events import event_properties
-from .perspective import epipolar_properties, perspective_properties
+from .perspective import perspective_properties
 from .phantoms import phantom_properties
 from .pictures import display_properties
 from .reconstruction import reconstruction_properties
@@ -222,7 +222,7 @@ class GeometryProperties(bpy.types.PropertyGroup):
 
 
 _ROOMS = (
-    phantom_properties, projection_properties, reconstruction_properties, display_properties, epipolar_properties,
+    phantom_properties, projection_properties, reconstruction_properties, display_properties,
     perspective_properties, event_properties, column_maps,
 )  # fmt: skip
 # Every property group; a group comes after those that it points to.
@@ -237,7 +237,7 @@ POINTERS = (
     (bpy.types.Scene, "mphdrr_projections", projection_properties.ProjectionProperties),
     (bpy.types.Scene, "mphdrr_reconstruction", reconstruction_properties.ReconstructionProperties),
     (bpy.types.Scene, "mphdrr_display", display_properties.DisplayProperties),
-    (bpy.types.Scene, "mphdrr_epipolar", epipolar_properties.EpipolarProperties),
+    (bpy.types.Scene, "mphdrr_epipolar", perspective_properties.EpipolarProperties),
     (bpy.types.Scene, "mphdrr_perspective", perspective_properties.PerspectiveProperties),
     (bpy.types.Scene, "mphdrr_events", event_properties.EventProperties),
     (bpy.types.WindowManager, "mphdrr_columns", column_maps.ColumnMapProperties),

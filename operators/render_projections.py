@@ -12,7 +12,7 @@ from ..addon.blender import choices, ids, jobs, storage
 from ..addon.blender.decimals import typed
 from ..addon.blender.file_properties import shown_files
 from ..addon.blender.reports import Reported, needs
-from ..addon.pictures import images, tiles
+from ..addon.pictures import images
 from ..addon.runs import rendering, runs
 from ..addon.runs.projection_properties import OPENING_ANGLE, ProjectionSettings, settings_recipe, use_preset
 from ..addon.scanner import scanner
@@ -102,27 +102,6 @@ class MPHDRR_OT_show_projections(ShowPicture, bpy.types.Operator):
     """Show the mosaic of the last run in an Image Editor, opened below the 3D view if there is none"""
 
     poll = needs(images.PROJECTED)
-
-
-def _shows_mosaic(context: bpy.types.Context) -> bool:
-    space = context.space_data
-    return space is not None and space.type == "IMAGE_EDITOR" and images.tiles(space.image) is not None
-
-
-class MPHDRR_OT_pick_module(bpy.types.Operator):
-    """Make the module active whose image in the mosaic is clicked"""
-
-    bl_options = {"UNDO", "INTERNAL"}
-
-    poll = needs((_shows_mosaic, "Only in an Image Editor that shows the mosaic"))
-
-    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
-        try:
-            picked = tiles.pick(context, event.mouse_region_x, event.mouse_region_y)
-        except InputError as error:
-            self.report({"WARNING"}, str(error))
-            return {"CANCELLED"}
-        return {"PASS_THROUGH"} if picked is None else {"FINISHED"}
 
 
 class MPHDRR_OT_export_dataset(jobs.ExportJob, bpy.types.Operator):

@@ -1,11 +1,13 @@
 """Sidebar, third and last step: the projections, and the dataset that they give."""
 
+import textwrap
+
 import bpy
 from bpy.app.translations import pgettext_iface as iface
 
 from ..addon.blender import ids, jobs
 from ..addon.blender.layouts import draw_all, draw_settings, invoking, labelled, shown_where
-from ..addon.runs import rendering, runs
+from ..addon.runs import preview, rendering, runs
 from ..addon.runs.projection_properties import drawn, makes_counts
 from ..addon.scanner import scanner
 from ..addon.volumes import volumes
@@ -14,6 +16,7 @@ from .runs import draw_changes
 
 _MAIN = ("time", "photons", "hole", "aperture_points", "pixel_points")
 """Settings of models that the panel itself shows; the others stand under Physics."""
+_LINE = 34  # letters that fit into the sidebar at its usual width
 
 
 class MPHDRR_PT_projections(Sidebar, bpy.types.Panel):
@@ -49,6 +52,23 @@ class MPHDRR_PT_projections(Sidebar, bpy.types.Panel):
         if settings.run_file:
             layout.operator(ids.SHOW_PROJECTIONS, text="Show Mosaic", icon="IMAGE_DATA")
             draw_changes(layout, context.scene)
+
+
+class MPHDRR_PT_preview(Sidebar, bpy.types.Panel):
+    bl_label = "Live Preview"
+    bl_parent_id = "MPHDRR_PT_projections"
+
+    def draw(self, context: bpy.types.Context) -> None:
+        layout, session = self.layout, preview.session()
+        layout.operator(ids.LIVE_PREVIEW, icon="HIDE_OFF", depress=session is not None)
+        if session is None:
+            return
+        column = layout.column(align=True)
+        column.active = False
+        if session.problem:
+            for line in textwrap.wrap(session.problem, _LINE):
+                column.label(text=line)
+        column.label(text=iface("{size} of voxels kept in memory").format(size=session.kept))
 
 
 class MPHDRR_PT_physics(Sidebar, bpy.types.Panel):

@@ -168,8 +168,8 @@ def _shapes(
         (False, faint, _FAINT, _WIDTH),
         (False, lines, _LINE, _WIDTH),
         (False, epipoles + radius * _CROSS, _LINE, _WIDTH),
-        (True, places + half * _SQUARE, _PIXEL, _MARKER_WIDTH),
         (False, places + radius * _CIRCLE, _MARKER, _MARKER_WIDTH),
+        (True, places + half * _SQUARE, _PIXEL, _MARKER_WIDTH),
     ]
 
 

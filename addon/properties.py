@@ -52,7 +52,7 @@ LABELS = {
     name: f"{_SHORT.get(name, name.split('_')[-1].capitalize())} {text.partition(':')[0]}"
     for name, text in LENGTHS.items()
 }
-"""Of the lengths, short enough for the sidebar: "Hole d"."""
+"""The lengths' names, short enough for the sidebar: "Hole d"."""
 _SEES_ROI = 1 - 1e-6  # of R: an `l` from the ROI sees R up to rounding
 
 

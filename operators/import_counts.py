@@ -19,11 +19,11 @@ from ..addon.runs import counts_import
 from ..core.runs.frame_files import COUNTS_FORMATS, RAW_TYPES
 from ..core.runs.orientations import ORIENTATIONS
 
-_UNSAID = "UNSAID"
+_NONE = "UNSAID"
 
 
 def _items(words: Any, text: str) -> choices.Items:
-    return choices.items({}, [(_UNSAID, "Not Said", text), *words])
+    return choices.items({}, [(_NONE, "Not Said", text), *words])
 
 
 class MPHDRR_OT_import_counts(jobs.JobOperator, bpy.types.Operator):
@@ -46,8 +46,8 @@ class MPHDRR_OT_import_counts(jobs.JobOperator, bpy.types.Operator):
         name="Orientation",
         description="How a frame, as a picture with row 0 at the top, lies on the crystal: seen from which side, with which "
         "of the module's axes at the top",
-        items=_items([(word, *said) for word, said in ORIENTATIONS.items()], "Nothing is imported until it is said"),
-        default=_UNSAID,
+        items=_items([(word, *words) for word, words in ORIENTATIONS.items()], "Nothing is imported until it is said"),
+        default=_NONE,
     )
     time: FloatProperty(
         name="Time (s)", description="Exposure of the frames in seconds; 0: not said", default=0.0, min=0.0,
@@ -63,7 +63,7 @@ class MPHDRR_OT_import_counts(jobs.JobOperator, bpy.types.Operator):
     dataset: StringProperty(name="Array", description="Its name in .npz and .h5. Empty: the only one of three axes")
     raw_type: EnumProperty(
         name="Type", description="Of the numbers in a raw file",
-        items=_items([(name, name, "") for name in RAW_TYPES], "The file is not raw"), default=_UNSAID,
+        items=_items([(name, name, "") for name in RAW_TYPES], "The file is not raw"), default=_NONE,
     )  # fmt: skip
     raw_shape: IntVectorProperty(
         name="Shape", description="Frames, rows and columns of a raw file", size=3, default=(0, 0, 0), min=0
@@ -80,16 +80,16 @@ class MPHDRR_OT_import_counts(jobs.JobOperator, bpy.types.Operator):
         names = sorted({item.name for item in self.files if item.name})
         folder = storage.absolute(self.directory)
         paths = [folder / name for name in names] if len(names) > 1 else [storage.absolute(self.filepath)]
-        return counts_import.importing(context, paths if self.filepath or names else [], self._said())
+        return counts_import.importing(context, paths if self.filepath or names else [], self._given())
 
-    def _said(self) -> dict[str, Any]:
+    def _given(self) -> dict[str, Any]:
         """The entries of a recipe that are given; None for the others."""
         return {
             "counts.frames": self.frames or None,
-            "counts.orientation": None if self.orientation == _UNSAID else [self.orientation],
+            "counts.orientation": None if self.orientation == _NONE else [self.orientation],
             "counts.expected": self.expected or None,
             "counts.dataset": self.dataset or None,
-            "counts.raw_type": None if self.raw_type == _UNSAID else self.raw_type,
+            "counts.raw_type": None if self.raw_type == _NONE else self.raw_type,
             "counts.raw_shape": tuple(self.raw_shape) if any(self.raw_shape) else None,
             "counts.raw_big_endian": self.raw_big_endian or None,
             "model.time": typed(self.time) or None,

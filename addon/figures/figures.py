@@ -332,10 +332,10 @@ def _say_what_is_unseen() -> float | None:
         elif scene.render.engine == "CYCLES" and known not in _drawn:
             reach = max((item.matrix_world @ Vector(corner)).length for corner in item.bound_box) + 1.0
             sizes = reach / np.array([50, 10, 10, 50, 1])  # of a small module behind it, as seen
-            with recorded_warnings() as said:
+            with recorded_warnings() as caught:
                 subject = Subject(PinholeSystem(-2 * reach * np.array([_DIRECTION]), *sizes))
                 list(rendering(Page(_SMALL, _SMALL), subject, Studio(volume=True, near=True), item, False, 1))
-            why = _UNSEEN if any(_UNSEEN in text for text in said) else ""
+            why = _UNSEEN if any(_UNSEEN in text for text in caught) else ""
             _drawn.update([] if why else [known])
         if why:
             text = f"the picture shows nothing of {item.name!r}{why}"

@@ -31,7 +31,7 @@ class RunViews:
 
     views: Views
     numbers: list[int]
-    """Of the modules (M,)."""
+    """The modules' (M,)."""
     roi_radius: Floats
     """(M,), mm."""
     name: str
@@ -57,7 +57,7 @@ class Picked:
 
     run: RunViews
     index: int
-    """Of the picked module among the run's."""
+    """Which of the run's modules is picked."""
     pixel: Floats
     """(2,)."""
     k: float
@@ -65,7 +65,7 @@ class Picked:
     k_range: tuple[float, float]
     """k at the front of the ROI, and at its back."""
     depth: float
-    """Of the marker, mm."""
+    """The marker's, mm."""
     ray: Floats
     """World points (3, 3), mm: the pinhole, and where the ray enters the ROI's depths and leaves them."""
     marker: Floats

@@ -148,7 +148,7 @@ def adding(
 def take_settings(item: bpy.types.Object, kind: str, values: Mapping[str, Any]) -> None:
     """Say that a volume is the phantom of a kind (`PhantomSettings.identifier`) with these settings; its voxels stay."""
     properties = item.mphdrr_volume
-    properties.kind = "VOLUME"  # until the kind is said, no change of a setting makes the voxels again
+    properties.kind = "VOLUME"  # until the kind is set, no change of a setting makes the voxels again
     for key, value in values.items():
         setattr(getattr(properties, kind), key, value)
     properties.kind = kind.upper()

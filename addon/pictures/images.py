@@ -27,7 +27,7 @@ from ..blender.windows import areas
 _KEY = "mphdrr_projection"  # custom property: marks the images that a new run replaces
 _ARRAYS = ("sources", "detector_centers", "u_steps", "v_steps")
 _PIXELS = 2.2e7
-"""Of all pictures together, about: larger images are shown smaller, since a picture takes memory again when it is drawn."""
+"""About as many all pictures have together: larger images are shown smaller, since drawing a picture takes memory again."""
 _PNG_LEVEL = 1  # fast
 _WAIT = 0.005  # s between two looks at a thread
 _SCANNER = "mphdrr_scanner"  # custom property of the mosaic: the collection of the scanner that the run is of
@@ -124,14 +124,14 @@ def showing_again(display: Display, kept: dict[int, NDArray[np.float32]]) -> Gen
     _describe(bpy.data.images[ids.MOSAIC], drawn, numbers, rings, unit, display)
 
 
-def _in_thread(make: Callable[[Progress], Any], said: bool) -> Generator[bool, None, Any]:
-    """What `make` makes in a thread; yields what is `said` meanwhile."""
+def _in_thread(make: Callable[[Progress], Any], is_mosaic_made: bool) -> Generator[bool, None, Any]:
+    """What `make` makes in a thread; yields `is_mosaic_made` meanwhile."""
     worker = jobs.Worker("Colours", make)
     worker.start()
     try:
         while worker.is_alive():
             worker.join(_WAIT)
-            yield said
+            yield is_mosaic_made
     finally:
         worker.cancel.set()
     if worker.error is not None:
@@ -140,7 +140,7 @@ def _in_thread(make: Callable[[Progress], Any], said: bool) -> Generator[bool, N
 
 
 def tiles(image: bpy.types.Image | None) -> dict[str, Any] | None:
-    """Of the mosaic: `numbers` and `rings` of its modules, `unit`, the tiles' size `tile` and their `corners`; else None.
+    """What the mosaic shows: `numbers` and `rings` of its modules, `unit`, size `tile` and `corners` of its tiles; else None.
 
     Rows and columns are counted from the top left. `window` is that of the colours; `totals` are what `summed` says of each
     image, "sum" or "mean", `maxima` their largest numbers, and `half` whether only their middle halves are meant and shown.

@@ -22,7 +22,7 @@ _KEY = (
     "mphdrr_field"  # custom property of a plane: middle and size (5,) of the virtual detector in the camera's frame, mm
 )
 _NEAR = 1e-5  # rounding
-_BETWEEN = 0.3  # of the way from the pinhole to the ROI's surface: where a plane is unless told otherwise
+_BETWEEN = 0.3  # of the way from the pinhole to the ROI's surface: where a plane is by default
 
 
 def make(scene: bpy.types.Scene, run: ProjectionRun, collection: bpy.types.Collection | None) -> list[bpy.types.Object]:

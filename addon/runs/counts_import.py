@@ -20,10 +20,10 @@ from . import rendering, runs
 _OF_FRAMES = ("detector.rows", "detector.columns", "detector.plane", "detector.magnification", "detector.pitch")
 
 
-def importing(context: bpy.types.Context, paths: list[Path], said: Mapping[str, Any]) -> jobs.Job:
+def importing(context: bpy.types.Context, paths: list[Path], given: Mapping[str, Any]) -> jobs.Job:
     """The job that reads measured counts as the run of the scene's scanner.
 
-    `said` are entries of a recipe: of its table ``counts``, the time, the pixel size, the modules. The rest of the model,
+    `given` are entries of a recipe: of its table ``counts``, the time, the pixel size, the modules. The rest of the model,
     such as isotope and aperture, which a reconstruction needs, is the panel's. Raises InputError where there is no scanner.
     """
     if not paths:
@@ -33,7 +33,7 @@ def importing(context: bpy.types.Context, paths: list[Path], said: Mapping[str, 
     recipe = runs.panel_recipe(scene).updated(
         {**dict.fromkeys(_OF_FRAMES), "model.time": None}
         | {"model.kind": "emission", "counts.files": [str(path) for path in paths]}
-        | dict(said)
+        | dict(given)
     )
     system = chosen_modules(scanner.read_scanner(collection), recipe["system.modules"], "modules")
     path, display = rendering.run_path(scene), scene.mphdrr_display.display()

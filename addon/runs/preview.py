@@ -44,7 +44,7 @@ _INTERVAL = 0.02  # s between two looks, while there is something to do
 _REST = 0.3  # s without a change before the picture is made with all pixels
 _SHOWN_PIXELS = 512**2
 _MOST_CAUTIONS = 2
-_PATIENCE = 0.5  # s, after which it is said that a picture takes long
+_PATIENCE = 0.5  # s, after which a line says that a picture takes long
 _OF_MODULE = (
     "numbers", "centers", "pinhole_diameter", "collimator_length", "detector_side", "detector_thickness",
 )  # fmt: skip
@@ -67,7 +67,7 @@ class Request:
 
     def same_as(self, other: "Request | None") -> bool:
         """Whether the other request asks for the same picture."""
-        return other is not None and _told(self) == _told(other)
+        return other is not None and _words(self) == _words(other)
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,7 +174,7 @@ def _corners(views: Views, shape: tuple[int, ...], share: float) -> NDArray[np.f
     )
 
 
-def _told(asked: Request) -> tuple[str, ...]:
+def _words(asked: Request) -> tuple[str, ...]:
     """A request in words that two have in common exactly if they ask for the same."""
     module = [getattr(asked.system, name).tolist() for name in _OF_MODULE]
     sources = [(str(path), pose.tolist()) for path, pose in filter(None, (asked.volume, asked.mu))]
@@ -255,12 +255,12 @@ class Session:
         """What stands beside the picture."""
         waits = "Waits for the running job" if jobs.is_running() else self.late
         if self.problem:
-            said: tuple[str, ...] = ("No preview", self.problem)
+            lines: tuple[str, ...] = ("No preview", self.problem)
         elif self.shown is None:
-            said = ("Preview", "The first picture is being made")
+            lines = ("Preview", "The first picture is being made")
         else:
-            said = (*self.shown.lines, *self.cautions)
-        return (*said, waits) if waits else said
+            lines = (*self.shown.lines, *self.cautions)
+        return (*lines, waits) if waits else lines
 
     @property
     def kept(self) -> str:

@@ -180,7 +180,7 @@ def taken_over(scene: bpy.types.Scene, run: ProjectionRun, volume: bpy.types.Obj
         recipe = run.recipe
     except InputError:
         return {}
-    with contextlib.suppress(InputError):  # what the panel cannot show is said to have changed
+    with contextlib.suppress(InputError):  # what the panel cannot show counts as changed
         _set_physics(scene, recipe)
     state = runs.state_of(run.system, recipe, volume, None)
     if volume is None:

@@ -141,7 +141,7 @@ def volume_to_render(scene: bpy.types.Scene) -> str:
 
 
 def measured_text(scene: bpy.types.Scene) -> str:
-    """What was said of the shown run's counts, where they were measured; else ""."""
+    """What is known of the shown run's counts, where they were measured; else ""."""
     item = shown(scene)
     return str(json.loads(item.state).get("measured", "")) if item is not None and item.state else ""
 
@@ -260,8 +260,8 @@ def _of_modules(collection: bpy.types.Collection | None, old: Mapping[str, Any])
         pairs = {number: values[name] for number, values in changed.items() if name in values}
         if pairs:
             first, *others = set(pairs.values())
-            said = "changed" if others else _now(*first, "mm")
-            yield f"{_modules(list(pairs), count)}: {text.partition(':')[0]} {said}"
+            what = "changed" if others else _now(*first, "mm")
+            yield f"{_modules(list(pairs), count)}: {text.partition(':')[0]} {what}"
     gone = [int(number) for number in old["modules"] if number not in modules]
     if gone:
         yield f"{_modules(gone, count)} {'are' if len(gone) > 1 else 'is'} gone"
@@ -342,7 +342,7 @@ def _same(old: Any, new: Any) -> bool:
 def _now(old: Any, new: Any, unit: str, setting: Setting | None = None) -> str:
     """Two values in words: "60 s, now 30 s"."""
 
-    def said(value: Any, written: Callable[[Any], str]) -> str:
+    def words(value: Any, written: Callable[[Any], str]) -> str:
         if value is None:
             return "all" if setting is not None and setting.absent == "all" else "none"
         if isinstance(value, str):
@@ -350,8 +350,8 @@ def _now(old: Any, new: Any, unit: str, setting: Setting | None = None) -> str:
         if isinstance(value, bool):
             return "on" if value else "off"
         if isinstance(value, list):
-            return ", ".join(said(x, written) for x in value)
+            return ", ".join(words(x, written) for x in value)
         return f"{written(value)} {unit}".strip()
 
-    short, exact = ([said(value, written) for value in (old, new)] for written in ("{:.6g}".format, repr))
+    short, exact = ([words(value, written) for value in (old, new)] for written in ("{:.6g}".format, repr))
     return ", now ".join(short if short[0] != short[1] else exact)

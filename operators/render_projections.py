@@ -86,16 +86,15 @@ class MPHDRR_OT_load_recipe(Reported, ImportHelper, bpy.types.Operator):
         return f"Set the panel as {bpy.path.basename(filepath)} says"
 
 
-class ShowPicture:
+class ShowPicture(Reported):
     """Mix into an operator that shows one of the pictures that are made here."""
 
+    bl_options = set()
     picture = ids.MOSAIC
 
-    def execute(self: Any, context: bpy.types.Context) -> set[str]:
+    def act(self, context: bpy.types.Context) -> None:
         if not images.show_below(bpy.data.images[self.picture], context):
-            self.report({"ERROR"}, "no window with a 3D view to open an Image Editor in")
-            return {"CANCELLED"}
-        return {"FINISHED"}
+            raise InputError("no window with a 3D view to open an Image Editor in")
 
 
 class MPHDRR_OT_show_projections(ShowPicture, bpy.types.Operator):

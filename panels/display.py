@@ -7,7 +7,7 @@ from ..addon.blender import ids
 from ..addon.blender.layouts import draw_all, labelled, shown_where
 from ..addon.pictures import images, tiles
 from ..addon.scanner import selection
-from .geometry import Sidebar
+from .sidebar import Folded, ImagesSidebar
 
 
 class _Display:
@@ -51,9 +51,8 @@ def _draw_totals(layout: bpy.types.UILayout, context: bpy.types.Context) -> None
         row.label(text=f"{value:.6g}", translate=False)
 
 
-class MPHDRR_PT_display(_Display, Sidebar, bpy.types.Panel):
+class MPHDRR_PT_display(_Display, Folded, bpy.types.Panel):
     bl_parent_id = "MPHDRR_PT_projections"
-    bl_options = {"DEFAULT_CLOSED"}
 
     def draw(self, context: bpy.types.Context) -> None:
         super().draw(context)
@@ -68,5 +67,5 @@ class MPHDRR_PT_display(_Display, Sidebar, bpy.types.Panel):
         draw_all(layout, settings, "backgrounds", "plane_opacity")
 
 
-class MPHDRR_PT_display_of_images(_Display, bpy.types.Panel):
-    bl_space_type, bl_region_type, bl_category = "IMAGE_EDITOR", "UI", ids.CATEGORY
+class MPHDRR_PT_display_of_images(_Display, ImagesSidebar, bpy.types.Panel):
+    """Beside the pictures."""

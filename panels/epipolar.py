@@ -6,7 +6,7 @@ from bpy.app.translations import pgettext_iface as iface
 from ..addon.blender import ids
 from ..addon.blender.layouts import draw_all, invoking, labelled, shown_where
 from ..addon.perspective import epipolar
-from .geometry import Sidebar, draw_facts, draw_text
+from .sidebar import ImagesSidebar, Sidebar, draw_facts, draw_text
 
 
 class _Epipolar:
@@ -47,5 +47,5 @@ class MPHDRR_PT_epipolar(_Epipolar, Sidebar, bpy.types.Panel):
     bl_parent_id = "MPHDRR_PT_projections"
 
 
-class MPHDRR_PT_epipolar_of_images(_Epipolar, bpy.types.Panel):
-    bl_space_type, bl_region_type, bl_category = "IMAGE_EDITOR", "UI", ids.CATEGORY
+class MPHDRR_PT_epipolar_of_images(_Epipolar, ImagesSidebar, bpy.types.Panel):
+    """Beside the pictures."""

@@ -5,12 +5,11 @@ import bpy
 from ..addon.blender import ids, jobs
 from ..addon.blender.layouts import draw_all, invoking, labelled
 from ..addon.events import event_notes
-from .geometry import Sidebar, draw_hint, draw_text
+from .sidebar import Folded, draw_hint, draw_text
 
 
-class MPHDRR_PT_event_set(Sidebar, bpy.types.Panel):
+class MPHDRR_PT_event_set(Folded, bpy.types.Panel):
     bl_order = ids.ORDER_EVENTS
-    bl_options = {"DEFAULT_CLOSED"}
 
     def draw(self, context: bpy.types.Context) -> None:
         layout = invoking(labelled(self.layout))

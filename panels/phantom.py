@@ -12,7 +12,7 @@ from ..addon.perspective import frustums
 from ..addon.phantoms import phantom_properties, phantoms
 from ..addon.scanner import selection
 from ..addon.volumes import slices, volumes
-from .geometry import Sidebar, draw_facts, draw_hint, draw_text
+from .sidebar import Folded, Sidebar, draw_facts, draw_hint, draw_text
 
 
 class MPHDRR_PT_phantom(Sidebar, bpy.types.Panel):
@@ -111,9 +111,8 @@ def _draw_phantom(layout: bpy.types.UILayout, item: bpy.types.Object, phantom: A
     column.operator(ids.SHOW_PHANTOM_OUTLINE, text=text, icon="SHADING_WIRE", depress=shown)
 
 
-class MPHDRR_PT_perspective(Sidebar, bpy.types.Panel):
+class MPHDRR_PT_perspective(Folded, bpy.types.Panel):
     bl_parent_id = "MPHDRR_PT_phantom"
-    bl_options = {"DEFAULT_CLOSED"}
 
     def draw(self, context: bpy.types.Context) -> None:
         layout = invoking(labelled(self.layout))

@@ -11,8 +11,8 @@ from ..addon.runs import preview, rendering, runs
 from ..addon.runs.projection_properties import drawn, makes_counts
 from ..addon.scanner import scanner
 from ..addon.volumes import volumes
-from .geometry import Sidebar, draw_hint, draw_text
 from .runs import draw_changes
+from .sidebar import Folded, Sidebar, draw_hint, draw_text
 
 _MAIN = ("time", "photons", "hole", "aperture_points", "pixel_points")
 """Settings of models that the panel itself shows; the others stand under Physics."""
@@ -71,9 +71,8 @@ class MPHDRR_PT_preview(Sidebar, bpy.types.Panel):
         column.label(text=iface("{size} of voxels kept in memory").format(size=session.kept))
 
 
-class MPHDRR_PT_physics(Sidebar, bpy.types.Panel):
+class MPHDRR_PT_physics(Folded, bpy.types.Panel):
     bl_parent_id = "MPHDRR_PT_projections"
-    bl_options = {"DEFAULT_CLOSED"}
 
     poll = shown_where(lambda context: context.scene.mphdrr_projections.model != "INVERSE_SQUARE")
 

@@ -105,7 +105,7 @@ def run_views(scene: bpy.types.Scene) -> RunViews | None:
 
 
 def required_views(scene: bpy.types.Scene) -> RunViews:
-    """As `run_views`; `InputError` where there are none."""
+    """The same as `run_views`; `InputError` where there are none."""
     run = run_views(scene)
     if run is not None:
         return run
@@ -128,7 +128,7 @@ def picked(scene: bpy.types.Scene) -> Picked | None:
 
 
 def shown(scene: bpy.types.Scene) -> tuple[Picked | None, str]:
-    """As `picked`, and what is wrong with the panel's module or pixel; "" where all is good."""
+    """The same as `picked`, and what is wrong with the panel's module or pixel; "" where all is good."""
     try:
         return picked(scene), ""
     except InputError as error:

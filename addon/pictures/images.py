@@ -140,7 +140,7 @@ def _in_thread(make: Callable[[Progress], Any], is_mosaic_made: bool) -> Generat
 
 
 def tiles(image: bpy.types.Image | None) -> dict[str, Any] | None:
-    """What the mosaic shows: `numbers` and `rings` of its modules, `unit`, size `tile` and `corners` of its tiles; else None.
+    """What the mosaic shows: `numbers` and `rings` of its modules, `unit`, the tiles' size `tile` and `corners`; else None.
 
     Rows and columns are counted from the top left. `window` is that of the colours; `totals` are what `summed` says of each
     image, "sum" or "mean", `maxima` their largest numbers, and `half` whether only their middle halves are meant and shown.

@@ -6,12 +6,9 @@ import bpy
 import numpy as np
 from mathutils import Euler
 
+from ..core import Recipe, euler_pose, read_system, run_recipe
 from ..core.example import EULER_DEGREES, EXAMPLE
-from ..core.geometry.frames import euler_pose
 from ..core.progress import Progress, stages_of
-from ..core.runs.recipe import Recipe
-from ..core.runs.run_recipe import run_recipe
-from ..core.workbook import read_system
 from .blender import jobs
 from .figures import studio
 from .phantoms import phantoms

@@ -10,10 +10,8 @@ from ..addon.blender.file_properties import file_property, shown_files
 from ..addon.blender.layouts import draw_all, labelled
 from ..addon.phantoms import phantoms
 from ..addon.phantoms.phantom_properties import FILE, PhantomSettings, identifier, sampling, settings_class
-from ..core.geometry.frames import euler_pose
+from ..core import Phantom, euler_pose, read_phantom
 from ..core.phantoms.kinds import KINDS
-from ..core.phantoms.language import read_phantom
-from ..core.phantoms.phantom import Phantom
 
 
 class AddPhantom(jobs.JobOperator):

@@ -9,10 +9,8 @@ from ..addon.blender import jobs
 from ..addon.blender.reports import Need, Reported, ask_to_remove, needs
 from ..addon.pictures import images
 from ..addon.runs import rendering, runs
-from ..core.errors import InputError
-from ..core.progress import Progress
+from ..core import InputError, Progress, read_run
 from ..core.runs.comparing import difference, difference_sheet
-from ..core.runs.files import read_run
 
 _others: list[tuple[str, str, str]] = []  # Blender keeps no texts of such a list: they must live on here
 

@@ -6,22 +6,15 @@ from typing import Any
 
 import numpy as np
 
+from ...core import Grid, InputError, ProjectionRun, euler_pose, read_phantom, read_recipe, read_system, read_volume
 from ...core.cli.options import add_command, output_path, progress_bar, refuse
-from ...core.errors import InputError
 from ...core.figures.kinds import KINDS, FigureKind, figure_kind
 from ...core.figures.page import SUFFIXES, Page
 from ...core.figures.subject import NEEDS, Subject, require
-from ...core.geometry.frames import euler_pose
-from ...core.geometry.grid import Grid
 from ...core.phantoms.kinds import KINDS as PHANTOMS
-from ...core.phantoms.language import read_phantom
 from ...core.runs.files import FORMATS, read_run
-from ...core.runs.recipe import read_recipe
-from ...core.runs.run import ProjectionRun
 from ...core.runs.run_recipe import phantom_pose, run_recipe
 from ...core.toml import read_toml
-from ...core.volumes.volume_files import read_volume
-from ...core.workbook import read_system
 from .scene import new_scene, quiet
 
 _WORKBOOKS = (".xlsx", ".xlsm")

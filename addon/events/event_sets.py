@@ -11,15 +11,13 @@ import numpy as np
 from mathutils import Matrix
 from numpy.typing import NDArray
 
-from ...core import events
-from ...core.errors import InputError
+from ...core import InputError, ProjectionRun, events
 from ...core.events.folders import SetFolder
 from ...core.events.templates import template_text
 from ...core.example import EXAMPLE
 from ...core.files import write_bytes
 from ...core.memory import readable_size
 from ...core.progress import Progress, stages_of
-from ...core.runs.run import ProjectionRun
 from ..blender import jobs, storage
 from ..figures import studio
 from ..phantoms import phantoms

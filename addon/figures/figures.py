@@ -17,6 +17,7 @@ import numpy as np
 from mathutils import Vector
 from numpy.typing import NDArray
 
+from ...core import Cancelled, PinholeSystem, Progress, read_run
 from ...core.cli.options import output_path
 from ...core.errors import InputError, warn
 from ...core.figures.kinds import KINDS, Studio, figure_kind
@@ -25,10 +26,7 @@ from ...core.figures.parts import heading, heading_height
 from ...core.figures.subject import Subject, require
 from ...core.geometry.collimator import Construction
 from ...core.geometry.module_parts import module_parts
-from ...core.geometry.system import PinholeSystem
-from ...core.progress import Cancelled, Progress
 from ...core.recording import recorded_warnings
-from ...core.runs.files import read_run
 from ...core.runs.resizing import resized
 from ..blender import compat, ids, jobs, storage, timers
 from ..blender.choices import items

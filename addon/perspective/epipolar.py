@@ -11,10 +11,7 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core.errors import InputError
-from ...core.geometry.views import Views
-from ...core.perspective.epipolar import epipolar_segments
-from ...core.perspective.view_rays import points_at_depths, project_points, view_frames
+from ...core import InputError, Views, epipolar_segments, points_at_depths, project_points, view_frames
 from ..blender import ids
 from ..blender.decimals import typed
 from ..pictures import images

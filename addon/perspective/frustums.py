@@ -16,11 +16,8 @@ import numpy as np
 from mathutils import Matrix
 from numpy.typing import NDArray
 
-from ...core.errors import InputError
-from ...core.geometry.views import Views
+from ...core import InputError, PerspectiveGrid, Views, from_perspective, to_perspective
 from ...core.memory import require
-from ...core.perspective.perspective_grid import PerspectiveGrid
-from ...core.perspective.resampling import from_perspective, to_perspective
 from ...core.progress import Progress, Stages, stages_of, tell
 from ...core.runs.mosaic import as_seen, png
 from ...core.runs.run_recipe import recipe_views

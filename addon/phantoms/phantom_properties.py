@@ -18,11 +18,9 @@ from bpy.props import (
     StringProperty,
 )
 
-from ...core.errors import InputError
-from ...core.geometry.grid import Grid
+from ...core import Grid, InputError, Phantom
 from ...core.phantoms.kinds import KINDS, Kind
 from ...core.phantoms.language import parse_phantom
-from ...core.phantoms.phantom import Phantom
 from ...core.volumes.volume import UNITS
 from ..blender import choices
 from ..blender.decimals import typed

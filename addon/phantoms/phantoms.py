@@ -16,12 +16,10 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core.errors import InputError
+from ...core import InputError, Mesh, Phantom
 from ...core.geometry.grid import Grid, grid_around
 from ...core.memory import require
-from ...core.phantoms.phantom import Phantom
 from ...core.progress import Progress, part_of, stages_of
-from ...core.volumes.meshes.mesh import Mesh
 from ..blender import jobs, storage
 from ..blender.objects import remove_objects, set_world_matrix, world_matrix
 from ..blender.reports import Need

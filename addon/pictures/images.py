@@ -13,13 +13,12 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core.geometry.views import Views
+from ...core import ProjectionRun, Views
 from ...core.memory import cores
 from ...core.progress import Progress, tell
 from ...core.runs.display import Display
 from ...core.runs.exr import exr_bytes
 from ...core.runs.mosaic import Sheet, as_seen, labels, png, sheet, smaller
-from ...core.runs.run import ProjectionRun
 from ..blender import ids, jobs
 from ..blender.reports import Need
 from ..blender.windows import areas

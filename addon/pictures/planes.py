@@ -11,9 +11,7 @@ import numpy as np
 from mathutils import Matrix
 from numpy.typing import NDArray
 
-from ...core.geometry.system import PinholeSystem
-from ...core.geometry.views import Views
-from ...core.runs.run import ProjectionRun
+from ...core import PinholeSystem, ProjectionRun, Views
 from ..blender import ids, objects
 from ..scanner import grabbing, scanner, selection
 from . import images

@@ -6,12 +6,11 @@ from typing import Any
 
 import bpy
 
-from ...core.errors import InputError
+from ...core import InputError, ProjectionRun
 from ...core.geometry.system import chosen_modules
 from ...core.progress import Progress, stages_of
 from ...core.runs.measured import recipe_counts
 from ...core.runs.mosaic import caption
-from ...core.runs.run import ProjectionRun
 from ..blender import jobs
 from ..pictures import images
 from ..scanner import scanner

@@ -16,16 +16,11 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core.errors import InputError
-from ...core.geometry.system import PinholeSystem
-from ...core.geometry.views import Views
+from ...core import InputError, PinholeSystem, ProjectionRun, Recipe, Views, Volume
 from ...core.memory import readable_size
 from ...core.runs.display import Display
 from ...core.runs.mosaic import as_seen, sized, totals
-from ...core.runs.recipe import Recipe
-from ...core.runs.run import ProjectionRun
 from ...core.runs.run_recipe import recipe_model, recipe_views, run_recipe
-from ...core.volumes.volume import Volume
 from ..blender import jobs, timers, windows
 from ..phantoms import phantoms
 from ..pictures import planes

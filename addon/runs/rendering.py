@@ -13,17 +13,15 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
+from ...core import ProjectionRun, Recipe, read_recipe, read_run, write_run
 from ...core.errors import InputError, warn
 from ...core.geometry.system import chosen_modules
 from ...core.memory import require
 from ...core.progress import Progress, Stages, stages_of
 from ...core.projector import Model
 from ...core.runs.display import Display
-from ...core.runs.files import read_run, write_run
 from ...core.runs.mosaic import caption
 from ...core.runs.projecting import warn_of_energy
-from ...core.runs.recipe import Recipe, read_recipe
-from ...core.runs.run import ProjectionRun
 from ...core.runs.run_recipe import recipe_model, run_recipe, with_phantom
 from ...core.volumes.volume import require_quantity
 from ..blender import ids, jobs, storage, timers

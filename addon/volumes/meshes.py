@@ -7,13 +7,11 @@ import numpy as np
 from mathutils import Matrix
 from numpy.typing import NDArray
 
+from ...core import Progress, volume_to_mesh, voxelize_mesh
 from ...core.errors import InputError, naming
 from ...core.geometry.grid import grid_around
 from ...core.memory import require
-from ...core.progress import Progress
 from ...core.volumes.meshes.mesh import Mesh, require_closed
-from ...core.volumes.meshes.surface import volume_to_mesh
-from ...core.volumes.meshes.voxelization import voxelize_mesh
 from ...core.volumes.volume import UNITS, Volume
 from ..blender import jobs
 from ..blender.objects import world_matrix

@@ -14,8 +14,7 @@ import numpy as np
 from mathutils import Vector
 from numpy.typing import NDArray
 
-from ...core.errors import InputError
-from ...core.volumes.volume import Volume
+from ...core import InputError, Volume
 from ..blender.compat import add_node, blank_material
 from ..blender.objects import link_beside, remove_objects
 from . import looks, vdb, volume_materials, volumes

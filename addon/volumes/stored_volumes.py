@@ -10,10 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ...core.errors import InputError
+from ...core import Grid, InputError, Volume
 from ...core.geometry.frames import checked_affine
-from ...core.geometry.grid import Grid
-from ...core.volumes.volume import Volume
 from ..blender import compat, ids
 from . import volume_materials
 from .vdb import BACKGROUND, write_vdb

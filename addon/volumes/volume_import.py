@@ -6,11 +6,9 @@ from typing import Any
 
 import bpy
 
+from ...core import Volume, centered, hu_to_mu
 from ...core.memory import require
-from ...core.physics.ct_numbers import hu_to_mu
 from ...core.progress import Progress, part_of
-from ...core.volumes.rearranging import centered
-from ...core.volumes.volume import Volume
 from ...core.volumes.volume_files import READ_FORMATS, read_volume
 from ..blender import jobs, storage
 from . import vdb, volumes

@@ -14,11 +14,10 @@ import numpy as np
 from mathutils import Matrix
 from numpy.typing import ArrayLike, NDArray
 
-from ...core.errors import InputError
+from ...core import InputError, Volume
 from ...core.geometry.frames import checked_affine
 from ...core.memory import readable_size
 from ...core.progress import Progress, stages_of
-from ...core.volumes.volume import Volume
 from ..blender import compat, ids, jobs, storage
 from ..blender.objects import world_matrix
 from ..blender.reports import Need

@@ -1,6 +1,7 @@
 """``mphdrr figure KIND FILE … -o PICTURE``; only the figures that are rendered, and a .blend, need Blender."""
 
 import argparse
+import contextlib
 from pathlib import Path
 from typing import Any
 
@@ -172,9 +173,13 @@ def _read(arguments: argparse.Namespace, file: str, scanner: Any) -> dict[str, A
 
 
 def _of_run(run: ProjectionRun) -> dict[str, Any]:
-    found = {"scanner": run.system, "volume": run.volume, "run": run, "name": str(run.settings.get("volume", ""))}
-    try:
-        placed = any(key.startswith("phantom.") for key in run.recipe.given)
-        return {**found, "pose": phantom_pose(run.recipe) if placed else None}
-    except InputError:  # of version 0.1.0, which keeps no recipe
-        return {**found, "pose": None}
+    found: dict[str, Any] = {
+        "scanner": run.system,
+        "volume": run.volume,
+        "run": run,
+        "name": str(run.settings.get("volume", "")),
+    }
+    with contextlib.suppress(InputError):  # of version 0.1.0, which keeps no recipe
+        if any(key.startswith("phantom.") for key in run.recipe.given):
+            found["pose"] = phantom_pose(run.recipe)
+    return {"pose": None, **found}

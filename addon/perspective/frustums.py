@@ -17,6 +17,7 @@ from mathutils import Matrix
 from numpy.typing import NDArray
 
 from ...core import InputError, PerspectiveGrid, Views, from_perspective, to_perspective
+from ...core.geometry.frames import affine_matrix
 from ...core.memory import require
 from ...core.progress import Progress, Stages, stages_of, tell
 from ...core.runs.mosaic import as_seen, png
@@ -300,10 +301,8 @@ def _build(
         layer = objects.picture_empty(text, frustum, picture, "DOUBLE_SIDED")
         layer.empty_display_size = max(n_u, n_v)
         across, up = origin - along_u, along_v - origin  # a picture's columns go against u, as the pinhole sees it
-        matrix = np.eye(4)
-        matrix[:3, 0], matrix[:3, 1] = across / n_u, up / n_v
-        matrix[:3, 2] = np.cross(across, up) / np.linalg.norm(np.cross(across, up))
-        matrix[:3, 3] = (along_u + along_v) / 2
+        normal = np.cross(across, up) / np.linalg.norm(np.cross(across, up))
+        matrix = affine_matrix(np.column_stack([across / n_u, up / n_v, normal]), (along_u + along_v) / 2)
         layer.hide_select, layer.matrix_basis = True, Matrix(matrix)
         home.objects.link(layer)
 

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core import InputError, Mesh, Phantom
+from ...core.geometry.frames import affine_matrix
 from ...core.geometry.grid import Grid, grid_around
 from ...core.memory import require
 from ...core.progress import Progress, part_of, stages_of
@@ -71,8 +72,7 @@ class Recipe:
         stored = []
         for quantity, pose in zip(quantities, poses, strict=True):
             if baked:
-                place = np.eye(4)
-                place[:3, 3] = pose[:3, 3]
+                place = affine_matrix(np.eye(3), pose[:3, 3])
                 # A grid along the world's axes that holds the phantom, with voxels as small as its own.
                 corners = list(itertools.product(*zip(*self.phantom.box, strict=True))) @ pose[:3, :3].T + pose[:3, 3]
                 grid = grid_around(corners, min(Grid(self.grid.shape, pose @ self.grid.affine).spacing))

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ...core import ProjectionRun, Views
 from ...core.memory import cores
-from ...core.progress import Progress, tell
+from ...core.progress import Progress, part_of, tell
 from ...core.runs.display import Display
 from ...core.runs.exr import exr_bytes
 from ...core.runs.mosaic import Sheet, as_seen, labels, png, sheet, smaller
@@ -49,10 +49,9 @@ class Pictures:
 
 def pictures(run: ProjectionRun, display: Display, progress: Progress | None = None) -> Pictures:
     """Make the contents of a run's images; leaves bpy alone. `progress` counts the files."""
-    count = 2 * len(run.views)
-    exact = _in_threads(exr_bytes, as_seen(run.projections), progress, 0, count)
+    exact = _in_threads(exr_bytes, as_seen(run.projections), part_of(progress, 0, 2))
     rings = run.system.rings().tolist()
-    colored = _colored(run.projections, display, progress, count // 2)
+    colored = _colored(run.projections, display, part_of(progress, 1, 2))
     return Pictures(display, exact, colored, *_mosaic(run.projections, labels(run), rings, run.unit, display))
 
 
@@ -193,17 +192,11 @@ def projection_name(number: int, numbers: list[int]) -> str:
     return ids.projection_name(number, max(numbers))
 
 
-def _colored(
-    projections: NDArray[np.float32], display: Display, progress: Progress | None = None, done: int = 0
-) -> list[bytes]:
-    """The pictures of projections (M, n_v, n_u) in one window, as PNG files; `progress` counts them after those `done`."""
+def _colored(projections: NDArray[np.float32], display: Display, progress: Progress | None = None) -> list[bytes]:
+    """The pictures of projections (M, n_v, n_u) in one window, as PNG files; `progress` counts them."""
     window = display.window(projections)
-
-    def file(picture: NDArray[np.float32]) -> bytes:
-        return png(display.colored(picture, window), _PNG_LEVEL)
-
     shown = smaller(as_seen(display.part(projections)), _PIXELS)
-    return _in_threads(file, shown, progress, done, done + len(shown))
+    return _in_threads(lambda picture: png(display.colored(picture, window), _PNG_LEVEL), shown, progress)
 
 
 def _mosaic(
@@ -214,15 +207,13 @@ def _mosaic(
     return png(drawn.picture, _PNG_LEVEL), drawn
 
 
-def _in_threads(
-    make: Callable[[Any], bytes], pictures: NDArray[np.float32], progress: Progress | None, done: int, total: int
-) -> list[bytes]:
+def _in_threads(make: Callable[[Any], bytes], pictures: NDArray[np.float32], progress: Progress | None) -> list[bytes]:
     """What `make` makes of each picture."""
     files: list[bytes] = []
     with ThreadPoolExecutor(cores()) as pool:
         for file in pool.map(make, pictures):
             files.append(file)
-            tell(progress, done + len(files), total)
+            tell(progress, len(files), len(pictures))
     return files
 
 

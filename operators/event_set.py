@@ -35,14 +35,12 @@ class MPHDRR_OT_try_event(jobs.JobOperator, bpy.types.Operator):
 
     bl_label = "Another Phantom of the Recipe"
 
-    recipe: RECIPE  # type: ignore[valid-type]
-    number: NEXT  # type: ignore[valid-type]
-    folder: FOLDER  # type: ignore[valid-type]
+    recipe: RECIPE
+    number: NEXT
+    folder: FOLDER
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        return event_sets.trying(
-            context, *map(self.given_or(context.scene.mphdrr_events), ("recipe", "number", "folder"))
-        )
+        return event_sets.trying(context, *self.given(context.scene.mphdrr_events, "recipe", "number", "folder"))
 
 
 class MPHDRR_OT_make_event_set(jobs.JobOperator, bpy.types.Operator):
@@ -50,12 +48,12 @@ class MPHDRR_OT_make_event_set(jobs.JobOperator, bpy.types.Operator):
     on from there the next time
     """
 
-    recipe: RECIPE  # type: ignore[valid-type]
-    folder: FOLDER  # type: ignore[valid-type]
-    count: COUNT  # type: ignore[valid-type]
+    recipe: RECIPE
+    folder: FOLDER
+    count: COUNT
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        return event_sets.making(*map(self.given_or(context.scene.mphdrr_events), ("recipe", "folder", "count")))
+        return event_sets.making(*self.given(context.scene.mphdrr_events, "recipe", "folder", "count"))
 
 
 class MPHDRR_OT_open_event(jobs.JobOperator, bpy.types.Operator):
@@ -63,11 +61,9 @@ class MPHDRR_OT_open_event(jobs.JobOperator, bpy.types.Operator):
     with its settings, hidden, and its projections as a run
     """
 
-    folder: FOLDER  # type: ignore[valid-type]
-    opened: OPENED  # type: ignore[valid-type]
-    model: MODEL  # type: ignore[valid-type]
+    folder: FOLDER
+    opened: OPENED
+    model: MODEL
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        return event_sets.opening(
-            context, *map(self.given_or(context.scene.mphdrr_events), ("folder", "opened", "model"))
-        )
+        return event_sets.opening(context, *self.given(context.scene.mphdrr_events, "folder", "opened", "model"))

@@ -35,7 +35,7 @@ class MPHDRR_OT_import_counts(jobs.JobOperator, bpy.types.Operator):
     asks_for = "filepath"
 
     filepath: file_property("With the counts")
-    directory: DIRECTORY  # type: ignore[valid-type]
+    directory: DIRECTORY
     files: files_property("With counts, if several: their frames follow each other in the order of the names")
     filter_glob: shown_files(COUNTS_FORMATS)
     frames: StringProperty(

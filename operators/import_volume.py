@@ -99,7 +99,7 @@ class MPHDRR_OT_import_volume_sequence(ReadVolumes, bpy.types.Operator):
 
     asks_for = "files"
 
-    directory: DIRECTORY  # type: ignore[valid-type]
+    directory: DIRECTORY
     files: files_property("Of one volume for each frame")
     filter_glob: shown_files(_STATES)
     name: StringProperty(name="Name", description="Empty: what the files' have in common", options={"SKIP_SAVE"})

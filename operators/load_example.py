@@ -4,7 +4,7 @@ import bpy
 
 from ..addon import example
 from ..addon.blender import jobs
-from ..addon.blender.reports import needs
+from ..addon.blender.reports import Reported, needs
 from ..core.example import EXAMPLE
 
 
@@ -17,7 +17,7 @@ class MPHDRR_OT_load_example(jobs.JobOperator, bpy.types.Operator):
         return example.example_job(context)
 
 
-class MPHDRR_OT_browse_example(bpy.types.Operator):
+class MPHDRR_OT_browse_example(Reported, bpy.types.Operator):
     """Choose the bundled workbook, a scanner of 80 modules in 4 rings"""
 
     bl_label = "Example Workbook"
@@ -25,7 +25,6 @@ class MPHDRR_OT_browse_example(bpy.types.Operator):
 
     poll = needs((lambda context: getattr(context.space_data, "type", "") == "FILE_BROWSER", "Only in a file browser"))
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
+    def act(self, context: bpy.types.Context) -> None:
         params = context.space_data.params
         params.directory, params.filename = bytes(EXAMPLE.parent), EXAMPLE.name
-        return {"FINISHED"}

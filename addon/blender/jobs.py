@@ -25,7 +25,7 @@ from ...core.errors import InputError
 from ...core.progress import Cancelled, Progress, StagedProgress
 from ...core.recording import recorded_warnings
 from . import ids, storage
-from .reports import warnings_reported
+from .reports import Reported, warnings_reported
 from .windows import redraw_sidebars
 
 _INTERVAL = 0.1  # s between two looks at the thread, and between two drawings of how far it is
@@ -227,6 +227,10 @@ class JobOperator:
         """The job, from the operator's and the scene's settings; raises InputError."""
         raise NotImplementedError
 
+    def given(self, panel: bpy.types.PropertyGroup, *names: str) -> list[Any]:
+        """The values of settings: each that of the operator where it is given, else the panel's."""
+        return list(map(self.given_or(panel), names))
+
     def given_or(self, panel: bpy.types.PropertyGroup) -> Callable[[str], Any]:
         """What gives a setting by its name: that of the operator where it is given, else the panel's."""
         return lambda name: getattr(self if self.properties.is_property_set(name) else panel, name)
@@ -419,7 +423,7 @@ class ExportJob(JobOperator, ExportHelper):
         return True
 
 
-class MPHDRR_OT_cancel_job(bpy.types.Operator):
+class MPHDRR_OT_cancel_job(Reported, bpy.types.Operator):
     """Stop a job, or take it out of the queue; the scene stays as it was"""
 
     bl_label = "Cancel"
@@ -427,25 +431,23 @@ class MPHDRR_OT_cancel_job(bpy.types.Operator):
 
     number: IntProperty(name="Job", description="Its number; 0: the running one", options={"HIDDEN", "SKIP_SAVE"})
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
+    def act(self, context: bpy.types.Context) -> None:
         """Ask it to stop at its next step."""
         for worker in filter(None, (_current, *_waiting)):
             if self.number == worker.number or (self.number == 0 and worker is _current):
                 worker.cancel.set()
-        return {"FINISHED"}
 
 
-class MPHDRR_OT_finish_job(bpy.types.Operator):
+class MPHDRR_OT_finish_job(Reported, bpy.types.Operator):
     """End the running job after the step that it is at, and keep what it has made so far"""
 
     bl_label = "Finish Now"
     bl_options = {"INTERNAL"}
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
+    def act(self, context: bpy.types.Context) -> None:
         """Ask it to come to its end."""
         if _current is not None and _current.enough is not None:
             _current.enough.set()
-        return {"FINISHED"}
 
 
 def draw_job(layout: bpy.types.UILayout) -> None:

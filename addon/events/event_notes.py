@@ -1,5 +1,7 @@
 """What the Event Set panel says of a recipe and of a set: read by threads, so that no file keeps the window waiting."""
 
+import contextlib
+import functools
 import threading
 import time
 from collections.abc import Callable
@@ -36,7 +38,6 @@ _Stamp = tuple[Any, ...]  # by which a file that has changed is read again
 NOTHING = Note("")
 _UNKNOWN: tuple[_Stamp | None, Note] = None, Note("Reading …")
 _known: dict[Path, tuple[_Stamp, Note]] = {}
-_stamps: dict[Path, tuple[float, _Stamp]] = {}
 _readers: dict[Path, threading.Thread] = {}
 
 
@@ -60,8 +61,8 @@ def models(folder: str) -> tuple[str, ...]:
 
 def stop() -> None:
     """Forget everything: the extension is disabled."""
-    for known in (_known, _stamps, _readers):
-        known.clear()
+    _known.clear()
+    _readers.clear()
 
 
 def _recipe_note(path: Path) -> Note:
@@ -113,18 +114,17 @@ def _read(path: Path, stamp: _Stamp, read: Callable[[Path], Note]) -> None:
 def _stamp(path: Path) -> _Stamp:
     """The dates of a file or folder and of what lies in it. Panels are drawn often: looks at the disk are 2 s apart."""
     now = time.monotonic()
-    looked, stamp = _stamps.get(path, (-_LOOK, ()))
-    if bpy.app.background or now - looked >= _LOOK:
-        found = []
-        for item in (path, path / RECIPE, path / INDEX, path / EVENTS, path / SHARDS):
-            try:
-                state = item.stat()
-            except OSError:
-                continue
+    return _stamp_at(path, now if bpy.app.background else now // _LOOK)
+
+
+@functools.lru_cache(maxsize=64)
+def _stamp_at(path: Path, now: float) -> _Stamp:
+    found = []
+    for item in (path, path / RECIPE, path / INDEX, path / EVENTS, path / SHARDS):
+        with contextlib.suppress(OSError):
+            state = item.stat()
             found.append((state.st_mtime_ns, state.st_size))
-        stamp = tuple(found)
-        _stamps[path] = now, stamp
-    return stamp
+    return tuple(found)
 
 
 def _watch() -> float | None:

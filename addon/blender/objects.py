@@ -77,7 +77,8 @@ def home(scene: bpy.types.Scene, name: str) -> bpy.types.Collection:
 
 def remove_empty_homes(scene: bpy.types.Scene, name: str) -> None:
     """Remove those of a scene's `homes` that hold nothing any more."""
-    bpy.data.batch_remove([home for home in homes(scene, name) if not home.all_objects])
+    for empty in [home for home in homes(scene, name) if not home.all_objects]:
+        bpy.data.collections.remove(empty)
 
 
 def link_beside(item: bpy.types.Object, other: bpy.types.Object) -> None:

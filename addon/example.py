@@ -6,14 +6,10 @@ import bpy
 import numpy as np
 from mathutils import Euler
 
-from ..core.geometry.frames import euler_pose
+from ..core import Recipe, euler_pose, read_system, run_recipe
+from ..core.example import EULER_DEGREES, EXAMPLE
 from ..core.progress import Progress, stages_of
-from ..core.runs.files import write_run
-from ..core.runs.recipe import Recipe
-from ..core.runs.run_recipe import run_recipe
-from ..core.workbook import read_system
 from .blender import jobs
-from .cli.demo import EULER_DEGREES, EXAMPLE
 from .figures import studio
 from .phantoms import phantoms
 from .phantoms.phantom_properties import plain_settings
@@ -40,9 +36,7 @@ def example_job(context: bpy.types.Context) -> jobs.Job:
         stages = stages_of(progress)
         stored = adding.work(progress)
         (run,) = run_recipe(recipe, system, stored[0].volume, stages=stages)
-        stages("writing the run file")
-        write_run(run, path)
-        return stored, run, images.pictures(run, display, stages("packing"))
+        return stored, run, rendering.kept(run, path, display, stages)
 
     def finish(result: Any) -> jobs.Finishing:
         stored, run, made = result

@@ -25,7 +25,7 @@ from ..core.geometry.system import LENGTHS
 from .blender import choices, ids
 from .blender.updates import FUNCTIONS, on_edit
 from .events import event_properties
-from .perspective import epipolar_properties, perspective_properties
+from .perspective import perspective_properties
 from .phantoms import phantom_properties
 from .pictures import display_properties
 from .reconstruction import reconstruction_properties
@@ -52,7 +52,7 @@ LABELS = {
     name: f"{_SHORT.get(name, name.split('_')[-1].capitalize())} {text.partition(':')[0]}"
     for name, text in LENGTHS.items()
 }
-"""Of the lengths, short enough for the sidebar: "Hole d"."""
+"""The lengths' names, short enough for the sidebar: "Hole d"."""
 _SEES_ROI = 1 - 1e-6  # of R: an `l` from the ROI sees R up to rounding
 
 
@@ -221,20 +221,12 @@ class GeometryProperties(bpy.types.PropertyGroup):
     )  # fmt: skip
 
 
+_ROOMS = (
+    phantom_properties, projection_properties, reconstruction_properties, display_properties,
+    perspective_properties, event_properties, column_maps,
+)  # fmt: skip
 # Every property group; a group comes after those that it points to.
-CLASSES = (
-    ModuleProperties,
-    ScannerProperties,
-    GeometryProperties,
-    *phantom_properties.CLASSES,
-    *projection_properties.CLASSES,
-    *reconstruction_properties.CLASSES,
-    *display_properties.CLASSES,
-    *epipolar_properties.CLASSES,
-    *perspective_properties.CLASSES,
-    *event_properties.CLASSES,
-    *column_maps.CLASSES,
-)
+CLASSES = (ModuleProperties, ScannerProperties, GeometryProperties, *(cls for room in _ROOMS for cls in room.CLASSES))
 
 # (Blender type, attribute name, group): `registration.py` attaches a `PointerProperty` of the group to the type.
 POINTERS = (
@@ -245,7 +237,7 @@ POINTERS = (
     (bpy.types.Scene, "mphdrr_projections", projection_properties.ProjectionProperties),
     (bpy.types.Scene, "mphdrr_reconstruction", reconstruction_properties.ReconstructionProperties),
     (bpy.types.Scene, "mphdrr_display", display_properties.DisplayProperties),
-    (bpy.types.Scene, "mphdrr_epipolar", epipolar_properties.EpipolarProperties),
+    (bpy.types.Scene, "mphdrr_epipolar", perspective_properties.EpipolarProperties),
     (bpy.types.Scene, "mphdrr_perspective", perspective_properties.PerspectiveProperties),
     (bpy.types.Scene, "mphdrr_events", event_properties.EventProperties),
     (bpy.types.WindowManager, "mphdrr_columns", column_maps.ColumnMapProperties),

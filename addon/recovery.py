@@ -9,7 +9,8 @@ from ..core.errors import InputError, warn
 from ..core.progress import Progress, part_of
 from .blender import jobs, storage
 from .phantoms import phantoms
-from .volumes import maps, volumes
+from .scanner import maps
+from .volumes import volumes
 
 
 def missing(scene: bpy.types.Scene) -> tuple[list[bpy.types.Object], list[bpy.types.Object]]:
@@ -54,7 +55,6 @@ def what_to_do(others: list[bpy.types.Object]) -> str:
     return f"{', '.join(item.name for item in others)}: find the voxel files in a folder, or import again"
 
 
-@bpy.app.handlers.persistent
 def after_load(*_: Any) -> None:
     """Say which files are missing, and what to do."""
     for scene in bpy.data.scenes:

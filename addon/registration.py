@@ -13,16 +13,16 @@ import bpy
 from .. import operators, panels
 from ..operators import add_phantom
 from . import preferences, properties, recovery
-from .blender import ids, jobs, plots, storage, updates
+from .blender import ids, jobs, plots, storage, timers, updates
 from .blender.layouts import invoking
 from .events import event_notes
 from .figures import figures
-from .perspective import epipolar_drawing, frustums
+from .perspective import color_bar, epipolar_drawing, frustums
 from .phantoms import live_phantoms
 from .pictures import planes, recoloring, tiles
 from .runs import preview, rendering, run_notes, runs
 from .scanner import following, framing, live_scanner, scanner, selection, sight_lines
-from .volumes import color_bar, slices, volumes
+from .volumes import slices, volumes
 
 
 def _classes(module: ModuleType) -> list[Any]:
@@ -101,7 +101,7 @@ _UNDONE = (recoloring.check, runs.after_update, live_scanner.after_undo, slices.
 _UPDATED = (live_scanner.after_update, selection.after_update, planes.after_update, frustums.after_update)
 _LOADED = (volumes.after_load, recovery.after_load, live_scanner.after_load, runs.after_load, recoloring.check)
 _FRAME = (runs.after_update, live_scanner.after_frame, preview.after_update, slices.after_frame_change)
-# By lists of bpy.app.handlers: decorate the functions with @bpy.app.handlers.persistent.
+# By lists of bpy.app.handlers; all of them stay when a file is loaded.
 _HANDLERS: dict[str, tuple[Any, ...]] = {
     "load_pre": (jobs.stop, slices.before_load, preview.stop, framing.forget),
     "load_post": _LOADED,
@@ -116,7 +116,11 @@ _HANDLERS: dict[str, tuple[Any, ...]] = {
     "save_post": (storage.after_save,),
     "save_post_fail": (storage.restore_paths,),
 }
-HANDLERS = tuple((getattr(bpy.app.handlers, name), each) for name, group in _HANDLERS.items() for each in group)
+HANDLERS = tuple(
+    (getattr(bpy.app.handlers, name), bpy.app.handlers.persistent(each))
+    for name, group in _HANDLERS.items()
+    for each in group
+)
 
 # What is drawn over Blender's editors, in a window.
 DRAWINGS = (
@@ -128,7 +132,14 @@ DRAWINGS = (
     (bpy.types.SpaceView3D, epipolar_drawing.draw_in_scene, "POST_VIEW"),
 )
 
-# What edited properties call (`addon/blender/updates.py`).
+
+def _modules_removed(scene: bpy.types.Scene, modules: list[bpy.types.Object]) -> None:
+    """Remove what a scene shows of modules: their projections, and the volumes as they see them."""
+    planes.remove(scene, modules)
+    frustums.remove(scene, modules)
+
+
+# What edited properties and rooms below call (`addon/blender/updates.py`).
 UPDATES: dict[str, Callable[..., None]] = {
     "module": following.refresh_module,
     "length": following.length_typed,
@@ -146,6 +157,7 @@ UPDATES: dict[str, Callable[..., None]] = {
     "planes": planes.update,
     "epipolar": epipolar_drawing.redraw,
     "active_run": rendering.active_run_changed,
+    "modules_removed": _modules_removed,
 }
 
 _registered = ExitStack()  # takes back what was registered, in reverse order
@@ -156,10 +168,7 @@ def register(command: Callable[..., int] | None = None) -> None:
     updates.FUNCTIONS.update(UPDATES)
     try:
         for cls in CLASSES:
-            if issubclass(cls, bpy.types.Operator):
-                cls.bl_idname = vars(cls).get("bl_idname", ids.operator_name(cls.__name__))
-                if cls.__doc__ is not None:
-                    cls.bl_description = " ".join(cls.__doc__.split())  # Blender would keep line breaks and indentation
+            _complete(cls)
             bpy.utils.register_class(cls)
             _registered.callback(bpy.utils.unregister_class, cls)
         for owner, name, group in properties.POINTERS:
@@ -190,10 +199,20 @@ def register(command: Callable[..., int] | None = None) -> None:
         atexit.register(unregister)
 
 
+def _complete(cls: Any) -> None:
+    """Give a class what follows from its name and its docstring, where it does not say another."""
+    if cls.__name__.startswith("MPHDRR_"):
+        cls.bl_label = getattr(cls, "bl_label", ids.label(cls.__name__))
+    if issubclass(cls, bpy.types.Operator):
+        cls.bl_idname = vars(cls).get("bl_idname", ids.operator_name(cls.__name__))
+        if cls.__doc__ is not None:
+            cls.bl_description = " ".join(cls.__doc__.split())  # Blender would keep line breaks and indentation
+
+
 def unregister() -> None:
     """Take back what `register` did."""
     atexit.unregister(unregister)
-    for module in (jobs, preview, live_scanner, live_phantoms, runs, plots, recoloring, event_notes):
+    for module in (jobs, preview, live_scanner, plots, recoloring, event_notes, timers):
         module.stop()
     _registered.close()
 

@@ -163,8 +163,8 @@ def in_the_scanner(system: mph.PinholeSystem, folder: Path, ct: mph.Volume | Non
     from mphdrr.addon.blender import jobs
     from mphdrr.addon.cli.scene import new_scene, quiet
     from mphdrr.addon.figures import figures
-    from mphdrr.addon.scanner import scanner
-    from mphdrr.addon.volumes import maps, slices, volumes
+    from mphdrr.addon.scanner import maps, scanner
+    from mphdrr.addon.volumes import slices, volumes
 
     with tempfile.TemporaryDirectory() as demo:
         cli.main(["demo", "--output", demo])

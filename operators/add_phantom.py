@@ -6,13 +6,12 @@ import bpy
 from bpy.props import BoolProperty, FloatProperty, FloatVectorProperty, StringProperty
 
 from ..addon.blender import jobs, storage
-from ..addon.blender.layouts import labelled
+from ..addon.blender.file_properties import file_property, shown_files
+from ..addon.blender.layouts import draw_all, labelled
 from ..addon.phantoms import phantoms
 from ..addon.phantoms.phantom_properties import FILE, PhantomSettings, identifier, sampling, settings_class
-from ..core.geometry.frames import euler_pose
+from ..core import Phantom, euler_pose, read_phantom
 from ..core.phantoms.kinds import KINDS
-from ..core.phantoms.language import read_phantom
-from ..core.phantoms.phantom import Phantom
 
 
 class AddPhantom(jobs.JobOperator):
@@ -34,9 +33,7 @@ class AddPhantom(jobs.JobOperator):
         row.enabled = self.quantity == "activity"
         row.prop(self, "attenuation")
         layout.column(align=True).prop(self, "location")
-        column = layout.column(align=True)
-        for angle in ("phi", "theta", "psi"):
-            column.prop(self, angle)
+        draw_all(layout.column(align=True), self, "phi", "theta", "psi")
 
     def adding(self: Any, name: str) -> jobs.Job:
         pose = euler_pose(self.phi, self.theta, self.psi, self.location)
@@ -69,11 +66,9 @@ ADD_KINDS = tuple(
 class MPHDRR_OT_import_phantom(PhantomSettings, AddPhantom, bpy.types.Operator):
     """Add the phantom that a TOML file describes as a volume; its text becomes one of the .blend"""
 
-    bl_label = "Import Phantom"
-
     __annotations__ = {
-        "filepath": StringProperty(description="Phantom to read", subtype="FILE_PATH", options={"SKIP_SAVE"}),
-        "filter_glob": StringProperty(default="*.toml", options={"HIDDEN"}),
+        "filepath": file_property("Phantom to read"),
+        "filter_glob": shown_files((".toml",)),
         "name": StringProperty(name="Name", description="Of the object; empty: the phantom's", options={"SKIP_SAVE"}),
         **sampling(),
     }

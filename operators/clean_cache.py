@@ -9,7 +9,6 @@ from ..addon.blender.reports import Reported, needs
 class MPHDRR_OT_clean_cache(Reported, bpy.types.Operator):
     """Delete compiled code; it is made again when it is needed"""
 
-    bl_label = "Clean Cache"
     bl_options = {"INTERNAL"}
 
     poll = needs((lambda context: preferences.cache_size() > 0, "The cache is empty"))

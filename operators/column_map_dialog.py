@@ -6,7 +6,7 @@ import textwrap
 import bpy
 from bpy.app.translations import pgettext_iface as iface
 
-from ..addon.blender.layouts import labelled
+from ..addon.blender.layouts import draw_all, labelled
 from ..addon.scanner.column_maps import ColumnMapProperties, ColumnMapQuantity
 from ..core.workbook.quantities import DERIVED, QUANTITIES
 
@@ -20,8 +20,7 @@ def draw(layout: bpy.types.UILayout, form: ColumnMapProperties) -> None:
     """Draw the settings, and below them what is read with them."""
     _lines(layout, json.loads(form.doubts or "[]"), "INFO")
     row = layout.row()
-    row.prop(form, "n_tables")
-    row.prop(form, "unit")
+    draw_all(row, form, "n_tables", "unit")
     _tables(layout, form)
     compared = [quantity for quantity in form.quantities if quantity.name in DERIVED]
     split = layout.split(factor=0.6) if compared else layout
@@ -39,13 +38,10 @@ def _tables(layout: bpy.types.UILayout, form: ColumnMapProperties) -> None:
         one = i > 0 and table.rows == "ONE_FOR_ALL"
         box.label(text=iface("Table {number}" if i else "Table {number}: pinholes").format(number=i + 1))
         column = box.column(align=True)
-        column.prop(table, "sheet")
-        column.prop(table, "header_row")
-        column.prop(table, "first_row")
+        draw_all(column, table, "sheet", "header_row", "first_row")
         rest = column.column(align=True)
         rest.enabled = not one
-        for name in ("last_row", "skip_rows", "number"):
-            rest.prop(table, name)
+        draw_all(rest, table, "last_row", "skip_rows", "number")
         if i > 0:
             column.prop(table, "rows")
 

@@ -20,7 +20,6 @@ class MPHDRR_FH_workbook(_Dropped, bpy.types.FileHandler):
 
 
 class MPHDRR_FH_phantom(_Dropped, bpy.types.FileHandler):
-    bl_label = "Phantom"
     bl_import_operator = ids.IMPORT_PHANTOM
     bl_file_extensions = ".toml"
 

@@ -21,8 +21,6 @@ class _EditPhantom(jobs.JobOperator):
 class MPHDRR_OT_update_phantom(_EditPhantom, bpy.types.Operator):
     """Make the active phantom's voxels again from its settings; its place stays"""
 
-    bl_label = "Update Phantom"
-
 
 class MPHDRR_OT_apply_phantom_pose(_EditPhantom, bpy.types.Operator):
     """Make the active phantom's voxels again on a grid along the world's axes; its settings are given up"""

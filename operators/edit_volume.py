@@ -6,14 +6,12 @@ from bpy.props import FloatProperty, StringProperty
 from ..addon import recovery
 from ..addon.blender import jobs, storage
 from ..addon.blender.decimals import typed
-from ..addon.blender.reports import Reported, needs
+from ..addon.blender.reports import Reported, ask_to_remove, needs
 from ..addon.volumes import slices, volume_import, volumes
 
 
 class MPHDRR_OT_add_slices(Reported, bpy.types.Operator):
     """Show an axial, a coronal and a sagittal slice of the active volume as planes that go with it"""
-
-    bl_label = "Add Slices"
 
     poll = needs(volumes.ACTIVE)
 
@@ -21,17 +19,13 @@ class MPHDRR_OT_add_slices(Reported, bpy.types.Operator):
         return f"Added {len(slices.add_slices(context.object))} slices"
 
 
-class MPHDRR_OT_remove_slices(bpy.types.Operator):
+class MPHDRR_OT_remove_slices(Reported, bpy.types.Operator):
     """Remove the active volume's slice planes"""
-
-    bl_label = "Remove Slices"
-    bl_options = {"REGISTER", "UNDO"}
 
     poll = needs(volumes.ACTIVE)
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
+    def act(self, context: bpy.types.Context) -> None:
         slices.remove_slices(context.object)
-        return {"FINISHED"}
 
 
 def _is_ct(context: bpy.types.Context) -> bool:
@@ -64,10 +58,8 @@ class MPHDRR_OT_clean_volume_files(Reported, bpy.types.Operator):
         unused = storage.unused_volumes()
         if not unused:
             return self.execute(context)
-        return context.window_manager.invoke_confirm(
-            self, event, title=f"Remove {storage.summary(unused)}?", confirm_text="Remove", icon="WARNING",
-            message="Neither Undo nor other .blend files that use this folder will find them again.",
-        )  # fmt: skip
+        message = "Neither Undo nor other .blend files that use this folder will find them again."
+        return ask_to_remove(self, context, event, f"Remove {storage.summary(unused)}?", message)
 
     def act(self, context: bpy.types.Context) -> str:
         return storage.remove_unused()

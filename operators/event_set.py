@@ -1,10 +1,11 @@
 """Event sets: a recipe written and tried on the phantom in the scene, a set made as a job, an event opened in the scene."""
 
 import bpy
-from bpy.props import EnumProperty, StringProperty
+from bpy.props import EnumProperty
 from bpy_extras.io_utils import ExportHelper
 
 from ..addon.blender import choices, jobs
+from ..addon.blender.file_properties import shown_files
 from ..addon.blender.reports import Reported
 from ..addon.events import event_sets
 from ..addon.events.event_properties import COUNT, FOLDER, MODEL, NEXT, OPENED, RECIPE
@@ -16,10 +17,8 @@ class MPHDRR_OT_new_event_recipe(Reported, ExportHelper, bpy.types.Operator):
     example's where there is none
     """
 
-    bl_label = "New Event Recipe"
-
     filename_ext = ".toml"
-    filter_glob: StringProperty(default="*.toml", options={"HIDDEN"})
+    filter_glob: shown_files((".toml",))
     like: EnumProperty(
         name="Like", description="What the recipe begins with",
         items=choices.items({}, ((name, name.capitalize(), text) for name, text in TEMPLATES.items())),
@@ -36,14 +35,12 @@ class MPHDRR_OT_try_event(jobs.JobOperator, bpy.types.Operator):
 
     bl_label = "Another Phantom of the Recipe"
 
-    recipe: RECIPE  # type: ignore[valid-type]
-    number: NEXT  # type: ignore[valid-type]
-    folder: FOLDER  # type: ignore[valid-type]
+    recipe: RECIPE
+    number: NEXT
+    folder: FOLDER
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        return event_sets.trying(
-            context, *map(self.given_or(context.scene.mphdrr_events), ("recipe", "number", "folder"))
-        )
+        return event_sets.trying(context, *self.given(context.scene.mphdrr_events, "recipe", "number", "folder"))
 
 
 class MPHDRR_OT_make_event_set(jobs.JobOperator, bpy.types.Operator):
@@ -51,14 +48,12 @@ class MPHDRR_OT_make_event_set(jobs.JobOperator, bpy.types.Operator):
     on from there the next time
     """
 
-    bl_label = "Make Event Set"
-
-    recipe: RECIPE  # type: ignore[valid-type]
-    folder: FOLDER  # type: ignore[valid-type]
-    count: COUNT  # type: ignore[valid-type]
+    recipe: RECIPE
+    folder: FOLDER
+    count: COUNT
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        return event_sets.making(*map(self.given_or(context.scene.mphdrr_events), ("recipe", "folder", "count")))
+        return event_sets.making(*self.given(context.scene.mphdrr_events, "recipe", "folder", "count"))
 
 
 class MPHDRR_OT_open_event(jobs.JobOperator, bpy.types.Operator):
@@ -66,13 +61,9 @@ class MPHDRR_OT_open_event(jobs.JobOperator, bpy.types.Operator):
     with its settings, hidden, and its projections as a run
     """
 
-    bl_label = "Open Event"
-
-    folder: FOLDER  # type: ignore[valid-type]
-    opened: OPENED  # type: ignore[valid-type]
-    model: MODEL  # type: ignore[valid-type]
+    folder: FOLDER
+    opened: OPENED
+    model: MODEL
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        return event_sets.opening(
-            context, *map(self.given_or(context.scene.mphdrr_events), ("folder", "opened", "model"))
-        )
+        return event_sets.opening(context, *self.given(context.scene.mphdrr_events, "folder", "opened", "model"))

@@ -3,10 +3,11 @@
 from pathlib import Path
 
 import bpy
-from bpy.props import BoolProperty, EnumProperty, StringProperty
+from bpy.props import BoolProperty, EnumProperty
 
 from ..addon.blender import jobs, storage
 from ..addon.blender.decimals import typed
+from ..addon.blender.file_properties import file_property, shown_files
 from ..addon.blender.reports import needs
 from ..addon.scanner import scanner, scanner_files, selection
 from ..addon.scanner.scanner_files import WORKBOOK_SUFFIXES
@@ -22,9 +23,9 @@ class MPHDRR_OT_export_geometry(jobs.ExportJob, bpy.types.Operator):
 
     poll = needs(selection.SCANNER)
 
-    filename_ext = ".xlsx"
-    filepath: StringProperty(name="File", description="Workbook to write", subtype="FILE_PATH", options={"SKIP_SAVE"})
-    filter_glob: StringProperty(default=";".join(f"*{s}" for s in WORKBOOK_SUFFIXES), options={"HIDDEN"})
+    endings = WORKBOOK_SUFFIXES
+    filepath: file_property("Workbook to write")
+    filter_glob: shown_files(WORKBOOK_SUFFIXES)
     use_template: BoolProperty(
         name="Keep Workbook",
         description="Write into a copy of the workbook that the scanner was imported from: its other sheets, formulas, "
@@ -39,13 +40,6 @@ class MPHDRR_OT_export_geometry(jobs.ExportJob, bpy.types.Operator):
             path = storage.absolute(workbook)
             self.filepath = str(path.with_stem(f"{path.stem.removesuffix('-edited')}-edited"))
         return super().ask(context)
-
-    def check(self, context: bpy.types.Context) -> bool:
-        """Add the default suffix to a name without one."""
-        if Path(self.filepath).suffix.lower() in WORKBOOK_SUFFIXES:
-            return False
-        self.filepath += self.filename_ext
-        return True
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
         path = self.given_file("set filepath to a name ending in .xlsx")
@@ -62,11 +56,8 @@ class MPHDRR_OT_export_for_program(jobs.ExportJob, bpy.types.Operator):
 
     poll = needs(selection.SCANNER)
 
-    filename_ext = ""
-    filepath: StringProperty(
-        name="File", description="File to write, or new folder for formats of several files", subtype="FILE_PATH",
-        options={"SKIP_SAVE"},
-    )  # fmt: skip
+    endings = ("",)
+    filepath: file_property("File to write, or new folder for formats of several files")
     format: EnumProperty(name="Format", description="What is written", items=_FORMATS)
 
     def check(self, context: bpy.types.Context) -> bool:

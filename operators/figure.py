@@ -1,11 +1,10 @@
 """File > Export > mphDRR Figure: a picture as papers show it, of what is in the scene."""
 
-from pathlib import Path
-
 import bpy
 from bpy.props import BoolProperty, EnumProperty, IntProperty, StringProperty
 
 from ..addon.blender import jobs
+from ..addon.blender.file_properties import file_property, shown_files
 from ..addon.blender.reports import Need, needs
 from ..addon.figures import figures
 from ..addon.scanner import scanner
@@ -20,14 +19,14 @@ _SHOWN: Need = (
 )
 
 
-class MPHDRR_OT_export_figure(jobs.JobOperator, bpy.types.Operator):
+class MPHDRR_OT_export_figure(jobs.ExportJob, bpy.types.Operator):
     """Draw a figure of the scanner, the volume or the last projections as PNG, or as SVG whose labels are text"""
 
-    bl_label = "Export Figure"
     bl_options = set()
 
-    filepath: StringProperty(name="File", description="File to write", subtype="FILE_PATH", options={"SKIP_SAVE"})
-    filter_glob: StringProperty(default=";".join(f"*{suffix}" for suffix in SUFFIXES), options={"HIDDEN"})
+    endings = SUFFIXES
+    filepath: file_property("File to write")
+    filter_glob: shown_files(SUFFIXES)
     figure: EnumProperty(name="Figure", description="What is shown", items=figures.KIND_ITEMS, default="SCANNER")
     width: IntProperty(name="Width", **_PIXELS)
     height: IntProperty(name="Height", **_PIXELS)
@@ -46,15 +45,7 @@ class MPHDRR_OT_export_figure(jobs.JobOperator, bpy.types.Operator):
         if self.filepath:
             return None
         self.filepath = f"figure{SUFFIXES[0]}"
-        context.window_manager.fileselect_add(self)
-        return {"RUNNING_MODAL"}
-
-    def check(self, context: bpy.types.Context) -> bool:
-        """Give a name without one of the suffixes the first."""
-        if Path(self.filepath).suffix.lower() in SUFFIXES:
-            return False
-        self.filepath += SUFFIXES[0]
-        return True
+        return super().ask(context)
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
         path = self.given_file(f"set filepath to a name ending in {' or '.join(SUFFIXES)}")

@@ -5,7 +5,6 @@ from typing import Any
 import bpy
 from bpy.props import (
     BoolProperty,
-    CollectionProperty,
     EnumProperty,
     FloatProperty,
     IntVectorProperty,
@@ -14,16 +13,17 @@ from bpy.props import (
 
 from ..addon.blender import choices, jobs, storage
 from ..addon.blender.decimals import typed
-from ..addon.blender.layouts import labelled
+from ..addon.blender.file_properties import DIRECTORY, file_property, files_property, shown_files
+from ..addon.blender.layouts import draw_all, labelled
 from ..addon.runs import counts_import
 from ..core.runs.frame_files import COUNTS_FORMATS, RAW_TYPES
 from ..core.runs.orientations import ORIENTATIONS
 
-_UNSAID = "UNSAID"
+_NONE = "UNSAID"
 
 
 def _items(words: Any, text: str) -> choices.Items:
-    return choices.items({}, [(_UNSAID, "Not Said", text), *words])
+    return choices.items({}, [(_NONE, "Not Said", text), *words])
 
 
 class MPHDRR_OT_import_counts(jobs.JobOperator, bpy.types.Operator):
@@ -34,13 +34,10 @@ class MPHDRR_OT_import_counts(jobs.JobOperator, bpy.types.Operator):
     bl_label = "Import Measured Counts"
     asks_for = "filepath"
 
-    filepath: StringProperty(name="File", description="With the counts", subtype="FILE_PATH", options={"SKIP_SAVE"})
-    directory: StringProperty(description="Where the files are", subtype="DIR_PATH", options={"SKIP_SAVE"})
-    files: CollectionProperty(
-        description="With counts, if several: their frames follow each other in the order of the names",
-        type=bpy.types.OperatorFileListElement, options={"SKIP_SAVE"},
-    )  # fmt: skip
-    filter_glob: StringProperty(default=";".join(f"*{ending}" for ending in COUNTS_FORMATS), options={"HIDDEN"})
+    filepath: file_property("With the counts")
+    directory: DIRECTORY
+    files: files_property("With counts, if several: their frames follow each other in the order of the names")
+    filter_glob: shown_files(COUNTS_FORMATS)
     frames: StringProperty(
         name="Frames", description="Which module each frame is of: the modules' numbers in the frames' order, such as 1-80, "
         "80-1 or 3,1,2; none for a frame that is not used, none*80 for 80 of them",
@@ -49,8 +46,8 @@ class MPHDRR_OT_import_counts(jobs.JobOperator, bpy.types.Operator):
         name="Orientation",
         description="How a frame, as a picture with row 0 at the top, lies on the crystal: seen from which side, with which "
         "of the module's axes at the top",
-        items=_items([(word, *said) for word, said in ORIENTATIONS.items()], "Nothing is imported until it is said"),
-        default=_UNSAID,
+        items=_items([(word, *words) for word, words in ORIENTATIONS.items()], "Nothing is imported until it is said"),
+        default=_NONE,
     )
     time: FloatProperty(
         name="Time (s)", description="Exposure of the frames in seconds; 0: not said", default=0.0, min=0.0,
@@ -66,7 +63,7 @@ class MPHDRR_OT_import_counts(jobs.JobOperator, bpy.types.Operator):
     dataset: StringProperty(name="Array", description="Its name in .npz and .h5. Empty: the only one of three axes")
     raw_type: EnumProperty(
         name="Type", description="Of the numbers in a raw file",
-        items=_items([(name, name, "") for name in RAW_TYPES], "The file is not raw"), default=_UNSAID,
+        items=_items([(name, name, "") for name in RAW_TYPES], "The file is not raw"), default=_NONE,
     )  # fmt: skip
     raw_shape: IntVectorProperty(
         name="Shape", description="Frames, rows and columns of a raw file", size=3, default=(0, 0, 0), min=0
@@ -75,29 +72,24 @@ class MPHDRR_OT_import_counts(jobs.JobOperator, bpy.types.Operator):
 
     def draw(self, context: bpy.types.Context) -> None:
         layout = labelled(self.layout)
-        for name in ("frames", "orientation", "time"):
-            layout.prop(self, name)
-        column = layout.column(heading="If Needed")
-        for name in ("modules", "pixel", "expected", "dataset"):
-            column.prop(self, name)
-        column = layout.column(heading="Raw File")
-        for name in ("raw_type", "raw_shape", "raw_big_endian"):
-            column.prop(self, name)
+        draw_all(layout, self, "frames", "orientation", "time")
+        draw_all(layout.column(heading="If Needed"), self, "modules", "pixel", "expected", "dataset")
+        draw_all(layout.column(heading="Raw File"), self, "raw_type", "raw_shape", "raw_big_endian")
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
         names = sorted({item.name for item in self.files if item.name})
         folder = storage.absolute(self.directory)
         paths = [folder / name for name in names] if len(names) > 1 else [storage.absolute(self.filepath)]
-        return counts_import.importing(context, paths if self.filepath or names else [], self._said())
+        return counts_import.importing(context, paths if self.filepath or names else [], self._given())
 
-    def _said(self) -> dict[str, Any]:
+    def _given(self) -> dict[str, Any]:
         """The entries of a recipe that are given; None for the others."""
         return {
             "counts.frames": self.frames or None,
-            "counts.orientation": None if self.orientation == _UNSAID else [self.orientation],
+            "counts.orientation": None if self.orientation == _NONE else [self.orientation],
             "counts.expected": self.expected or None,
             "counts.dataset": self.dataset or None,
-            "counts.raw_type": None if self.raw_type == _UNSAID else self.raw_type,
+            "counts.raw_type": None if self.raw_type == _NONE else self.raw_type,
             "counts.raw_shape": tuple(self.raw_shape) if any(self.raw_shape) else None,
             "counts.raw_big_endian": self.raw_big_endian or None,
             "model.time": typed(self.time) or None,

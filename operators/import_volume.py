@@ -7,11 +7,12 @@ from pathlib import Path
 from typing import Any
 
 import bpy
-from bpy.props import BoolProperty, CollectionProperty, EnumProperty, FloatProperty, IntProperty, StringProperty
+from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, StringProperty
 
 from ..addon.blender import choices, jobs, storage
 from ..addon.blender.decimals import typed
-from ..addon.blender.layouts import labelled
+from ..addon.blender.file_properties import DIRECTORY, file_property, files_property, shown_files
+from ..addon.blender.layouts import draw_all, labelled
 from ..addon.volumes.volume_import import READ_ENDINGS, importing, name_of
 from ..core.errors import InputError
 from ..core.volumes.volume import UNITS
@@ -60,14 +61,11 @@ class ReadVolumes(jobs.JobOperator):
 
     def draw(self: Any, context: bpy.types.Context) -> None:
         layout = labelled(self.layout)
-        for name in (*self.own_names, "quantity", "center", "attenuation"):
-            layout.prop(self, name)
+        draw_all(layout, self, *self.own_names, "quantity", "center", "attenuation")
         row = layout.row()
         row.enabled = self.attenuation
         row.prop(self, "energy")
-        column = layout.column(heading="OpenVDB", align=True)
-        column.prop(self, "grid")
-        column.prop(self, "unit")
+        draw_all(layout.column(heading="OpenVDB", align=True), self, "grid", "unit")
 
     def importing(self, paths: Sequence[Path], name: str, frame_start: int = 1) -> jobs.Job:
         return importing(
@@ -85,13 +83,10 @@ class ReadVolumes(jobs.JobOperator):
 class MPHDRR_OT_import_volume(ReadVolumes, bpy.types.Operator):
     """Read a CT, an image or an OpenVDB grid as a volume to project; of a DICOM series choose the folder"""
 
-    bl_label = "Import Volume"
     asks_for = "filepath"
 
-    filepath: StringProperty(
-        name="File", description="Or folder of a DICOM series", subtype="FILE_PATH", options={"SKIP_SAVE"}
-    )
-    filter_glob: StringProperty(default=";".join(f"*{ending}" for ending in READ_ENDINGS), options={"HIDDEN"})
+    filepath: file_property("Or folder of a DICOM series")
+    filter_glob: shown_files(READ_ENDINGS)
     name: StringProperty(name="Name", description="The object's name. Empty: the file's", options={"SKIP_SAVE"})
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
@@ -102,14 +97,11 @@ class MPHDRR_OT_import_volume(ReadVolumes, bpy.types.Operator):
 class MPHDRR_OT_import_volume_sequence(ReadVolumes, bpy.types.Operator):
     """Read several files, in the order of their numbers, as one volume that plays over the frames"""
 
-    bl_label = "Import Volume Sequence"
     asks_for = "files"
 
-    directory: StringProperty(description="Where the files are", subtype="DIR_PATH", options={"SKIP_SAVE"})
-    files: CollectionProperty(
-        description="Of one volume for each frame", type=bpy.types.OperatorFileListElement, options={"SKIP_SAVE"}
-    )
-    filter_glob: StringProperty(default=";".join(f"*{ending}" for ending in _STATES), options={"HIDDEN"})
+    directory: DIRECTORY
+    files: files_property("Of one volume for each frame")
+    filter_glob: shown_files(_STATES)
     name: StringProperty(name="Name", description="Empty: what the files' have in common", options={"SKIP_SAVE"})
     frame_start: IntProperty(name="First Frame", description="Frame that shows the first file", default=1)
 

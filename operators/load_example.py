@@ -4,14 +4,12 @@ import bpy
 
 from ..addon import example
 from ..addon.blender import jobs
-from ..addon.blender.reports import needs
-from ..addon.cli.demo import EXAMPLE
+from ..addon.blender.reports import Reported, needs
+from ..core.example import EXAMPLE
 
 
 class MPHDRR_OT_load_example(jobs.JobOperator, bpy.types.Operator):
     """Load the bundled scanner of 80 modules with a Derenzo phantom, and show what every module sees of it"""
-
-    bl_label = "Load Example"
 
     poll = needs((lambda context: not jobs.is_running(), "Another job is running: wait for it or cancel it"))
 
@@ -19,7 +17,7 @@ class MPHDRR_OT_load_example(jobs.JobOperator, bpy.types.Operator):
         return example.example_job(context)
 
 
-class MPHDRR_OT_browse_example(bpy.types.Operator):
+class MPHDRR_OT_browse_example(Reported, bpy.types.Operator):
     """Choose the bundled workbook, a scanner of 80 modules in 4 rings"""
 
     bl_label = "Example Workbook"
@@ -27,7 +25,6 @@ class MPHDRR_OT_browse_example(bpy.types.Operator):
 
     poll = needs((lambda context: getattr(context.space_data, "type", "") == "FILE_BROWSER", "Only in a file browser"))
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
+    def act(self, context: bpy.types.Context) -> None:
         params = context.space_data.params
         params.directory, params.filename = bytes(EXAMPLE.parent), EXAMPLE.name
-        return {"FINISHED"}

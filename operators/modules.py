@@ -7,10 +7,9 @@ from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty
 
 from ..addon.blender import jobs
 from ..addon.blender.decimals import typed
-from ..addon.blender.reports import needs
-from ..addon.scanner import following, module_edits, scanner, selection
+from ..addon.blender.reports import ask_to_remove, needs
+from ..addon.scanner import following, maps, module_edits, scanner, selection
 from ..addon.scanner.scanner_parts import modules_text
-from ..addon.volumes import maps
 
 
 class MPHDRR_OT_show_modules(selection.OnScanner, bpy.types.Operator):
@@ -156,10 +155,8 @@ class MPHDRR_OT_remove_scanner(selection.OnScanner, bpy.types.Operator):
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         collection = scanner.required_scanner(context.scene)
         n = len(scanner.modules(collection))
-        return context.window_manager.invoke_confirm(
-            self, event, title=f"Remove '{collection.name}'?", message=f"With its {n} modules; your own objects stay",
-            confirm_text="Remove", icon="WARNING",
-        )  # fmt: skip
+        message = f"With its {n} modules; your own objects stay"
+        return ask_to_remove(self, context, event, f"Remove '{collection.name}'?", message)
 
     def change(self, context: bpy.types.Context, collection: bpy.types.Collection) -> str:
         name = collection.name

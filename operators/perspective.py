@@ -22,10 +22,8 @@ class MPHDRR_OT_show_in_perspective(_InPerspective, bpy.types.Operator):
     the module; the settings are what the panel says now, unless a script gives others
     """
 
-    bl_label = "Show in Perspective"
-
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        return frustums.showing(context, *map(self.given_or(context.scene.mphdrr_perspective), ("planes", "uniform")))
+        return frustums.showing(context, *self.given(context.scene.mphdrr_perspective, "planes", "uniform"))
 
 
 class MPHDRR_OT_resample_in_perspective(_InPerspective, bpy.types.Operator):
@@ -36,13 +34,11 @@ class MPHDRR_OT_resample_in_perspective(_InPerspective, bpy.types.Operator):
     bl_label = "Volume Through Module"
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        return frustums.resampling(context, *map(self.given_or(context.scene.mphdrr_perspective), ("cells", "uniform")))
+        return frustums.resampling(context, *self.given(context.scene.mphdrr_perspective, "cells", "uniform"))
 
 
 class MPHDRR_OT_clear_perspective(Reported, bpy.types.Operator):
     """Remove all volumes in perspective, of all modules"""
-
-    bl_label = "Clear Perspective"
 
     poll = needs((lambda context: frustums.frustums(context.scene), "No volume is shown in perspective"))
 

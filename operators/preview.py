@@ -12,8 +12,6 @@ from ..addon.volumes import volumes
 class MPHDRR_OT_live_preview(bpy.types.Operator):
     """Show in the 3D views what the active module sees, made again while it, the phantom or a number changes; again: stop"""
 
-    bl_label = "Live Preview"
-
     _can_start = needs(
         (lambda context: not bpy.app.background, "Needs a window"),
         selection.SCANNER,

@@ -10,12 +10,14 @@ from bpy_extras.io_utils import ImportHelper
 
 from ..addon.blender import choices, ids, jobs, storage
 from ..addon.blender.decimals import typed
+from ..addon.blender.file_properties import shown_files
 from ..addon.blender.reports import Reported, needs
-from ..addon.pictures import images, tiles
+from ..addon.pictures import images
 from ..addon.runs import rendering, runs
 from ..addon.runs.projection_properties import OPENING_ANGLE, ProjectionSettings, settings_recipe, use_preset
 from ..addon.scanner import scanner
 from ..core.errors import InputError
+from ..core.runs.files import FORMATS
 from ..core.runs.presets import PRESETS
 
 
@@ -23,8 +25,6 @@ class MPHDRR_OT_render_projections(ProjectionSettings, jobs.JobOperator, bpy.typ
     """Project the volume into every module: exact line integrals or SPECT counts, stored as images and as a file beside
     the .blend. The settings are what the panel says now, unless a script gives others
     """
-
-    bl_label = "Render Projections"
 
     volume: StringProperty(name="Volume", description="Name of the volume object to project", options={"SKIP_SAVE"})
     mu: StringProperty(
@@ -54,13 +54,12 @@ class MPHDRR_OT_render_projections(ProjectionSettings, jobs.JobOperator, bpy.typ
         return self.given_or(scene.mphdrr_projections)(name)
 
 
-class MPHDRR_OT_use_preset(bpy.types.Operator):
+class MPHDRR_OT_use_preset(Reported, bpy.types.Operator):
     """Count photons, with isotope, aperture and crystal chosen together; time, noise, attenuation and the detector's own
     blur stay as they are
     """
 
     bl_label = "Physics Preset"
-    bl_options = {"REGISTER", "UNDO"}
 
     preset: EnumProperty(
         name="Preset",
@@ -68,9 +67,8 @@ class MPHDRR_OT_use_preset(bpy.types.Operator):
         items=choices.items({}, ((each.name, each.label, each.text) for each in PRESETS.values())),
     )
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
+    def act(self, context: bpy.types.Context) -> None:
         use_preset(context.scene.mphdrr_projections, self.preset)
-        return {"FINISHED"}
 
 
 class MPHDRR_OT_load_recipe(Reported, ImportHelper, bpy.types.Operator):
@@ -78,9 +76,7 @@ class MPHDRR_OT_load_recipe(Reported, ImportHelper, bpy.types.Operator):
     scene has objects of their names, volumes. By default the recipe of the last run
     """
 
-    bl_label = "Load Recipe"
-
-    filter_glob: StringProperty(default="*.toml;*.h5;*.hdf5;*.npz;*.pt", options={"HIDDEN"})
+    filter_glob: shown_files((".toml", *FORMATS))
 
     def act(self, context: bpy.types.Context) -> str:
         filepath = self.filepath or context.scene.mphdrr_projections.run_file
@@ -90,46 +86,21 @@ class MPHDRR_OT_load_recipe(Reported, ImportHelper, bpy.types.Operator):
         return f"Set the panel as {bpy.path.basename(filepath)} says"
 
 
-class ShowPicture:
+class ShowPicture(Reported):
     """Mix into an operator that shows one of the pictures that are made here."""
 
+    bl_options = set()
     picture = ids.MOSAIC
 
-    def execute(self: Any, context: bpy.types.Context) -> set[str]:
+    def act(self, context: bpy.types.Context) -> None:
         if not images.show_below(bpy.data.images[self.picture], context):
-            self.report({"ERROR"}, "no window with a 3D view to open an Image Editor in")
-            return {"CANCELLED"}
-        return {"FINISHED"}
+            raise InputError("no window with a 3D view to open an Image Editor in")
 
 
 class MPHDRR_OT_show_projections(ShowPicture, bpy.types.Operator):
     """Show the mosaic of the last run in an Image Editor, opened below the 3D view if there is none"""
 
-    bl_label = "Show Projections"
-
     poll = needs(images.PROJECTED)
-
-
-def _shows_mosaic(context: bpy.types.Context) -> bool:
-    space = context.space_data
-    return space is not None and space.type == "IMAGE_EDITOR" and images.tiles(space.image) is not None
-
-
-class MPHDRR_OT_pick_module(bpy.types.Operator):
-    """Make the module active whose image in the mosaic is clicked"""
-
-    bl_label = "Pick Module"
-    bl_options = {"UNDO", "INTERNAL"}
-
-    poll = needs((_shows_mosaic, "Only in an Image Editor that shows the mosaic"))
-
-    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
-        try:
-            picked = tiles.pick(context, event.mouse_region_x, event.mouse_region_y)
-        except InputError as error:
-            self.report({"WARNING"}, str(error))
-            return {"CANCELLED"}
-        return {"PASS_THROUGH"} if picked is None else {"FINISHED"}
 
 
 class MPHDRR_OT_export_dataset(jobs.ExportJob, bpy.types.Operator):
@@ -138,20 +109,13 @@ class MPHDRR_OT_export_dataset(jobs.ExportJob, bpy.types.Operator):
     bl_label = "Export mphDRR Dataset"
     bl_options = set()
 
-    filename_ext = ".h5"
-    filter_glob: StringProperty(default="*.h5;*.hdf5;*.npz;*.pt", options={"HIDDEN"})
+    endings = FORMATS
+    filter_glob: shown_files(FORMATS)
 
     def draw(self, context: bpy.types.Context) -> None:
         """Beside the file browser: where the run is not of the scene as it is now."""
         for line in runs.change_lines(context.scene):
             self.layout.label(text=line, icon="ERROR")
-
-    def check(self, context: bpy.types.Context) -> bool:
-        """Give a name without suffix the default one; the other formats' suffixes stay."""
-        if Path(self.filepath).suffix:
-            return False
-        self.filepath += self.filename_ext
-        return True
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
         return rendering.exporting(context.scene, self.filepath)

@@ -6,13 +6,11 @@ import bpy
 from bpy.props import EnumProperty, IntProperty
 
 from ..addon.blender import jobs
-from ..addon.blender.reports import Need, Reported, needs
+from ..addon.blender.reports import Need, Reported, ask_to_remove, needs
 from ..addon.pictures import images
 from ..addon.runs import rendering, runs
-from ..core.errors import InputError
-from ..core.progress import Progress
+from ..core import InputError, Progress, read_run
 from ..core.runs.comparing import difference, difference_sheet
-from ..core.runs.files import read_run
 
 _others: list[tuple[str, str, str]] = []  # Blender keeps no texts of such a list: they must live on here
 
@@ -30,7 +28,6 @@ _LISTED: Need = (lambda context: context.scene.mphdrr_projections.runs, "No runs
 class MPHDRR_OT_show_run(jobs.JobOperator, bpy.types.Operator):
     """Show a run of the list: its images, the mosaic and the planes in the scene. Modules and volumes stay as they are"""
 
-    bl_label = "Show Run"
     bl_options = {"REGISTER", "UNDO", "INTERNAL"}  # a click in the list
 
     poll = needs(_LISTED)
@@ -45,18 +42,14 @@ class MPHDRR_OT_show_run(jobs.JobOperator, bpy.types.Operator):
 class MPHDRR_OT_remove_run(Reported, bpy.types.Operator):
     """Remove a run from the list, and its file from the disk if it is in this .blend's own folder"""
 
-    bl_label = "Remove Run"
-
     poll = needs(_LISTED)
 
     index: IntProperty(name="Index", description="Place of the run in the list, from 0", min=0, options={"SKIP_SAVE"})
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         item = _required_run(context.scene, self.index)
-        return context.window_manager.invoke_confirm(
-            self, event, title=f"Remove {item.name!r} ({runs.size_text([item])})?", confirm_text="Remove", icon="WARNING",
-            message="Neither Undo nor the .blend as it was saved will find its file again.",
-        )  # fmt: skip
+        message = "Neither Undo nor the .blend as it was saved will find its file again."
+        return ask_to_remove(self, context, event, f"Remove {item.name!r} ({runs.size_text([item])})?", message)
 
     def act(self, context: bpy.types.Context) -> str:
         _required_run(context.scene, self.index)
@@ -75,8 +68,6 @@ class MPHDRR_OT_compare_runs(jobs.JobOperator, bpy.types.Operator):
     """Draw the shown run minus another one, of the same modules, pixels and unit, as a mosaic: white where they are equal,
     red where the shown one has more, blue where it has less
     """
-
-    bl_label = "Compare Runs"
 
     poll = needs(_LISTED)
 

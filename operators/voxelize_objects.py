@@ -42,7 +42,6 @@ class MPHDRR_OT_voxelize_objects(jobs.JobOperator, bpy.types.Operator):
 class MPHDRR_OT_mesh_from_volume(jobs.JobOperator, bpy.types.Operator):
     """Make a closed mesh of the active volume's surface of one value, for display and print"""
 
-    bl_label = "Mesh from Volume"
     dialog = {"confirm_text": "Make"}
 
     level: FloatProperty(

@@ -10,7 +10,8 @@ from ..addon.blender import ids, jobs
 from ..addon.blender.layouts import invoking, labelled
 from ..addon.properties import LABELS
 from ..addon.scanner import following, scanner, selection
-from .geometry import ScannerPanel, draw_facts, draw_text
+from .geometry import ScannerPanel
+from .sidebar import draw_facts, draw_text
 
 _MOST_FINDINGS = 8
 

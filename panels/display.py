@@ -4,10 +4,10 @@ import bpy
 from bpy.app.translations import pgettext_iface as iface
 
 from ..addon.blender import ids
-from ..addon.blender.layouts import labelled, shown_where
+from ..addon.blender.layouts import draw_all, labelled, shown_where
 from ..addon.pictures import images, tiles
 from ..addon.scanner import selection
-from .geometry import Sidebar
+from .sidebar import Folded, ImagesSidebar
 
 
 class _Display:
@@ -20,8 +20,7 @@ class _Display:
     def draw(self, context: bpy.types.Context) -> None:
         layout = labelled(self.layout)  # type: ignore[attr-defined]
         settings = context.scene.mphdrr_display
-        layout.prop(settings, "colors")
-        layout.prop(settings, "scale")
+        draw_all(layout, settings, "colors", "scale")
         layout.prop(settings, "automatic", text="Automatic Window")
         column = layout.column(align=True)
         column.active = not settings.automatic
@@ -52,9 +51,8 @@ def _draw_totals(layout: bpy.types.UILayout, context: bpy.types.Context) -> None
         row.label(text=f"{value:.6g}", translate=False)
 
 
-class MPHDRR_PT_display(_Display, Sidebar, bpy.types.Panel):
+class MPHDRR_PT_display(_Display, Folded, bpy.types.Panel):
     bl_parent_id = "MPHDRR_PT_projections"
-    bl_options = {"DEFAULT_CLOSED"}
 
     def draw(self, context: bpy.types.Context) -> None:
         super().draw(context)
@@ -66,9 +64,8 @@ class MPHDRR_PT_display(_Display, Sidebar, bpy.types.Panel):
         distance = column.row()
         distance.active = not settings.plane_at_detector
         distance.prop(settings, "plane_distance")
-        layout.prop(settings, "backgrounds")
-        layout.prop(settings, "plane_opacity")
+        draw_all(layout, settings, "backgrounds", "plane_opacity")
 
 
-class MPHDRR_PT_display_of_images(_Display, bpy.types.Panel):
-    bl_space_type, bl_region_type, bl_category = "IMAGE_EDITOR", "UI", ids.CATEGORY
+class MPHDRR_PT_display_of_images(_Display, ImagesSidebar, bpy.types.Panel):
+    """Beside the pictures."""

@@ -4,9 +4,9 @@ import bpy
 from bpy.app.translations import pgettext_iface as iface
 
 from ..addon.blender import ids
-from ..addon.blender.layouts import invoking, labelled, shown_where
+from ..addon.blender.layouts import draw_all, invoking, labelled, shown_where
 from ..addon.perspective import epipolar
-from .geometry import Sidebar, draw_facts, draw_text
+from .sidebar import ImagesSidebar, Sidebar, draw_facts, draw_text
 
 
 class _Epipolar:
@@ -26,10 +26,7 @@ class _Epipolar:
         run = epipolar.run_views(context.scene)
         if run is None or settings.views != run.name:
             return
-        column = layout.column(align=True)
-        column.prop(settings, "module")
-        column.prop(settings, "column")
-        column.prop(settings, "row")
+        draw_all(layout.column(align=True), settings, "module", "column", "row")
         found, problem = epipolar.shown(context.scene)
         if problem:
             draw_text(layout, problem)
@@ -50,5 +47,5 @@ class MPHDRR_PT_epipolar(_Epipolar, Sidebar, bpy.types.Panel):
     bl_parent_id = "MPHDRR_PT_projections"
 
 
-class MPHDRR_PT_epipolar_of_images(_Epipolar, bpy.types.Panel):
-    bl_space_type, bl_region_type, bl_category = "IMAGE_EDITOR", "UI", ids.CATEGORY
+class MPHDRR_PT_epipolar_of_images(_Epipolar, ImagesSidebar, bpy.types.Panel):
+    """Beside the pictures."""

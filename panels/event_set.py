@@ -3,15 +3,13 @@
 import bpy
 
 from ..addon.blender import ids, jobs
-from ..addon.blender.layouts import invoking, labelled
+from ..addon.blender.layouts import draw_all, invoking, labelled
 from ..addon.events import event_notes
-from .geometry import Sidebar, draw_hint, draw_text
+from .sidebar import Folded, draw_hint, draw_text
 
 
-class MPHDRR_PT_event_set(Sidebar, bpy.types.Panel):
-    bl_label = "Event Set"
+class MPHDRR_PT_event_set(Folded, bpy.types.Panel):
     bl_order = ids.ORDER_EVENTS
-    bl_options = {"DEFAULT_CLOSED"}
 
     def draw(self, context: bpy.types.Context) -> None:
         layout = invoking(labelled(self.layout))
@@ -32,8 +30,7 @@ class MPHDRR_PT_event_set(Sidebar, bpy.types.Panel):
         if settings.tried:
             draw_text(layout, settings.tried[:1].upper() + settings.tried[1:], "OUTLINER_DATA_VOLUME")
         column = layout.column(align=True)
-        column.prop(settings, "folder")
-        column.prop(settings, "count")
+        draw_all(column, settings, "folder", "count")
         column.operator(ids.MAKE_EVENT_SET, icon="FILE_CACHE")
         if made is not None:
             _draw_note(layout, made)

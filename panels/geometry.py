@@ -1,7 +1,6 @@
 """Sidebar, first step: the scanner and its modules."""
 
 import json
-import textwrap
 
 import bpy
 import numpy as np
@@ -10,16 +9,7 @@ from bpy.app.translations import pgettext_iface as iface
 from ..addon.blender import ids, jobs
 from ..addon.blender.layouts import invoking, shown_where
 from ..addon.scanner import following, scanner, selection
-
-_LINE = 32  # letters that fit into the sidebar at its usual width
-
-
-class Sidebar:
-    """Mixed into the panels of the extension's tab."""
-
-    bl_space_type = "VIEW_3D"
-    bl_region_type = "UI"
-    bl_category = ids.CATEGORY
+from .sidebar import Folded, Sidebar, draw_facts, draw_hint, draw_text
 
 
 class MPHDRR_UL_modules(bpy.types.UIList):
@@ -94,11 +84,10 @@ class MPHDRR_PT_geometry(Sidebar, bpy.types.Panel):
         _show(row, "All", 0, 0, "ALL")
 
 
-class ScannerPanel(Sidebar):
+class ScannerPanel(Folded):
     """Mixed into panels inside Geometry that need a scanner; they draw by `draw_scanner`."""
 
     bl_parent_id = "MPHDRR_PT_geometry"
-    bl_options = {"DEFAULT_CLOSED"}  # so that Phantom and Projections are in sight
 
     poll = shown_where(lambda context: scanner.active_scanner(context.scene) is not None)
 
@@ -147,28 +136,6 @@ class MPHDRR_PT_modules(ScannerPanel, bpy.types.Panel):
         row = layout.row()
         row.active = state.show_rays or state.show_frustums or state.show_detectors
         row.prop(state, "sight_all")
-
-
-def draw_facts(split: bpy.types.UILayout, *facts: tuple[str, str]) -> None:
-    """Draw names and their values, side by side."""
-    names, values = split.column(align=True), split.column(align=True)
-    for name, value in facts:
-        names.label(text=name)
-        values.label(text=value)
-
-
-def draw_hint(layout: bpy.types.UILayout, text: str) -> None:
-    """Draw what comes next, in grey."""
-    row = layout.row()
-    row.active = False
-    row.label(text=text, icon="INFO")
-
-
-def draw_text(layout: bpy.types.UILayout, text: str, icon: str = "ERROR") -> None:
-    """Draw a text in lines that fit into a narrow sidebar."""
-    column = layout.column(align=True)
-    for i, line in enumerate(textwrap.wrap(text, _LINE)):
-        column.label(text=line, icon="BLANK1" if i else icon)
 
 
 def _columns(layout: bpy.types.UILayout, name: str, *numbers: str) -> None:

@@ -1,7 +1,6 @@
-"""Object > mphDRR, and Image > mphDRR Projections: every command, so that the menus' search (F3) finds it.
+"""Add > mphDRR, Object > mphDRR, and Image > mphDRR Projections: every command, so that the menus' search (F3) finds it.
 
-What adds something is under Add > mphDRR (`add_menu.py`), what reads and writes files also under File
-(`addon/registration.py`).
+What adds something is under Add > mphDRR, what reads and writes files also under File (`addon/registration.py`).
 """
 
 import bpy
@@ -9,7 +8,26 @@ from bpy.app.translations import pgettext_iface as iface
 
 from ..addon.blender import ids
 from ..addon.blender.layouts import invoking
+from ..addon.phantoms.phantom_properties import menu_entries
 from ..addon.scanner import selection
+
+
+class MPHDRR_MT_add(bpy.types.Menu):
+    bl_label = "mphDRR"
+
+    def draw(self, context: bpy.types.Context) -> None:
+        layout = invoking(self.layout)
+        for kind, label, beats in menu_entries():
+            layout.operator(ids.ADD_PHANTOM + kind, text=label, icon="OUTLINER_DATA_VOLUME")
+            if beats:
+                text = iface("Beating {phantom}").format(phantom=iface(label))
+                layout.operator(ids.ADD_PHANTOM + kind, text=text, icon="OUTLINER_DATA_VOLUME").frames = 24
+        layout.operator(ids.IMPORT_PHANTOM, text="Phantom from TOML File", icon="FILE_TEXT")
+        layout.separator()
+        layout.operator(ids.IMPORT_VOLUME, text="Volume from File", icon="IMPORT")
+        layout.operator(ids.IMPORT_VOLUME_SEQUENCE, text="Volume Sequence from Files", icon="RENDER_ANIMATION")
+        layout.operator(ids.VOXELIZE_OBJECTS, text="Volume from Meshes", icon="OUTLINER_DATA_MESH")
+        layout.operator(ids.ADD_MAP, text="Map of the Scanner", icon="OUTLINER_DATA_LIGHTPROBE")
 
 
 class MPHDRR_MT_commands(bpy.types.Menu):
@@ -84,8 +102,6 @@ class MPHDRR_MT_volumes(bpy.types.Menu):
 
 
 class MPHDRR_MT_projections(bpy.types.Menu):
-    bl_label = "Projections"
-
     def draw(self, context: bpy.types.Context) -> None:
         layout = invoking(self.layout)
         layout.operator(ids.RENDER_PROJECTIONS, icon="RENDER_STILL")

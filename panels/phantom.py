@@ -1,4 +1,4 @@
-"""Sidebar, second step: the phantom; and Add > mphDRR, everything that can be put into the scanner."""
+"""Sidebar, second step: the phantom, its numbers and looks; below it, the active volume as the active module sees it."""
 
 from typing import Any
 
@@ -6,15 +6,16 @@ import bpy
 from bpy.app.translations import pgettext_iface as iface
 
 from ..addon import recovery
-from ..addon.blender import ids, storage
-from ..addon.blender.layouts import invoking, labelled
+from ..addon.blender import ids, jobs, storage
+from ..addon.blender.layouts import draw_all, invoking, labelled
+from ..addon.perspective import frustums
 from ..addon.phantoms import phantom_properties, phantoms
+from ..addon.scanner import selection
 from ..addon.volumes import slices, volumes
-from .geometry import Sidebar, draw_facts, draw_hint, draw_text
+from .sidebar import Folded, Sidebar, draw_facts, draw_hint, draw_text
 
 
 class MPHDRR_PT_phantom(Sidebar, bpy.types.Panel):
-    bl_label = "Phantom"
     bl_order = ids.ORDER_PHANTOM
 
     def draw(self, context: bpy.types.Context) -> None:
@@ -108,3 +109,36 @@ def _draw_phantom(layout: bpy.types.UILayout, item: bpy.types.Object, phantom: A
     shown = phantoms.outline_of(item) is not None
     text = "Hide Outline" if shown else "Show Outline"
     column.operator(ids.SHOW_PHANTOM_OUTLINE, text=text, icon="SHADING_WIRE", depress=shown)
+
+
+class MPHDRR_PT_perspective(Folded, bpy.types.Panel):
+    bl_parent_id = "MPHDRR_PT_phantom"
+
+    def draw(self, context: bpy.types.Context) -> None:
+        layout = invoking(labelled(self.layout))
+        settings, camera = context.scene.mphdrr_perspective, selection.active_module(context)
+        if camera is None:
+            draw_hint(layout, "Import a geometry first.")
+            return
+        jobs.draw_job(layout)
+        name = context.object.name if volumes.is_volume(context.object) else iface("no volume is selected")
+        text = iface("{volume}, by {module}").format(volume=name, module=camera.name)
+        layout.label(text=text, translate=False, icon="VIEW_PERSPECTIVE")
+        draw_all(layout.column(align=True), settings, "uniform", "planes")
+        row = layout.row(align=True)
+        row.operator(ids.SHOW_IN_PERSPECTIVE)
+        row.operator(ids.CLEAR_PERSPECTIVE, text="", icon="X")
+        for frustum in frustums.frustums(context.scene):
+            _draw_frustum(layout.column(align=True), context.scene, frustum)
+        layout.prop(settings, "cells")
+        layout.operator(ids.RESAMPLE_IN_PERSPECTIVE)
+
+
+def _draw_frustum(column: bpy.types.UILayout, scene: bpy.types.Scene, frustum: bpy.types.Object) -> None:
+    """What is shown, and what has changed since."""
+    module = "?" if frustum.parent is None else frustum.parent.name
+    text = iface("Shown: {volume}, by {module}").format(volume=frustums.volume_of(frustum), module=module)
+    column.label(text=text, translate=False)
+    if changed := frustums.changes(scene, frustum):
+        column.alert = True
+        draw_text(column, iface("Not as it is now: {text}").format(text=changed), "ERROR")

@@ -1,23 +1,25 @@
 """Sidebar, third and last step: the projections, and the dataset that they give."""
 
+import textwrap
+
 import bpy
 from bpy.app.translations import pgettext_iface as iface
 
 from ..addon.blender import ids, jobs
-from ..addon.blender.layouts import draw_settings, invoking, labelled, shown_where
-from ..addon.runs import rendering, runs
+from ..addon.blender.layouts import draw_all, draw_settings, invoking, labelled, shown_where
+from ..addon.runs import preview, rendering, runs
 from ..addon.runs.projection_properties import drawn, makes_counts
 from ..addon.scanner import scanner
 from ..addon.volumes import volumes
-from .geometry import Sidebar, draw_hint, draw_text
 from .runs import draw_changes
+from .sidebar import Folded, Sidebar, draw_hint, draw_text
 
 _MAIN = ("time", "photons", "hole", "aperture_points", "pixel_points")
 """Settings of models that the panel itself shows; the others stand under Physics."""
+_LINE = 34  # letters that fit into the sidebar at its usual width
 
 
 class MPHDRR_PT_projections(Sidebar, bpy.types.Panel):
-    bl_label = "Projections"
     bl_order = ids.ORDER_PROJECTIONS
 
     def draw(self, context: bpy.types.Context) -> None:
@@ -32,8 +34,7 @@ class MPHDRR_PT_projections(Sidebar, bpy.types.Panel):
         modules = column.column(align=True)
         modules.prop(settings, "all_modules")
         if not settings.all_modules:
-            modules.prop(settings, "first")
-            modules.prop(settings, "last")
+            draw_all(modules, settings, "first", "last")
         draw_settings(column, settings, drawn(settings, "compute"))
         row = invoking(layout.row())
         row.scale_y = 1.4
@@ -53,10 +54,25 @@ class MPHDRR_PT_projections(Sidebar, bpy.types.Panel):
             draw_changes(layout, context.scene)
 
 
-class MPHDRR_PT_physics(Sidebar, bpy.types.Panel):
-    bl_label = "Physics"
+class MPHDRR_PT_preview(Sidebar, bpy.types.Panel):
+    bl_label = "Live Preview"
     bl_parent_id = "MPHDRR_PT_projections"
-    bl_options = {"DEFAULT_CLOSED"}
+
+    def draw(self, context: bpy.types.Context) -> None:
+        layout, session = self.layout, preview.session()
+        layout.operator(ids.LIVE_PREVIEW, icon="HIDE_OFF", depress=session is not None)
+        if session is None:
+            return
+        column = layout.column(align=True)
+        column.active = False
+        if session.problem:
+            for line in textwrap.wrap(session.problem, _LINE):
+                column.label(text=line)
+        column.label(text=iface("{size} of voxels kept in memory").format(size=session.kept))
+
+
+class MPHDRR_PT_physics(Folded, bpy.types.Panel):
+    bl_parent_id = "MPHDRR_PT_projections"
 
     poll = shown_where(lambda context: context.scene.mphdrr_projections.model != "INVERSE_SQUARE")
 
@@ -83,7 +99,6 @@ class MPHDRR_PT_physics(Sidebar, bpy.types.Panel):
 
 
 class MPHDRR_PT_export(Sidebar, bpy.types.Panel):
-    bl_label = "Export"
     bl_order = ids.ORDER_EXPORT
 
     def draw(self, context: bpy.types.Context) -> None:

@@ -7,7 +7,7 @@ from ..addon.blender import ids, jobs, plots
 from ..addon.blender.layouts import draw_settings, invoking, labelled
 from ..addon.reconstruction.reconstruction_properties import drawn
 from ..addon.runs import runs
-from .geometry import Sidebar, draw_hint, draw_text
+from .sidebar import Folded, Sidebar, draw_hint, draw_text
 
 _MAIN = ("method", "iterations", "subsets", "voxels", "spacing")
 """Settings that the panel itself shows; the others stand under Model and Prior."""
@@ -15,7 +15,6 @@ _PLOT = 6.0  # of a button's heights
 
 
 class MPHDRR_PT_reconstruction(Sidebar, bpy.types.Panel):
-    bl_label = "Reconstruction"
     bl_order = ids.ORDER_RECONSTRUCTION
 
     def draw(self, context: bpy.types.Context) -> None:
@@ -55,10 +54,9 @@ def _draw_result(layout: bpy.types.UILayout, settings: bpy.types.PropertyGroup, 
     box.operator(ids.SHOW_RECONSTRUCTION, text="Show Slices", icon="IMAGE_DATA")
 
 
-class MPHDRR_PT_reconstruction_model(Sidebar, bpy.types.Panel):
+class MPHDRR_PT_reconstruction_model(Folded, bpy.types.Panel):
     bl_label = "Model and Prior"
     bl_parent_id = "MPHDRR_PT_reconstruction"
-    bl_options = {"DEFAULT_CLOSED"}
 
     def draw(self, context: bpy.types.Context) -> None:
         settings = context.scene.mphdrr_reconstruction
@@ -66,10 +64,9 @@ class MPHDRR_PT_reconstruction_model(Sidebar, bpy.types.Panel):
         draw_settings(labelled(self.layout).column(), settings, others)
 
 
-class MPHDRR_PT_backprojection(Sidebar, bpy.types.Panel):
+class MPHDRR_PT_backprojection(Folded, bpy.types.Panel):
     bl_label = "Back-Projection"
     bl_parent_id = "MPHDRR_PT_reconstruction"
-    bl_options = {"DEFAULT_CLOSED"}
 
     def draw(self, context: bpy.types.Context) -> None:
         layout = invoking(labelled(self.layout))

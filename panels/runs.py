@@ -7,7 +7,7 @@ from ..addon.blender import ids, jobs
 from ..addon.blender.layouts import invoking, shown_where
 from ..addon.pictures import images
 from ..addon.runs import runs
-from .geometry import Sidebar, draw_text
+from .sidebar import ImagesSidebar, Sidebar, draw_text
 
 
 class MPHDRR_UL_runs(bpy.types.UIList):
@@ -65,8 +65,8 @@ class MPHDRR_PT_runs(_Runs, Sidebar, bpy.types.Panel):
     bl_order = ids.ORDER_RUNS
 
 
-class MPHDRR_PT_runs_of_images(_Runs, bpy.types.Panel):
-    bl_space_type, bl_region_type, bl_category = "IMAGE_EDITOR", "UI", ids.CATEGORY
+class MPHDRR_PT_runs_of_images(_Runs, ImagesSidebar, bpy.types.Panel):
+    """Beside the pictures."""
 
 
 def draw_changes(layout: bpy.types.UILayout, scene: bpy.types.Scene) -> None:

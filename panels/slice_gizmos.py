@@ -13,7 +13,6 @@ class MPHDRR_GGT_slices(bpy.types.GizmoGroup):
     """An arrow at a corner of each slice."""
 
     bl_idname = "MPHDRR_GGT_slices"
-    bl_label = "Slices"
     bl_space_type = "VIEW_3D"
     bl_region_type = "WINDOW"
     bl_options = {"3D", "PERSISTENT"}

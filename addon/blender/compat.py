@@ -19,7 +19,7 @@ def blank_material(name: str) -> bpy.types.Material:
 
 
 Place = tuple[float, float]
-"""Of a node in its editor."""
+"""Where a node is in its editor."""
 
 
 def add_node(

@@ -11,29 +11,41 @@ class Eyedropper:
     What is under the mouse stands in the status bar.
     """
 
-    def says(self, context: bpy.types.Context, event: bpy.types.Event) -> str:
-        """The status bar's text."""
+    asks = ""
+    """What the user is to click on, such as "a picture"."""
+
+    def under(self, context: bpy.types.Context, event: bpy.types.Event) -> Any:
+        """What is under the mouse; None where there is nothing to take."""
         raise NotImplementedError
 
-    def takes(self, context: bpy.types.Context, event: bpy.types.Event) -> bool:
-        """Take what is under the mouse, and report; returns whether there was something."""
+    def says(self, found: Any) -> str:
+        """The status bar's text, where that is under the mouse."""
+        raise NotImplementedError
+
+    def takes(self, context: bpy.types.Context, found: Any) -> bool:
+        """Take what was under the mouse, and report; returns whether it could be taken."""
         raise NotImplementedError
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         """Wait for the click."""
         context.window.cursor_modal_set("EYEDROPPER")
         context.window_manager.modal_handler_add(self)
-        context.workspace.status_text_set(self.says(context, event))
+        context.workspace.status_text_set(self.says(self.under(context, event)))
         return {"RUNNING_MODAL"}
 
-    def modal(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+    def modal(self: Any, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         """Take what is clicked on; views may be moved meanwhile."""
         if event.type in {"ESC", "RIGHTMOUSE"}:
             return self._end(context, "CANCELLED")
         if event.type == "LEFTMOUSE" and event.value == "PRESS":
-            return self._end(context, "FINISHED") if self.takes(context, event) else {"RUNNING_MODAL"}
+            found = self.under(context, event)
+            if found is None:
+                self.report({"WARNING"}, f"Click on {self.asks}, or press Esc")
+            elif self.takes(context, found):
+                return self._end(context, "FINISHED")
+            return {"RUNNING_MODAL"}
         if event.type == "MOUSEMOVE":
-            context.workspace.status_text_set(self.says(context, event))
+            context.workspace.status_text_set(self.says(self.under(context, event)))
         moves_view = event.type in {"MIDDLEMOUSE", "WHEELUPMOUSE", "WHEELDOWNMOUSE"}
         return {"PASS_THROUGH"} if moves_view else {"RUNNING_MODAL"}
 

@@ -44,7 +44,6 @@ USE_PRESET = "mphdrr.use_preset"
 LOAD_RECIPE = "mphdrr.load_recipe"
 SHOW_PROJECTIONS = "mphdrr.show_projections"
 EXPORT_FIGURE = "mphdrr.export_figure"
-SHOW_RUN = "mphdrr.show_run"
 REMOVE_RUN = "mphdrr.remove_run"
 COMPARE_RUNS = "mphdrr.compare_runs"
 LIVE_PREVIEW = "mphdrr.live_preview"
@@ -79,12 +78,19 @@ RECONSTRUCTION = "mphDRR reconstruction"  # slices of the last one, and its obje
 PLANES = "mphDRR projections"  # the collection of the planes that show them
 PERSPECTIVES = "mphDRR perspective"  # the collection of volumes in modules' coordinates (`frustums.py`)
 STUDIO = "mphDRR studio"  # the collection of the lights, and a world
+_SMALL = ("from", "in")  # words without a capital in labels
 PREVIEW = ".preview"  # in the names of coarser copies of large volumes, for display only
 
 
 def operator_name(class_name: str) -> str:
     """The idname of an operator's class: "mphdrr.show_run" of "MPHDRR_OT_show_run"."""
     return class_name.replace("MPHDRR_OT_", f"{PREFIX}.")
+
+
+def label(class_name: str) -> str:
+    """What the user reads of an operator or a panel: "Show Run" of "MPHDRR_OT_show_run"."""
+    words = class_name.split("_")[2:]
+    return " ".join(word if word in _SMALL else word.capitalize() for word in words)
 
 
 def module_name(number: int, n_modules: int = 80) -> str:

@@ -25,7 +25,7 @@ from ...core.errors import InputError
 from ...core.progress import Cancelled, Progress, StagedProgress
 from ...core.recording import recorded_warnings
 from . import ids, storage
-from .reports import warnings_reported
+from .reports import Reported, warnings_reported
 from .windows import redraw_sidebars
 
 _INTERVAL = 0.1  # s between two looks at the thread, and between two drawings of how far it is
@@ -182,7 +182,6 @@ def is_running() -> bool:
     return _current is not None or bool(_waiting)
 
 
-@bpy.app.handlers.persistent
 def stop(*_: Any) -> None:
     """Stop all jobs and wait for the running one's thread: before a file is loaded, or the extension is disabled."""
     global _current
@@ -227,6 +226,10 @@ class JobOperator:
     def job(self, context: bpy.types.Context) -> Job:
         """The job, from the operator's and the scene's settings; raises InputError."""
         raise NotImplementedError
+
+    def given(self, panel: bpy.types.PropertyGroup, *names: str) -> list[Any]:
+        """The values of settings: each that of the operator where it is given, else the panel's."""
+        return list(map(self.given_or(panel), names))
 
     def given_or(self, panel: bpy.types.PropertyGroup) -> Callable[[str], Any]:
         """What gives a setting by its name: that of the operator where it is given, else the panel's."""
@@ -381,34 +384,46 @@ class JobOperator:
         _redraw(context)
 
     def _failed(self, error: BaseException) -> set[str]:
+        if not isinstance(error, Exception):
+            raise error  # KeyboardInterrupt and the like
+        level, text = "ERROR", str(error)
         if isinstance(error, Cancelled):
             left = "nothing was changed" if self._job is None else self._job.left()
-            self.report({"WARNING"}, f"{self.bl_label}: cancelled, {left}")
-        elif isinstance(error, InputError):
-            self.report({"ERROR"}, str(error))
+            level, text = "WARNING", f"{self.bl_label}: cancelled, {left}"
         elif isinstance(error, ReferenceError):  # a datablock that the job had made or found
-            self.report(
-                {"ERROR"}, f"{self.bl_label}: stopped, since Undo has taken back what it works on; start it again"
-            )
+            text = f"{self.bl_label}: stopped, since Undo has taken back what it works on; start it again"
         elif isinstance(error, MemoryError):
-            self.report({"ERROR"}, f"{self.bl_label}: not enough memory; choose fewer voxels or pixels")
-        elif isinstance(error, Exception):
+            text = f"{self.bl_label}: not enough memory; choose fewer voxels or pixels"
+        elif not isinstance(error, InputError):
             traceback.print_exception(error)
-            self.report({"ERROR"}, f"{self.bl_label} failed: {type(error).__name__}: {error} (details in the console)")
-        else:
-            raise error  # KeyboardInterrupt and the like
+            text = f"{self.bl_label} failed: {type(error).__name__}: {error} (details in the console)"
+        self.report({level}, text)
         return {"CANCELLED"}
 
 
 class ExportJob(JobOperator, ExportHelper):
-    """Mix into an operator whose job writes the file that the user chooses."""
+    """Mix into an operator whose job writes the file that the user chooses, with one of the `endings` in its name."""
+
+    endings: tuple[str, ...] = ()
+
+    @property
+    def filename_ext(self) -> str:
+        """What Blender adds to the .blend's name."""
+        return self.endings[0]
 
     def ask(self, context: bpy.types.Context) -> set[str] | None:
         """Open the file browser."""
         return ExportHelper.invoke(self, context, None)
 
+    def check(self, context: bpy.types.Context) -> bool:
+        """Give a name without one of the endings the first."""
+        if self.filepath.lower().endswith(self.endings):
+            return False
+        self.filepath += self.endings[0]
+        return True
 
-class MPHDRR_OT_cancel_job(bpy.types.Operator):
+
+class MPHDRR_OT_cancel_job(Reported, bpy.types.Operator):
     """Stop a job, or take it out of the queue; the scene stays as it was"""
 
     bl_label = "Cancel"
@@ -416,25 +431,23 @@ class MPHDRR_OT_cancel_job(bpy.types.Operator):
 
     number: IntProperty(name="Job", description="Its number; 0: the running one", options={"HIDDEN", "SKIP_SAVE"})
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
+    def act(self, context: bpy.types.Context) -> None:
         """Ask it to stop at its next step."""
         for worker in filter(None, (_current, *_waiting)):
             if self.number == worker.number or (self.number == 0 and worker is _current):
                 worker.cancel.set()
-        return {"FINISHED"}
 
 
-class MPHDRR_OT_finish_job(bpy.types.Operator):
+class MPHDRR_OT_finish_job(Reported, bpy.types.Operator):
     """End the running job after the step that it is at, and keep what it has made so far"""
 
     bl_label = "Finish Now"
     bl_options = {"INTERNAL"}
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
+    def act(self, context: bpy.types.Context) -> None:
         """Ask it to come to its end."""
         if _current is not None and _current.enough is not None:
             _current.enough.set()
-        return {"FINISHED"}
 
 
 def draw_job(layout: bpy.types.UILayout) -> None:

@@ -23,6 +23,12 @@ def invoking(layout: bpy.types.UILayout) -> bpy.types.UILayout:
     return layout
 
 
+def draw_all(layout: bpy.types.UILayout, settings: Any, *names: str) -> None:
+    """Draw settings below each other, as they are called."""
+    for name in names:
+        layout.prop(settings, name)
+
+
 def draw_settings(
     layout: bpy.types.UILayout, settings: bpy.types.PropertyGroup, names: Iterable[tuple[str, bool]]
 ) -> None:

@@ -41,7 +41,7 @@ def needs(*every: Need) -> Any:
 
 
 class Reported:
-    """Mix into an operator that does `act`, and reports the line that this returns, or what it raises."""
+    """Mix into an operator that does `act`, and reports the line that this returns, if it does, or what it raises."""
 
     bl_options = {"REGISTER", "UNDO"}
 
@@ -50,13 +50,23 @@ class Reported:
         return run_reported(self, lambda: self.act(context))
 
 
-def run_reported(operator: bpy.types.Operator, action: Callable[[], str]) -> set[str]:
-    """Run an operator's work; report its warnings, and the line that it returns or an `InputError` as {'ERROR'}."""
+def run_reported(operator: bpy.types.Operator, action: Callable[[], str | None]) -> set[str]:
+    """Run an operator's work; report its warnings, and the line that it returns, or an `InputError` as {'ERROR'}."""
     try:
         with warnings_reported(operator):
             text = action()
     except (InputError, MemoryError) as error:
         operator.report({"ERROR"}, str(error) or "not enough memory")
         return {"CANCELLED"}
-    operator.report({"INFO"}, text)
+    if text:
+        operator.report({"INFO"}, text)
     return {"FINISHED"}
+
+
+def ask_to_remove(
+    operator: bpy.types.Operator, context: bpy.types.Context, event: bpy.types.Event, title: str, message: str
+) -> set[str]:
+    """Open the dialog whose button removes something; for an operator's `invoke`."""
+    return context.window_manager.invoke_confirm(
+        operator, event, title=title, message=message, confirm_text="Remove", icon="WARNING"
+    )

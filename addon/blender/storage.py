@@ -145,7 +145,6 @@ def _of_states(data: bpy.types.Volume, path: Path) -> list[Path]:
     return [of_frame(path, data.frame_offset + 1 + k) for k in range(data.frame_duration)]
 
 
-@bpy.app.handlers.persistent
 def before_save(filepath: str, _: Any = None) -> None:
     """Copy files from the temporary folder, and keep paths up to date that Blender does not know of."""
     _before_save.clear()
@@ -167,7 +166,6 @@ def before_save(filepath: str, _: Any = None) -> None:
             run.is_saved = True
 
 
-@bpy.app.handlers.persistent
 def after_save(filepath: str, _: Any = None) -> None:
     """Set paths back after "Save Copy", when this session still belongs to another file or to none."""
     if not filepath or bpy.data.filepath != filepath:
@@ -179,7 +177,6 @@ def after_save(filepath: str, _: Any = None) -> None:
     _before_save.clear()
 
 
-@bpy.app.handlers.persistent
 def restore_paths(*_: Any) -> None:
     """Set paths back as they were before a save, for example when Blender could not write the .blend."""
     for owner, name, old in _before_save:

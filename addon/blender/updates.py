@@ -1,4 +1,4 @@
-"""What an edited property calls: functions by name, so that property groups import nothing that draws or rebuilds."""
+"""What an edited property, or a room below, calls: functions by name, so that nobody imports what draws or rebuilds."""
 
 from collections.abc import Callable
 from typing import Any
@@ -6,7 +6,9 @@ from typing import Any
 import bpy
 
 FUNCTIONS: dict[str, Callable[..., None]] = {}
-"""Filled by `registration.py`. Each takes the property's object, collection or scene, and what was given to `on_edit`."""
+"""Filled by `registration.py`. Those of properties take the property's object, collection or scene, and what was given to
+`on_edit`.
+"""
 
 
 def on_edit(name: str, *arguments: Any) -> Callable[[bpy.types.PropertyGroup, bpy.types.Context], None]:

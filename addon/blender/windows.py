@@ -1,8 +1,9 @@
 """The editors in Blender's windows: to have them drawn again, and to draw lines over them."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Any
 
+import blf
 import bpy
 import gpu
 from gpu_extras.batch import batch_for_shader
@@ -26,6 +27,18 @@ def redraw_sidebars() -> None:
         for region in area.regions:
             if region.type == "UI":
                 region.tag_redraw()
+
+
+def draw_texts(texts: Iterable[tuple[str, float, float, tuple[float, ...]]], size: float) -> None:
+    """Write texts at places (x, y) of the region, in colours, over their shadows; all in pixels."""
+    blf.size(0, size)
+    blf.enable(0, blf.SHADOW)
+    blf.shadow(0, 5, 0.0, 0.0, 0.0, 1.0)
+    for text, x, y, color in texts:
+        blf.color(0, *color)
+        blf.position(0, x, y, 0.0)
+        blf.draw(0, text)
+    blf.disable(0, blf.SHADOW)
 
 
 def draw_lines(points: Any, color: tuple[float, ...], width: float, kind: str = "LINES") -> None:

@@ -8,18 +8,14 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from ...core import ProjectionRun, Recipe, run_recipe, write_run
 from ...core.cli.options import add_command, add_workbook, progress_bar, read_workbook
 from ...core.errors import warn
+from ...core.example import EULER_DEGREES, EXAMPLE
 from ...core.files import ensure_folder
-from ...core.runs.files import write_run
 from ...core.runs.mosaic import write_sheet
-from ...core.runs.recipe import Recipe
-from ...core.runs.run import ProjectionRun
-from ...core.runs.run_recipe import run_recipe
 from .scene import INSTALL_BLENDER, new_scene, quiet, save_scene
 
-EXAMPLE = Path(__file__).parents[2] / "examples" / "dc-spect-80.xlsx"
-EULER_DEGREES = (30.0, 55.0, 0.0)  # tilted, so that modules see along and across the rods
 _FIGURES = {"phantom": "inside", "cut-away": "cut-away", "sums": "sums"}
 """Name and kind of those besides the modules' ranges."""
 _SIZE = dict.fromkeys(("scanner", "inside", "cut-away"), (880, 510))

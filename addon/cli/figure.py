@@ -1,27 +1,21 @@
 """``mphdrr figure KIND FILE … -o PICTURE``; only the figures that are rendered, and a .blend, need Blender."""
 
 import argparse
+import contextlib
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from ...core import Grid, InputError, ProjectionRun, euler_pose, read_phantom, read_recipe, read_system, read_volume
 from ...core.cli.options import add_command, output_path, progress_bar, refuse
-from ...core.errors import InputError
 from ...core.figures.kinds import KINDS, FigureKind, figure_kind
 from ...core.figures.page import SUFFIXES, Page
 from ...core.figures.subject import NEEDS, Subject, require
-from ...core.geometry.frames import euler_pose
-from ...core.geometry.grid import Grid
 from ...core.phantoms.kinds import KINDS as PHANTOMS
-from ...core.phantoms.language import read_phantom
 from ...core.runs.files import FORMATS, read_run
-from ...core.runs.recipe import read_recipe
-from ...core.runs.run import ProjectionRun
 from ...core.runs.run_recipe import phantom_pose, run_recipe
 from ...core.toml import read_toml
-from ...core.volumes.volume_files import read_volume
-from ...core.workbook import read_system
 from .scene import new_scene, quiet
 
 _WORKBOOKS = (".xlsx", ".xlsm")
@@ -179,9 +173,13 @@ def _read(arguments: argparse.Namespace, file: str, scanner: Any) -> dict[str, A
 
 
 def _of_run(run: ProjectionRun) -> dict[str, Any]:
-    found = {"scanner": run.system, "volume": run.volume, "run": run, "name": str(run.settings.get("volume", ""))}
-    try:
-        placed = any(key.startswith("phantom.") for key in run.recipe.given)
-        return {**found, "pose": phantom_pose(run.recipe) if placed else None}
-    except InputError:  # of version 0.1.0, which keeps no recipe
-        return {**found, "pose": None}
+    found: dict[str, Any] = {
+        "scanner": run.system,
+        "volume": run.volume,
+        "run": run,
+        "name": str(run.settings.get("volume", "")),
+    }
+    with contextlib.suppress(InputError):  # of version 0.1.0, which keeps no recipe
+        if any(key.startswith("phantom.") for key in run.recipe.given):
+            found["pose"] = phantom_pose(run.recipe)
+    return {"pose": None, **found}

@@ -10,9 +10,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ...core import InputError, read_run
 from ...core.cli.options import add_command, add_workbook, chosen_modules, output_path, read_workbook
-from ...core.errors import InputError
-from ...core.runs.files import read_run
 from ...core.volumes.volume_files import read_volume, read_volume_of
 
 if TYPE_CHECKING:

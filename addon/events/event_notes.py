@@ -1,5 +1,7 @@
 """What the Event Set panel says of a recipe and of a set: read by threads, so that no file keeps the window waiting."""
 
+import contextlib
+import functools
 import threading
 import time
 from collections.abc import Callable
@@ -16,7 +18,7 @@ from ...core.events.folders import INDEX, RECIPE, SetFolder
 from ...core.events.store import EVENTS, SHARDS, size_of
 from ...core.memory import readable_size
 from ...core.recording import recorded_warnings
-from ..blender import storage
+from ..blender import storage, timers
 from ..blender.windows import redraw_sidebars
 
 _INTERVAL = 0.1  # s between two looks at a thread that reads
@@ -34,9 +36,8 @@ class Note:
 
 _Stamp = tuple[Any, ...]  # by which a file that has changed is read again
 NOTHING = Note("")
-_READING = Note("Reading …")
+_UNKNOWN: tuple[_Stamp | None, Note] = None, Note("Reading …")
 _known: dict[Path, tuple[_Stamp, Note]] = {}
-_stamps: dict[Path, tuple[float, _Stamp]] = {}
 _readers: dict[Path, threading.Thread] = {}
 
 
@@ -60,10 +61,8 @@ def models(folder: str) -> tuple[str, ...]:
 
 def stop() -> None:
     """Forget everything: the extension is disabled."""
-    for known in (_known, _stamps, _readers):
-        known.clear()
-    if bpy.app.timers.is_registered(_watch):
-        bpy.app.timers.unregister(_watch)
+    _known.clear()
+    _readers.clear()
 
 
 def _recipe_note(path: Path) -> Note:
@@ -91,19 +90,14 @@ def _set_note(path: Path) -> Note:
 def _note(path: Path, read: Callable[[Path], Note]) -> Note:
     """The note on a file or folder as it is now; in a window, what was known before while a thread reads it."""
     stamp = _stamp(path)
-    known = _known.get(path)
-    if known is not None and known[0] == stamp:
-        return known[1]
-    if path not in _readers:
-        reader = threading.Thread(target=_read, args=(path, stamp, read), name="mphDRR: reading", daemon=True)
-        if bpy.app.background:
-            reader.run()
-            return _known[path][1]
-        _readers[path] = reader
-        reader.start()
-        if not bpy.app.timers.is_registered(_watch):
-            bpy.app.timers.register(_watch, first_interval=_INTERVAL)
-    return _READING if known is None else known[1]
+    if bpy.app.background and _known.get(path, _UNKNOWN)[0] != stamp:
+        _read(path, stamp, read)
+    known, note = _known.get(path, _UNKNOWN)
+    if known != stamp and path not in _readers:
+        _readers[path] = threading.Thread(target=_read, args=(path, stamp, read), name="mphDRR: reading", daemon=True)
+        _readers[path].start()
+        timers.soon(_watch, _INTERVAL)
+    return note
 
 
 def _read(path: Path, stamp: _Stamp, read: Callable[[Path], Note]) -> None:
@@ -120,18 +114,17 @@ def _read(path: Path, stamp: _Stamp, read: Callable[[Path], Note]) -> None:
 def _stamp(path: Path) -> _Stamp:
     """The dates of a file or folder and of what lies in it. Panels are drawn often: looks at the disk are 2 s apart."""
     now = time.monotonic()
-    looked, stamp = _stamps.get(path, (-_LOOK, ()))
-    if bpy.app.background or now - looked >= _LOOK:
-        found = []
-        for item in (path, path / RECIPE, path / INDEX, path / EVENTS, path / SHARDS):
-            try:
-                state = item.stat()
-            except OSError:
-                continue
+    return _stamp_at(path, now if bpy.app.background else now // _LOOK)
+
+
+@functools.lru_cache(maxsize=64)
+def _stamp_at(path: Path, now: float) -> _Stamp:
+    found = []
+    for item in (path, path / RECIPE, path / INDEX, path / EVENTS, path / SHARDS):
+        with contextlib.suppress(OSError):
+            state = item.stat()
             found.append((state.st_mtime_ns, state.st_size))
-        stamp = tuple(found)
-        _stamps[path] = now, stamp
-    return stamp
+    return tuple(found)
 
 
 def _watch() -> float | None:

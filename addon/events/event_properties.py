@@ -43,12 +43,12 @@ OPENED = number("Number of the event to open, from 0")
 class EventProperties(bpy.types.PropertyGroup):
     """State of the Event Set panel."""
 
-    recipe: RECIPE  # type: ignore[valid-type]
-    number: NEXT  # type: ignore[valid-type]
-    folder: FOLDER  # type: ignore[valid-type]
-    count: COUNT  # type: ignore[valid-type]
-    opened: OPENED  # type: ignore[valid-type]
-    model: MODEL  # type: ignore[valid-type]
+    recipe: RECIPE
+    number: NEXT
+    folder: FOLDER
+    count: COUNT
+    opened: OPENED
+    model: MODEL
     phantom: PointerProperty(
         name="Phantom", description="That events are tried on", type=bpy.types.Object,
         poll=lambda self, item: volumes.is_volume(item), options={"HIDDEN"},

@@ -11,17 +11,14 @@ import numpy as np
 from mathutils import Matrix
 from numpy.typing import NDArray
 
-from ...core import events
-from ...core.errors import InputError
+from ...core import InputError, ProjectionRun, events
 from ...core.events.folders import SetFolder
 from ...core.events.templates import template_text
+from ...core.example import EXAMPLE
 from ...core.files import write_bytes
 from ...core.memory import readable_size
 from ...core.progress import Progress, stages_of
-from ...core.runs.files import write_run
-from ...core.runs.run import ProjectionRun
 from ..blender import jobs, storage
-from ..cli.demo import EXAMPLE
 from ..figures import studio
 from ..phantoms import phantoms
 from ..phantoms.phantom_properties import KindSettings, plain_settings
@@ -80,16 +77,16 @@ def trying(context: bpy.types.Context, filepath: str, number: int, folder: str =
 
     def work(progress: Progress) -> tuple[_Phantom, str]:
         planned = events.plan(read(), number)
-        return _phantom_of(planned, target, files, progress), _said(planned)
+        return _phantom_of(planned, target, files, progress), _text(planned)
 
     def finish(made: tuple[_Phantom, str]) -> str:
-        phantom, said = made
+        phantom, text = made
         scene = jobs.scene_again(uid, "the event is")
         settings = scene.mphdrr_events
         item = _put(scene, phantom, target)
-        settings.phantom, settings.tried, settings.number = item, said, number + 1
+        settings.phantom, settings.tried, settings.number = item, text, number + 1
         _show(item, settings.truth)
-        return f"{item.name!r} is now the phantom of {said}"
+        return f"{item.name!r} is now the phantom of {text}"
 
     return jobs.Job("Trying an event", work, finish)
 
@@ -135,7 +132,7 @@ class _Opened:
     """An event, ready to be put into the scene."""
 
     name: str
-    said: str
+    text: str
     truth: StoredVolume
     phantom: _Phantom | None  # of one that a volume's file describes: the truth is all there is
     run: ProjectionRun | None
@@ -151,7 +148,7 @@ def opening(context: bpy.types.Context, folder: str, number: int, model: str = "
     if not folder:
         raise InputError("no folder given: choose that of an event set")
     scene, path, files = context.scene, storage.absolute(folder), storage.folder()
-    target, truth_uid = _target_of(_own(scene, "phantom")), _uid(_own(scene, "truth"))
+    target, truth_uid = _target_of(_own(scene, "phantom")), getattr(_own(scene, "truth"), "session_uid", 0)
     run_file, display, uid = rendering.run_path(scene), scene.mphdrr_display.display(), scene.session_uid
 
     def work(progress: Progress) -> _Opened:
@@ -164,13 +161,10 @@ def opening(context: bpy.types.Context, folder: str, number: int, model: str = "
         phantom = None if planned.entry.kind is None else _phantom_of(planned, target, files, progress)
         models = planned.recipe.models
         if not models:
-            return _Opened(name, _said(planned), truth, phantom, None, None)
+            return _Opened(name, _text(planned), truth, phantom, None, None)
         run = event.run(model or next(iter(models)))
         run = replace(run, settings={**run.settings, "volume": name})
-        stages("writing the run file")
-        write_run(run, run_file)
-        pictures = images.pictures(run, display, stages("packing"))
-        return _Opened(name, _said(planned), truth, phantom, run, pictures)
+        return _Opened(name, _text(planned), truth, phantom, run, rendering.kept(run, run_file, display, stages))
 
     def finish(opened: _Opened) -> jobs.Finishing:
         run, mosaic = opened.run, None
@@ -192,14 +186,14 @@ def opening(context: bpy.types.Context, folder: str, number: int, model: str = "
         else:
             volumes.replace_stored(item, opened.truth)
             item.name = opened.name
-        settings.truth, settings.tried = item, opened.said
+        settings.truth, settings.tried = item, opened.text
         _show(item, settings.phantom)
         yield None
         if run is not None:
             rendering.place(scene, run, collection)
             runs.add(scene, run, run_file, rendering.taken_over(scene, run, item), collection)
             images.show_below(mosaic, bpy.context)
-        return f"Opened {opened.said}" + ("" if run is not None else "; it has no projections of a model")
+        return f"Opened {opened.text}" + ("" if run is not None else "; it has no projections of a model")
 
     return jobs.Job("Opening an event", work, finish, lambda: run_file.unlink(missing_ok=True))
 
@@ -291,10 +285,6 @@ def _target_of(item: bpy.types.Object | None) -> _Target:
     return _Target(item.session_uid, others, 0 if settings is None else settings.voxels)
 
 
-def _uid(item: bpy.types.Object | None) -> int:
-    return 0 if item is None else int(item.session_uid)
-
-
 def _show(item: bpy.types.Object, other: bpy.types.Object | None) -> None:
     """Select a volume, and hide the other one, which is at the same place."""
     bpy.context.view_layer.update()  # or it does not know new objects
@@ -306,17 +296,17 @@ def _show(item: bpy.types.Object, other: bpy.types.Object | None) -> None:
         volumes.make_active(bpy.context, item)
 
 
-def _said(planned: events.PlannedEvent) -> str:
+def _text(planned: events.PlannedEvent) -> str:
     """What an event is, in a line."""
-    said = [f"event {planned.number}: {planned.name}", *([planned.split] if planned.split else [])]
+    parts = [f"event {planned.number}: {planned.name}", *([planned.split] if planned.split else [])]
     if any(planned.position):
-        said.append("at {:.4g} {:.4g} {:.4g} mm".format(*planned.position))
+        parts.append("at {:.4g} {:.4g} {:.4g} mm".format(*planned.position))
     if any(planned.euler_degrees):
-        said.append("turned by {:.4g} {:.4g} {:.4g}°".format(*planned.euler_degrees))
-    said += ["mirrored"] if planned.mirror else []
+        parts.append("turned by {:.4g} {:.4g} {:.4g}°".format(*planned.euler_degrees))
+    parts += ["mirrored"] if planned.mirror else []
     for name, factor in (("size", planned.size), ("activity", planned.activity_factor)):
-        said += [f"{name} × {factor:.3g}"] if factor != 1.0 else []
-    return ", ".join(said)
+        parts += [f"{name} × {factor:.3g}"] if factor != 1.0 else []
+    return ", ".join(parts)
 
 
 def _events(count: int) -> str:

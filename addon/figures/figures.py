@@ -17,6 +17,7 @@ import numpy as np
 from mathutils import Vector
 from numpy.typing import NDArray
 
+from ...core import Cancelled, PinholeSystem, Progress, read_run
 from ...core.cli.options import output_path
 from ...core.errors import InputError, warn
 from ...core.figures.kinds import KINDS, Studio, figure_kind
@@ -24,12 +25,9 @@ from ...core.figures.page import SUFFIXES, Page, box
 from ...core.figures.parts import heading, heading_height
 from ...core.figures.subject import Subject, require
 from ...core.geometry.collimator import Construction
-from ...core.geometry.system import PinholeSystem
-from ...core.progress import Cancelled, Progress
 from ...core.recording import recorded_warnings
-from ...core.runs.files import read_run
 from ...core.runs.resizing import resized
-from ..blender import compat, ids, jobs, storage
+from ..blender import compat, ids, jobs, storage, timers
 from ..blender.choices import items
 from ..phantoms import phantoms
 from ..scanner import collimators, following, scanner, selection
@@ -307,13 +305,14 @@ def _leave_a_trace(scene: bpy.types.Scene, drawn: list[bpy.types.Object]) -> Gen
     return bool(np.abs(resized(pictures[0] - pictures[1], rows, columns)).max() > _TRACE)
 
 
-@bpy.app.handlers.persistent
 def before_render(scene: bpy.types.Scene, *_: Any) -> None:
     """Blender's own Render: say which volumes of the 3D views the picture lacks; in the window, when it is done."""
-    if bpy.app.background and not scene.name.startswith(ids.STUDIO):
+    if scene.name.startswith(ids.STUDIO):
+        return
+    if bpy.app.background:
         _say_what_is_unseen()
-    elif not (scene.name.startswith(ids.STUDIO) or bpy.app.timers.is_registered(_say_what_is_unseen)):
-        bpy.app.timers.register(_say_what_is_unseen, first_interval=_REST)
+    else:
+        timers.soon(_say_what_is_unseen, _REST)
 
 
 def _say_what_is_unseen() -> float | None:
@@ -330,10 +329,10 @@ def _say_what_is_unseen() -> float | None:
         elif scene.render.engine == "CYCLES" and known not in _drawn:
             reach = max((item.matrix_world @ Vector(corner)).length for corner in item.bound_box) + 1.0
             sizes = reach / np.array([50, 10, 10, 50, 1])  # of a small module behind it, as seen
-            with recorded_warnings() as said:
+            with recorded_warnings() as caught:
                 subject = Subject(PinholeSystem(-2 * reach * np.array([_DIRECTION]), *sizes))
                 list(rendering(Page(_SMALL, _SMALL), subject, Studio(volume=True, near=True), item, False, 1))
-            why = _UNSEEN if any(_UNSEEN in text for text in said) else ""
+            why = _UNSEEN if any(_UNSEEN in text for text in caught) else ""
             _drawn.update([] if why else [known])
         if why:
             text = f"the picture shows nothing of {item.name!r}{why}"

@@ -3,7 +3,7 @@
 import bpy
 from mathutils import Vector
 
-from ..blender import ids
+from ..blender import ids, objects
 
 # Direction from which each sun shines, its strength, W/m^2, and its angular size, rad: soft shadows.
 _SUNS = (((-0.5, -1.8, 2.6), 0.8, 0.6), ((2.4, -0.4, 0.8), 0.9, 0.8), ((-0.8, 1.6, 1.6), 0.9, 0.6))
@@ -21,8 +21,7 @@ def light(scene: bpy.types.Scene) -> None:
 
 def furnish(scene: bpy.types.Scene) -> None:
     """Put the suns into a scene, in a collection that can be hidden or deleted; and a world where there is none."""
-    home = bpy.data.collections.new(ids.STUDIO)
-    scene.collection.children.link(home)
+    home = objects.home(scene, ids.STUDIO)
     for direction, strength, angle in _SUNS:
         sun = bpy.data.lights.new(ids.STUDIO, "SUN")
         sun.energy, sun.angle = strength, angle

@@ -3,6 +3,7 @@
 All of it is that of the run's own views: where modules have moved since, the run is not of the scene as it is now.
 """
 
+import functools
 import hashlib
 from dataclasses import dataclass
 
@@ -10,10 +11,7 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core.errors import InputError
-from ...core.geometry.views import Views
-from ...core.perspective.epipolar import epipolar_segments
-from ...core.perspective.view_rays import points_at_depths, project_points, view_frames
+from ...core import InputError, Views, epipolar_segments, points_at_depths, project_points, view_frames
 from ..blender import ids
 from ..blender.decimals import typed
 from ..pictures import images
@@ -21,7 +19,6 @@ from ..pictures import images
 Floats = NDArray[np.float64]
 
 _LEAST = 0.01  # of the isocentre's depth: where a ROI begins that reaches behind the pinhole
-_last: dict[tuple[object, ...], "Picked"] = {}  # what was asked for last
 _runs: dict[int, "RunViews"] = {}  # by the mosaic's session_uid: that of the shown run
 
 
@@ -31,7 +28,7 @@ class RunViews:
 
     views: Views
     numbers: list[int]
-    """Of the modules (M,)."""
+    """The modules' (M,)."""
     roi_radius: Floats
     """(M,), mm."""
     name: str
@@ -57,7 +54,7 @@ class Picked:
 
     run: RunViews
     index: int
-    """Of the picked module among the run's."""
+    """Which of the run's modules is picked."""
     pixel: Floats
     """(2,)."""
     k: float
@@ -65,7 +62,7 @@ class Picked:
     k_range: tuple[float, float]
     """k at the front of the ROI, and at its back."""
     depth: float
-    """Of the marker, mm."""
+    """The marker's, mm."""
     ray: Floats
     """World points (3, 3), mm: the pinhole, and where the ray enters the ROI's depths and leaves them."""
     marker: Floats
@@ -105,7 +102,7 @@ def run_views(scene: bpy.types.Scene) -> RunViews | None:
 
 
 def required_views(scene: bpy.types.Scene) -> RunViews:
-    """As `run_views`; `InputError` where there are none."""
+    """The same as `run_views`; `InputError` where there are none."""
     run = run_views(scene)
     if run is not None:
         return run
@@ -124,17 +121,11 @@ def picked(scene: bpy.types.Scene) -> Picked | None:
     settings, run = scene.mphdrr_epipolar, run_views(scene)
     if run is None or settings.views != run.name:
         return None
-    numbers = settings.module, typed(settings.column), typed(settings.row), typed(settings.k)
-    key = (id(run), *numbers)
-    if key not in _last:
-        made = _picked(run, *numbers)
-        _last.clear()
-        _last[key] = made
-    return _last[key]
+    return _picked(run, settings.module, typed(settings.column), typed(settings.row), typed(settings.k))
 
 
 def shown(scene: bpy.types.Scene) -> tuple[Picked | None, str]:
-    """As `picked`, and what is wrong with the panel's module or pixel; "" where all is good."""
+    """The same as `picked`, and what is wrong with the panel's module or pixel; "" where all is good."""
     try:
         return picked(scene), ""
     except InputError as error:
@@ -164,6 +155,7 @@ def clear(scene: bpy.types.Scene) -> None:
     scene.mphdrr_epipolar.views = ""
 
 
+@functools.lru_cache(maxsize=1)
 def _picked(run: RunViews, module: int, column: float, row: float, k: float) -> Picked:
     views, index = run.views, run.index(module)
     n_v, n_u = views.shape

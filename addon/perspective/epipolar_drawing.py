@@ -1,5 +1,6 @@
 """The picked pixel, its ray and epipolar lines, drawn over the pictures and in the 3D views; never rendered."""
 
+from collections.abc import Callable
 from typing import Any
 
 import bpy
@@ -51,21 +52,13 @@ def draw_over_pictures() -> None:
 
     unit = context.preferences.system.ui_scale
     radius, others, own = unit * _RADIUS, index != found.index, index == found.index
-    places = placed(found.places)
-    faint, lines = (_open_at(placed(ends), places, radius)[others] for ends in (found.lines, found.lines_in_roi))
-    epipoles = placed(found.epipoles)[others, None, None] + radius * _CROSS
-    markers = places[others, None, None] + radius * _CIRCLE
-    edges = placed(found.pixel + np.full((len(found.places), 1, 2), 0.5))[own, 0]
-    half = np.maximum(np.abs(edges - places[own]), radius)[:, None, None]
+    edges = placed(found.pixel + np.full((len(found.places), 1, 2), 0.5))[:, 0]
+    half = np.maximum(np.abs(edges - placed(found.places)), radius)[:, None, None]
     gpu.state.blend_set("ALPHA")
-    _lines(faint, _FAINT, unit * _WIDTH)
-    for ends, color, thick in (
-        (lines, _LINE, _WIDTH),
-        (epipoles, _LINE, _WIDTH),
-        (places[own, None, None] + half * _SQUARE, _PIXEL, _MARKER_WIDTH),
-        (markers, _MARKER, _MARKER_WIDTH),
-    ):
-        _lines(ends, _OUTLINE, unit * (thick + 2.0))
+    for of_own, ends, color, thick in _shapes(found, placed, radius, half):
+        ends = ends[own if of_own else others]
+        if color != _FAINT:
+            _lines(ends, _OUTLINE, unit * (thick + 2.0))
         _lines(ends, color, unit * thick)
     gpu.state.blend_set("NONE")
 
@@ -157,14 +150,26 @@ def _on_planes(context: bpy.types.Context, found: epipolar.Picked) -> _Drawn:
         return ((1 - _BEFORE) * pinholes + _BEFORE * points)[chosen].reshape(-1, 2, 3)
 
     others, own = seen & (index != found.index), seen & (index == found.index)
-    places, epipoles = (local(pixels)[:, None, None] for pixels in (found.places, found.epipoles))
-    faint, lines = (_open_at(local(ends), places[:, 0, 0], radius) for ends in (found.lines, found.lines_in_roi))
+    shapes = _shapes(found, local, radius, radius)
+    return [(world(own if of_own else others, ends), color, width) for of_own, ends, color, width in shapes]
+
+
+def _shapes(
+    found: epipolar.Picked, placed: Callable[[Floats], Floats], radius: float, half: float | Floats
+) -> list[tuple[bool, Floats, tuple[float, ...], float]]:
+    """What is drawn: whether of the picked module or of all others, ends (P, n, 2, 2) of lines, their colour and width.
+
+    ``placed(pixels)`` gives the places (P, …, 2) of pixels (M, …, 2) of the modules; marks have a `radius` there, and `half`
+    (P, 1, 1, 2) is that of the picked pixel.
+    """
+    places, epipoles = (placed(pixels)[:, None, None] for pixels in (found.places, found.epipoles))
+    faint, lines = (_open_at(placed(ends), places[:, 0, 0], radius) for ends in (found.lines, found.lines_in_roi))
     return [
-        (world(others, faint), _FAINT, _WIDTH),
-        (world(others, lines), _LINE, _WIDTH),
-        (world(others, epipoles + radius * _CROSS), _LINE, _WIDTH),
-        (world(others, places + radius * _CIRCLE), _MARKER, _MARKER_WIDTH),
-        (world(own, places + radius * _SQUARE), _PIXEL, _MARKER_WIDTH),
+        (False, faint, _FAINT, _WIDTH),
+        (False, lines, _LINE, _WIDTH),
+        (False, epipoles + radius * _CROSS, _LINE, _WIDTH),
+        (False, places + radius * _CIRCLE, _MARKER, _MARKER_WIDTH),
+        (True, places + half * _SQUARE, _PIXEL, _MARKER_WIDTH),
     ]
 
 

@@ -16,22 +16,21 @@ import numpy as np
 from mathutils import Matrix
 from numpy.typing import NDArray
 
-from ...core.errors import InputError
-from ...core.geometry.views import Views
+from ...core import InputError, PerspectiveGrid, Views, from_perspective, to_perspective
+from ...core.geometry.frames import affine_matrix
 from ...core.memory import require
-from ...core.perspective.perspective_grid import PerspectiveGrid
-from ...core.perspective.resampling import from_perspective, to_perspective
-from ...core.progress import Progress, stages_of, tell
+from ...core.progress import Progress, Stages, stages_of, tell
 from ...core.runs.mosaic import as_seen, png
 from ...core.runs.run_recipe import recipe_views
 from ...core.volumes.volume import Volume, outside_value
-from ..blender import ids, jobs, storage
+from ..blender import ids, jobs, objects
 from ..phantoms import phantoms
+from ..pictures import images
 from ..runs import runs
-from ..scanner import cameras, selection
+from ..scanner import selection
 from ..scanner.module_values import module_numbers, system_of
 from ..volumes import slices, volume_materials, volumes
-from ..volumes.stored_volumes import StoredVolume, store_volume
+from ..volumes.stored_volumes import StoredVolume
 
 _KEY = "mphdrr_frustum"  # custom property of the lines: what the frustum was made of, JSON
 _NEAREST = 0.1  # of the pinhole's distance from the isocentre: where layers begin at the nearest
@@ -70,10 +69,7 @@ def showing(context: bpy.types.Context, planes: int, uniform: str) -> jobs.Job:
 
     def work(progress: Progress) -> tuple[PerspectiveGrid, list[bytes]]:
         stages = stages_of(progress)
-        stages("reading the voxels")
-        volume = asked.read()
-        g = _grid(asked, volume, planes, uniform)
-        array = in_perspective(volume, g, stages("following the rays"))
+        _, g, array = _followed(asked, planes, uniform, stages)
         packing, files = stages("packing"), list[bytes]()
         for layer in np.moveaxis(array, 2, 0):
             files.append(png(colored(as_seen(layer.T), quantity, low, high), _PNG_LEVEL))
@@ -99,35 +95,33 @@ def resampling(context: bpy.types.Context, cells: int, uniform: str) -> jobs.Job
 
     Raises InputError as `showing`.
     """
-    asked, folder = _request(context), storage.folder()
-    pose, shown = volumes.pose_of_object(context.object), _shown_range(context.object)
-    collection = context.object.users_collection[0]
-    collection_uid = collection.session_uid
+    asked, shown = _request(context), _shown_range(context.object)
     rows, columns = asked.views.shape
     voxels = float(np.prod(context.object.mphdrr_volume.shape))
     require(8.0 * cells * rows * columns + 8.0 * voxels, f"{columns} x {rows} x {cells} cells")
     provenance = {"volume": asked.name, "through": asked.module, "cells": [columns, rows, cells], "evenly_in": uniform}
 
-    def work(progress: Progress) -> StoredVolume:
+    def make(progress: Progress) -> Volume:
         stages = stages_of(progress)
-        stages("reading the voxels")
-        volume = asked.read()
-        g = _grid(asked, volume, cells, uniform)
-        array = in_perspective(volume, g, stages("following the rays"))
-        found = on_voxels(array, g, volume, stages("back on voxels"))
-        stages("writing the voxels")
-        return store_volume(found, folder, pose, provenance)
+        volume, g, array = _followed(asked, cells, uniform, stages)
+        return on_voxels(array, g, volume, stages("back on voxels"))
 
-    def finish(stored: StoredVolume) -> str:
-        home = jobs.found_again(bpy.data.collections, collection_uid)
-        item = volumes.add_stored(stored, f"{asked.name} through {asked.module}", home)
+    def finish(item: bpy.types.Object, stored: StoredVolume) -> str:
         item.mphdrr_volume.display_low, item.mphdrr_volume.display_high = shown
-        volumes.make_active(bpy.context, item)
-        _, factor = volume_materials.shown_unit(stored.volume.quantity)
-        values = f"{factor * stored.low:.4g} to {factor * stored.high:.4g} {item.mphdrr_volume.unit}".removesuffix(" 1")
-        return f"Added {item.name!r}: {values}"
+        return f"Added {item.name!r}: {volumes.values_text(stored)}"
 
-    return jobs.Job(f"{asked.name} through {asked.module}", work, finish)
+    name, pose = f"{asked.name} through {asked.module}", volumes.pose_of_object(context.object)
+    return volumes.adding(name, make, name, finish, pose, provenance, context.object.users_collection[0])
+
+
+def _followed(
+    asked: _Request, layers: int, uniform: str, stages: Stages
+) -> tuple[Volume, PerspectiveGrid, NDArray[np.float32]]:
+    """The volume, the module's cells, and what these see of it."""
+    stages("reading the voxels")
+    volume = asked.read()
+    g = _grid(asked, volume, layers, uniform)
+    return volume, g, in_perspective(volume, g, stages("following the rays"))
 
 
 def in_perspective(volume: Volume, g: PerspectiveGrid, progress: Progress | None = None) -> NDArray[np.float32]:
@@ -157,7 +151,8 @@ def colored(values: NDArray[np.float32], quantity: str, low: float, high: float)
 
 def frustums(scene: bpy.types.Scene) -> list[bpy.types.Object]:
     """The frustums in the scene: their lines, which have the layers as children."""
-    return sorted((o for home in _homes(scene) for o in home.objects if _KEY in o), key=lambda o: o.name)
+    homes = objects.homes(scene, ids.PERSPECTIVES)
+    return sorted((o for home in homes for o in home.objects if _KEY in o), key=lambda o: o.name)
 
 
 def layers(frustum: bpy.types.Object) -> list[bpy.types.Object]:
@@ -204,14 +199,11 @@ def remove(scene: bpy.types.Scene, modules: list[bpy.types.Object] | None = None
     """Remove the frustums of modules (their cameras), or of all, with what belongs to them; returns how many."""
     found = [frustum for frustum in frustums(scene) if modules is None or frustum.parent in modules]
     for frustum in found:
-        cameras.remove_objects([*frustum.children, frustum])
-    for home in _homes(scene):
-        if not home.all_objects:
-            bpy.data.collections.remove(home)
+        objects.remove_objects([*frustum.children, frustum])
+    objects.remove_empty_homes(scene, ids.PERSPECTIVES)
     return len(found)
 
 
-@bpy.app.handlers.persistent
 def after_update(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
     """Modules were shown, hidden or deleted: their frustums, too."""
     if not depsgraph.id_type_updated("SCENE") or scene != bpy.context.scene:
@@ -292,11 +284,8 @@ def _build(
     scene: bpy.types.Scene, camera: bpy.types.Object, asked: _Request, g: PerspectiveGrid, files: list[bytes]
 ) -> None:
     """Put a frustum into the scene: lines around the layers and from the pinhole, and a picture for each layer."""
-    home = next(iter(_homes(scene)), None)
-    if home is None:
-        home = bpy.data.collections.new(ids.PERSPECTIVES)
-        scene.collection.children.link(home)
-    to_camera = np.linalg.inv(cameras.world_matrix(camera))
+    home = objects.home(scene, ids.PERSPECTIVES)
+    to_camera = np.linalg.inv(objects.world_matrix(camera))
     corners = _corners(g) @ to_camera[:3, :3].T + to_camera[:3, 3]  # (n_k, 4, 3)
     name = ids.part_name(camera.name, "perspective")
     frustum = bpy.data.objects.new(name, _lines(name, corners))
@@ -308,18 +297,13 @@ def _build(
     digits = len(str(len(files)))
     for n, (file, (origin, along_u, _, along_v)) in enumerate(zip(files, corners, strict=True), start=1):
         text = f"{name} layer {n:0{digits}d}"
-        picture = bpy.data.images.new(text, 1, 1, alpha=True)
-        picture.pack(data=file, data_len=len(file))
-        picture.source = "FILE"
-        layer = bpy.data.objects.new(text, None)
-        layer.empty_display_type, layer.data, layer.use_empty_image_alpha = "IMAGE", picture, True
-        layer.empty_image_side, layer.empty_display_size = "DOUBLE_SIDED", max(n_u, n_v)
+        picture = images.filled(bpy.data.images.new(text, 1, 1, alpha=True), file)
+        layer = objects.picture_empty(text, frustum, picture, "DOUBLE_SIDED")
+        layer.empty_display_size = max(n_u, n_v)
         across, up = origin - along_u, along_v - origin  # a picture's columns go against u, as the pinhole sees it
-        matrix = np.eye(4)
-        matrix[:3, 0], matrix[:3, 1] = across / n_u, up / n_v
-        matrix[:3, 2] = np.cross(across, up) / np.linalg.norm(np.cross(across, up))
-        matrix[:3, 3] = (along_u + along_v) / 2
-        layer.parent, layer.hide_select, layer.matrix_basis = frustum, True, Matrix(matrix)
+        normal = np.cross(across, up) / np.linalg.norm(np.cross(across, up))
+        matrix = affine_matrix(np.column_stack([across / n_u, up / n_v, normal]), (along_u + along_v) / 2)
+        layer.hide_select, layer.matrix_basis = True, Matrix(matrix)
         home.objects.link(layer)
 
 
@@ -337,8 +321,3 @@ def _lines(name: str, corners: Floats) -> bpy.types.Mesh:
     mesh = bpy.data.meshes.new(name)
     mesh.from_pydata(points, [*around, *((0, last - a) for a in range(4))], [])
     return mesh
-
-
-def _homes(scene: bpy.types.Scene) -> list[bpy.types.Collection]:
-    """The collections of frustums in the scene."""
-    return [home for home in scene.collection.children if home.name.startswith(ids.PERSPECTIVES)]

@@ -1,9 +1,11 @@
-"""The Perspective panel's settings: `Scene.mphdrr_perspective`."""
+"""The settings of the Perspective panel, `Scene.mphdrr_perspective`, and of Epipolar Lines, `Scene.mphdrr_epipolar`."""
 
 import bpy
-from bpy.props import EnumProperty, IntProperty
+from bpy.props import EnumProperty, FloatProperty, IntProperty, StringProperty
 
 from ..blender import choices
+from ..blender.updates import on_edit
+from . import epipolar
 
 _UNIFORM = (
     ("K", "Magnification", "Evenly spaced in k, the magnification: densest near the pinhole, where a module sees most"),
@@ -32,4 +34,46 @@ class PerspectiveProperties(PerspectiveSettings, bpy.types.PropertyGroup):
     """State of the Perspective panel."""
 
 
-CLASSES = (PerspectiveProperties,)
+def _range(settings: bpy.types.PropertyGroup) -> tuple[float, float]:
+    """k at the front and at the back of the ROI; (0, 0) where no pixel is picked."""
+    found, _ = epipolar.shown(settings.id_data)
+    return (0.0, 0.0) if found is None else found.k_range
+
+
+def _along(settings: bpy.types.PropertyGroup) -> float:
+    front, back = _range(settings)
+    return min(max((settings.k - front) / (back - front), 0.0), 1.0) if front != back else 0.0
+
+
+def _set_along(settings: bpy.types.PropertyGroup, value: float) -> None:
+    front, back = _range(settings)
+    if front != back:
+        settings.k = front + value * (back - front)
+
+
+class EpipolarProperties(bpy.types.PropertyGroup):
+    """A pixel of the shown run, and a marker on its ray."""
+
+    views: StringProperty(
+        name="Views", description="Which views the pixel was picked in; empty: none is picked", options={"HIDDEN"}
+    )
+    module: IntProperty(name="Module", description="Number of the module whose pixel it is", update=on_edit("epipolar"))
+    column: FloatProperty(
+        name="Column", description="Of the pixel, counted as in the arrays, along +u; 0: the centre of pixel 0", step=100,
+        precision=2, update=on_edit("epipolar"),
+    )  # fmt: skip
+    row: FloatProperty(
+        name="Row", description="Of the pixel, counted as in the arrays, along +v; 0: the centre of pixel 0", step=100,
+        precision=2, update=on_edit("epipolar"),
+    )  # fmt: skip
+    k: FloatProperty(
+        name="k", description="Magnification of the marker in the picked module: the virtual detector's distance from the "
+        "pinhole over the marker's depth", default=1.0, min=1e-6, step=1, precision=4, update=on_edit("epipolar"),
+    )  # fmt: skip
+    along: FloatProperty(
+        name="Along Ray", description="Where the marker is, evenly in k: 0 at the front of the ROI, 1 at its back",
+        subtype="FACTOR", min=0.0, max=1.0, get=_along, set=_set_along,
+    )  # fmt: skip
+
+
+CLASSES = (PerspectiveProperties, EpipolarProperties)

@@ -4,7 +4,7 @@ import bpy
 
 from ...core.errors import InputError
 from ...core.recording import recorded_warnings
-from ..blender import jobs
+from ..blender import jobs, timers
 from . import phantoms
 
 QUICK_VOXELS = 64**3
@@ -36,14 +36,8 @@ def settings_changed(item: bpy.types.ID) -> None:
     properties.message = next(iter(caught), "")
     if properties.outdated and settings.n_voxels <= RESTED_VOXELS and _has_window():
         _edited = item.name
-        stop()
-        bpy.app.timers.register(_rested, first_interval=_REST)
-
-
-def stop() -> None:
-    """Forget what waits: the extension is disabled."""
-    if bpy.app.timers.is_registered(_rested):
-        bpy.app.timers.unregister(_rested)
+        timers.forget(_rested)
+        timers.soon(_rested, _REST)
 
 
 def _has_window() -> bool:

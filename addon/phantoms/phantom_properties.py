@@ -18,14 +18,13 @@ from bpy.props import (
     StringProperty,
 )
 
-from ...core.errors import InputError
-from ...core.geometry.grid import Grid
+from ...core import Grid, InputError, Phantom
 from ...core.phantoms.kinds import KINDS, Kind
 from ...core.phantoms.language import parse_phantom
-from ...core.phantoms.phantom import Phantom
 from ...core.volumes.volume import UNITS
 from ..blender import choices
 from ..blender.decimals import typed
+from ..blender.layouts import draw_all
 from ..blender.updates import on_edit
 
 FILE = "file"  # beside the names of `KINDS`: a phantom that a text in TOML describes
@@ -87,9 +86,7 @@ class PhantomSettings:
                         row.prop(self, name, index=k, text="")
             else:
                 own.prop(self, name)
-        column = layout.column(align=True)
-        for name in sampling():
-            column.prop(self, name)
+        draw_all(layout.column(align=True), self, *sampling())
 
 
 class KindSettings(PhantomSettings):

@@ -16,15 +16,14 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core.errors import InputError
+from ...core import InputError, Mesh, Phantom
+from ...core.geometry.frames import affine_matrix
 from ...core.geometry.grid import Grid, grid_around
 from ...core.memory import require
-from ...core.phantoms.phantom import Phantom
 from ...core.progress import Progress, part_of, stages_of
-from ...core.volumes.meshes.mesh import Mesh
 from ..blender import jobs, storage
+from ..blender.objects import remove_objects, set_world_matrix, world_matrix
 from ..blender.reports import Need
-from ..scanner.cameras import remove_objects, set_world_matrix, world_matrix
 from ..volumes import meshes, volumes
 from ..volumes.stored_volumes import StoredVolume, moved, store_volume
 from ..volumes.vdb import provenance_of
@@ -73,8 +72,7 @@ class Recipe:
         stored = []
         for quantity, pose in zip(quantities, poses, strict=True):
             if baked:
-                place = np.eye(4)
-                place[:3, 3] = pose[:3, 3]
+                place = affine_matrix(np.eye(3), pose[:3, 3])
                 # A grid along the world's axes that holds the phantom, with voxels as small as its own.
                 corners = list(itertools.product(*zip(*self.phantom.box, strict=True))) @ pose[:3, :3].T + pose[:3, 3]
                 grid = grid_around(corners, min(Grid(self.grid.shape, pose @ self.grid.affine).spacing))
@@ -148,7 +146,7 @@ def adding(
 def take_settings(item: bpy.types.Object, kind: str, values: Mapping[str, Any]) -> None:
     """Say that a volume is the phantom of a kind (`PhantomSettings.identifier`) with these settings; its voxels stay."""
     properties = item.mphdrr_volume
-    properties.kind = "VOLUME"  # until the kind is said, no change of a setting makes the voxels again
+    properties.kind = "VOLUME"  # until the kind is set, no change of a setting makes the voxels again
     for key, value in values.items():
         setattr(getattr(properties, kind), key, value)
     properties.kind = kind.upper()

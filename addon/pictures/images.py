@@ -13,13 +13,12 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core.geometry.views import Views
+from ...core import ProjectionRun, Views
 from ...core.memory import cores
-from ...core.progress import Progress, tell
+from ...core.progress import Progress, part_of, tell
 from ...core.runs.display import Display
 from ...core.runs.exr import exr_bytes
 from ...core.runs.mosaic import Sheet, as_seen, labels, png, sheet, smaller
-from ...core.runs.run import ProjectionRun
 from ..blender import ids, jobs
 from ..blender.reports import Need
 from ..blender.windows import areas
@@ -27,7 +26,7 @@ from ..blender.windows import areas
 _KEY = "mphdrr_projection"  # custom property: marks the images that a new run replaces
 _ARRAYS = ("sources", "detector_centers", "u_steps", "v_steps")
 _PIXELS = 2.2e7
-"""Of all pictures together, about: larger images are shown smaller, since a picture takes memory again when it is drawn."""
+"""About as many all pictures have together: larger images are shown smaller, since drawing a picture takes memory again."""
 _PNG_LEVEL = 1  # fast
 _WAIT = 0.005  # s between two looks at a thread
 _SCANNER = "mphdrr_scanner"  # custom property of the mosaic: the collection of the scanner that the run is of
@@ -50,10 +49,9 @@ class Pictures:
 
 def pictures(run: ProjectionRun, display: Display, progress: Progress | None = None) -> Pictures:
     """Make the contents of a run's images; leaves bpy alone. `progress` counts the files."""
-    count = 2 * len(run.views)
-    exact = _in_threads(exr_bytes, as_seen(run.projections), progress, 0, count)
+    exact = _in_threads(exr_bytes, as_seen(run.projections), part_of(progress, 0, 2))
     rings = run.system.rings().tolist()
-    colored = _colored(run.projections, display, progress, count // 2)
+    colored = _colored(run.projections, display, part_of(progress, 1, 2))
     return Pictures(display, exact, colored, *_mosaic(run.projections, labels(run), rings, run.unit, display))
 
 
@@ -71,7 +69,7 @@ def storing(run: ProjectionRun, made: Pictures) -> Generator[tuple[str, int, int
             yield "storing", k, len(numbers)
             name = projection_name(number, numbers)
             new[name] = bpy.data.images.new(name, 1, 1, float_buffer=True, is_data=True)
-            _fill(new[name], exact)
+            filled(new[name], exact)
             new[ids.picture_name(name)] = _new_picture(ids.picture_name(name), colored)
         yield "storing", len(numbers), len(numbers)
         new[ids.MOSAIC] = _new_picture(ids.MOSAIC, made.mosaic)  # as large as all: it has a turn of its own
@@ -113,25 +111,25 @@ def showing_again(display: Display, kept: dict[int, NDArray[np.float32]]) -> Gen
         del found
     projections = kept[uid]
     file, drawn = yield from _in_thread(lambda progress: _mosaic(projections, texts, rings, unit, display), False)
-    mosaic = _fill(bpy.data.images[ids.MOSAIC], file)
+    mosaic = filled(bpy.data.images[ids.MOSAIC], file)
     _describe(_read_now(mosaic), drawn, numbers, rings, unit, None)
     files = yield from _in_thread(lambda progress: _colored(projections, display, progress), True)
     for name, file in zip(names, files, strict=True):
         picture = bpy.data.images.get(ids.picture_name(name))
         if picture is not None:
-            _read_now(_fill(picture, file))
+            _read_now(filled(picture, file))
             yield True
     _describe(bpy.data.images[ids.MOSAIC], drawn, numbers, rings, unit, display)
 
 
-def _in_thread(make: Callable[[Progress], Any], said: bool) -> Generator[bool, None, Any]:
-    """What `make` makes in a thread; yields what is `said` meanwhile."""
+def _in_thread(make: Callable[[Progress], Any], is_mosaic_made: bool) -> Generator[bool, None, Any]:
+    """What `make` makes in a thread; yields `is_mosaic_made` meanwhile."""
     worker = jobs.Worker("Colours", make)
     worker.start()
     try:
         while worker.is_alive():
             worker.join(_WAIT)
-            yield said
+            yield is_mosaic_made
     finally:
         worker.cancel.set()
     if worker.error is not None:
@@ -140,7 +138,7 @@ def _in_thread(make: Callable[[Progress], Any], said: bool) -> Generator[bool, N
 
 
 def tiles(image: bpy.types.Image | None) -> dict[str, Any] | None:
-    """Of the mosaic: `numbers` and `rings` of its modules, `unit`, the tiles' size `tile` and their `corners`; else None.
+    """What the mosaic shows: `numbers` and `rings` of its modules, `unit`, the tiles' size `tile` and `corners`; else None.
 
     Rows and columns are counted from the top left. `window` is that of the colours; `totals` are what `summed` says of each
     image, "sum" or "mean", `maxima` their largest numbers, and `half` whether only their middle halves are meant and shown.
@@ -194,17 +192,11 @@ def projection_name(number: int, numbers: list[int]) -> str:
     return ids.projection_name(number, max(numbers))
 
 
-def _colored(
-    projections: NDArray[np.float32], display: Display, progress: Progress | None = None, done: int = 0
-) -> list[bytes]:
-    """The pictures of projections (M, n_v, n_u) in one window, as PNG files; `progress` counts them after those `done`."""
+def _colored(projections: NDArray[np.float32], display: Display, progress: Progress | None = None) -> list[bytes]:
+    """The pictures of projections (M, n_v, n_u) in one window, as PNG files; `progress` counts them."""
     window = display.window(projections)
-
-    def file(picture: NDArray[np.float32]) -> bytes:
-        return png(display.colored(picture, window), _PNG_LEVEL)
-
     shown = smaller(as_seen(display.part(projections)), _PIXELS)
-    return _in_threads(file, shown, progress, done, done + len(shown))
+    return _in_threads(lambda picture: png(display.colored(picture, window), _PNG_LEVEL), shown, progress)
 
 
 def _mosaic(
@@ -215,15 +207,13 @@ def _mosaic(
     return png(drawn.picture, _PNG_LEVEL), drawn
 
 
-def _in_threads(
-    make: Callable[[Any], bytes], pictures: NDArray[np.float32], progress: Progress | None, done: int, total: int
-) -> list[bytes]:
+def _in_threads(make: Callable[[Any], bytes], pictures: NDArray[np.float32], progress: Progress | None) -> list[bytes]:
     """What `make` makes of each picture."""
     files: list[bytes] = []
     with ThreadPoolExecutor(cores()) as pool:
         for file in pool.map(make, pictures):
             files.append(file)
-            tell(progress, done + len(files), total)
+            tell(progress, len(files), len(pictures))
     return files
 
 
@@ -259,7 +249,7 @@ def store_reconstruction(file: bytes) -> bpy.types.Image:
 def _store(name: str, file: bytes) -> bpy.types.Image:
     """One of our images of that name, showing a PNG; saved while nothing shows it."""
     old = bpy.data.images.get(name)
-    image = _new_picture(name, file) if old is None else _fill(old, file)
+    image = _new_picture(name, file) if old is None else filled(old, file)
     image.use_fake_user, image[_KEY] = True, True
     return image
 
@@ -294,13 +284,6 @@ def projection_array(image: bpy.types.Image) -> NDArray[np.float32]:
     if not was_read and image.packed_file is not None:
         image.buffers_free()  # four times the size of the numbers
     return np.ascontiguousarray(pixels.reshape(height, width, 4)[:, ::-1, 0])
-
-
-def redraw_mosaic() -> None:
-    """Have the Image Editors that show the mosaic drawn again: another module is active."""
-    for area in areas("IMAGE_EDITOR"):
-        if tiles(area.spaces.active.image) is not None:
-            area.tag_redraw()
 
 
 def show(image: bpy.types.Image, context: bpy.types.Context) -> bool:
@@ -355,7 +338,7 @@ def _fit(context: bpy.types.Context, window: bpy.types.Window, area: bpy.types.A
 
 
 def _new_picture(name: str, png: bytes) -> bpy.types.Image:
-    return _read_now(_fill(bpy.data.images.new(name, 1, 1), png))
+    return _read_now(filled(bpy.data.images.new(name, 1, 1), png))
 
 
 def _read_now(image: bpy.types.Image) -> bpy.types.Image:
@@ -364,7 +347,7 @@ def _read_now(image: bpy.types.Image) -> bpy.types.Image:
     return image
 
 
-def _fill(image: bpy.types.Image, file: bytes) -> bpy.types.Image:
+def filled(image: bpy.types.Image, file: bytes) -> bpy.types.Image:
     """Pack the contents of a file into an image, which shows it from now on."""
     image.pack(data=file, data_len=len(file))
     if image.source != "FILE":

@@ -11,10 +11,8 @@ import numpy as np
 from mathutils import Matrix
 from numpy.typing import NDArray
 
-from ...core.geometry.system import PinholeSystem
-from ...core.geometry.views import Views
-from ...core.runs.run import ProjectionRun
-from ..blender import ids
+from ...core import PinholeSystem, ProjectionRun, Views
+from ..blender import ids, objects
 from ..scanner import grabbing, scanner, selection
 from . import images
 
@@ -22,7 +20,7 @@ _KEY = (
     "mphdrr_field"  # custom property of a plane: middle and size (5,) of the virtual detector in the camera's frame, mm
 )
 _NEAR = 1e-5  # rounding
-_BETWEEN = 0.3  # of the way from the pinhole to the ROI's surface: where a plane is unless told otherwise
+_BETWEEN = 0.3  # of the way from the pinhole to the ROI's surface: where a plane is by default
 
 
 def make(scene: bpy.types.Scene, run: ProjectionRun, collection: bpy.types.Collection | None) -> list[bpy.types.Object]:
@@ -36,10 +34,7 @@ def make(scene: bpy.types.Scene, run: ProjectionRun, collection: bpy.types.Colle
     if collection is None:
         return []
     old = {plane.parent: plane for plane in planes(scene)}  # used again: Blender need not sort the scene's objects anew
-    home = next(iter(_homes(scene)), None)
-    if home is None:
-        home = bpy.data.collections.new(ids.PLANES)
-        scene.collection.children.link(home)
+    home = objects.home(scene, ids.PLANES)
     cameras = {camera.mphdrr_module.number: camera for camera in scanner.modules(collection)}
     made = []
     numbers = run.system.numbers.tolist()
@@ -50,9 +45,8 @@ def make(scene: bpy.types.Scene, run: ProjectionRun, collection: bpy.types.Colle
         picture = bpy.data.images[ids.picture_name(images.projection_name(number, numbers))]
         plane = old.pop(camera, None)
         if plane is None:
-            plane = bpy.data.objects.new(ids.part_name(camera.name, "projection"), None)
-            plane.empty_display_type, plane.empty_image_side, plane.use_empty_image_alpha = "IMAGE", "BACK", True
-            plane.parent, plane.lock_scale = camera, (True, True, True)
+            plane = objects.picture_empty(ids.part_name(camera.name, "projection"), camera, picture, "BACK")
+            plane.lock_scale = (True, True, True)
             plane.mphdrr_module.part, plane.mphdrr_module.number = "PLANE", number
             home.objects.link(plane)
         else:
@@ -68,28 +62,21 @@ def make(scene: bpy.types.Scene, run: ProjectionRun, collection: bpy.types.Colle
 
 def planes(scene: bpy.types.Scene) -> list[bpy.types.Object]:
     """The planes in the scene."""
-    return [o for home in _homes(scene) for o in home.objects if _KEY in o]
+    return [o for home in objects.homes(scene, ids.PLANES) for o in home.objects if _KEY in o]
 
 
-def remove(scene: bpy.types.Scene, collection: bpy.types.Collection | None = None) -> None:
-    """Remove the planes and the cameras' backgrounds, of one scanner or of all."""
+def remove(scene: bpy.types.Scene, modules: list[bpy.types.Object] | None = None) -> None:
+    """Remove the planes and the backgrounds of modules (their cameras), or of all."""
     for plane in planes(scene):
-        if collection is None or plane.parent in scanner.modules(collection):
+        if modules is None or plane.parent in modules:
             _remove(plane)
-    for home in _homes(scene):
-        if not home.all_objects:
-            bpy.data.collections.remove(home)
+    objects.remove_empty_homes(scene, ids.PLANES)
 
 
 def _remove(plane: bpy.types.Object) -> None:
     if plane.parent is not None:
         _remove_background(plane.parent.data, plane.data)
     bpy.data.objects.remove(plane)
-
-
-def _homes(scene: bpy.types.Scene) -> list[bpy.types.Collection]:
-    """The collections of planes in the scene."""
-    return [home for home in scene.collection.children if home.name.startswith(ids.PLANES)]
 
 
 def update(scene: bpy.types.Scene) -> None:
@@ -146,7 +133,6 @@ def share_of_way(settings: bpy.types.PropertyGroup, module: bpy.types.PropertyGr
     return (settings.plane_distance or _BETWEEN * (module.pinhole_distance - module.roi_radius)) / distance
 
 
-@bpy.app.handlers.persistent
 def after_update(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
     """Another module is active, modules were shown or hidden, or `l` was edited: planes and backgrounds follow."""
     if depsgraph.id_type_updated("SCENE") and scene == bpy.context.scene:

@@ -12,7 +12,7 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ..blender import ids
+from ..blender import ids, timers
 from . import images, planes
 
 _REST = 0.05  # s after an edit of the display until the pictures are made anew
@@ -28,11 +28,10 @@ def display_changed(*_: Any) -> None:
     if bpy.app.background:
         for _step in recoloring():
             pass
-    elif not bpy.app.timers.is_registered(_turn):
-        bpy.app.timers.register(_turn, first_interval=_REST)
+    else:
+        timers.soon(_turn, _REST)
 
 
-@bpy.app.handlers.persistent
 def check(*_: Any) -> None:
     """Make the pictures anew where they are not as the display says: Undo, or a file, may have them of different times."""
     scene = bpy.context.scene
@@ -47,8 +46,6 @@ def stop() -> None:
     """Forget what waits: the extension is disabled."""
     global _asked, _steps
     _asked, _steps = False, None
-    if bpy.app.timers.is_registered(_turn):
-        bpy.app.timers.unregister(_turn)
 
 
 def recoloring() -> Generator[None, None, None]:

@@ -24,11 +24,11 @@ class Picture:
     number: int
     """The module's."""
     name: str
-    """Of the exact image."""
+    """The exact image's."""
     corner: tuple[int, int]
     """Row and column of its top left in the image, pixels of that."""
     size: tuple[int, int]
-    """Rows and columns of it, pixels of the image."""
+    """Its rows and columns, pixels of the image."""
     half: bool
     """Whether it shows the projection's middle half."""
 

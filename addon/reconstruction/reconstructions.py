@@ -26,10 +26,9 @@ from ...core.runs.reconstructing import reconstruct_run, reconstruction_grid
 from ...core.runs.run import ProjectionRun
 from ...core.runs.run_recipe import truth_of_run
 from ...core.volumes.volume import Volume
-from ..blender import ids, jobs, plots, storage
+from ..blender import ids, jobs, objects, plots, storage
 from ..pictures import images
 from ..runs import rendering, runs
-from ..scanner import cameras
 from ..volumes import volumes
 from ..volumes.stored_volumes import StoredVolume, store_volume
 
@@ -154,7 +153,7 @@ class _Shelf:
         item = jobs.found_again(bpy.data.objects, self._item)
         if item is not None:
             materials = [material for material in item.data.materials if material]
-            cameras.remove_objects([item, *item.children])
+            objects.remove_objects([item, *item.children])
             bpy.data.batch_remove([material for material in materials if material.users == 0])
         scene = jobs.found_again(bpy.data.scenes, self._scene)
         if scene is not None and self._item:

@@ -6,13 +6,11 @@ from typing import Any
 
 import bpy
 
-from ...core.errors import InputError
+from ...core import InputError, ProjectionRun
 from ...core.geometry.system import chosen_modules
 from ...core.progress import Progress, stages_of
-from ...core.runs.files import write_run
 from ...core.runs.measured import recipe_counts
 from ...core.runs.mosaic import caption
-from ...core.runs.run import ProjectionRun
 from ..blender import jobs
 from ..pictures import images
 from ..scanner import scanner
@@ -21,10 +19,10 @@ from . import rendering, runs
 _OF_FRAMES = ("detector.rows", "detector.columns", "detector.plane", "detector.magnification", "detector.pitch")
 
 
-def importing(context: bpy.types.Context, paths: list[Path], said: Mapping[str, Any]) -> jobs.Job:
+def importing(context: bpy.types.Context, paths: list[Path], given: Mapping[str, Any]) -> jobs.Job:
     """The job that reads measured counts as the run of the scene's scanner.
 
-    `said` are entries of a recipe: of its table ``counts``, the time, the pixel size, the modules. The rest of the model,
+    `given` are entries of a recipe: of its table ``counts``, the time, the pixel size, the modules. The rest of the model,
     such as isotope and aperture, which a reconstruction needs, is the panel's. Raises InputError where there is no scanner.
     """
     if not paths:
@@ -34,7 +32,7 @@ def importing(context: bpy.types.Context, paths: list[Path], said: Mapping[str, 
     recipe = runs.panel_recipe(scene).updated(
         {**dict.fromkeys(_OF_FRAMES), "model.time": None}
         | {"model.kind": "emission", "counts.files": [str(path) for path in paths]}
-        | dict(said)
+        | dict(given)
     )
     system = chosen_modules(scanner.read_scanner(collection), recipe["system.modules"], "modules")
     path, display = rendering.run_path(scene), scene.mphdrr_display.display()
@@ -43,9 +41,7 @@ def importing(context: bpy.types.Context, paths: list[Path], said: Mapping[str, 
     def work(progress: Progress) -> tuple[ProjectionRun, images.Pictures]:
         stages = stages_of(progress)
         run = recipe_counts(recipe, system, stages)
-        stages("writing the run file")
-        write_run(run, path)
-        return run, images.pictures(run, display, stages("packing"))
+        return run, rendering.kept(run, path, display, stages)
 
     def finish(result: tuple[ProjectionRun, images.Pictures]) -> jobs.Finishing:
         run, made = result

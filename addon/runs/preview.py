@@ -16,17 +16,12 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core.errors import InputError
-from ...core.geometry.system import PinholeSystem
-from ...core.geometry.views import Views
+from ...core import InputError, PinholeSystem, ProjectionRun, Recipe, Views, Volume
 from ...core.memory import readable_size
 from ...core.runs.display import Display
 from ...core.runs.mosaic import as_seen, sized, totals
-from ...core.runs.recipe import Recipe
-from ...core.runs.run import ProjectionRun
 from ...core.runs.run_recipe import recipe_model, recipe_views, run_recipe
-from ...core.volumes.volume import Volume
-from ..blender import jobs, windows
+from ..blender import jobs, timers, windows
 from ..phantoms import phantoms
 from ..pictures import planes
 from ..scanner import scanner, selection
@@ -44,7 +39,10 @@ _INTERVAL = 0.02  # s between two looks, while there is something to do
 _REST = 0.3  # s without a change before the picture is made with all pixels
 _SHOWN_PIXELS = 512**2
 _MOST_CAUTIONS = 2
-_PATIENCE = 0.5  # s, after which it is said that a picture takes long
+_PATIENCE = 0.5  # s, after which a line says that a picture takes long
+_OF_MODULE = (
+    "numbers", "centers", "pinhole_diameter", "collimator_length", "detector_side", "detector_thickness",
+)  # fmt: skip
 
 Source = tuple[Path, NDArray[np.float64]]
 """File and pose (4, 4) of a volume, mm."""
@@ -64,7 +62,7 @@ class Request:
 
     def same_as(self, other: "Request | None") -> bool:
         """Whether the other request asks for the same picture."""
-        return other is not None and _told(self) == _told(other)
+        return other is not None and _words(self) == _words(other)
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,14 +169,11 @@ def _corners(views: Views, shape: tuple[int, ...], share: float) -> NDArray[np.f
     )
 
 
-def _told(asked: Request) -> tuple[str, ...]:
+def _words(asked: Request) -> tuple[str, ...]:
     """A request in words that two have in common exactly if they ask for the same."""
-    module = [asked.system.numbers, asked.system.centers]
-    module += [asked.system.pinhole_diameter, asked.system.collimator_length, asked.system.detector_side]
-    module += [asked.system.detector_thickness]
+    module = [getattr(asked.system, name).tolist() for name in _OF_MODULE]
     sources = [(str(path), pose.tolist()) for path, pose in filter(None, (asked.volume, asked.mu))]
-    values = [array.tolist() for array in module]
-    return tuple(map(repr, (dict(asked.recipe.given), values, sources, asked.display, asked.share, asked.lines)))
+    return tuple(map(repr, (dict(asked.recipe.given), module, sources, asked.display, asked.share, asked.lines)))
 
 
 class Session:
@@ -255,12 +250,12 @@ class Session:
         """What stands beside the picture."""
         waits = "Waits for the running job" if jobs.is_running() else self.late
         if self.problem:
-            said: tuple[str, ...] = ("No preview", self.problem)
+            lines: tuple[str, ...] = ("No preview", self.problem)
         elif self.shown is None:
-            said = ("Preview", "The first picture is being made")
+            lines = ("Preview", "The first picture is being made")
         else:
-            said = (*self.shown.lines, *self.cautions)
-        return (*said, waits) if waits else said
+            lines = (*self.shown.lines, *self.cautions)
+        return (*lines, waits) if waits else lines
 
     @property
     def kept(self) -> str:
@@ -286,26 +281,22 @@ def start() -> None:
     after_update()
 
 
-@bpy.app.handlers.persistent
 def stop(*_: Any) -> None:
     """Switch the preview off: also before a file is loaded, or the extension is disabled."""
     global _session, _drawing
-    if bpy.app.timers.is_registered(_look):
-        bpy.app.timers.unregister(_look)
+    timers.forget(_look)
     if _drawing is not None:
         _drawing()
         windows.redraw("VIEW_3D")
     _session = _drawing = None
 
 
-@bpy.app.handlers.persistent
 def after_update(scene: bpy.types.Scene | None = None, depsgraph: bpy.types.Depsgraph | None = None) -> None:
     """Something in the scene has changed: look at it as soon as Blender has time."""
     if _session is None or (depsgraph is not None and depsgraph.mode != "VIEWPORT"):
         return
     _session.has_changed = True
-    if not bpy.app.timers.is_registered(_look):
-        bpy.app.timers.register(_look)
+    timers.soon(_look)
 
 
 def _look() -> float | None:

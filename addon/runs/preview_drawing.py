@@ -3,6 +3,7 @@
 It is drawn over the views and is no datablock: nothing of it is saved, undone or rendered.
 """
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -23,31 +24,24 @@ def start(session: Any) -> Callable[[], None]:
     """Draw the preview of a `preview.Session` from now on; the result takes it back."""
     if bpy.app.background:
         return lambda: None
-    view, textures = bpy.types.SpaceView3D, _Textures()
+    view = bpy.types.SpaceView3D
     handles = [
-        view.draw_handler_add(_draw_plane, (session, textures), "WINDOW", "POST_VIEW"),
-        view.draw_handler_add(_draw_corner, (session, textures), "WINDOW", "POST_PIXEL"),
+        view.draw_handler_add(_draw_plane, (session,), "WINDOW", "POST_VIEW"),
+        view.draw_handler_add(_draw_corner, (session,), "WINDOW", "POST_PIXEL"),
     ]
 
     def end() -> None:
         for handle in handles:
             view.draw_handler_remove(handle, "WINDOW")
+        _textures.cache_clear()
 
     return end
 
 
-class _Textures:
-    """The textures of the preview that is shown; made when they are first drawn."""
-
-    def __init__(self) -> None:
-        self._of: Any = None
-        self._made: tuple[Any, Any] = (None, None)
-
-    def of(self, shown: Any) -> tuple[Any, Any]:
-        """The textures of a preview's picture and of its colours."""
-        if self._of is not shown:
-            self._made, self._of = (_texture(shown.picture), _texture(shown.colors)), shown
-        return self._made
+@functools.lru_cache(maxsize=1)
+def _textures(shown: Any) -> tuple[Any, Any]:
+    """The textures of a preview's picture and of its colours; made when they are first drawn."""
+    return _texture(shown.picture), _texture(shown.colors)
 
 
 def _texture(picture: NDArray[np.uint8]) -> Any:
@@ -58,7 +52,7 @@ def _texture(picture: NDArray[np.uint8]) -> Any:
     return gpu.types.GPUTexture((width, height), format="RGBA8", data=data)
 
 
-def _draw_corner(session: Any, textures: _Textures) -> None:
+def _draw_corner(session: Any) -> None:
     """Draw the picture and its lines in the lower right corner, beside the sidebar."""
     context = bpy.context
     unit = context.preferences.system.ui_scale
@@ -75,7 +69,7 @@ def _draw_corner(session: Any, textures: _Textures) -> None:
     gpu.state.blend_set("ALPHA")
     _rectangle(left - size, margin - size, right + size, top)
     if shown is not None:
-        picture, colors = textures.of(shown)
+        picture, colors = _textures(shown)
         _picture(picture, _box(left, margin + size, left + width, margin + size + height))
         _picture(colors, _box(left, margin, left + width, margin + 0.6 * size))
     blf.color(0, *_FRONT)
@@ -85,7 +79,7 @@ def _draw_corner(session: Any, textures: _Textures) -> None:
     gpu.state.blend_set("NONE")
 
 
-def _draw_plane(session: Any, textures: _Textures) -> None:
+def _draw_plane(session: Any) -> None:
     """Draw the picture where the module's plane stands; it faces the ROI, as the planes do."""
     shown = session.shown
     if shown is None or shown.corners is None:
@@ -97,7 +91,7 @@ def _draw_plane(session: Any, textures: _Textures) -> None:
     if np.dot(towards, inward) <= 0:
         return
     gpu.state.depth_test_set("LESS_EQUAL")
-    _picture(textures.of(shown)[0], (corners + 1e-3 * inward).tolist())  # before the plane of the last run
+    _picture(_textures(shown)[0], (corners + 1e-3 * inward).tolist())  # before the plane of the last run
     gpu.state.depth_test_set("NONE")
 
 

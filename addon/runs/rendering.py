@@ -13,19 +13,18 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
+from ...core import ProjectionRun, Recipe, read_recipe, read_run, write_run
 from ...core.errors import InputError, warn
 from ...core.geometry.system import chosen_modules
 from ...core.memory import require
-from ...core.progress import Progress, stages_of
+from ...core.progress import Progress, Stages, stages_of
 from ...core.projector import Model
-from ...core.runs.files import read_run, write_run
+from ...core.runs.display import Display
 from ...core.runs.mosaic import caption
 from ...core.runs.projecting import warn_of_energy
-from ...core.runs.recipe import Recipe, read_recipe
-from ...core.runs.run import ProjectionRun
 from ...core.runs.run_recipe import recipe_model, run_recipe, with_phantom
 from ...core.volumes.volume import require_quantity
-from ..blender import ids, jobs, storage
+from ..blender import ids, jobs, storage, timers
 from ..phantoms import phantoms
 from ..pictures import images, planes, recoloring
 from ..scanner import following, scanner
@@ -66,9 +65,7 @@ def render_job(context: bpy.types.Context, recipe: Recipe, volume: str = "", mu:
             warn_of_energy(model, energy, f"the mu of {recipe['attenuation.object']!r}")
         stages("reading")
         (run,) = run_recipe(recipe, system, read_volume(), read_mu and read_mu(), stages)
-        stages("writing the run file")
-        write_run(run, path)
-        return run, images.pictures(run, display, stages("packing"))
+        return run, kept(run, path, display, stages)
 
     def finish(result: tuple[ProjectionRun, images.Pictures]) -> jobs.Finishing:
         run, made = result
@@ -80,6 +77,13 @@ def render_job(context: bpy.types.Context, recipe: Recipe, volume: str = "", mu:
         return f"Projected {recipe['volume.object']!r} into {len(run.views)} modules in {seconds:.1f} s: {where}"
 
     return jobs.Job("Projecting", work, finish, lambda: path.unlink(missing_ok=True))
+
+
+def kept(run: ProjectionRun, path: Path, display: Display, stages: Stages) -> images.Pictures:
+    """Write a run's file, in a job's thread, and make what its images hold."""
+    stages("writing the run file")
+    write_run(run, path)
+    return images.pictures(run, display, stages("packing"))
 
 
 def sources(
@@ -174,7 +178,7 @@ def taken_over(scene: bpy.types.Scene, run: ProjectionRun, volume: bpy.types.Obj
         recipe = run.recipe
     except InputError:
         return {}
-    with contextlib.suppress(InputError):  # what the panel cannot show is said to have changed
+    with contextlib.suppress(InputError):  # what the panel cannot show counts as changed
         _set_physics(scene, recipe)
     state = runs.state_of(run.system, recipe, volume, None)
     if volume is None:
@@ -250,8 +254,8 @@ def active_run_changed(scene: bpy.types.Scene) -> None:
         return
     if bpy.app.background:
         _show_chosen()
-    elif not bpy.app.timers.is_registered(_show_chosen):
-        bpy.app.timers.register(_show_chosen, first_interval=_REST)
+    else:
+        timers.soon(_show_chosen, _REST)
 
 
 def _show_chosen() -> float | None:

@@ -1,8 +1,8 @@
-"""Lines over the pictures in the Image Editor: what was said of measured counts, and what has changed since."""
+"""Lines over the pictures in the Image Editor: what is known of measured counts, and what has changed since."""
 
-import blf
 import bpy
 
+from ..blender import windows
 from ..pictures import images
 from . import runs
 
@@ -23,14 +23,8 @@ def draw() -> None:
     texts = [(measured, _PLAIN)] if measured else []
     if lines and lines != [runs.UNKNOWN]:
         texts.append((f"Not of the scene as it is now: {', '.join(lines)}", _COLOR))
-    if not texts:
-        return
     scale = context.preferences.system.ui_scale
-    blf.size(0, _SIZE * scale)
-    blf.enable(0, blf.SHADOW)
-    blf.shadow(0, 5, 0.0, 0.0, 0.0, 1.0)
-    for k, (text, color) in enumerate(texts):
-        blf.color(0, *color)
-        blf.position(0, _LEFT * scale, (_BOTTOM + 1.5 * _SIZE * k) * scale, 0)
-        blf.draw(0, text)
-    blf.disable(0, blf.SHADOW)
+    up = (scale * (_BOTTOM + 1.5 * _SIZE * k) for k in range(len(texts)))
+    windows.draw_texts(
+        ((text, scale * _LEFT, y, color) for (text, color), y in zip(texts, up, strict=True)), scale * _SIZE
+    )

@@ -19,10 +19,10 @@ from ...core.memory import readable_size
 from ...core.runs.recipe import Recipe, fitting_recipe
 from ...core.runs.run import ProjectionRun
 from ...core.runs.settings import SAMPLING, SETTINGS, Setting
-from ..blender import ids, storage, windows
+from ..blender import ids, objects, storage, timers, windows
 from ..blender.decimals import typed
 from ..phantoms import phantoms
-from ..scanner import cameras, following, scanner
+from ..scanner import following, scanner
 from ..scanner.module_values import FROM_ROI, numbers_of
 from ..scanner.scanner_parts import modules_text
 from ..volumes import volumes
@@ -141,7 +141,7 @@ def volume_to_render(scene: bpy.types.Scene) -> str:
 
 
 def measured_text(scene: bpy.types.Scene) -> str:
-    """What was said of the shown run's counts, where they were measured; else ""."""
+    """What is known of the shown run's counts, where they were measured; else ""."""
     item = shown(scene)
     return str(json.loads(item.state).get("measured", "")) if item is not None and item.state else ""
 
@@ -164,7 +164,6 @@ def remove_file(item: bpy.types.PropertyGroup) -> bool:
     return True
 
 
-@bpy.app.handlers.persistent
 def after_load(*_: Any) -> None:
     """A file was opened; one of an earlier version has one run, and no list."""
     _looked.clear()
@@ -177,17 +176,10 @@ def after_load(*_: Any) -> None:
     after_update()
 
 
-@bpy.app.handlers.persistent
 def after_update(*_: Any) -> None:
     """Something has changed: compare the runs with the scene once it rests. Costs next to nothing itself."""
-    if not bpy.app.background and not bpy.app.timers.is_registered(_look):
-        bpy.app.timers.register(_look, first_interval=_REST)
-
-
-def stop() -> None:
-    """Forget what waits: the extension is disabled."""
-    if bpy.app.timers.is_registered(_look):
-        bpy.app.timers.unregister(_look)
+    if not bpy.app.background:
+        timers.soon(_look, _REST)
 
 
 def _look() -> None:
@@ -240,7 +232,7 @@ def _of_modules(collection: bpy.types.Collection | None, old: Mapping[str, Any])
         yield "the scanner is gone"
         return
     found = scanner.modules(collection)
-    now_all = numbers_of(found, cameras.world_matrices(found))
+    now_all = numbers_of(found, objects.world_matrices(found))
     modules = {str(now.number): (camera, now) for camera, now in zip(found, now_all, strict=True)}
     moved: list[int] = []
     changed: dict[int, dict[str, tuple[float, float]]] = {}
@@ -268,8 +260,8 @@ def _of_modules(collection: bpy.types.Collection | None, old: Mapping[str, Any])
         pairs = {number: values[name] for number, values in changed.items() if name in values}
         if pairs:
             first, *others = set(pairs.values())
-            said = "changed" if others else _now(*first, "mm")
-            yield f"{_modules(list(pairs), count)}: {text.partition(':')[0]} {said}"
+            what = "changed" if others else _now(*first, "mm")
+            yield f"{_modules(list(pairs), count)}: {text.partition(':')[0]} {what}"
     gone = [int(number) for number in old["modules"] if number not in modules]
     if gone:
         yield f"{_modules(gone, count)} {'are' if len(gone) > 1 else 'is'} gone"
@@ -350,7 +342,7 @@ def _same(old: Any, new: Any) -> bool:
 def _now(old: Any, new: Any, unit: str, setting: Setting | None = None) -> str:
     """Two values in words: "60 s, now 30 s"."""
 
-    def said(value: Any, written: Callable[[Any], str]) -> str:
+    def words(value: Any, written: Callable[[Any], str]) -> str:
         if value is None:
             return "all" if setting is not None and setting.absent == "all" else "none"
         if isinstance(value, str):
@@ -358,8 +350,8 @@ def _now(old: Any, new: Any, unit: str, setting: Setting | None = None) -> str:
         if isinstance(value, bool):
             return "on" if value else "off"
         if isinstance(value, list):
-            return ", ".join(said(x, written) for x in value)
+            return ", ".join(words(x, written) for x in value)
         return f"{written(value)} {unit}".strip()
 
-    short, exact = ([said(value, written) for value in (old, new)] for written in ("{:.6g}".format, repr))
+    short, exact = ([words(value, written) for value in (old, new)] for written in ("{:.6g}".format, repr))
     return ", now ".join(short if short[0] != short[1] else exact)

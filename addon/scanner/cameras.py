@@ -4,11 +4,8 @@ A Blender camera is right-handed with X right, Y up and looks along -Z; seen fro
 to the LEFT. So a module's camera has X = -u, Y = v, Z = -k.
 """
 
-from collections.abc import Sequence
-
 import bpy
 import numpy as np
-from mathutils import Matrix
 from numpy.typing import NDArray
 
 from ...core.geometry.frames import module_poses
@@ -22,17 +19,6 @@ _SMALLEST = 1.0  # Blender silently clamps Camera.lens and Camera.sensor_width b
 def camera_matrices(centers: NDArray[np.float64]) -> NDArray[np.float64]:
     """World matrices (M, 4, 4) of cameras at pinhole `centers` (M, 3), mm, aimed at the isocentre."""
     return module_poses(centers) @ _CAMERA_FROM_MODULE
-
-
-def euler_angles(matrix: NDArray[np.float64]) -> tuple[float, float, float]:
-    """XYZ Euler angles, radians, of a camera matrix, in float64: Blender's float32 angles show -0.000007 degrees for 0."""
-    r = matrix[:3, :3]
-    y = -np.arcsin(np.clip(r[2, 0], -1.0, 1.0))
-    return (
-        float(np.arctan2(r[2, 1], r[2, 2])),
-        0.0 if abs(y) < 1e-12 else float(y),
-        float(np.arctan2(r[1, 0], r[0, 0])),
-    )
 
 
 def set_field_of_view(camera: bpy.types.Camera, width: float, distance: float) -> None:
@@ -60,46 +46,3 @@ def set_up_camera(camera: bpy.types.Camera, system: PinholeSystem, m: int) -> No
     camera.clip_end = 20.0 * (b + radius)
     camera.display_size = 0.3 * float(system.detector_side[m])
     camera.passepartout_alpha = 0.9
-
-
-def world_matrix(item: bpy.types.Object) -> NDArray[np.float64]:
-    """World matrix (4, 4) of an object as it stands now, in float64.
-
-    `Object.matrix_world` is out of date after a script has set a location, and while the object is hidden: it is used
-    only for objects with constraints or a parent that is not a plain object.
-    """
-    if any(not c.mute for c in item.constraints) or (item.parent is not None and item.parent_type != "OBJECT"):
-        return np.array(item.matrix_world, dtype=np.float64)
-    local = np.array(item.matrix_basis, dtype=np.float64)
-    if item.parent is None:
-        return local
-    return world_matrix(item.parent) @ np.array(item.matrix_parent_inverse, dtype=np.float64) @ local
-
-
-def world_matrices(items: Sequence[bpy.types.Object]) -> NDArray[np.float64]:
-    """`world_matrix` of each object: (N, 4, 4)."""
-    return np.array([world_matrix(item) for item in items]).reshape(-1, 4, 4)
-
-
-def set_world_matrix(item: bpy.types.Object, matrix: NDArray[np.float64]) -> None:
-    """Put an object at a world matrix (4, 4), under whatever parent it has."""
-    if item.parent is not None:
-        parent = world_matrix(item.parent) @ np.array(item.matrix_parent_inverse, dtype=np.float64)
-        matrix = np.linalg.inv(parent) @ matrix
-    item.matrix_basis = Matrix(matrix)
-    if item.parent is None and item.rotation_mode == "XYZ":
-        item.rotation_euler = euler_angles(matrix)
-
-
-def unparent(item: bpy.types.Object) -> None:
-    """Take an object off its parent and leave it where it is."""
-    matrix = world_matrix(item)
-    item.parent = None
-    set_world_matrix(item, matrix)
-
-
-def remove_objects(items: Sequence[bpy.types.Object]) -> None:
-    """Remove objects, and their meshes or cameras that nothing else uses."""
-    datas = {item.data for item in items if item.data is not None}
-    bpy.data.batch_remove(list(items))
-    bpy.data.batch_remove([data for data in datas if data.users == 0])

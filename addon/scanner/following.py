@@ -16,6 +16,7 @@ from ...core.errors import InputError
 from ...core.geometry.collimator import Construction, EdgePlace
 from ...core.geometry.system import LENGTHS
 from ...core.physics.performance import ModulePerformance, isocentre_performance
+from ..blender import objects
 from ..blender.decimals import typed
 from . import cameras, collimators
 from .module_values import TYPED, ModuleNumbers, are_aimed, numbers_of, system_of
@@ -121,7 +122,7 @@ def _refresh_modules(
     parts: dict[bpy.types.Object, list[bpy.types.Object]], scanner: bpy.types.PropertyGroup, aim: bool
 ) -> bool:
     """Make modules follow, all together, which is faster than one by one; returns whether a readout has changed."""
-    cameras_, matrices = list(parts), cameras.world_matrices(list(parts))
+    cameras_, matrices = list(parts), objects.world_matrices(list(parts))
     may_aim = aim and scanner.keep_aimed
     off = ~are_aimed(matrices) & np.any(matrices[:, :3, 3], axis=1) & may_aim
     to_aim = []
@@ -132,8 +133,8 @@ def _refresh_modules(
                 to_aim.append(m)
             module.placed = place
     for m, matrix in zip(to_aim, cameras.camera_matrices(matrices[to_aim, :3, 3]), strict=True):
-        cameras.set_world_matrix(cameras_[m], matrix)
-        matrices[m] = cameras.world_matrix(cameras_[m])
+        objects.set_world_matrix(cameras_[m], matrix)
+        matrices[m] = objects.world_matrix(cameras_[m])
     built_as, intrinsic_fwhm = _construction_numbers(scanner), typed(scanner.intrinsic_fwhm)
     found, changed = numbers_of(cameras_, matrices), []
     for camera, numbers, aimed in zip(cameras_, found, are_aimed(matrices).tolist(), strict=True):

@@ -41,14 +41,12 @@ def look(collection: bpy.types.Collection, reach: float, rotation: Quaternion | 
         views[key] = before, _state(space)
 
 
-@bpy.app.handlers.persistent
 def before_undo(*_: Any) -> None:
     """Note which scanners there are, to know which of them an undo or redo brings or takes."""
     _there.clear()
     _there.update(_scanners())
 
 
-@bpy.app.handlers.persistent
 def after_undo(*_: Any) -> None:
     """A view that nobody has turned since is as it was before, or after, an import that was undone or redone."""
     changed = _there ^ _scanners()
@@ -64,7 +62,6 @@ def after_undo(*_: Any) -> None:
                     view.view_location, view.view_rotation, view.view_distance, view.view_perspective = turned
 
 
-@bpy.app.handlers.persistent
 def forget(*_: Any) -> None:
     """Another file is opened: its views are its own."""
     _looked.clear()

@@ -14,7 +14,8 @@ import numpy as np
 from mathutils import Matrix
 from numpy.typing import NDArray
 
-from . import cameras, following
+from ..blender import objects
+from . import following
 
 _HOME = "mphdrr_home"  # custom property of a plane: its place on its camera (4, 4)
 _START = "mphdrr_start"  # custom property of a part that is dragged: world matrix (4, 4) of its camera when that began
@@ -64,7 +65,7 @@ def carry(items: Iterable[bpy.types.Object], dragging: bool) -> set[bpy.types.Ob
     for item in filter(is_off, items):
         camera, home = item.parent, _home(item)
         if camera not in starts and (is_dragged(item) or not _moves_itself(camera, dragging)):
-            start = np.reshape(item[_START], (4, 4)) if is_dragged(item) else cameras.world_matrix(camera)
+            start = np.reshape(item[_START], (4, 4)) if is_dragged(item) else objects.world_matrix(camera)
             motion: Any = np.array(item.matrix_basis, np.float64) @ np.linalg.inv(home)
             motion[:3, :3] /= np.linalg.norm(motion[:3, :3], axis=0)
             _move(camera, start @ motion)
@@ -93,7 +94,7 @@ def put_back(item: bpy.types.Object) -> None:
 
 def _moves_itself(camera: bpy.types.Object, dragging: bool) -> bool:
     """Whether a camera has been moved, or is animated or under a constraint."""
-    place = cameras.world_matrix(camera)[:3, 3].astype(np.float32)
+    place = objects.world_matrix(camera)[:3, 3].astype(np.float32)
     was_moved = np.any(np.array(camera.mphdrr_module.placed, np.float32) != place)
     return bool(was_moved) or (dragging and camera.select_get()) or not following.is_free(camera)
 
@@ -105,7 +106,7 @@ def _home(item: bpy.types.Object) -> NDArray[np.float64]:
 def _move(camera: bpy.types.Object, matrix: NDArray[np.float64]) -> None:
     """Put a camera at a world matrix, as far as its locks allow."""
     location, rotation = camera.location.copy(), camera.rotation_euler.copy()
-    cameras.set_world_matrix(camera, matrix)
+    objects.set_world_matrix(camera, matrix)
     for axis in range(3):
         if camera.lock_location[axis]:
             camera.location[axis] = location[axis]

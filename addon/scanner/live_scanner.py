@@ -18,13 +18,11 @@ _unstored = False  # modules have moved and no undo step has it
 _undone: dict[str, str] = {}  # by scanner: what the last undo left untidy, in words
 
 
-@bpy.app.handlers.persistent
 def after_update(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
     """Blender has evaluated the scene: modules that moved are rebuilt."""
     _follow(scene, depsgraph, aim=True)
 
 
-@bpy.app.handlers.persistent
 def after_frame(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
     """The frame has changed: modules that an animation moved are rebuilt, and keep the aim that it gives them."""
     _follow(scene, depsgraph, aim=False)
@@ -69,7 +67,6 @@ def _carry(off: list[bpy.types.Object]) -> set[bpy.types.Object]:
     return carried
 
 
-@bpy.app.handlers.persistent
 def after_undo(*_: Any) -> None:
     """Undo and redo restore some datablocks and leave others: make everything agree again."""
     global _unstored
@@ -87,7 +84,6 @@ def after_undo(*_: Any) -> None:
         _undone[collection.name] = collection.mphdrr_scanner.untidy
 
 
-@bpy.app.handlers.persistent
 def after_load(*_: Any) -> None:
     """A file was opened; one of an older version has shared meshes and no readouts. Nothing is tidied unasked."""
     for collection in _local(bpy.data.collections):

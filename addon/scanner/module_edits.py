@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 from ...core.errors import InputError
 from ...core.geometry.ring_fits import ring_order
 from ...core.recording import recorded_warnings
-from ..blender import ids
-from ..perspective import frustums
-from ..pictures import planes
+from ..blender import ids, objects
+from ..blender.updates import FUNCTIONS
 from . import cameras, collimators, following, scanner
 from .following import PARTS
 from .module_values import add_module, module_numbers
@@ -70,7 +69,7 @@ def tidy(collection: bpy.types.Collection) -> tuple[list[int], int]:
     """
     copied, orphans, numbers = copied_cameras(collection), orphan_parts(collection), []
     _require_solids(collection, [*copied, *bare_cameras(collection)])
-    cameras.remove_objects(orphans)
+    objects.remove_objects(orphans)
     for camera in copied:
         adopt(collection, camera)
         numbers.append(camera.mphdrr_module.number)
@@ -150,7 +149,7 @@ def duplicate(
         copy.animation_data_clear()
         for home in camera.users_collection:
             home.objects.link(copy)
-        cameras.set_world_matrix(copy, cameras.camera_matrices(place[None])[0])
+        objects.set_world_matrix(copy, cameras.camera_matrices(place[None])[0])
         adopt(collection, copy, place)
         made.append(copy)
     following.refresh(collection)
@@ -186,22 +185,21 @@ def remove(collection: bpy.types.Collection, modules: Sequence[bpy.types.Object]
     if len(modules) >= len(scanner.modules(collection)):
         raise InputError("a scanner needs at least one module: keep one, or press Remove Scanner")
     for scene in bpy.data.scenes:
-        frustums.remove(scene, list(modules))
+        FUNCTIONS["modules_removed"](scene, list(modules))
     children = [child for camera in modules for child in camera.children]
     parts = [child for child in children if child.mphdrr_module.part in (*PARTS, "PLANE")]
     for child in children:
         if child not in parts:
-            cameras.unparent(child)
-    cameras.remove_objects([*parts, *modules])
+            objects.unparent(child)
+    objects.remove_objects([*parts, *modules])
     following.refresh(collection)
 
 
 def remove_scanner(scene: bpy.types.Scene, collection: bpy.types.Collection) -> None:
     """Remove a scanner, with its projections in the scene; the user's objects in it move to the scene's collection."""
-    planes.remove(scene, collection)
-    frustums.remove(scene, scanner.modules(collection))
+    FUNCTIONS["modules_removed"](scene, scanner.modules(collection))
     _, others = parts_and_others(collection)
-    cameras.remove_objects([item for item in others if item.mphdrr_module.part != "NONE"])  # copies
+    objects.remove_objects([item for item in others if item.mphdrr_module.part != "NONE"])  # copies
     clear(scene, collection, {})
     bpy.data.collections.remove(collection)
     materials = [bpy.data.materials.get(name) for name, _ in collimators.LOOKS.values()]

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from ...core.errors import InputError
 from ...core.geometry.design_formulas import collimator_length
 from ...core.geometry.system import LENGTHS, PinholeSystem
+from ..blender import objects
 from ..blender.decimals import typed
 from . import cameras
 
@@ -94,7 +95,7 @@ def module_numbers(camera: bpy.types.Object) -> ModuleNumbers:
     Numbers that have not changed are as imported. An `l` that follows the ROI is calculated in float64 once a number in
     its formula has changed; where the formula has no solution (a pinhole inside the ROI) `l` keeps its last value.
     """
-    return numbers_of([camera], cameras.world_matrix(camera)[None])[0]
+    return numbers_of([camera], objects.world_matrix(camera)[None])[0]
 
 
 def numbers_of(cameras_: Sequence[bpy.types.Object], matrices: NDArray[np.float64]) -> list[ModuleNumbers]:
@@ -147,7 +148,7 @@ def _center(camera: bpy.types.Object, place: list[float], exact: list[float] | N
 def is_moved(camera: bpy.types.Object) -> bool:
     """Whether the pinhole is not where it was imported."""
     center = exact_values(camera).get("center")
-    return _center(camera, cameras.world_matrix(camera)[:3, 3].tolist(), center).tolist() != center
+    return _center(camera, objects.world_matrix(camera)[:3, 3].tolist(), center).tolist() != center
 
 
 def is_edited(camera: bpy.types.Object) -> bool:
@@ -159,7 +160,7 @@ def is_edited(camera: bpy.types.Object) -> bool:
 def off_aim(cameras_: Iterable[bpy.types.Object]) -> list[int]:
     """Numbers of the modules whose cameras do not look at the isocentre, or are rolled."""
     found = list(cameras_)
-    aimed = are_aimed(cameras.world_matrices(found))
+    aimed = are_aimed(objects.world_matrices(found))
     return [camera.mphdrr_module.number for camera, is_aimed in zip(found, aimed, strict=True) if not is_aimed]
 
 

@@ -18,7 +18,7 @@ from ...core.geometry import checks
 from ...core.geometry.collimator import Construction
 from ...core.geometry.system import PinholeSystem
 from ...core.workbook import ColumnMap, QuantityCells, SystemSource
-from ..blender import ids
+from ..blender import ids, objects
 from . import cameras, following, framing
 from .following import modules
 from .module_values import is_edited, is_moved, numbers_of, off_aim, remember, system_of
@@ -220,7 +220,7 @@ def read_scanner(collection: bpy.types.Collection, *, aimed: bool = False) -> Pi
     as_imported = len(found) == collection.mphdrr_scanner.n_modules and not any(
         camera.mphdrr_module.added or is_moved(camera) or is_edited(camera) for camera in found
     )
-    numbers = numbers_of(found, cameras.world_matrices(found))
+    numbers = numbers_of(found, objects.world_matrices(found))
     return system_of(numbers, source(collection) if as_imported else None)
 
 
@@ -246,8 +246,8 @@ def aim_modules(collection: bpy.types.Collection) -> list[int]:
     off = off_aim(modules(collection))
     for camera in modules(collection):
         if camera.mphdrr_module.number in off:
-            center = cameras.world_matrix(camera)[None, :3, 3]
-            cameras.set_world_matrix(camera, cameras.camera_matrices(center)[0])
+            center = objects.world_matrix(camera)[None, :3, 3]
+            objects.set_world_matrix(camera, cameras.camera_matrices(center)[0])
     following.refresh(collection)
     return sorted(off)
 

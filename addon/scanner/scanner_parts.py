@@ -7,7 +7,7 @@ import bpy
 
 from ...core.geometry.module_parts import ModulePart
 from ...core.geometry.system import PinholeSystem
-from ..blender import ids
+from ..blender import ids, objects
 from . import cameras, collimators
 from .module_values import is_edited, is_moved, off_aim, write_module
 
@@ -42,7 +42,7 @@ class NewScanner:
             cameras.set_up_camera(data, system, m)
             camera = self._keep(bpy.data.objects.new(name, data), name)
             self.cameras[number] = camera
-            cameras.set_world_matrix(camera, matrices[m])
+            objects.set_world_matrix(camera, matrices[m])
             camera.lock_scale = (True, True, True)  # or its collimator would grow with it
             write_module(camera, system, m, int(rings[m]))
             self.rings[rings[m]].objects.link(camera)
@@ -136,7 +136,7 @@ def clear(scene: bpy.types.Scene, collection: bpy.types.Collection, replacements
     new_of = {o: replacements.get(o.mphdrr_module.number) for o in parts if o.mphdrr_module.is_module}
     for item in bpy.data.objects:
         if item.parent in ours and item not in ours and new_of.get(item.parent) is None:
-            cameras.unparent(item)
+            objects.unparent(item)
 
     datas = {o.data for o in parts if o.data is not None}
     bpy.data.batch_remove([o for o in parts if o not in new_of])

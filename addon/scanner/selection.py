@@ -4,8 +4,8 @@ from collections.abc import Iterable
 
 import bpy
 
+from ..blender import windows
 from ..blender.reports import Need, Reported, needs
-from ..pictures import images
 from . import following, scanner
 
 SCANNER: Need = (
@@ -63,7 +63,6 @@ def select(context: bpy.types.Context, modules: Iterable[bpy.types.Object]) -> N
         layer.objects.active = shown[0]
 
 
-@bpy.app.handlers.persistent
 def after_update(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
     """Another object was made active in the viewport: the panels' scanner, the list and the mosaic follow."""
     if not depsgraph.id_type_updated("SCENE") or scene != bpy.context.scene:
@@ -78,7 +77,7 @@ def after_update(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None
             if scene.mphdrr_geometry.scanner != collection:  # writing it makes Blender look at all objects
                 scene.mphdrr_geometry.scanner = collection
             _list(scene, camera or next(iter(scanner.modules(collection)), None))
-        images.redraw_mosaic()
+        windows.redraw("IMAGE_EDITOR")  # the mosaic has a frame around the active module's image
 
 
 def scanner_chosen(scene: bpy.types.Scene) -> None:

@@ -5,8 +5,8 @@ import gpu
 import numpy as np
 from numpy.typing import NDArray
 
-from ..blender import windows
-from . import cameras, following, scanner, selection
+from ..blender import objects, windows
+from . import following, scanner, selection
 
 # By the setting: the lines' colour, and which of the points of `lines` they join.
 _DRAWN = {
@@ -35,7 +35,7 @@ def lines(context: bpy.types.Context) -> dict[str, NDArray[np.float64]]:
     depth, side = (scene.mphdrr_projections.magnification * sizes).T
     local = np.zeros((len(shown), 6, 3))  # the pinhole, the detector's corners and its middle
     local[:, 1:5, :2], local[:, 1:, 2] = _CORNERS * side[:, None, None] / 2, -depth[:, None]
-    matrices = cameras.world_matrices(shown)
+    matrices = objects.world_matrices(shown)
     points = local @ matrices[:, :3, :3].transpose(0, 2, 1) + matrices[:, None, :3, 3]
     return {name: points[:, _DRAWN[name][1]].reshape(-1, 2, 3) for name in wanted}
 

@@ -10,7 +10,7 @@ import bpy
 from mathutils import Vector
 
 from ..blender import compat
-from ..scanner.cameras import remove_objects
+from ..blender.objects import link_beside, remove_objects
 from . import volume_materials
 from .volume_materials import Cut, change
 
@@ -90,8 +90,7 @@ def _new_surface(item: bpy.types.Object) -> bpy.types.Object:
     made = surface.modifiers.new("Surface", "VOLUME_TO_MESH")
     made.object, made.use_smooth_shade, made.voxel_amount = item, True, _FINE
     surface.modifiers.new("Cut", "NODES").node_group = _cutting(name)
-    for collection in item.users_collection:
-        collection.objects.link(surface)
+    link_beside(surface, item)
     return surface
 
 

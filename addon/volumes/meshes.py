@@ -7,18 +7,16 @@ import numpy as np
 from mathutils import Matrix
 from numpy.typing import NDArray
 
+from ...core import Progress, volume_to_mesh, voxelize_mesh
 from ...core.errors import InputError, naming
 from ...core.geometry.grid import grid_around
 from ...core.memory import require
-from ...core.progress import Progress
 from ...core.volumes.meshes.mesh import Mesh, require_closed
-from ...core.volumes.meshes.surface import volume_to_mesh
-from ...core.volumes.meshes.voxelization import voxelize_mesh
-from ...core.volumes.volume import UNITS
-from ..blender import jobs, storage
-from ..scanner.cameras import world_matrix
+from ...core.volumes.volume import UNITS, Volume
+from ..blender import jobs
+from ..blender.objects import world_matrix
 from . import volume_materials, volumes
-from .stored_volumes import StoredVolume, store_volume
+from .stored_volumes import StoredVolume
 
 _BYTES = 40.0  # a voxel, while the volume is made and put into the scene
 
@@ -47,18 +45,17 @@ def voxelizing(
     shape = " x ".join(map(str, grid.shape))
     require(_BYTES * grid.n_voxels, f"a volume of {shape} voxels")
     name = name or f"{items[0].name} {quantity}"
-    folder, provenance = storage.folder(), {"meshes": [item.name for item in items], "values": values}
+    provenance = {"meshes": [item.name for item in items], "values": values}
 
-    def work(progress: Progress) -> StoredVolume:
-        return store_volume(voxelize_mesh(solids, grid, values, quantity, progress), folder, provenance=provenance)
+    def make(progress: Progress) -> Volume:
+        return voxelize_mesh(solids, grid, values, quantity, progress)
 
-    def finish(stored: StoredVolume) -> str:
-        volumes.make_active(bpy.context, volumes.add_stored(stored, name))
+    def finish(item: bpy.types.Object, stored: StoredVolume) -> str:
         content = float(stored.volume.array.sum(dtype=np.float64)) * grid.voxel_volume
         total = f"{content * 1e-3:.4g} kBq" if quantity == "activity" else f"{content:.4g} {UNITS[quantity]} mm^3"
         return f"Added {name!r}: {shape} voxels of {grid.spacing[0]:.3g} mm, {total} in all"
 
-    return jobs.Job("Voxelizing meshes", work, finish)
+    return volumes.adding("Voxelizing meshes", make, name, finish, provenance=provenance)
 
 
 def extracting(item: bpy.types.Object, level: float | None = None) -> jobs.Job:

@@ -14,10 +14,9 @@ import numpy as np
 from mathutils import Vector
 from numpy.typing import NDArray
 
-from ...core.errors import InputError
-from ...core.volumes.volume import Volume
+from ...core import InputError, Volume
 from ..blender.compat import add_node, blank_material
-from ..scanner.cameras import remove_objects
+from ..blender.objects import link_beside, remove_objects
 from . import looks, vdb, volume_materials, volumes
 
 _PLANES = ("Sagittal", "Coronal", "Axial")  # across world x, y, z
@@ -157,7 +156,6 @@ def _paint(item: bpy.types.Object, plane: bpy.types.Object) -> None:
     _painted[image.session_uid] = wanted
 
 
-@bpy.app.handlers.persistent
 def after_undo(*_: object) -> None:
     """Undo and redo restore planes and their settings, but not what was painted."""
     for gone in _painted.keys() - {image.session_uid for image in bpy.data.images}:
@@ -170,7 +168,6 @@ def after_undo(*_: object) -> None:
                 print(f"mphDRR: {plane.name} is not painted: {error}")
 
 
-@bpy.app.handlers.persistent
 def before_load(*_: object) -> None:
     """Another file has other volumes."""
     global _last
@@ -178,7 +175,6 @@ def before_load(*_: object) -> None:
     _painted.clear()
 
 
-@bpy.app.handlers.persistent
 def before_save(*_: object) -> None:
     """Pack the planes' images: Blender does not save what was painted."""
     for item in bpy.data.objects:
@@ -188,7 +184,6 @@ def before_save(*_: object) -> None:
                 image.pack()
 
 
-@bpy.app.handlers.persistent
 def after_frame_change(scene: bpy.types.Scene, *_: object) -> None:
     """The planes of a sequence show the current frame's state."""
     for item in volumes.volume_objects(scene):
@@ -225,8 +220,7 @@ def _plane(item: bpy.types.Object, volume: Volume, axis: int, name: str) -> bpy.
     plane = bpy.data.objects.new(name, mesh)
     plane[_KEY], plane[_LATTICE] = axis, _lattice(volume)
     plane.parent = item
-    for collection in item.users_collection:
-        collection.objects.link(plane)
+    link_beside(plane, item)
     return plane
 
 

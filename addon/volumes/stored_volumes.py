@@ -10,10 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ...core.errors import InputError
-from ...core.geometry.frames import checked_affine
-from ...core.geometry.grid import Grid
-from ...core.volumes.volume import Volume
+from ...core import Grid, InputError, Volume
+from ...core.geometry.frames import affine_matrix, checked_affine
 from ..blender import compat, ids
 from . import volume_materials
 from .vdb import BACKGROUND, write_vdb
@@ -54,11 +52,7 @@ def store_volume(
     if len({state.quantity for state in states}) != 1:
         found = ", ".join(state.quantity for state in states) or "none"
         raise InputError(f"volume sequence: expected volumes of one quantity, got {found}")
-    if pose is None:
-        place = np.eye(4)
-        place[:3, 3] = states[0].grid.center
-    else:
-        place = checked_affine(pose, "volume pose")
+    place = affine_matrix(np.eye(3), states[0].grid.center) if pose is None else checked_affine(pose, "volume pose")
     path = write_states([moved(state, np.linalg.inv(place)) for state in states], folder, provenance)
     low, high = min(float(v.array.min()) for v in states), max(float(v.array.max()) for v in states)
     return StoredVolume(states, place, path, low, high, max(map(_extent, states)))
@@ -106,8 +100,7 @@ def coarser(volume: Volume) -> Volume:
     array = np.pad(volume.array, padding, constant_values=_empty(volume))
     a, b, c = (n // 2 for n in array.shape)
     means = array.reshape(a, 2, b, 2, c, 2).mean(axis=(1, 3, 5), dtype=np.float32)
-    blocks = np.diag([2.0, 2.0, 2.0, 1.0])
-    blocks[:3, 3] = 0.5  # the block's middle
+    blocks = affine_matrix(2.0 * np.eye(3), np.full(3, 0.5))  # the block's middle
     return Volume(means, Grid((a, b, c), volume.grid.affine @ blocks), volume.quantity)
 
 

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from ...core.errors import InputError, reading, warn
 from ...core.files import replacing, require_file
+from ...core.geometry.frames import affine_matrix
 from ...core.geometry.grid import Grid
 from ...core.memory import require
 from ...core.validation import freeze, positive
@@ -145,9 +146,7 @@ def _drawn(affine: NDArray[np.float64], shape: Sequence[int], mirrored: bool, sh
     stored = np.eye(4)
     if mirrored:
         stored[0, 0], stored[0, 3] = -1.0, shape[0] - 1
-    centers = np.eye(4)
-    centers[:3, 3] = shift
-    return affine @ stored @ centers
+    return affine @ stored @ affine_matrix(np.eye(3), np.full(3, shift))
 
 
 def _described(path: Path) -> dict[str, Any]:
@@ -184,8 +183,7 @@ def _volume_of(grid: Any, quantity: str | None, unit: float) -> Volume:
         raise InputError(f"the grid {grid.name!r} is a frustum, whose voxels are no parallelepipeds: resample it first")
     far = 2.0**20  # index units: far enough that subtracting the origin costs no digits
     origin, *ends = (np.array(grid.transform.indexToWorld(tuple(point))) for point in far * np.eye(4, 3, -1))
-    drawn = np.eye(4)  # on column vectors
-    drawn[:3] = np.column_stack([*((end - origin) / far for end in ends), origin])
+    drawn = affine_matrix((np.array(ends) - origin).T / far, origin)  # on column vectors
     known = grid.metadata
     first, last = (np.array(corner) for corner in grid.evalActiveVoxelBoundingBox())
     if {"mphdrr_shape", "mphdrr_affine", "mphdrr_mirrored", "mphdrr_center_shift"} <= known.keys():
@@ -227,9 +225,7 @@ def _centered(grid: Any, drawn: NDArray[np.float64]) -> NDArray[np.float64]:
             4,
         )
         return drawn
-    centers = np.eye(4)
-    centers[:3, 3] = -shift
-    return drawn @ centers
+    return drawn @ affine_matrix(np.eye(3), np.full(3, -shift))
 
 
 def _values(grid: Any, first: NDArray[Any], shape: Sequence[int]) -> NDArray[np.float32]:

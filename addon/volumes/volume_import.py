@@ -6,15 +6,13 @@ from typing import Any
 
 import bpy
 
+from ...core import Volume, centered, hu_to_mu
 from ...core.memory import require
-from ...core.physics.ct_numbers import hu_to_mu
-from ...core.progress import Progress, part_of, stages_of
-from ...core.volumes.rearranging import centered
-from ...core.volumes.volume import UNITS, Volume
+from ...core.progress import Progress, part_of
 from ...core.volumes.volume_files import READ_FORMATS, read_volume
 from ..blender import jobs, storage
-from . import vdb, volume_materials, volumes
-from .stored_volumes import StoredVolume, store_volume
+from . import vdb, volumes
+from .stored_volumes import StoredVolume
 
 READ_ENDINGS = (*READ_FORMATS, ".vdb")
 """Endings of the names of files that can be read as volumes."""
@@ -46,9 +44,11 @@ def importing(
     grid, unit
         Of OpenVDB files, see `vdb.read_vdb`.
     """
-    folder, count = storage.folder(), len(paths)
+    count = len(paths)
+    names = [path.name for path in paths]
+    provenance: dict[str, Any] = {"file": names[0]} if count == 1 else {"files": names}
 
-    def work(progress: Progress) -> StoredVolume:
+    def make(progress: Progress) -> list[Volume]:
         states: list[Volume] = []
         for k, path in enumerate(paths):
             progress(k, count)
@@ -59,8 +59,6 @@ def importing(
             if k == 0 and count > 1:
                 shape = " x ".join(map(str, states[0].grid.shape))
                 require(4.0 * (count - 1) * states[0].grid.n_voxels, f"{count} volumes of {shape} voxels")
-        names = [path.name for path in paths]
-        provenance: dict[str, Any] = {"file": names[0]} if count == 1 else {"files": names}
         provenance["read_as"] = states[0].quantity
         if energy is not None:
             states = [hu_to_mu(volume, energy) for volume in states]
@@ -69,22 +67,20 @@ def importing(
             middle = states[0].grid.center
             provenance["moved_mm"] = (-middle).tolist()
             states = [centered(volume, volume.grid.center - middle) for volume in states]
-        stages_of(progress)("writing the voxels")
-        return store_volume(states, folder, None, provenance)
+        return states
 
-    def finish(stored: StoredVolume) -> str:
-        item = volumes.add_stored(stored, name or name_of(paths[0]), bpy.context.collection)
+    def finish(item: bpy.types.Object, stored: StoredVolume) -> str:
         if item.data.is_sequence:
             item.data.frame_start = frame_start
-        volumes.make_active(bpy.context, item)
         volume, states = stored.volume, f"{count} states of " if count > 1 else ""
         voxels = " x ".join(map(str, volume.grid.shape))
-        shown_in, factor = volume_materials.shown_unit(volume.quantity)
-        values = f"{volume.quantity}, {factor * stored.low:.4g} to {factor * stored.high:.4g} {shown_in}"
         moved = ", its middle moved to the isocentre" if center else ""
+        values = f"{volume.quantity}, {volumes.values_text(stored)}"
         return f"Imported {item.name!r}: {states}{voxels} voxels of {values}{moved}"
 
-    return jobs.Job("Importing a volume" if count == 1 else f"Importing {count} volumes", work, finish)
+    label = "Importing a volume" if count == 1 else f"Importing {count} volumes"
+    name, home = name or name_of(paths[0]), bpy.context.collection
+    return volumes.adding(label, make, name, finish, provenance=provenance, collection=home)
 
 
 def name_of(path: Path) -> str:
@@ -98,25 +94,22 @@ def converting(item: bpy.types.Object, energy: float) -> jobs.Job:
     """The job that adds the attenuation of a CT, for photons of an energy in keV; the CT stays."""
     volumes.require_volume(item)
     readers = [volumes.reader(item, path) for path in storage.files_of_states(item.data)]
-    pose, folder = volumes.pose_of_object(item), storage.folder()
-    name, collection, count = f"{item.name} mu", item.users_collection[0], len(readers)
+    count = len(readers)
     n_x, n_y, n_z = item.mphdrr_volume.shape
     require(8.0 * count * n_x * n_y * n_z, f"the attenuation of {count * n_x * n_y * n_z} voxels")
     provenance: dict[str, Any] = {"ct": item.name, "energy_keV": energy}
     frame_start, sequence_mode = item.data.frame_start, item.data.sequence_mode
 
-    def work(progress: Progress) -> StoredVolume:
+    def make(progress: Progress) -> list[Volume]:
         states: list[Volume] = []
         for read in readers:
             progress(len(states), count)
             states.append(hu_to_mu(read(), energy))
-        stages_of(progress)("writing the voxels")
-        return store_volume(states, folder, pose, provenance)
+        return states
 
-    def finish(stored: StoredVolume) -> str:
-        made = volumes.add_stored(stored, name, collection)
+    def finish(made: bpy.types.Object, stored: StoredVolume) -> str:
         made.data.frame_start, made.data.sequence_mode = frame_start, sequence_mode
-        volumes.make_active(bpy.context, made)
-        return f"Added {made.name!r}: {stored.low:.4g} to {stored.high:.4g} {UNITS['mu']} at {energy:g} keV"
+        return f"Added {made.name!r}: {volumes.values_text(stored)} at {energy:g} keV"
 
-    return jobs.Job("CT to attenuation", work, finish)
+    pose, home = volumes.pose_of_object(item), item.users_collection[0]
+    return volumes.adding("CT to attenuation", make, f"{item.name} mu", finish, pose, provenance, home)

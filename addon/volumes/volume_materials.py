@@ -43,7 +43,7 @@ _THINNEST = 1e-5  # Blender's least density of smoke
 _FAR = 1e9  # where nothing is cut
 
 Cut = Sequence[tuple[Sequence[float], float]]
-"""Of each axis of a grid: a vector n and a number t; points x, mm in the object's space, with n x > t lie in front."""
+"""A vector n and a number t for each axis of a grid; points x, mm in the object's space, with n x > t lie in front."""
 
 
 def ramp(quantity: str) -> tuple[tuple[float, tuple[float, float, float]], ...]:

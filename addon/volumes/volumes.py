@@ -14,13 +14,13 @@ import numpy as np
 from mathutils import Matrix
 from numpy.typing import ArrayLike, NDArray
 
-from ...core.errors import InputError
+from ...core import InputError, Volume
 from ...core.geometry.frames import checked_affine
 from ...core.memory import readable_size
-from ...core.volumes.volume import Volume
-from ..blender import compat, ids, storage
+from ...core.progress import Progress, stages_of
+from ..blender import compat, ids, jobs, storage
+from ..blender.objects import world_matrix
 from ..blender.reports import Need
-from ..scanner.cameras import world_matrix
 from . import volume_materials
 from .stored_volumes import StoredVolume, moved, store_volume, write_states
 from .vdb import SMOKE, read_vdb
@@ -52,6 +52,41 @@ def add_stored(stored: StoredVolume, name: str, collection: bpy.types.Collection
     (collection or bpy.context.scene.collection).objects.link(item)
     _describe(item, stored)
     return item
+
+
+def adding(
+    label: str,
+    make: Callable[[Progress], Volume | Sequence[Volume]],
+    name: str,
+    finish: Callable[[bpy.types.Object, StoredVolume], str],
+    pose: ArrayLike | None = None,
+    provenance: dict[str, Any] | None = None,
+    collection: bpy.types.Collection | None = None,
+) -> jobs.Job:
+    """The job that adds the volume, or its states, that ``make(progress)`` makes in a thread, and selects it alone.
+
+    `finish` sets the rest of the new object and returns the line to report. The other arguments are those of `add_volume`;
+    `make` may add to the `provenance`.
+    """
+    folder, home_uid = storage.folder(), 0 if collection is None else collection.session_uid
+
+    def work(progress: Progress) -> StoredVolume:
+        made = make(progress)
+        stages_of(progress)("writing the voxels")
+        return store_volume(made, folder, pose, provenance)
+
+    def finished(stored: StoredVolume) -> str:
+        item = add_stored(stored, name, jobs.found_again(bpy.data.collections, home_uid))
+        make_active(bpy.context, item)
+        return finish(item, stored)
+
+    return jobs.Job(label, work, finished)
+
+
+def values_text(stored: StoredVolume) -> str:
+    """Smallest and largest value as the window shows them, with their unit: "0 to 100 kBq/mL"."""
+    unit, factor = volume_materials.shown_unit(stored.volume.quantity)
+    return f"{factor * stored.low:.4g} to {factor * stored.high:.4g} {unit}".removesuffix(" 1")
 
 
 def replace_stored(item: bpy.types.Object, stored: StoredVolume) -> None:
@@ -184,7 +219,6 @@ def volume_objects(scene: bpy.types.Scene) -> list[bpy.types.Object]:
     return sorted((item for item in scene.objects if is_volume(item)), key=lambda item: item.name)
 
 
-@bpy.app.handlers.persistent
 def after_load(*_: Any) -> None:
     """Rewrite volumes of a .blend whose Blender draws voxels half a voxel elsewhere."""
     missing = storage.missing_volumes()

@@ -5,12 +5,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
 
+from ..example import EXAMPLE
 from ..toml import toml_value
 from ..validation import one_of
 
 _FOLDER = Path(__file__).with_name("templates")
-EXAMPLE = Path(__file__).parents[2] / "examples" / "dc-spect-80.xlsx"
-"""The workbook that comes with the program."""
 
 TEMPLATES: Mapping[str, str] = MappingProxyType({
     "derenzo": "Derenzo phantoms turned at random: counts or line integrals, Radon images; explains draws",

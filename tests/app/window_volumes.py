@@ -62,7 +62,7 @@ def steps():
     """Yields seconds to wait."""
     from importlib import import_module
 
-    color_bar, slices = import_module(f"{addon}.volumes.color_bar"), import_module(f"{addon}.volumes.slices")
+    color_bar, slices = import_module(f"{addon}.perspective.color_bar"), import_module(f"{addon}.volumes.slices")
     for name in ("Cube", "Light", "Camera"):
         bpy.data.objects[name].hide_set(True)
     space = viewport()[1].spaces.active

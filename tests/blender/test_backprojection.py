@@ -8,10 +8,11 @@ import pytest
 
 import mphdrr.core as mph
 from mphdrr.addon.blender import jobs, storage
+from mphdrr.addon.perspective import color_bar
 from mphdrr.addon.reconstruction import backprojections
 from mphdrr.addon.reconstruction.reconstruction_properties import voxels_recipe
 from mphdrr.addon.scanner import scanner
-from mphdrr.addon.volumes import color_bar, slices, volumes
+from mphdrr.addon.volumes import slices, volumes
 from mphdrr.core.progress import Cancelled
 from mphdrr.core.runs.files import read_run
 

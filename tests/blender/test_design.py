@@ -11,7 +11,8 @@ import pytest
 
 import mphdrr.core as mph
 from mphdrr.addon import registration
-from mphdrr.addon.scanner import cameras, collimators, following, live_scanner, module_edits, scanner
+from mphdrr.addon.blender import objects
+from mphdrr.addon.scanner import collimators, following, live_scanner, module_edits, scanner
 from mphdrr.addon.scanner.module_values import module_numbers
 from mphdrr.core.errors import InputError, InputWarning
 from mphdrr.core.geometry.system import PinholeSystem
@@ -381,12 +382,12 @@ def test_modules_are_removed_with_their_parts(collection):
     marker = bpy.data.objects.new("Marker", None)
     bpy.context.scene.collection.objects.link(marker)
     marker.parent = scanner.module(collection, 8)
-    place = cameras.world_matrix(marker)
+    place = objects.world_matrix(marker)
     select(scanner.module(collection, 2), scanner.module(collection, 8))
     bpy.ops.mphdrr.remove_modules()
     assert scanner.read_scanner(collection).numbers.tolist() == [1, 3, 4, 5, 6, 7]
     assert sum(o.type == "MESH" for o in collection.all_objects) == 13
-    assert np.allclose(cameras.world_matrix(marker), place, atol=1e-4)
+    assert np.allclose(objects.world_matrix(marker), place, atol=1e-4)
     assert_consistent(collection)
     select(*scanner.modules(collection))
     with pytest.raises(RuntimeError, match="at least one module"):

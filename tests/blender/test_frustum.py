@@ -8,9 +8,9 @@ import pytest
 from mathutils import Euler
 
 import mphdrr.core as mph
-from mphdrr.addon.blender import ids, jobs, storage
+from mphdrr.addon.blender import ids, jobs, objects, storage
 from mphdrr.addon.perspective import frustums
-from mphdrr.addon.scanner import cameras, module_edits, scanner
+from mphdrr.addon.scanner import module_edits, scanner
 from mphdrr.addon.volumes import slices, volumes
 from mphdrr.core.progress import Cancelled
 from mphdrr.core.runs.mosaic import as_seen
@@ -297,6 +297,6 @@ def test_back_on_voxels_it_is_what_the_modules_cells_keep(shown, scene, ring_sys
     assert found.quantity == "activity"
     np.testing.assert_allclose(found.grid.affine, volume.grid.affine, atol=1e-5)
     np.testing.assert_allclose(found.array, expected, atol=1e-5 * expected.max())
-    np.testing.assert_allclose(cameras.world_matrix(item), cameras.world_matrix(shown), atol=1e-6)
+    np.testing.assert_allclose(objects.world_matrix(item), objects.world_matrix(shown), atol=1e-6)
     bpy.ops.mphdrr.show_in_perspective(planes=2)
     assert frustums.volume_of(frustums.frustums(scene)[0]) == item.name

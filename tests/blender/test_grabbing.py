@@ -5,8 +5,9 @@ import numpy as np
 import pytest
 from mathutils import Euler, Matrix
 
+from mphdrr.addon.blender import objects
 from mphdrr.addon.pictures import planes
-from mphdrr.addon.scanner import cameras, grabbing, live_scanner, scanner
+from mphdrr.addon.scanner import grabbing, live_scanner, scanner
 from mphdrr.addon.volumes import volumes
 from mphdrr.core.geometry.grid import Grid
 from mphdrr.core.volumes.volume import Volume
@@ -121,10 +122,10 @@ def test_what_is_locked_animated_copied_or_moved_itself_is_respected(scene, coll
     other = scanner.module(collection, 6)
     copy = part(other, "COLLIMATOR").copy()
     other.users_collection[0].objects.link(copy)
-    place = cameras.world_matrix(other)
+    place = objects.world_matrix(other)
     copy.location.x += 20.0
     bpy.context.view_layer.update()
-    assert np.array_equal(cameras.world_matrix(other), place) and copy.location.x == 20.0
+    assert np.array_equal(objects.world_matrix(other), place) and copy.location.x == 20.0
     assert planes.planes(scene)
 
 

@@ -13,8 +13,8 @@ from mphdrr.addon.phantoms import phantoms
 from mphdrr.addon.phantoms.phantom_properties import plain_settings
 from mphdrr.addon.pictures import images, planes
 from mphdrr.addon.runs import rendering
-from mphdrr.addon.scanner import scanner, scanner_files
-from mphdrr.addon.volumes import maps, volume_import, volumes
+from mphdrr.addon.scanner import maps, scanner, scanner_files
+from mphdrr.addon.volumes import volume_import, volumes
 from mphdrr.core.geometry.grid import Grid
 from mphdrr.core.progress import Cancelled, StagedProgress
 from mphdrr.core.runs.recipe import Recipe

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from mphdrr.addon.volumes import color_bar, looks, slices, volume_materials, volumes
+from mphdrr.addon.perspective import color_bar
+from mphdrr.addon.volumes import looks, slices, volume_materials, volumes
 from mphdrr.core.geometry.grid import Grid
 from mphdrr.core.geometry.part_colors import LOOKS
 from mphdrr.core.volumes.volume import Volume

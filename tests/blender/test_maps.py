@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from mphdrr.addon.blender import jobs
-from mphdrr.addon.scanner import scanner
-from mphdrr.addon.volumes import maps, volumes
+from mphdrr.addon.scanner import maps, scanner
+from mphdrr.addon.volumes import volumes
 from mphdrr.core.geometry.grid import Grid
 from mphdrr.core.physics.maps import sensitivity_map
 from mphdrr.core.physics.performance import sensitivity

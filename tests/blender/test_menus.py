@@ -62,3 +62,10 @@ def test_a_word_finds_several_commands_in_the_3d_view(scene, word):
     draw = registration.MENUS[[menu for menu, _ in registration.MENUS].index(bpy.types.VIEW3D_MT_object)][1]
     paths = [path for each in entries(draw, "Object").values() for path in each]
     assert sum(word in path.lower() for path in paths) >= 5
+
+
+def test_labels_follow_from_the_names_of_classes_unless_these_say_another():
+    assert bpy.ops.mphdrr.show_run.get_rna_type().name == "Show Run"
+    assert bpy.ops.mphdrr.mesh_from_volume.get_rna_type().name == "Mesh from Volume"
+    assert bpy.ops.mphdrr.ct_to_attenuation.get_rna_type().name == "CT to Attenuation"
+    assert bpy.types.MPHDRR_PT_event_set.bl_label == "Event Set"

@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 from mathutils import Matrix
 
-from mphdrr.addon.blender import jobs
+from mphdrr.addon.blender import jobs, objects
 from mphdrr.addon.phantoms import phantom_properties, phantoms
-from mphdrr.addon.scanner import cameras
 from mphdrr.addon.volumes import volumes
 from mphdrr.core.errors import InputError
 from mphdrr.core.geometry.frames import euler_pose
@@ -221,7 +220,7 @@ def test_outline_goes_with_the_phantom_and_its_settings():
     outline = phantoms.outline_of(item)
     assert outline.display_type == "WIRE" and outline.parent == item
     assert outline.dimensions[2] == pytest.approx(90)
-    np.testing.assert_allclose(cameras.world_matrix(outline), cameras.world_matrix(item), atol=1e-6)
+    np.testing.assert_allclose(objects.world_matrix(outline), objects.world_matrix(item), atol=1e-6)
     meshes = len(bpy.data.meshes)
     assert bpy.ops.mphdrr.show_phantom_outline() == {"FINISHED"}
     assert phantoms.outline_of(item) is None and len(bpy.data.meshes) == meshes - 1

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from mphdrr.addon import registration
+from mphdrr.addon.blender import objects
 from mphdrr.addon.scanner import cameras, scanner
 from mphdrr.core.errors import InputError, InputWarning
 from mphdrr.core.geometry.collimator import Construction
@@ -119,7 +120,7 @@ def test_moved_camera_and_edited_number_are_read(scene, ring_system):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         scanner.read_scanner(collection)
-    assert np.allclose(cameras.world_matrix(third), cameras.camera_matrices(back.centers)[2], atol=2e-5)
+    assert np.allclose(objects.world_matrix(third), cameras.camera_matrices(back.centers)[2], atol=2e-5)
 
 
 def test_hidden_or_parented_camera_is_read_where_it_is(scene, ring_system):

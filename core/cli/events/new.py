@@ -5,7 +5,8 @@ import os
 from pathlib import Path
 
 from ...errors import InputError
-from ...events.templates import EXAMPLE, TEMPLATES, template_text
+from ...events.templates import TEMPLATES, template_text
+from ...example import EXAMPLE
 from ...files import replacing
 from ..options import add_command, output_path, print_answer
 

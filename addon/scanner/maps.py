@@ -10,9 +10,9 @@ from ...core.memory import require
 from ...core.physics.maps import MAPS, within_roi
 from ...core.progress import Progress
 from ..blender import choices, jobs, storage
-from ..scanner import scanner
-from . import slices, volume_materials, volumes
-from .stored_volumes import StoredVolume, store_volume
+from ..volumes import slices, volume_materials, volumes
+from ..volumes.stored_volumes import StoredVolume, store_volume
+from . import scanner
 
 _DESCRIPTIONS = {
     "sensitivity": "Of all modules together, cps/MBq",

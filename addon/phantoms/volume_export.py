@@ -9,8 +9,8 @@ from ...core.errors import InputError
 from ...core.progress import Progress, stages_of
 from ...core.volumes.volume_files import VOLUME_FORMATS, write_volume
 from ..blender import jobs
-from ..phantoms import phantoms
-from . import vdb, volumes
+from ..volumes import vdb, volumes
+from . import phantoms
 
 WRITTEN_ENDINGS = (".vdb", *VOLUME_FORMATS)
 """Endings of the names of files that volumes can be written to."""

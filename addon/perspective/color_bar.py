@@ -1,13 +1,15 @@
 """The colour bar of a volume with slices, or in perspective, in the 3D views: what colours mean, numbers and their unit."""
 
-import blf
+import itertools
+
 import bpy
 import gpu
 import numpy as np
 from gpu_extras.batch import batch_for_shader
 
-from ..perspective import frustums
-from . import slices, volumes
+from ..blender import windows
+from ..volumes import slices, volumes
+from . import frustums
 
 _LEFT, _BOTTOM, _WIDTH, _HEIGHT, _LETTERS = 90, 60, 14, 180, 12  # at a resolution scale of 1, pixels
 _MARKS = (0.0, 0.25, 0.5, 0.75, 1.0)
@@ -51,11 +53,6 @@ def draw() -> None:
     batch_for_shader(shader, "TRI_STRIP", shape).draw(shader)
     letters = height / _HEIGHT * _LETTERS
     title, texts = marks(item)
-    blf.size(0, letters)
-    blf.color(0, 1.0, 1.0, 1.0, 1.0)
-    blf.enable(0, blf.SHADOW)
-    blf.shadow(0, 3, 0.0, 0.0, 0.0, 1.0)
-    for share, text in (*zip(_MARKS, texts, strict=True), (1.0 + 1.8 * letters / height, title)):
-        blf.position(0, left if text is title else left + 1.5 * width, bottom + share * height - 0.35 * letters, 0.0)
-        blf.draw(0, text)
-    blf.disable(0, blf.SHADOW)
+    ups = [bottom + share * height - 0.35 * letters for share in (*_MARKS, 1.0 + 1.8 * letters / height)]
+    lefts = [*(left + 1.5 * width for _ in texts), left]
+    windows.draw_texts(zip((*texts, title), lefts, ups, itertools.repeat((1.0,) * 4)), letters)

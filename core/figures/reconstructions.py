@@ -10,8 +10,8 @@ from ..geometry.grid import Grid
 from ..runs.display import Display
 from ..volumes.resampling import resample
 from ..volumes.volume import Volume
-from .page import Page, Point, box
-from .parts import FAINT, INK, bar_width, color_bar, heading, number, ticks
+from .page import Page
+from .parts import FAINT, INK, Axes, bar_width, color_bar, heading, number, ticks
 
 SIZE, SIZE_BESIDE_TRUTH = (1600, 500), (1600, 850)
 """Width and height, pixels, that suit a reconstruction alone, and one beside the truth."""
@@ -58,10 +58,8 @@ def draw(
         for (axis, across, up), picture in zip(_SLICES, row, strict=True):
             shape = max(1, round(extent[across] * pixels)), max(1, round(extent[up] * pixels))
             place = round(x), round(y + 1.5 * em + (tall - extent[up] * pixels) / 2)
-            at = (
-                volume.grid.center[axis]
-                + (volume.grid.shape[axis] // 2 - (volume.grid.shape[axis] - 1) / 2) * (volume.grid.spacing[axis])
-            )
+            grid, n = volume.grid, volume.grid.shape[axis]
+            at = grid.center[axis] + (n // 2 - (n - 1) / 2) * grid.spacing[axis]
             text = f"{_NAMES[across]} {_NAMES[up]},  {_NAMES[axis]} = {number(round(float(at), 2) + 0.0)} mm"
             page.text(text, x + shape[0] / 2, y + 1.1 * em, 0.9 * em, FAINT, "middle")
             page.image(display.colored(picture.T[::-1], window), *place, *shape)
@@ -71,14 +69,8 @@ def draw(
     first = round(top + 1.5 * em)
     color_bar(page, display, window, volume.unit, round(x + 0.4 * em), first, max(2, round(y - 0.4 * em) - first))
     if len(objective):
-        plot_left = x + bar + 7.5 * em
-        plot = (
-            plot_left,
-            top + 1.5 * em,
-            page.width - plot_left - 1.5 * em,
-            min(0.45 * page.width * _PLOT * 2, y - top - 4.5 * em),
-        )
-        draw_objective(page, objective, plot, objective_name)
+        x, y = x + bar + 7.5 * em, min(0.45 * page.width * _PLOT * 2, y - top - 4.5 * em)
+        draw_objective(page, objective, (x, top + 1.5 * em, page.width - x - 1.5 * em, y), objective_name)
 
 
 def draw_objective(
@@ -95,40 +87,22 @@ def draw_objective(
     `em` is the size of its text, which lines are in proportion to.
     """
     values = np.asarray(objective, float)
-    left, top, width, height = place
     em = em or page.em
     low, high = float(values.min()), float(values.max())
     spread = (high - low) or abs(high) or 1.0
     low, high = low - 0.06 * spread, high + 0.06 * spread
-    last = max(len(values), 2)
-
-    def at(iteration: float, value: float) -> Point:
-        return left + width * (iteration - 1) / (last - 1), top + height * (high - value) / (high - low)
-
-    page.line([*box(left, top, width, height), (left, top)], ink, 0.06 * em)
-    points = [at(i, value) for i, value in enumerate(values, 1)]
-    if len(points) > 1:
-        page.line(points, color, 0.16 * em)
-    for x, y in points if len(points) <= 30 else points[-1:]:
-        r = 0.22 * em
-        page.area([(x - r, y), (x, y - r), (x + r, y), (x, y + r)], color)
-    if not name:
-        return
-    size = 0.85 * em
-    marks = ticks(low, high, 5)
+    axes = Axes(page, place, (1, max(len(values), 2)), (low, high), em, ink)
+    marks = ticks(low, high, 5) if name else []
     # The objective changes little beside its size: as many digits as tell the numbers from each other.
     digits = max(4, math.ceil(math.log10(max(abs(low), abs(high)) / (marks[1] - marks[0]))) + 1) if marks[1:] else 4
-    for value in marks:
-        y = at(1, value)[1]
-        page.line([(left - 0.3 * em, y), (left, y)], ink, 0.06 * em)
-        page.text(number(value, digits), left - 0.5 * em, y + 0.3 * em, size, ink, "end")
-    for value in ticks(1, last, 6):
-        if value == round(value):
-            x = at(value, low)[0]
-            page.line([(x, top + height), (x, top + height + 0.3 * em)], ink, 0.06 * em)
-            page.text(number(value), x, top + height + 1.3 * em, size, ink, "middle")
-    page.text(name[:1].upper() + name[1:], left + width / 2, top - 0.5 * em, em, ink, "middle")
-    page.text("iteration", left + width / 2, top + height + 2.6 * em, size, ink, "middle")
+    whole = [n for n in ticks(*axes.x, 6) if n == round(n)] if name else []
+    axes.draw(whole, marks, name[:1].upper() + name[1:], "iteration" if name else "", digits)
+    iterations = np.arange(1, len(values) + 1)
+    if len(values) > 1:
+        axes.curve(iterations, values, color, 0.16)
+    for i in iterations if len(values) <= 30 else iterations[-1:]:
+        (x, y), r = axes.to(i, values[i - 1]), 0.22 * em
+        page.area([(x - r, y), (x, y - r), (x + r, y), (x, y + r)], color)
 
 
 def _slice(volume: Volume, grid: Grid, axis: int) -> NDArray[np.float32]:

@@ -12,8 +12,8 @@ from ..runs import letters
 from ..runs.display import Display
 from ..volumes.resampling import values_at
 from ..volumes.volume import Volume
-from .page import Page, box
-from .parts import FAINT, INK, bar_width, color_bar, heading, number, ticks
+from .page import Page
+from .parts import FAINT, INK, Axes, bar_width, color_bar, heading, number, ticks
 
 SIZE = (1800, 950)
 """Width and height, pixels, of a page that suits."""
@@ -188,21 +188,10 @@ def _draw_plots(page: Page, plots: Sequence[_Plot], room: tuple[int, int, int, i
 
 
 def _draw_plot(page: Page, plot: _Plot, frame: tuple[float, float, float, float], span: tuple[float, float]) -> None:
-    em, (left, top, width, height), (low, high) = page.em, frame, span
-    first, last = float(plot.curves[0].x[0]), float(plot.curves[0].x[-1])
-    page.line([*box(left, top, width, height), (left, top)], FAINT, 0.06 * em)
+    em, (left, top, width, height), xs = page.em, frame, plot.curves[0].x
+    axes = Axes(page, frame, (float(xs[0]), float(xs[-1])), span, em, FAINT)
+    axes.draw(ticks(*axes.x, max(2, int(width / (4 * em)))), ticks(*span, max(2, int(height / (2.5 * em)))))
     size = 0.8 * em * min(1.0, width / letters.width(plot.title, 0.8 * em))  # smaller where the title is too long
     page.text(plot.title, left, top - 0.5 * em, size, INK)
-    for value in ticks(low, high, max(2, int(height / (2.5 * em)))):
-        y = top + height * (high - value) / (high - low)
-        page.line([(left - 0.3 * em, y), (left, y)], FAINT, 0.06 * em)
-        page.text(number(value), left - 0.5 * em, y + 0.3 * em, 0.75 * em, INK, "end")
-    for value in ticks(first, last, max(2, int(width / (4 * em)))):
-        x = left + width * (value - first) / (last - first)
-        page.line([(x, top + height), (x, top + height + 0.3 * em)], FAINT, 0.06 * em)
-        page.text(number(value), x, top + height + 1.2 * em, 0.75 * em, INK, "middle")
     for curve in plot.curves:
-        xs, ys = (curve.x - first) / (last - first), (high - curve.y) / (high - low)
-        page.line(
-            [(left + width * x, top + height * y) for x, y in zip(xs, ys, strict=True)], curve.color, curve.width * em
-        )
+        axes.curve(*curve)

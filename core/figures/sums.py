@@ -8,7 +8,7 @@ from ..runs.display import Display
 from ..runs.run_recipe import euler_degrees
 from ..volumes.volume import LINE_INTEGRALS, Volume, require_quantity
 from .page import Page
-from .parts import INK, bar_width, color_bar, heading, number, ticks
+from .parts import INK, Axes, bar_width, color_bar, heading, number, ticks
 from .subject import Subject
 
 # The axis summed along, and those to the right and upward: seen from the head, from the front and from the left.
@@ -108,23 +108,10 @@ def _panel(
     shape: tuple[int, int],
 ) -> None:
     """One sum with its title and axes."""
-    em, (left, top), (width, height) = page.em, place, shape
+    em, (left, top), (width, height) = page.em, place, np.maximum(shape, 1).tolist()
     axis, right, up = _PANELS[panel]
-    width, height = max(1, width), max(1, height)
     page.image(picture, left, top, width, height)
-    bottom, end = top + height, left + width
-    page.line([(left, top), (end, top), (end, bottom), (left, bottom), (left, top)], INK, 0.06 * em)
-    page.text(f"Sum along {_NAMES[axis]}", (left + end) / 2, top - 0.6 * em, em, INK, "middle")
-    tick, size = 0.35 * em, 0.85 * em
-    low, high = box[:, right]
-    for value in ticks(low, high, min(6, int(width / (3.5 * em)))):
-        x = left + (value - low) / (high - low) * width
-        page.line([(x, bottom), (x, bottom + tick)], INK, 0.06 * em)
-        page.text(number(value), x, bottom + 1.3 * em, size, INK, "middle")
-    page.text(f"{_NAMES[right]}, mm", (left + end) / 2, bottom + 2.7 * em, size, INK, "middle")
-    low, high = box[:, up]
-    for value in ticks(low, high, min(6, int(height / (2.5 * em)))):
-        y = bottom - (value - low) / (high - low) * height
-        page.line([(left - tick, y), (left, y)], INK, 0.06 * em)
-        page.text(number(value), left - 1.6 * tick, y + 0.3 * em, size, INK, "end")
-    page.text(f"{_NAMES[up]}, mm", left - 2.9 * em, (top + bottom) / 2, size, INK, "middle", upward=True)
+    axes = Axes(page, (left, top, width, height), tuple(box[:, right]), tuple(box[:, up]), em)
+    xs, ys = ticks(*axes.x, min(6, int(width / (3.5 * em)))), ticks(*axes.y, min(6, int(height / (2.5 * em))))
+    axes.draw(xs, ys, f"Sum along {_NAMES[axis]}", f"{_NAMES[right]}, mm")
+    page.text(f"{_NAMES[up]}, mm", left - 2.9 * em, top + height / 2, 0.85 * em, INK, "middle", upward=True)

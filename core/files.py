@@ -9,7 +9,7 @@ import stat
 import time
 import uuid
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -145,6 +145,14 @@ def require_file(path: str | os.PathLike[str], expected: str = "a file") -> Path
             raise InputError(f"{path}: is {found}, expected {expected}")
         path.open("rb").close()  # libraries say little about files that they may not read
     return path
+
+
+def require_ending(path: str | os.PathLike[str], endings: Sequence[str]) -> str:
+    """Which of `endings` the name of a file has, or `InputError`."""
+    name = Path(path).name.lower()
+    if (ending := next((ending for ending in endings if name.endswith(ending)), None)) is None:
+        raise InputError(f"{path}: expected a name ending in {', '.join(endings)}")
+    return ending
 
 
 def read_bytes(path: str | os.PathLike[str]) -> bytes:

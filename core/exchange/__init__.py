@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import InputError
-from ..files import new_folder, replacing
+from ..files import new_folder, replacing, require_ending
 from ..geometry.system import PinholeSystem
 from ..geometry.views import Views
 from ..validation import instance, one_of
@@ -64,7 +64,7 @@ def write_geometry(
     chosen, path = FORMATS[format], Path(path)
     for name in sorted(options.keys() - chosen.options.keys()):
         raise InputError(f"format {format}: no option {name!r}, it has {', '.join(chosen.options) or 'none'}")
-    if chosen.suffixes and not path.name.lower().endswith(chosen.suffixes):
-        raise InputError(f"{path}: expected a name ending in {', '.join(chosen.suffixes)}")
+    if chosen.suffixes:
+        require_ending(path, chosen.suffixes)
     with replacing(path) if chosen.suffixes else new_folder(path) as temporary:
         chosen.write(system, views, temporary, **options)

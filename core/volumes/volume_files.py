@@ -7,7 +7,7 @@ from pathlib import Path
 from numpy.typing import ArrayLike
 
 from ..errors import InputError, naming, reading, refusing
-from ..files import replacing, require_file
+from ..files import replacing, require_ending, require_file
 from ..progress import Progress
 from ..validation import instance, real_array
 from .formats import dicom, hdf5, metaimage, nifti, nrrd, numpy_files
@@ -92,9 +92,7 @@ def read_volume_of(
 def write_volume(volume: Volume, path: str | os.PathLike[str]) -> None:
     """Write a volume as NIfTI (.nii, .nii.gz; its affine is rounded to float32), .npz, .nrrd or .h5 (exact)."""
     path = Path(path)
-    write = _WRITERS.get(_ending(path, VOLUME_FORMATS))
-    if write is None:
-        raise InputError(f"{path}: expected a name ending in {', '.join(VOLUME_FORMATS)}")
+    write = _WRITERS[require_ending(path, VOLUME_FORMATS)]
     instance(volume, Volume, "write_volume")
     with replacing(path) as temporary:
         write(volume, temporary)

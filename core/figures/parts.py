@@ -80,6 +80,37 @@ class Axes(NamedTuple):
                 page.text(text, left + width / 2, y, size, INK, "middle")
 
 
+def arranged(
+    sizes: Sequence[tuple[float, float]],
+    margins: tuple[float, float, float, float],
+    room: tuple[float, float, float, float],
+    *ways: Sequence[Sequence[int]],
+) -> tuple[float, list[Point]]:
+    """Arrange rectangles of `sizes`, mm, in rows: pixels per mm, and each one's left top corner.
+
+    Of the `ways`, rows of the rectangles' indices, the one is taken that shows them largest; it is centred in the `room`
+    (left, top, width, height). `margins` are free around each rectangle: left, top, right, bottom.
+    """
+    left, top, width, height = room
+    beside, beyond = margins[0] + margins[2], margins[1] + margins[3]
+
+    def scale(rows: Sequence[Sequence[int]]) -> float:
+        across = min((width - len(row) * beside) / sum(sizes[i][0] for i in row) for row in rows)
+        return min(across, (height - len(rows) * beyond) / sum(max(sizes[i][1] for i in row) for row in rows))
+
+    rows = max(ways, key=scale)
+    pixels = max(scale(rows), 1e-9)
+    talls = [max(sizes[i][1] for i in row) * pixels + beyond for row in rows]
+    corners, y = dict[int, Point](), top + max(0.0, (height - sum(talls)) / 2)
+    for row, tall in zip(rows, talls, strict=True):
+        x = left + max(0.0, (width - sum(sizes[i][0] * pixels + beside for i in row)) / 2)
+        for i in row:
+            corners[i] = x + margins[0], y + tall - margins[3] - sizes[i][1] * pixels
+            x += sizes[i][0] * pixels + beside
+        y += tall
+    return pixels, [corners[i] for i in range(len(sizes))]
+
+
 def number(value: float, digits: int = 4) -> str:
     """A number with a proper minus sign."""
     return f"{value + 0.0:.{digits}g}".replace("-", "−")  # -0 is 0

@@ -11,7 +11,7 @@ from ..runs.display import Display
 from ..volumes.resampling import resample
 from ..volumes.volume import Volume
 from .page import Page
-from .parts import FAINT, INK, Axes, bar_width, color_bar, heading, number, ticks
+from .parts import FAINT, INK, Axes, arranged, bar_width, color_bar, heading, number, ticks
 
 SIZE, SIZE_BESIDE_TRUTH = (1600, 500), (1600, 850)
 """Width and height, pixels, that suit a reconstruction alone, and one beside the truth."""
@@ -43,34 +43,29 @@ def draw(
     display = Display(colors="inferno" if volume.quantity == "activity" else "grey")
     # A hot voxel of the reconstruction must not darken all others: the truth says how bright things are.
     window = display.window(np.concatenate([picture.ravel() for picture in pictures[-1]]))
-    extent = volume.grid.spacing * volume.grid.shape
-    gap, left = 0.8 * em, 2.6 * em
-    bar = bar_width(page, display, window, volume.unit)
-    right = page.width * (1 - _PLOT if len(objective) else 1) - bar - 3.0 * em
-    height = (page.height - top - 0.6 * em) / len(rows) - 1.9 * em
-    pixels = (right - left - 2 * gap) / sum(extent[across] for _, across, _ in _SLICES)
-    pixels = max(min(pixels, height / max(extent[up] for _, _, up in _SLICES)), 1e-9)
-    y = float(top)
-    for (name, _), row in zip(rows, pictures, strict=True):
-        tall = max(extent[up] for _, _, up in _SLICES) * pixels
-        page.text(name, 1.5 * em, y + 1.5 * em + tall / 2, em, INK, "middle", upward=True)
-        x = left
-        for (axis, across, up), picture in zip(_SLICES, row, strict=True):
-            shape = max(1, round(extent[across] * pixels)), max(1, round(extent[up] * pixels))
-            place = round(x), round(y + 1.5 * em + (tall - extent[up] * pixels) / 2)
-            grid, n = volume.grid, volume.grid.shape[axis]
-            at = grid.center[axis] + (n // 2 - (n - 1) / 2) * grid.spacing[axis]
-            text = f"{_NAMES[across]} {_NAMES[up]},  {_NAMES[axis]} = {number(round(float(at), 2) + 0.0)} mm"
-            page.text(text, x + shape[0] / 2, y + 1.1 * em, 0.9 * em, FAINT, "middle")
-            page.image(display.colored(picture.T[::-1], window), *place, *shape)
-            x += extent[across] * pixels + gap
-        y += tall + 1.9 * em
-    _scale_bar(page, pixels, float(extent[0]), left + 0.6 * em, y - 1.0 * em)
-    first = round(top + 1.5 * em)
-    color_bar(page, display, window, volume.unit, round(x + 0.4 * em), first, max(2, round(y - 0.4 * em) - first))
+    grid, bar = volume.grid, bar_width(page, display, window, volume.unit)
+    extent = (grid.spacing * grid.shape).tolist()
+    sizes = [(extent[across], extent[up]) for _ in rows for _, across, up in _SLICES]
+    right = page.width * (1 - _PLOT if len(objective) else 1) - bar - 2.6 * em
+    room = 2.2 * em, float(top), right - 2.2 * em, page.height - top - 0.6 * em
+    in_rows = [range(i, i + 3) for i in range(0, len(sizes), 3)]
+    pixels, places = arranged(sizes, (0.4 * em, 1.5 * em, 0.4 * em, 0.4 * em), room, in_rows)
+    for i, ((x, y), (width, height)) in enumerate(zip(places, sizes, strict=True)):
+        (name, _), (axis, across, up), n = rows[i // 3], _SLICES[i % 3], grid.shape[_SLICES[i % 3][0]]
+        if i % 3 == 0:
+            page.text(name, x - 1.1 * em, y + height * pixels / 2, em, INK, "middle", upward=True)
+        at = grid.center[axis] + (n // 2 - (n - 1) / 2) * grid.spacing[axis]
+        text = f"{_NAMES[across]} {_NAMES[up]},  {_NAMES[axis]} = {number(round(float(at), 2) + 0.0)} mm"
+        page.text(text, x + width * pixels / 2, y - 0.4 * em, 0.9 * em, FAINT, "middle")
+        picture = display.colored(pictures[i // 3][i % 3].T[::-1], window)
+        page.image(picture, round(x), round(y), round(width * pixels), round(height * pixels))
+    x, y = x + width * pixels + 1.2 * em, y + height * pixels
+    first = round(min(place[1] for place in places))
+    _scale_bar(page, pixels, extent[0], places[-3][0] + 0.6 * em, y - 0.6 * em)
+    color_bar(page, display, window, volume.unit, round(x), first, max(2, round(y) - first))
     if len(objective):
-        x, y = x + bar + 7.5 * em, min(0.45 * page.width * _PLOT * 2, y - top - 4.5 * em)
-        draw_objective(page, objective, (x, top + 1.5 * em, page.width - x - 1.5 * em, y), objective_name)
+        x, height = x + bar + 7.1 * em, min(0.9 * page.width * _PLOT, y - first - 3 * em)
+        draw_objective(page, objective, (x, first, page.width - x - 1.5 * em, height), objective_name)
 
 
 def draw_objective(

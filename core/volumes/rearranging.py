@@ -1,7 +1,5 @@
 """Changes that keep the voxels' values: crop, pad, reorient, move, and split by labels."""
 
-from itertools import permutations
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -60,17 +58,12 @@ def pad(volume: Volume, before: ArrayLike, after: ArrayLike, value: float | None
 
 def canonical(volume: Volume) -> Volume:
     """The volume flipped and transposed so that its index axes are closest to right, front and head (RAS)."""
+    from nibabel.orientations import apply_orientation, inv_ornt_aff, io_orientation
+
     instance(volume, Volume, "canonical")
-    directions = volume.grid.affine[:3, :3] / volume.grid.spacing
-    # Of all assignments of index axes to world axes the one with the largest sum of cosines.
-    order = max(permutations(range(3)), key=lambda axes: sum(abs(directions[i, axis]) for i, axis in enumerate(axes)))
-    array, affine = volume.array.transpose(order), volume.grid.affine[:, [*order, 3]].copy()
-    for axis in range(3):
-        if affine[axis, axis] < 0:
-            array = np.flip(array, axis)
-            affine[:3, 3] += affine[:3, axis] * (array.shape[axis] - 1)
-            affine[:3, axis] *= -1
-    grid = Grid(array.shape, affine)  # type: ignore[arg-type]
+    turns = io_orientation(volume.grid.affine)
+    array = apply_orientation(volume.array, turns)
+    grid = Grid(array.shape, volume.grid.affine @ inv_ornt_aff(turns, volume.grid.shape))
     return Volume(freeze(np.array(array, order="C")), grid, volume.quantity)
 
 

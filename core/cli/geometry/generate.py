@@ -5,10 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from ...errors import InputError
-from ...geometry.generators import ellipse_rings, plate_rings, regular_polygon
-from ...geometry.system import PinholeSystem
-from ...workbook import write_system
+from .... import core as mph
 from ..options import add_command, output_path
 
 _SIZES = {
@@ -76,27 +73,27 @@ def _run(arguments: argparse.Namespace) -> None:
     path = output_path(arguments.output, (".xlsx",))
     sizes = {size: getattr(arguments, size) for size, _, _ in _SIZES.values()}
     system = arguments.generate(arguments, {"z": arguments.z, "mirrored": arguments.mirrored, **sizes})
-    write_system(system, path)
+    mph.write_system(system, path)
     b, l = system.pinhole_distance, system.collimator_length
     print(f"{path}: {len(system)} modules, b {b.min():.2f} to {b.max():.2f} mm, l {l.min():.2f} to {l.max():.2f} mm")
 
 
-def _ellipse(arguments: argparse.Namespace, modules: dict[str, Any]) -> PinholeSystem:
+def _ellipse(arguments: argparse.Namespace, modules: dict[str, Any]) -> mph.PinholeSystem:
     axes = arguments.semi_axes
     start, end, rotation = np.deg2rad([arguments.start, arguments.end, arguments.rotation])
     ring = {"start": start, "end": end, "spacing": arguments.spacing}
     curve = {"center": arguments.center, "rotation": rotation}
-    return ellipse_rings(arguments.modules, axes[0] if len(axes) == 1 else axes, **ring, **curve, **modules)
+    return mph.ellipse_rings(arguments.modules, axes[0] if len(axes) == 1 else axes, **ring, **curve, **modules)
 
 
-def _plates(arguments: argparse.Namespace, modules: dict[str, Any]) -> PinholeSystem:
+def _plates(arguments: argparse.Namespace, modules: dict[str, Any]) -> mph.PinholeSystem:
     if (arguments.polygon is None) != (arguments.apothem is None):
-        raise InputError("--polygon and --apothem: expected both, or --vertices")
+        raise mph.InputError("--polygon and --apothem: expected both, or --vertices")
     if arguments.polygon is not None:
-        vertices = regular_polygon(arguments.polygon, arguments.apothem, float(np.deg2rad(arguments.rotation)))
+        vertices = mph.regular_polygon(arguments.polygon, arguments.apothem, float(np.deg2rad(arguments.rotation)))
     elif len(arguments.vertices) % 2:
-        raise InputError(f"--vertices: expected x and y of each, got {len(arguments.vertices)} numbers")
+        raise mph.InputError(f"--vertices: expected x and y of each, got {len(arguments.vertices)} numbers")
     else:
         vertices = np.reshape(arguments.vertices, (-1, 2))
     counts = arguments.modules
-    return plate_rings(counts[0] if len(counts) == 1 else counts, vertices, closed=not arguments.open, **modules)
+    return mph.plate_rings(counts[0] if len(counts) == 1 else counts, vertices, closed=not arguments.open, **modules)

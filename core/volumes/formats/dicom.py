@@ -323,9 +323,9 @@ def _tomogram_frames(header: Any) -> list[dict[str, Any]]:
     count = int(header.get("NumberOfFrames") or 1)
     kind = image_kind(header) or (TOMOGRAMS[0] if "SliceVector" in header else "")
     if kind not in TOMOGRAMS:
-        found = f"ImageType {kind or 'without a third value'}, {count} frame{'s' * (count > 1)}"
+        stated = f"ImageType {kind or 'without a third value'}, {count} frame{'s' * (count > 1)}"
         what = _OTHERS.get(kind, "something else")
-        raise InputError(f"it holds {what} ({found}); expected a reconstructed tomogram (RECON TOMO)")
+        raise InputError(f"it holds {what} ({stated}); expected a reconstructed tomogram (RECON TOMO)")
     if "SliceVector" in header:
         slices = _numbers(header, "SliceVector", count)
         _require_one_volume(header, count, len(np.unique(slices)))

@@ -161,6 +161,14 @@ def read_bytes(path: str | os.PathLike[str]) -> bytes:
         return require_file(path).read_bytes()
 
 
+def read_text(path: str | os.PathLike[str], expected: str = "a text in UTF-8") -> str:
+    """The text of a file, every line's end as it is; `InputError` with what is `expected` where it is none in UTF-8."""
+    try:
+        return read_bytes(path).decode("utf-8-sig")
+    except UnicodeDecodeError:
+        raise InputError(f"{path}: expected {expected}") from None
+
+
 def _to_disk(path: Path) -> None:
     """Flush a file or folder to the disk, so that a power cut after the renaming finds the new file whole."""
     # Folders can only be opened for reading, and Windows flushes only what is open for writing.

@@ -147,17 +147,15 @@ def _execute(macros: Iterable[str]) -> list[str]:
 
 def _volume(part: Placed) -> list[str]:
     """The commands that make a volume, without its place."""
-    shape: str = part.shape
-    a, b, *more = part.size
-    if shape == "box":
-        settings = {"XLength": a, "YLength": b, "ZLength": more[0]}
-    elif shape == "cylinder":
-        settings = {"Rmin": 0, "Rmax": a, "Height": b}
-    elif shape == "cone":
-        settings = {"Rmin1": 0, "Rmax1": a, "Rmin2": 0, "Rmax2": b, "Height": more[0], "PhiStart": 0, "DeltaPhi": 360}
-    else:
-        square = {"Dy1": a, "Dx1": a, "Dx2": a, "Alp1": 0, "Dy2": b, "Dx3": b, "Dx4": b, "Alp2": 0}
-        shape, settings = "trap", {"Dz": more[0] / 2, "Theta": 0, "Phi": 0, **square}
+    a, b, last = part.size[0], part.size[1], part.size[-1]
+    square = {"Dy1": a, "Dx1": a, "Dx2": a, "Alp1": 0, "Dy2": b, "Dx3": b, "Dx4": b, "Alp2": 0}
+    cone = {"Rmin1": 0, "Rmax1": a, "Rmin2": 0, "Rmax2": b, "Height": last, "PhiStart": 0, "DeltaPhi": 360}
+    shape, settings = {
+        "box": ("box", {"XLength": a, "YLength": b, "ZLength": last}),
+        "cylinder": ("cylinder", {"Rmin": 0, "Rmax": a, "Height": last}),
+        "cone": ("cone", cone),
+        "trd": ("trap", {"Dz": last / 2, "Theta": 0, "Phi": 0, **square}),
+    }[part.shape]
     sizes = (f"geometry/set{key} {_n(x)} {'deg' if key in _IN_DEGREES else 'mm'}" for key, x in settings.items())
     made = _under(f"/gate/{part.mother}/daughters", f"name {part.name}", f"insert {shape}")
     return made + _under(f"/gate/{part.name}", *sizes, f"setMaterial {part.material}")

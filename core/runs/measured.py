@@ -7,14 +7,13 @@ import operator
 import re
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InputError, naming, warn
-from ..files import read_bytes
+from ..files import read_text
 from ..geometry.system import Detector, PinholeSystem
 from ..memory import require
 from ..progress import Stages
@@ -123,7 +122,7 @@ def recipe_counts(recipe: Recipe, system: PinholeSystem, stages: Stages = lambda
     found = read_frames(recipe["counts.files"], layout, stages("reading"))
     frames, orientation = recipe["counts.frames"], recipe["counts.orientation"]
     if recipe["counts.frames_file"] is not None:
-        frames = _read_numbers(Path(recipe["counts.frames_file"]))
+        frames = read_text(recipe["counts.frames_file"])
     with naming(found.name):
         run = counts_run(
             found, system, frames, orientation[0] if orientation and len(orientation) == 1 else orientation,
@@ -189,13 +188,6 @@ def _whole(values: Any) -> list[int | None]:
         return [None if value is None else operator.index(value) for value in values]
     except TypeError:
         raise InputError(f"frames (--frames): expected the modules' numbers, got {values!r:.40}") from None
-
-
-def _read_numbers(path: Path) -> str:
-    try:
-        return read_bytes(path).decode()
-    except UnicodeDecodeError:
-        raise InputError(f"{path}: not a text file") from None
 
 
 def _words(orientation: Any, count: int) -> list[str]:

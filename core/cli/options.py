@@ -53,7 +53,7 @@ class NotingStore(argparse.Action):
 
 
 def refuse(arguments: argparse.Namespace, names: Iterable[str], why: str) -> None:
-    """Raise `InputError` if one of the options that are stored as `names` was typed: the option, and `why` not."""
+    """Refuse options that were typed, by the `names` they are stored as: the message names the option and `why` not."""
     noted = getattr(arguments, "typed", {})
     for name in names:
         if name in noted or getattr(arguments, name, None) is True:  # a flag

@@ -49,10 +49,9 @@ def write_geometry(
     options
         The format's own: ``FORMATS[format].options``.
 
-    Raises
-    ------
-    InputError
-        For an unknown format, option or ending, and for what the format cannot express. An existing file then stays.
+    Notes
+    -----
+    Where the format cannot express a geometry, it is refused and an existing file stays.
     """
     instance(system, PinholeSystem, "write_geometry")
     one_of(format, FORMATS, "format")

@@ -47,7 +47,7 @@ _EULER = "euler_degrees"
 
 
 def read_phantom(path: str | os.PathLike[str]) -> ShapePhantom:
-    """The phantom that a TOML file describes, see `core.phantoms.language`; `InputError` names file, shape and key."""
+    """The phantom that a TOML file describes, see `core.phantoms.language`; messages name file, shape and key."""
     return _phantom(read_toml(path), str(path))
 
 

@@ -173,8 +173,7 @@ class Phantom:
 class ShapePhantom(Phantom):
     """A phantom given as a list of shapes, in the order of painting: later ones replace what is beneath them.
 
-    `mu_energy` is the energy, keV, at which mu holds. `InputError` if there are no shapes, or negative ones make a sum
-    negative.
+    `mu_energy` is the energy, keV, at which mu holds. Negative shapes may not make a sum negative.
 
     Examples
     --------

@@ -66,7 +66,7 @@ def counts_run(
     expected
         Whether the numbers are expected means, which may be fractions.
     detector, magnification, pitch
-        Where the run's images are taken, as of `PinholeSystem.views`; a `pitch` on the real detector is the size of the
+        Where the run's images are taken, see `PinholeSystem.views`; a `pitch` on the real detector is the size of the
         crystal's pixels, by default the crystal's side divided by their number.
     recipe
         Says the rest of the model, for reconstruction: isotope, aperture, crystal, attenuation.

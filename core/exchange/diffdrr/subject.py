@@ -57,11 +57,6 @@ def read(
         Factor for CT numbers above 350 HU.
     center_volume
         Move the volume's middle to the world's origin.
-
-    Raises
-    ------
-    InputError
-        The volume does not hold CT numbers, the labelmap has another shape, or the orientation is unknown.
     """
     if isinstance(volume, Volume):
         require_quantity(volume.quantity, ("hu",), "read")

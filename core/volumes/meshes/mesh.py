@@ -95,7 +95,7 @@ def as_mesh(given: Any) -> Mesh:
 
 
 def require_closed(mesh: Mesh) -> None:
-    """Raise `InputError` if the surface is open or its faces look to different sides; the message says where."""
+    """Refuse a surface that is open or whose faces look to different sides; the message says where."""
     vertices = mesh.vertices
     size = float(np.ptp(vertices, axis=0).max())
     # In .stl and other files every triangle has its own copy of its corners.

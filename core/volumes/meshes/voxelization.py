@@ -43,7 +43,7 @@ def voxelize_mesh(
     ----------
     mesh
         A `Mesh`, a trimesh mesh or scene, ``(vertices (V, 3), faces (F, 3))`` in world mm, or the path of a file (see
-        `read_mesh`); or a list of these, in which later ones replace what they cover of earlier ones. `InputError` says
+        `read_mesh`); or a list of these, in which later ones replace what they cover of earlier ones. Messages say
         where a mesh is open or its faces look to different sides.
     grid
         Where the voxels are; any affine.

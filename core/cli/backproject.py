@@ -8,19 +8,13 @@ from ..runs.backprojecting import backprojection_grid
 from ..runs.files import FORMATS
 from ..runs.settings import SETTINGS
 from ..volumes.volume_files import VOLUME_FORMATS
-from .options import add_command, described, output_path, print_answer, progress_bar
+from .options import add_run, described, output_path, print_answer, progress_bar
 from .recipe_options import add_setting, typed_entries
 
 
 def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     """Add the command."""
-    parser = add_command(
-        subparsers,
-        "backproject",
-        "put together what a run's views say of each voxel: sum, geometric mean or minimum",
-        "mphdrr backproject run.h5 --how product --voxels 128 128 64 --spacing 1 -o product.nii.gz",
-        _run,
-    )
+    parser = add_run(subparsers, "backproject", _run)
     parser.add_argument("file", metavar="RUN", help=f"a run of mphDRR: {', '.join(FORMATS)}")
     text = "of the views that see a voxel: the sum of their values, their geometric mean, or the least"
     parser.add_argument("--how", choices=tuple(HOW), default="sum", help=text)
@@ -34,6 +28,10 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
 
 
 def _run(arguments: argparse.Namespace) -> None:
+    """Put together what a run's views say of each voxel: sum, geometric mean or minimum.
+
+    mphdrr backproject run.h5 --how product --voxels 128 128 64 --spacing 1 -o product.nii.gz
+    """
     path = output_path(arguments.output, VOLUME_FORMATS)
     counted = output_path(arguments.views_that_see, VOLUME_FORMATS) if arguments.views_that_see else None
     if counted is not None and counted.resolve() == path.resolve():

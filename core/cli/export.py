@@ -5,13 +5,12 @@ import argparse
 from ... import core as mph
 from ..runs.files import FORMATS
 from ..runs.mosaic import write_sheet
-from .options import add_command, output_path
+from .options import add_run, output_path
 
 
 def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     """Add the command."""
-    summary, example = "write a projection run in another format", "mphdrr export run.h5 -o run.pt -o run.npz"
-    parser, formats = add_command(subparsers, "export", summary, example, _run), ", ".join(FORMATS)
+    parser, formats = add_run(subparsers, "export", _run), ", ".join(FORMATS)
     add = parser.add_argument
     add("file", metavar="RUN", help=f"a run written by mphDRR: {formats}")
     add("-o", "--output", action="append", default=[], metavar="FILE", help=f"{formats}; may be repeated")
@@ -19,6 +18,10 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
 
 
 def _run(arguments: argparse.Namespace) -> None:
+    """Write a projection run in another format.
+
+    mphdrr export run.h5 -o run.pt -o run.npz
+    """
     if not arguments.output and not arguments.mosaic:
         raise mph.InputError("nothing to write: give --output FILE or --mosaic PNG")
     run = mph.read_run(arguments.file)

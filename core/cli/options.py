@@ -1,11 +1,13 @@
 """Options and parsing that several commands share."""
 
 import argparse
+import inspect
 import json
+import re
 import sys
 import textwrap
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -58,6 +60,15 @@ def refuse(arguments: argparse.Namespace, names: Iterable[str], why: str) -> Non
     for name in names:
         if name in noted or getattr(arguments, name, None) is True:  # a flag
             raise InputError(f"{noted.get(name, '--' + name.replace('_', '-'))} {why}")
+
+
+def add_run(subparsers: Any, name: str, run: Callable[[argparse.Namespace], None]) -> argparse.ArgumentParser:
+    """The parser of a command that calls `run`, whose docstring is the help: what it does, and below it examples."""
+    summary, _, below = inspect.cleandoc(run.__doc__ or "").partition("\n\n")
+    words = " ".join(summary.split()).rstrip(".")
+    words = words[0].lower() + words[1:] if words[1].islower() else words
+    examples = re.split(r"\s+(?=mphdrr )", below)
+    return add_command(subparsers, name, words, "\nexample: ".join(" ".join(each.split()) for each in examples), run)
 
 
 def add_command(subparsers, name: str, summary: str, example: str, run: Any = None) -> argparse.ArgumentParser:  # type: ignore[no-untyped-def]

@@ -13,7 +13,7 @@ from ..runs.files import FORMATS
 from ..runs.mosaic import write_sheet
 from ..runs.presets import PRESETS
 from ..runs.settings import SETTINGS
-from .options import add_command, numbered_path, output_path, progress_bar
+from .options import add_run, numbered_path, output_path, progress_bar
 from .recipe_options import add_entries, add_option, add_setting, typed_entries
 
 _LISTED = (
@@ -40,18 +40,7 @@ _DERENZO = {
 
 def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     """Add the command."""
-    parser = add_command(
-        subparsers,
-        "project",
-        "project a volume, or a phantom, into every module; or take measured counts for the projections",
-        "mphdrr project scanner.xlsx --volume ct.nii.gz --energy 60 --size 250 250 -o run.h5\n"
-        "example: mphdrr project scanner.xlsx --volume heart.nii.gz --mu ct-mu.nii.gz --preset tc99m-tungsten-czt "
-        "--time 600 --write-recipe heart.toml\n"
-        "example: mphdrr project heart.toml --noise 1 -o counts.h5\n"
-        "example: mphdrr project scanner.xlsx --counts counts.npy --frames 1-80 --orientation front+v --time 600 "
-        "-o run.h5 --mosaic check.png",
-        _run,
-    )
+    parser = add_run(subparsers, "project", _run)
     text = "geometry workbook (.xlsx, .xlsm), recipe (.toml), or run (.h5, .npz, .pt), to be made again"
     parser.add_argument("file", nargs="?", metavar="FILE", help=text)
     for setting in SETTINGS.values():
@@ -128,6 +117,15 @@ def _chosen(arguments: argparse.Namespace) -> tuple[mph.Recipe, dict[str, Any]]:
 
 
 def _run(arguments: argparse.Namespace) -> None:
+    """Project a volume, or a phantom, into every module; or take measured counts for the projections.
+
+    mphdrr project scanner.xlsx --volume ct.nii.gz --energy 60 --size 250 250 -o run.h5
+    mphdrr project scanner.xlsx --volume heart.nii.gz --mu ct-mu.nii.gz --preset tc99m-tungsten-czt --time 600
+        --write-recipe heart.toml
+    mphdrr project heart.toml --noise 1 -o counts.h5
+    mphdrr project scanner.xlsx --counts counts.npy --frames 1-80 --orientation front+v --time 600 -o run.h5
+        --mosaic check.png
+    """
     if arguments.write_recipe:
         path = output_path(arguments.write_recipe, (".toml",))
         recipe, _ = _chosen(arguments)

@@ -15,20 +15,13 @@ from ..runs.files import FORMATS
 from ..runs.reconstructing import flattering
 from ..runs.run_recipe import truth_of_run
 from ..volumes.volume import UNITS
-from .options import add_command, output_path, print_answer, progress_bar, refuse
+from .options import add_run, output_path, print_answer, progress_bar, refuse
 from .phantom import Make, add_kinds, add_pose, read_pose
 
 
 def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     """Add the command."""
-    score = add_command(
-        subparsers,
-        "score",
-        "score a reconstructed volume beside the truth: what a run was simulated of, a phantom, or a volume",
-        "mphdrr score volume.nii.gz --truth run.h5 --picture score.png\n"
-        "example: mphdrr score volume.nii.gz derenzo --rods 8 6 5 4 3 2 --activity 100 --euler 0 90 0",
-        _run,
-    )
+    score = add_run(subparsers, "score", _run)
     score.add_argument("volume", metavar="VOLUME", help="to score (formats: docs/volumes.md)")
     truth = "a simulated run, a phantom's .toml, or a volume; one on another grid is resampled onto VOLUME's voxels"
     score.add_argument("--truth", metavar="FILE", help=truth)
@@ -56,6 +49,11 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(arguments: argparse.Namespace) -> None:
+    """Score a reconstructed volume beside the truth: what a run was simulated of, a phantom, or a volume.
+
+    mphdrr score volume.nii.gz --truth run.h5 --picture score.png
+    mphdrr score volume.nii.gz derenzo --rods 8 6 5 4 3 2 --activity 100 --euler 0 90 0
+    """
     picture = None if arguments.picture is None else output_path(arguments.picture, SUFFIXES)
     if arguments.make is None and arguments.truth is None:
         raise mph.InputError("score: expected --truth FILE or a kind of phantom, see mphdrr score --help")

@@ -12,7 +12,7 @@ from ..validation import positive, real_array, shape_text
 from ..volumes.meshes.mesh import MESH_FORMATS, MILLIMETRES
 from ..volumes.volume import UNITS
 from ..volumes.volume_files import VOLUME_FORMATS
-from .options import add_command, described, one_or_three, output_path, print_answer, progress_bar
+from .options import add_command, add_run, described, one_or_three, output_path, print_answer, progress_bar
 
 _MESH_UNIT: dict[str, Any] = {
     "choices": tuple(MILLIMETRES),
@@ -25,17 +25,11 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     volume = add_command(subparsers, "volume", "look at volumes and convert them", "mphdrr volume info ct.nii.gz")
     actions = volume.add_subparsers(metavar="ACTION", required=True)
 
-    info = add_command(actions, "info", "show a volume's place, grid and values", "mphdrr volume info ct.nii.gz", _info)
+    info = add_run(actions, "info", _info)
     _add_input(info)
     info.add_argument("--json", action="store_true", help="print JSON")
 
-    convert = add_command(
-        actions,
-        "convert",
-        "convert a volume to another format, and crop, move, resample it or convert it to attenuation",
-        "mphdrr volume convert dicom_folder --center --spacing 2 --to-mu --energy Tc-99m -o mu.nii.gz",
-        _convert,
-    )
+    convert = add_run(actions, "convert", _convert)
     _add_input(convert)
     steps = convert.add_argument_group("changes, in this order")
     add = steps.add_argument
@@ -52,13 +46,7 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     convert.add_argument("--energy", metavar="KEV", help=energy)
     convert.add_argument("-o", "--output", required=True, metavar="FILE", help=", ".join(VOLUME_FORMATS))
 
-    from_mesh = add_command(
-        actions,
-        "from-mesh",
-        "fill closed meshes with activity or attenuation",
-        "mphdrr volume from-mesh body.stl heart.stl --value 0.0154 0.0160 --quantity mu --spacing 2 -o mu.nii.gz",
-        _from_mesh,
-    )
+    from_mesh = add_run(actions, "from-mesh", _from_mesh)
     add = from_mesh.add_argument
     add("mesh", nargs="+", metavar="MESH", help=f"{', '.join(MESH_FORMATS)}; later ones replace earlier ones")
     add("--unit", **_MESH_UNIT)
@@ -69,13 +57,7 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     add("--voxels", type=int, nargs=3, metavar="N", help=voxels)
     add("-o", "--output", required=True, metavar="FILE", help=", ".join(VOLUME_FORMATS))
 
-    to_mesh = add_command(
-        actions,
-        "to-mesh",
-        "make a closed mesh of the surface at a level, to show or to print",
-        "mphdrr volume to-mesh ct.nii.gz --level 300 -o bones.stl",
-        _to_mesh,
-    )
+    to_mesh = add_run(actions, "to-mesh", _to_mesh)
     _add_input(to_mesh)
     level = "in the volume's unit; default: halfway to the largest value"
     to_mesh.add_argument("--level", type=float, metavar="X", help=level)
@@ -101,6 +83,10 @@ def _input(arguments: argparse.Namespace) -> mph.Volume:
 
 
 def _info(arguments: argparse.Namespace) -> None:
+    """Show a volume's place, grid and values.
+
+    mphdrr volume info ct.nii.gz
+    """
     volume = _input(arguments)
     array, grid = volume.array, volume.grid
     corners = grid.corners()
@@ -127,6 +113,10 @@ def _info(arguments: argparse.Namespace) -> None:
 
 
 def _convert(arguments: argparse.Namespace) -> None:
+    """Convert a volume to another format, and crop, move, resample it or convert it to attenuation.
+
+    mphdrr volume convert dicom_folder --center --spacing 2 --to-mu --energy Tc-99m -o mu.nii.gz
+    """
     path = output_path(arguments.output, VOLUME_FORMATS)
     if arguments.energy is not None and not arguments.to_mu:
         raise mph.InputError("--energy needs --to-mu")
@@ -167,6 +157,10 @@ def _respaced(volume: mph.Volume, spacing: list[float], method: str | None) -> m
 
 
 def _from_mesh(arguments: argparse.Namespace) -> None:
+    """Fill closed meshes with activity or attenuation.
+
+    mphdrr volume from-mesh body.stl heart.stl --value 0.0154 0.0160 --quantity mu --spacing 2 -o mu.nii.gz
+    """
     path = output_path(arguments.output, VOLUME_FORMATS)
     if len(arguments.value) not in (1, len(arguments.mesh)):
         raise mph.InputError(f"--value: expected one number, or one for each of {len(arguments.mesh)} meshes")
@@ -182,6 +176,10 @@ def _from_mesh(arguments: argparse.Namespace) -> None:
 
 
 def _to_mesh(arguments: argparse.Namespace) -> None:
+    """Make a closed mesh of the surface at a level, to show or to print.
+
+    mphdrr volume to-mesh ct.nii.gz --level 300 -o bones.stl
+    """
     path = output_path(arguments.output, MESH_FORMATS)
     mesh = mph.volume_to_mesh(_input(arguments), arguments.level, progress_bar("surface"))
     mph.write_mesh(mesh, path, arguments.unit)

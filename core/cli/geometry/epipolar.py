@@ -23,11 +23,7 @@ _CHANCE = 0.01
 
 def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     """Add the action."""
-    example = (
-        " --pixel 7:120,130\nexample: mphdrr geometry epipolar scanner.xlsx --pixel 7:120,130 --pixel 31:99.4,140.2"
-    )
-    summary = "say where all modules see what a pixel of one sees; or where a point is, by its pixels in several"
-    parser = add_action(actions, "epipolar", summary, example + " --pixel 52:131,88 --sigma 0.5", _run)
+    parser = add_action(actions, "epipolar", _run)
     add = parser.add_argument
     pixel = "module number, column and row of its image, counted from 0; several: of one point, whose place is sought"
     add("--pixel", action="append", required=True, metavar="MODULE:COLUMN,ROW", help=pixel)
@@ -39,6 +35,11 @@ def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
 
 
 def _run(arguments: argparse.Namespace) -> None:
+    """Say where all modules see what a pixel of one sees; or where a point is, by its pixels in several.
+
+    mphdrr geometry epipolar scanner.xlsx --pixel 7:120,130
+    mphdrr geometry epipolar scanner.xlsx --pixel 7:120,130 --pixel 31:99.4,140.2 --pixel 52:131,88 --sigma 0.5
+    """
     system = read_workbook(arguments)
     pixels = [_pixel(system, text) for text in arguments.pixel]
     views = views_of(system, arguments)

@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 from .... import core as mph
 from ...exchange import FORMATS, Format
-from ..options import add_command, add_workbook, chosen_modules, output_path, read_workbook
+from ..options import add_run, add_workbook, chosen_modules, output_path, read_workbook
 from .arguments import add_views, views_of
 
 _WORDS = {bool: "yes|no", int: "N", float: "NUMBER", str: "TEXT", tuple: "NUMBER,NUMBER,...", mph.Grid: "VOLUME-FILE"}
@@ -17,14 +17,7 @@ _WORDS = {bool: "yes|no", int: "N", float: "NUMBER", str: "TEXT", tuple: "NUMBER
 
 def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     """Add the action."""
-    parser = add_command(
-        actions,
-        "export",
-        "write the geometry for another program",
-        "mphdrr geometry export scanner.xlsx -o scanner.xml --size 128 128 --detector real\n"
-        "example: mphdrr geometry export scanner.xlsx -o cameras.npz --format pytorch3d --set in_ndc=no",
-        _run,
-    )
+    parser = add_run(actions, "export", _run)
     add_workbook(parser)
     add = parser.add_argument
     add("-o", "--output", required=True, metavar="OUT", help="file, or new folder, to write")
@@ -37,6 +30,11 @@ def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
 
 
 def _run(arguments: argparse.Namespace) -> None:
+    """Write the geometry for another program.
+
+    mphdrr geometry export scanner.xlsx -o scanner.xml --size 128 128 --detector real
+    mphdrr geometry export scanner.xlsx -o cameras.npz --format pytorch3d --set in_ndc=no
+    """
     format = FORMATS[arguments.format] if arguments.format else _format_of(arguments.output)
     options = dict(_option(format, text) for text in arguments.set)
     path = output_path(arguments.output, format.suffixes) if format.suffixes else Path(arguments.output)

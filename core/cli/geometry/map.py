@@ -17,8 +17,7 @@ _OF_MATERIALS = ("sensitivity", "resolution")
 
 def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     """Add the action."""
-    example = " --quantity sensitivity --voxels 64 --spacing 3 -o sensitivity.nii.gz"
-    parser = add_action(actions, "map", "make a volume of what the scanner does in every voxel", example, _run)
+    parser = add_action(actions, "map", _run)
     add = parser.add_argument
     quantity = (
         "counts per decay; number of modules that see the voxel; expected FWHM, mm; completeness of the angular "
@@ -35,6 +34,10 @@ def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
 
 
 def _run(arguments: argparse.Namespace) -> None:
+    """Make a volume of what the scanner does in every voxel.
+
+    mphdrr geometry map scanner.xlsx --quantity sensitivity --voxels 64 --spacing 3 -o sensitivity.nii.gz
+    """
     path = output_path(arguments.output, VOLUME_FORMATS)
     if arguments.quantity not in _OF_MATERIALS:
         refuse(arguments, MATERIAL_OPTIONS, f"has no effect on --quantity {arguments.quantity}")

@@ -15,6 +15,7 @@ from .subject import Subject
 _PANELS = ((2, 0, 1), (1, 0, 2), (0, 1, 2))
 _ARRANGED = (((0, 1, 2),), ((0,), (1, 2)), ((0,), (1,), (2,)))
 _NAMES = "xyz"
+_Frame = tuple[int, int, int, int]  # left, top, width, height
 
 
 def orthogonal_sum(volume: Volume, axis: int) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
@@ -53,8 +54,8 @@ def draw(page: Page, subject: Subject) -> None:
     sizes = [(extent[right], extent[up]) for _, right, up in _PANELS]
     pixels, places = arranged(sizes, (4.2 * em, 1.9 * em, 1.2 * em, 3.8 * em), room, *_ARRANGED)
     for panel, ((x, y), (across, tall)) in enumerate(zip(places, sizes, strict=True)):
-        shape = round(across * pixels), round(tall * pixels)
-        _panel(page, panel, display.colored(sums[panel][0].T[::-1], window), box, (round(x), round(y)), shape)
+        frame = round(x), round(y), max(1, round(across * pixels)), max(1, round(tall * pixels))
+        _panel(page, panel, display.colored(sums[panel][0].T[::-1], window), box, frame)
     first, last = (
         min(y for _, y in places),
         max(y + size[1] * pixels for (_, y), size in zip(places, sizes, strict=True)),
@@ -80,19 +81,12 @@ def _numbers(values: object) -> str:
     return ", ".join(number(round(float(value), 3) + 0.0) for value in np.asarray(values))
 
 
-def _panel(
-    page: Page,
-    panel: int,
-    picture: NDArray[np.uint8],
-    box: NDArray[np.float64],
-    place: tuple[int, int],
-    shape: tuple[int, int],
-) -> None:
+def _panel(page: Page, panel: int, picture: NDArray[np.uint8], box: NDArray[np.float64], frame: _Frame) -> None:
     """One sum with its title and axes."""
-    em, (left, top), (width, height) = page.em, place, np.maximum(shape, 1).tolist()
+    em, (left, top, width, height) = page.em, frame
     axis, right, up = _PANELS[panel]
     page.image(picture, left, top, width, height)
-    axes = Axes(page, (left, top, width, height), tuple(box[:, right]), tuple(box[:, up]), em)
+    axes = Axes(page, frame, tuple(box[:, right]), tuple(box[:, up]), em)
     xs, ys = ticks(*axes.x, min(6, int(width / (3.5 * em)))), ticks(*axes.y, min(6, int(height / (2.5 * em))))
     axes.draw(xs, ys, f"Sum along {_NAMES[axis]}", f"{_NAMES[right]}, mm")
     page.text(f"{_NAMES[up]}, mm", left - 2.9 * em, top + height / 2, 0.85 * em, INK, "middle", upward=True)

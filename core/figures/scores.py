@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..geometry.frames import moved
 from ..reconstruction.scores.derenzo import DerenzoSector
 from ..reconstruction.scores.summary import VolumeScore
 from ..runs import letters
@@ -85,11 +86,10 @@ def _middle(score: VolumeScore, low: Floats, high: Floats) -> Floats:
     """Where the slices meet: in the largest sphere; else near the middle, but where there is much of the truth."""
     if score.nema is not None:
         largest = score.nema[int(score.nema.diameter.argmax())].center
-        return (np.linalg.inv(score.pose) @ [*largest, 1.0])[:3]
+        return moved(np.linalg.inv(score.pose), largest)
     shares = (np.arange(_COARSE) + 0.5) / _COARSE
     points = low + np.stack(np.meshgrid(shares, shares, shares, indexing="ij"), axis=-1).reshape(-1, 3) * (high - low)
-    world = points @ score.pose[:3, :3].T + score.pose[:3, 3]
-    values = values_at(score.truth, world, "nearest").reshape((_COARSE,) * 3).astype(float)
+    values = values_at(score.truth, moved(score.pose, points), "nearest").reshape((_COARSE,) * 3).astype(float)
     best = []
     for axis in range(3):
         sums = np.abs(values).sum(axis=tuple({0, 1, 2} - {axis}))
@@ -100,9 +100,7 @@ def _middle(score: VolumeScore, low: Floats, high: Floats) -> Floats:
 
 def _shown(score: VolumeScore) -> tuple[Floats, Floats]:
     """Opposite corners, in the axes of `score.pose`, mm, of the box that slices show."""
-    corners = score.volume.grid.corners()
-    to_axes = np.linalg.inv(score.pose)
-    inside = corners @ to_axes[:3, :3].T + to_axes[:3, 3]
+    inside = moved(np.linalg.inv(score.pose), score.volume.grid.corners())
     low, high = inside.min(axis=0), inside.max(axis=0)
     if score.phantom is not None:
         start, end = score.phantom.box
@@ -122,8 +120,7 @@ def _slice(
     points = np.empty((counts[plane[0]], counts[plane[1]], 3))
     points[:] = middle
     points[..., plane[0]], points[..., plane[1]] = at[plane[0]][:, None], at[plane[1]]
-    world = points.reshape(-1, 3) @ pose[:3, :3].T + pose[:3, 3]
-    return values_at(volume, world, "nearest").reshape(points.shape[:2])
+    return values_at(volume, moved(pose, points.reshape(-1, 3)), "nearest").reshape(points.shape[:2])
 
 
 def _lines_of_profiles(page: Page, score: VolumeScore, low: Floats, scale: float, corner: tuple[float, float]) -> None:
@@ -131,7 +128,7 @@ def _lines_of_profiles(page: Page, score: VolumeScore, low: Floats, scale: float
     to_axes = np.linalg.inv(score.pose)
     for sector in score.derenzo or ():
         for profile in sector.profiles:
-            ends = profile.points[[0, -1]] @ to_axes[:3, :3].T + to_axes[:3, 3]
+            ends = moved(to_axes, profile.points[[0, -1]])
             line = [(corner[0] + (x - low[0]) * scale, corner[1] - (y - low[1]) * scale) for x, y, _ in ends.tolist()]
             page.line(line, _ON_SLICE, 0.06 * page.em)
 
@@ -145,7 +142,7 @@ def _plots(score: VolumeScore, middle: Floats) -> list[_Plot]:
     for axis in range(3):
         points = np.tile(middle, (_MOST, 1))
         points[:, axis] = np.linspace(low[axis], high[axis], _MOST)
-        world = points @ score.pose[:3, :3].T + score.pose[:3, 3]
+        world = moved(score.pose, points)
         true, found = (values_at(volume, world).astype(float) for volume in (score.truth, score.volume))
         curves = (_Curve(points[:, axis], found, _FOUND, 0.16), _Curve(points[:, axis], true, _TRUE, 0.07))
         plots.append(_Plot(f"Along {'xyz'[axis]}, mm", curves))

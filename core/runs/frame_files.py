@@ -19,7 +19,7 @@ from ..hdf5 import numbers, opened
 from ..memory import require
 from ..progress import Progress, tell
 from ..recording import recorded_warnings
-from ..validation import one_of, whole_shape
+from ..validation import one_of, shape_text, whole_shape
 from ..volumes.formats import metaimage, numpy_files
 from ..volumes.formats.dicom import TOMOGRAMS, decoded, image_kind, is_dicom, require_grey
 
@@ -187,7 +187,7 @@ def _counts(array: NDArray[Any], kind: str = "", **known: Sequence[float]) -> Co
 
 def _require_memory(shape: Sequence[int], itemsize: int) -> None:
     # The numbers, their float32 images, and the checks of them.
-    require((itemsize + 9.0) * math.prod(map(int, shape)), f"counts of {' x '.join(map(str, shape))}")
+    require((itemsize + 9.0) * math.prod(map(int, shape)), f"counts of {shape_text(tuple(shape))}")
 
 
 def _raw(path: Path, layout: Layout) -> NDArray[Any]:
@@ -205,9 +205,8 @@ def _numbers(path: Path, kind: np.dtype[Any], shape: tuple[int, ...], skip: int 
     """All numbers of a file behind its first `skip` bytes."""
     needed, size = skip + kind.itemsize * math.prod(shape), path.stat().st_size
     if needed != size:
-        what = f"{' x '.join(map(str, shape))} numbers of {kind.itemsize} bytes" + (
-            f" behind {skip} bytes" if skip else ""
-        )
+        behind = f" behind {skip} bytes" if skip else ""
+        what = f"{shape_text(shape)} numbers of {kind.itemsize} bytes{behind}"
         raise InputError(f"expected {needed} bytes ({what}), {path.name} has {size}")
     _require_memory(shape, kind.itemsize)
     return np.fromfile(path, kind, offset=skip).reshape(shape)
@@ -328,10 +327,8 @@ def _dicom(path: Path, layout: Layout) -> Counts:
     import pydicom
 
     data = pydicom.dcmread(path)
-    if data.get("Modality") != "NM":
-        raise InputError(
-            f"modality {data.get('Modality') or 'unsaid'}: expected nuclear medicine (NM) with a frame a module"
-        )
+    if (modality := data.get("Modality")) != "NM":
+        raise InputError(f"modality {modality or 'missing'}: expected nuclear medicine (NM) with a frame a module")
     if image_kind(data) in TOMOGRAMS or "SliceVector" in data:
         raise InputError("it holds a reconstructed tomogram; expected a frame a module")
     require_grey(data)

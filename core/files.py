@@ -147,12 +147,17 @@ def require_file(path: str | os.PathLike[str], expected: str = "a file") -> Path
     return path
 
 
+def ending_of(path: str | os.PathLike[str], endings: Sequence[str]) -> str:
+    """Which of `endings` the name of a file has, or ""."""
+    name = Path(path).name.lower()
+    return next((ending for ending in endings if name.endswith(ending)), "")
+
+
 def require_ending(path: str | os.PathLike[str], endings: Sequence[str]) -> str:
     """Which of `endings` the name of a file has, or `InputError`."""
-    name = Path(path).name.lower()
-    if (ending := next((ending for ending in endings if name.endswith(ending)), None)) is None:
-        raise InputError(f"{path}: expected a name ending in {', '.join(endings)}")
-    return ending
+    if ending := ending_of(path, endings):
+        return ending
+    raise InputError(f"{path}: expected a name ending in {', '.join(endings)}")
 
 
 def read_bytes(path: str | os.PathLike[str]) -> bytes:

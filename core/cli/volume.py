@@ -87,17 +87,17 @@ def _info(arguments: argparse.Namespace) -> None:
 
     mphdrr volume info ct.nii.gz
     """
+    from nibabel.orientations import aff2axcodes
+
     volume = _input(arguments)
     array, grid = volume.array, volume.grid
     corners = grid.corners()
-    # The direction of each index axis in the patient: the closest of R, L, A, P, S, I.
-    axes = [(int(np.abs(axis).argmax()), axis) for axis in grid.affine[:3, :3].T]
     facts = {
         "quantity": volume.quantity,
         "unit": volume.unit,
         "voxels": list(grid.shape),
         "spacing_mm": grid.spacing.tolist(),
-        "axes": "".join(("RAS" if axis[world] > 0 else "LPI")[world] for world, axis in axes),
+        "axes": "".join(aff2axcodes(grid.affine)),  # of R, L, A, P, S, I the closest
         "center_mm": grid.center.tolist(),
         "low_mm": corners.min(axis=0).tolist(),
         "high_mm": corners.max(axis=0).tolist(),

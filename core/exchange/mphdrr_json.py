@@ -43,7 +43,7 @@ def _write(system: PinholeSystem, views: Views, temporary: Path) -> None:
 
 
 def read_geometry(path: str | os.PathLike[str]) -> tuple[PinholeSystem, Views]:
-    """Read what `write_geometry` wrote in the format ``"mphdrr"``, bit for bit."""
+    """Read what `write_geometry` wrote in the format ``"mphdrr"``, bit for bit; `InputError` for any other file."""
     content = read_bytes(path)
     try:
         document = json.loads(content)

@@ -148,8 +148,7 @@ def _add_output(parser: argparse.ArgumentParser, make: Make) -> None:
     add_pose(parser)
     add = parser.add_argument
     add("--voxels", type=int, nargs="+", default=[256], metavar="N", help="voxels along x y z, or one")
-    spacing = "voxel size, one or three; default: so that it fits"
-    add("--spacing", type=float, nargs="+", metavar="MM", help=spacing)
+    add("--spacing", type=float, nargs="+", metavar="MM", help="voxel size, one or three; default: so that it fits")
     add("--quantity", choices=QUANTITIES, default="activity", help="what the voxels hold")
     add("--random", type=int, metavar="SEED", help="draw position and Euler angles at random")
     box = "with --random: sides of the box around --position in which the middle is drawn"

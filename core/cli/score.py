@@ -41,8 +41,7 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
 
 def _add_options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    quantity = "what the volumes' values are; default: what their files say"
-    add("--quantity", choices=tuple(UNITS), help=quantity)
+    add("--quantity", choices=tuple(UNITS), help="what the volumes' values are; default: what their files say")
     add("--json", action="store_true", help="print JSON")
     picture = f"of slices beside the truth, and profiles: {', '.join(SUFFIXES)}"
     add("--picture", metavar="FILE", help=picture)

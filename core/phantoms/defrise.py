@@ -34,8 +34,7 @@ class DefrisePhantom(Phantom):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.disks > 1:
-            name = f"{self.title}: disk thickness"
-            require_at_most(self.disk_thickness, self.spacing, name, "from disk to disk")
+            require_at_most(self.disk_thickness, self.spacing, f"{self.title}: disk thickness", "from disk to disk")
 
     @cached_property
     def shapes(self) -> Sequence[Shape]:

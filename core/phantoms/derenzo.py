@@ -187,8 +187,7 @@ class DerenzoPhantom(Phantom):
             raise InputError(f"Derenzo activity: expected {expected}, got {self.activity:g}")
         empty = [f"{w:g}" for w, (_, n) in zip(self.rod_diameters, self._rods._rows, strict=True) if w > 0 and n == 0]
         if empty:
-            text = f"no rod of {', '.join(empty)} mm fits into a radius of {self.radius:g} mm: such sectors stay empty"
-            warn(text)
+            warn(f"no rod of {', '.join(empty)} mm fits into a radius of {self.radius:g} mm: such sectors stay empty")
         if not self.cylinder_radius:
             if self.background or self.cylinder_height:
                 raise InputError(

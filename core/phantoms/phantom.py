@@ -97,8 +97,7 @@ class Phantom:
         whole = self._total(quantity) * (1.0 if pose is None else abs(float(np.linalg.det(np.asarray(pose)[:3, :3]))))
         held = float(image.sum(dtype=np.float64)) * grid.voxel_volume / whole if whole > 0 else 1.0
         if held < _HELD:
-            text = f"{1 - held:.0%} of the {self.title} lies outside the grid: take larger or more voxels"
-            warn(text, 2)
+            warn(f"{1 - held:.0%} of the {self.title} lies outside the grid: take larger or more voxels", 2)
         return Volume(freeze(image), grid, quantity)
 
     def line_integrals(

@@ -9,7 +9,7 @@ import stat
 import time
 import uuid
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -147,10 +147,31 @@ def require_file(path: str | os.PathLike[str], expected: str = "a file") -> Path
     return path
 
 
+def ending_of(path: str | os.PathLike[str], endings: Sequence[str]) -> str:
+    """Which of `endings` the name of a file has, or ""."""
+    name = Path(path).name.lower()
+    return next((ending for ending in endings if name.endswith(ending)), "")
+
+
+def require_ending(path: str | os.PathLike[str], endings: Sequence[str]) -> str:
+    """Which of `endings` the name of a file has, or `InputError`."""
+    if ending := ending_of(path, endings):
+        return ending
+    raise InputError(f"{path}: expected a name ending in {', '.join(endings)}")
+
+
 def read_bytes(path: str | os.PathLike[str]) -> bytes:
     """All of a file; `InputError` where `require_file` gives it, or it cannot be read."""
     with refusing(path, "cannot be read"):
         return require_file(path).read_bytes()
+
+
+def read_text(path: str | os.PathLike[str], expected: str = "a text in UTF-8") -> str:
+    """The text of a file, every line's end as it is; `InputError` with what is `expected` where it is none in UTF-8."""
+    try:
+        return read_bytes(path).decode("utf-8-sig")
+    except UnicodeDecodeError:
+        raise InputError(f"{path}: expected {expected}") from None
 
 
 def _to_disk(path: Path) -> None:

@@ -7,24 +7,21 @@ from collections.abc import Iterable
 from typing import Any
 
 from .errors import InputError
-from .files import read_bytes
+from .files import read_text
 
 
 def read_toml(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """What a TOML file holds; `InputError` if it cannot be read or is not TOML."""
+    """What a TOML file holds."""
     return parse_toml(toml_text(path), str(path))
 
 
 def toml_text(path: str | os.PathLike[str]) -> str:
-    """The text of a TOML file, every line's end as it is; `InputError` if it cannot be read."""
-    try:
-        return read_bytes(path).decode("utf-8-sig")
-    except UnicodeDecodeError:
-        raise InputError(f"{path}: expected TOML, a text in UTF-8") from None
+    """The text of a TOML file, every line's end as it is."""
+    return read_text(path, "TOML, a text in UTF-8")
 
 
 def parse_toml(text: str, name: str) -> dict[str, Any]:
-    """What a text in TOML holds; `InputError`, which calls the text `name`, if it is not TOML."""
+    """What a text in TOML holds; messages call it `name`."""
     try:
         return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:

@@ -2,25 +2,19 @@
 
 import argparse
 
-from ..errors import InputError
-from ..perspective.backprojection import HOW, views_that_see
-from ..runs.backprojecting import backproject_run, backprojection_grid
-from ..runs.files import FORMATS, read_run
+from ... import core as mph
+from ..perspective.backprojection import HOW
+from ..runs.backprojecting import backprojection_grid
+from ..runs.files import FORMATS
 from ..runs.settings import SETTINGS
-from ..volumes.volume import Volume
-from ..volumes.volume_files import VOLUME_FORMATS, write_volume
-from .options import add_command, output_path, print_answer, progress_bar
+from ..volumes.volume_files import VOLUME_FORMATS
+from .options import add_run, described, output_path, print_answer, progress_bar
 from .recipe_options import add_setting, typed_entries
 
 
 def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     """Add the command."""
-    parser = add_command(
-        subparsers,
-        "backproject",
-        "put together what a run's views say of each voxel: sum, geometric mean or minimum",
-        "mphdrr backproject run.h5 --how product --voxels 128 128 64 --spacing 1 -o product.nii.gz",
-    )
+    parser = add_run(subparsers, "backproject", _run)
     parser.add_argument("file", metavar="RUN", help=f"a run of mphDRR: {', '.join(FORMATS)}")
     text = "of the views that see a voxel: the sum of their values, their geometric mean, or the least"
     parser.add_argument("--how", choices=tuple(HOW), default="sum", help=text)
@@ -30,38 +24,39 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     add("-o", "--output", required=True, metavar="FILE", help=f"the volume: {', '.join(VOLUME_FORMATS)}")
     add("--views-that-see", metavar="FILE", help="also write how many views see each voxel, as a volume")
     add("--json", action="store_true", help="print JSON")
-    parser.set_defaults(run=_run, entries=[])
+    parser.set_defaults(entries=[])
 
 
 def _run(arguments: argparse.Namespace) -> None:
+    """Put together what a run's views say of each voxel: sum, geometric mean or minimum.
+
+    mphdrr backproject run.h5 --how product --voxels 128 128 64 --spacing 1 -o product.nii.gz
+    """
     path = output_path(arguments.output, VOLUME_FORMATS)
     counted = output_path(arguments.views_that_see, VOLUME_FORMATS) if arguments.views_that_see else None
     if counted is not None and counted.resolve() == path.resolve():
-        raise InputError(f"--views-that-see {counted}: it is the same file as --output")
-    run = read_run(arguments.file)
-    recipe = run.recipe.updated(typed_entries(arguments))
-    grid = backprojection_grid(run, recipe)
-    seeing = views_that_see(run.views, grid, progress_bar("counting views"))
-    assert isinstance(seeing, Volume)
+        raise mph.InputError(f"--views-that-see {counted}: it is the same file as --output")
+    run = mph.read_run(arguments.file)
+    grid = backprojection_grid(run, run.recipe.updated(typed_entries(arguments)))
+    seeing = mph.views_that_see(run.views, grid, progress_bar("counting views"))
+    assert isinstance(seeing, mph.Volume)
     if not seeing.array.any():
-        raise InputError("--center: no view sees any of these voxels; expected some in the field of view")
-    volume = backproject_run(run, arguments.how, grid=grid, stages=progress_bar)
-    write_volume(volume, path)
+        raise mph.InputError("--center: no view sees any of these voxels; expected some in the field of view")
+    volume = mph.backproject_run(run, arguments.how, grid=grid, stages=progress_bar)
+    mph.write_volume(volume, path)
     if counted is not None:
-        write_volume(seeing, counted)
+        mph.write_volume(seeing, counted)
     fewest, most = int(seeing.array.min()), int(seeing.array.max())
-    low, high = float(volume.array.min()), float(volume.array.max())
     record = {
         "file": str(path),
         "how": arguments.how,
         "views": len(run.views),
         "voxels": list(grid.shape),
         "spacing_mm": grid.spacing.tolist(),
-        "smallest": low,
-        "largest": high,
+        "smallest": float(volume.array.min()),
+        "largest": float(volume.array.max()),
         "fewest_views": fewest,
         "most_views": most,
     }
-    voxels = " x ".join(map(str, grid.shape))
     seen_by = f"each seen by {fewest} to {most} of {len(run.views)} views"
-    print_answer(arguments, record, [f"{path}: {arguments.how}, {voxels} voxels, {low:.4g} to {high:.4g}, {seen_by}"])
+    print_answer(arguments, record, [f"{path}: {arguments.how}, {described(volume)}, {seen_by}"])

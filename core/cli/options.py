@@ -1,19 +1,23 @@
 """Options and parsing that several commands share."""
 
 import argparse
+import inspect
 import json
+import re
 import sys
 import textwrap
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
 from ..errors import InputError
-from ..files import ensure_folder, refuse_folder
+from ..files import ensure_folder, refuse_folder, require_ending
 from ..geometry.system import PinholeSystem
 from ..geometry.system import chosen_modules as chosen_modules
 from ..progress import Progress
+from ..validation import shape_text
+from ..volumes.volume import Volume
 from ..workbook import read_system
 
 _HANGING = 15 * " "  # under the second column of lists in descriptions
@@ -51,22 +55,28 @@ class NotingStore(argparse.Action):
 
 
 def refuse(arguments: argparse.Namespace, names: Iterable[str], why: str) -> None:
-    """Raise `InputError` if one of the options that are stored as `names` was typed: the option, and `why` not."""
+    """Refuse options that were typed, by the `names` they are stored as: the message names the option and `why` not."""
     noted = getattr(arguments, "typed", {})
     for name in names:
         if name in noted or getattr(arguments, name, None) is True:  # a flag
             raise InputError(f"{noted.get(name, '--' + name.replace('_', '-'))} {why}")
 
 
-def add_command(subparsers, name: str, summary: str, example: str) -> argparse.ArgumentParser:  # type: ignore[no-untyped-def]
-    """A command's parser, its help ending in an example."""
-    return subparsers.add_parser(
-        name,
-        help=summary,
-        description=summary[0].upper() + summary[1:] + ".",
-        epilog=f"example: {example}",
-        formatter_class=_HelpFormatter,
-    )
+def add_run(subparsers: Any, name: str, run: Callable[[argparse.Namespace], None]) -> argparse.ArgumentParser:
+    """The parser of a command that calls `run`, whose docstring is the help: what it does, and below it examples."""
+    summary, _, below = inspect.cleandoc(run.__doc__ or "").partition("\n\n")
+    words = " ".join(summary.split()).rstrip(".")
+    words = words[0].lower() + words[1:] if words[1].islower() else words
+    examples = re.split(r"\s+(?=mphdrr )", below)
+    return add_command(subparsers, name, words, "\nexample: ".join(" ".join(each.split()) for each in examples), run)
+
+
+def add_command(subparsers, name: str, summary: str, example: str, run: Any = None) -> argparse.ArgumentParser:  # type: ignore[no-untyped-def]
+    """A command's parser, its help ending in an example; `run` is called with the parsed arguments."""
+    words = {"description": f"{summary[0].upper()}{summary[1:]}.", "epilog": f"example: {example}"}
+    parser = subparsers.add_parser(name, help=summary, **words, formatter_class=_HelpFormatter)
+    parser.set_defaults(run=run)
+    return parser
 
 
 def add_workbook(parser: argparse.ArgumentParser, name: str = "workbook", default: str | None = None) -> None:
@@ -84,6 +94,11 @@ def add_workbook(parser: argparse.ArgumentParser, name: str = "workbook", defaul
 def read_workbook(arguments: argparse.Namespace) -> PinholeSystem:
     """The scanner of the workbook of `add_workbook`."""
     return read_system(arguments.workbook, columns=arguments.columns)
+
+
+def described(volume: Volume) -> str:
+    """A volume's voxels and the range of its values, for people: ``64 x 64 x 64 voxels, 0 to 4.2``."""
+    return f"{shape_text(volume.grid.shape)} voxels, {float(volume.array.min()):.4g} to {float(volume.array.max()):.4g}"
 
 
 def print_answer(arguments: argparse.Namespace, record: Any, lines: Iterable[str], notes: Iterable[str] = ()) -> None:
@@ -107,15 +122,15 @@ def output_path(text: str, suffixes: tuple[str, ...] = ()) -> Path:
     Called before the long work, so that what cannot be written fails at once.
     """
     path = Path(text)
-    if suffixes and not path.name.lower().endswith(suffixes):
-        raise InputError(f"{path}: expected a name ending in {', '.join(suffixes)}")
+    if suffixes:
+        require_ending(path, suffixes)
     refuse_folder(path)
     ensure_folder(path.parent)
     return path
 
 
 def numbered_path(path: Path, number: int, count: int) -> Path:
-    """Of `count` files, the one with that number: train-007.nii.gz for train.nii.gz, or `path` itself where it is all."""
+    """The name of one of `count` files: train-007.nii.gz for train.nii.gz, or `path` itself where it is the only one."""
     if count == 1:
         return path
     suffix = ".nii.gz" if path.name.lower().endswith(".nii.gz") else path.suffix

@@ -10,31 +10,25 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError
-from ..geometry.frames import euler_pose
-from ..geometry.grid import Grid
-from ..phantoms.derenzo import DerenzoPhantom
+from ... import core as mph
 from ..phantoms.kinds import KINDS
-from ..phantoms.language import read_phantom, write_phantom
-from ..phantoms.phantom import QUANTITIES, Phantom, ShapePhantom
-from ..phantoms.random import random_pose
-from ..phantoms.shapes import Box, Cylinder, Ellipsoid, Sphere
-from ..validation import seed_number, whole_shape
+from ..phantoms.phantom import QUANTITIES
+from ..validation import seed_number, shape_text, whole_shape
 from ..volumes.volume import UNITS
-from ..volumes.volume_files import VOLUME_FORMATS, write_volume
+from ..volumes.volume_files import VOLUME_FORMATS
 from .options import add_command, numbered_path, one_or_three, output_path, progress_bar, refuse
 
 _DEST = "of_phantom_"  # before the name of a phantom's setting: the voxels have a spacing, too
 
-Make = Callable[[argparse.Namespace], Phantom]
+Make = Callable[[argparse.Namespace], mph.Phantom]
 """Makes the phantom that a command line asks for."""
 
 # Single shapes: class, how many numbers (mm) each of its dimensions takes, and an example.
 _SHAPES = (
-    (Cylinder, {"radius": "+", "height": None}, "--radius 100 --height 200 --activity 5 --mu 0.0154"),
-    (Sphere, {"radius": None}, "--radius 20 --activity 40"),
-    (Ellipsoid, {"radii": 3}, "--radii 30 20 50 --activity 40"),
-    (Box, {"size": 3}, "--size 30 20 50 --activity 40"),
+    (mph.Cylinder, {"radius": "+", "height": None}, "--radius 100 --height 200 --activity 5 --mu 0.0154"),
+    (mph.Sphere, {"radius": None}, "--radius 20 --activity 40"),
+    (mph.Ellipsoid, {"radii": 3}, "--radii 30 20 50 --activity 40"),
+    (mph.Box, {"size": 3}, "--size 30 20 50 --activity 40"),
 )
 
 
@@ -66,7 +60,7 @@ def add_kinds(
 
     for kind in KINDS:
         parser = add(kind.name, f"{verb} {kind.summary}", kind.example)
-        if kind.phantom is DerenzoPhantom:  # its rods and water have options of their own
+        if kind.phantom is mph.DerenzoPhantom:  # its rods and water have options of their own
             _add_derenzo(parser)
             finish(parser, _derenzo, False)
             continue
@@ -82,7 +76,7 @@ def add_kinds(
     options = example.format("file thorax.toml", "thorax")
     file = add_command(kinds, "file", f"{verb} the phantom that a TOML file describes", options)
     file.add_argument("file", metavar="TOML", help="shapes in the order of painting, see docs/phantoms.md")
-    finish(file, lambda arguments: read_phantom(arguments.file), False)
+    finish(file, lambda arguments: mph.read_phantom(arguments.file), False)
 
 
 def _add_derenzo(parser: argparse.ArgumentParser) -> None:
@@ -98,22 +92,22 @@ def _add_derenzo(parser: argparse.ArgumentParser) -> None:
     add("--background", type=float, default=0.0, metavar="kBq/mL", help="concentration in the water")
 
 
-def _derenzo(arguments: argparse.Namespace) -> DerenzoPhantom:
+def _derenzo(arguments: argparse.Namespace) -> mph.Phantom:
     radius, height = arguments.water
-    return DerenzoPhantom(
+    return mph.DerenzoPhantom(
         arguments.radius, tuple(arguments.rods), arguments.height, arguments.activity, arguments.sectors,
         cylinder_radius=radius, cylinder_height=height, background=arguments.background,
     )  # fmt: skip
 
 
-def _of_shape(shape: Any, names: list[str], arguments: argparse.Namespace) -> Phantom:
+def _of_shape(shape: Any, names: list[str], arguments: argparse.Namespace) -> mph.Phantom:
     dimensions = {name: getattr(arguments, name) for name in names}
     if isinstance(dimensions.get("radius"), list) and len(dimensions["radius"]) == 1:
         (dimensions["radius"],) = dimensions["radius"]
-    return ShapePhantom([shape(**dimensions, activity=arguments.activity, mu=arguments.mu)], name=shape.KIND)
+    return mph.ShapePhantom([shape(**dimensions, activity=arguments.activity, mu=arguments.mu)], name=shape.KIND)
 
 
-def _of_kind(kind: Any, arguments: argparse.Namespace) -> Phantom:
+def _of_kind(kind: Any, arguments: argparse.Namespace) -> mph.Phantom:
     return kind(**{field.name: getattr(arguments, _DEST + field.name) for field in dataclasses.fields(kind)})
 
 
@@ -146,7 +140,7 @@ def add_pose(parser: argparse.ArgumentParser, default: Any = (0, 0, 0)) -> None:
 def read_pose(arguments: argparse.Namespace) -> NDArray[np.float64]:
     """World-from-phantom (4, 4), mm, as `add_pose` asks for it."""
     phi, theta, psi = np.deg2rad(arguments.euler)
-    return euler_pose(phi, theta, psi, arguments.position)
+    return mph.euler_pose(phi, theta, psi, arguments.position)
 
 
 def _add_output(parser: argparse.ArgumentParser, make: Make) -> None:
@@ -154,8 +148,7 @@ def _add_output(parser: argparse.ArgumentParser, make: Make) -> None:
     add_pose(parser)
     add = parser.add_argument
     add("--voxels", type=int, nargs="+", default=[256], metavar="N", help="voxels along x y z, or one")
-    spacing = "voxel size, one or three; default: so that it fits"
-    add("--spacing", type=float, nargs="+", metavar="MM", help=spacing)
+    add("--spacing", type=float, nargs="+", metavar="MM", help="voxel size, one or three; default: so that it fits")
     add("--quantity", choices=QUANTITIES, default="activity", help="what the voxels hold")
     add("--random", type=int, metavar="SEED", help="draw position and Euler angles at random")
     box = "with --random: sides of the box around --position in which the middle is drawn"
@@ -169,10 +162,10 @@ def _add_output(parser: argparse.ArgumentParser, make: Make) -> None:
 def _require_fitting(arguments: argparse.Namespace, is_text: bool) -> None:
     """Refuse options that contradict each other or would have no effect."""
     if arguments.count < 1:
-        raise InputError(f"--count: expected at least 1, got {arguments.count}")
+        raise mph.InputError(f"--count: expected at least 1, got {arguments.count}")
     if arguments.random is None:
         if arguments.count > 1 or any(arguments.box):
-            raise InputError("--count and --box need --random")
+            raise mph.InputError("--count and --box need --random")
     else:
         seed_number(arguments.random, "--random", "a seed, ")
         refuse(arguments, ("euler",), "has no effect with --random, which draws the angles")
@@ -189,7 +182,7 @@ def _run(arguments: argparse.Namespace) -> None:
     _require_fitting(arguments, is_text)
     phantom = arguments.make(arguments)
     if is_text:
-        write_phantom(phantom, path)
+        mph.write_phantom(phantom, path)
         print(f"{path}: {len(phantom.shapes)} shapes, {phantom.total_activity:.4g} kBq in all")
         return
     states = phantom.beating(arguments.frames) if "frames" in arguments else [phantom]
@@ -197,17 +190,17 @@ def _run(arguments: argparse.Namespace) -> None:
     # By default the grid holds the phantom however it is turned, and moved within the box.
     voxels = whole_shape(one_or_three(arguments.voxels), "--voxels", 3)
     fitted = (max(state.extent for state in states) + max(box)) / max(1, min(voxels) - 2)
-    grid = Grid.centered(voxels, one_or_three(arguments.spacing or [fitted]), arguments.position)
+    grid = mph.Grid.centered(voxels, one_or_three(arguments.spacing or [fitted]), arguments.position)
     pose = read_pose(arguments)
     rng = None if arguments.random is None else np.random.default_rng(arguments.random)
     n_files, written = arguments.count * len(states), []
     for index in range(n_files):
         state = states[index % len(states)]
         if rng is not None and state is states[0]:  # the other states take the same pose
-            pose = random_pose(rng, box, arguments.position)
+            pose = mph.random_pose(rng, box, arguments.position)
         volume = state.voxelize(grid, pose, progress_bar("voxelizing"), quantity=arguments.quantity)
         file = numbered_path(path, index + 1, n_files)
-        write_volume(volume, file)
+        mph.write_volume(volume, file)
         entry = {"file": str(file), "pose": pose.tolist(), "quantity": volume.quantity}
         if UNITS[volume.quantity] == "kBq/mL":
             total = float(volume.array.sum(dtype=np.float64) * volume.grid.voxel_volume * 1e-3)
@@ -217,6 +210,6 @@ def _run(arguments: argparse.Namespace) -> None:
             content = f"mu up to {entry['largest']:.4g} 1/mm"
         written.append({**entry, "phase": state.phase} if len(states) > 1 else entry)
         if not arguments.json:
-            print(f"{file}: {' x '.join(map(str, volume.grid.shape))} voxels, {content}")
+            print(f"{file}: {shape_text(volume.grid.shape)} voxels, {content}")
     if arguments.json:
         print(json.dumps(written, indent=2))

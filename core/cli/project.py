@@ -7,17 +7,13 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from ..errors import InputError
+from ... import core as mph
 from ..phantoms.kinds import KINDS
-from ..runs.files import FORMATS, read_run, write_run
+from ..runs.files import FORMATS
 from ..runs.mosaic import write_sheet
 from ..runs.presets import PRESETS
-from ..runs.recipe import Recipe, read_recipe, write_recipe
-from ..runs.run_recipe import run_recipe
 from ..runs.settings import SETTINGS
-from .options import add_command, numbered_path, output_path, progress_bar
+from .options import add_run, numbered_path, output_path, progress_bar
 from .recipe_options import add_entries, add_option, add_setting, typed_entries
 
 _LISTED = (
@@ -44,17 +40,7 @@ _DERENZO = {
 
 def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     """Add the command."""
-    parser = add_command(
-        subparsers,
-        "project",
-        "project a volume, or a phantom, into every module; or take measured counts for the projections",
-        "mphdrr project scanner.xlsx --volume ct.nii.gz --energy 60 --size 250 250 -o run.h5\n"
-        "example: mphdrr project scanner.xlsx --volume heart.nii.gz --mu ct-mu.nii.gz --preset tc99m-tungsten-czt "
-        "--time 600 --write-recipe heart.toml\n"
-        "example: mphdrr project heart.toml --noise 1 -o counts.h5\n"
-        "example: mphdrr project scanner.xlsx --counts counts.npy --frames 1-80 --orientation front+v --time 600 "
-        "-o run.h5 --mosaic check.png",
-    )
+    parser = add_run(subparsers, "project", _run)
     text = "geometry workbook (.xlsx, .xlsm), recipe (.toml), or run (.h5, .npz, .pt), to be made again"
     parser.add_argument("file", nargs="?", metavar="FILE", help=text)
     for setting in SETTINGS.values():
@@ -67,8 +53,7 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     for word, (_, text) in SETTINGS["model.kind"].words.items():
         add_option(model, f"--{word}", ("model.kind",), text, action="store_const", const=word)
     add_option(model, "--photons", ("model.photons",), SETTINGS["model.photons"].help)
-    text = "physics of counts in one choice, which options override: "
-    text += ", ".join(PRESETS)
+    text = f"physics of counts in one choice, which options override: {', '.join(PRESETS)}"
     parser.add_argument("--preset", choices=PRESETS, metavar="NAME", help=text)
     for option, keys in _DERENZO.items():
         nargs = "+" if option == "--rods" else len(keys) if len(keys) > 1 else None
@@ -78,11 +63,10 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     parser.add_argument("--write-recipe", metavar="FILE", help=text)
     parser.add_argument("-o", "--output", metavar="FILE", help=", ".join(FORMATS))
     parser.add_argument("--mosaic", metavar="PNG", help="also write all images in one picture")
-    parser.set_defaults(run=_run)
 
 
-def _changes(arguments: argparse.Namespace, recipe: Recipe) -> dict[str, Any]:
-    """What the options say, by the keys of recipes."""
+def _changes(arguments: argparse.Namespace, recipe: mph.Recipe) -> dict[str, Any]:
+    """What the options change, by the keys of recipes."""
     typed, changes = vars(arguments), typed_entries(arguments)
     if changes.get("model.photons") is not None:
         changes.setdefault("model.kind", "transmission")
@@ -99,22 +83,22 @@ def _changes(arguments: argparse.Namespace, recipe: Recipe) -> dict[str, Any]:
     return changes
 
 
-def _chosen(arguments: argparse.Namespace) -> tuple[Recipe, dict[str, Any]]:
-    """The recipe of the options; and of a run that it began with, the scanner and the volume if they are still its own."""
-    file, recipe, run = arguments.file, Recipe(), None
+def _chosen(arguments: argparse.Namespace) -> tuple[mph.Recipe, dict[str, Any]]:
+    """The recipe of the options, and from a run that it began with the scanner and the volume if it still has them."""
+    file, recipe, run = arguments.file, mph.Recipe(), None
     suffix = Path(file or "").suffix.lower()
     if suffix == ".toml":
-        recipe = read_recipe(file)
+        recipe = mph.read_recipe(file)
     elif suffix in FORMATS:
-        run = read_run(file)
+        run = mph.read_run(file)
         recipe = run.recipe
     elif file is not None:
-        recipe = Recipe({"system.file": file})
+        recipe = mph.Recipe({"system.file": file})
     before = recipe.tables()
     preset = {} if arguments.preset is None else PRESETS[arguments.preset].changes
     recipe = recipe.updated(preset)
-    said = {key: preset[key] for key in preset if key == "model.isotope"}  # which images of photons alone have
-    recipe = recipe.updated({**said, **_changes(arguments, recipe)})
+    isotope = {key: preset[key] for key in preset if key == "model.isotope"}  # which images of photons alone have
+    recipe = recipe.updated({**isotope, **_changes(arguments, recipe)})
     if run is None:
         return recipe, {}
     now = recipe.tables()
@@ -125,7 +109,7 @@ def _chosen(arguments: argparse.Namespace) -> tuple[Recipe, dict[str, Any]]:
     together = recipe["attenuation.of_phantom"] or (recipe["volume.center"] and "attenuation" in now)
     if not together and all(now.get(table) == before.get(table) for table in ("volume", "phantom")):
         if run.volume is None and recipe["counts.files"] is None:
-            raise InputError(
+            raise mph.InputError(
                 f"{file}: it holds measured counts, not what was measured; name a volume, a phantom, or --counts"
             )
         kept["volume"] = run.volume
@@ -133,14 +117,23 @@ def _chosen(arguments: argparse.Namespace) -> tuple[Recipe, dict[str, Any]]:
 
 
 def _run(arguments: argparse.Namespace) -> None:
+    """Project a volume, or a phantom, into every module; or take measured counts for the projections.
+
+    mphdrr project scanner.xlsx --volume ct.nii.gz --energy 60 --size 250 250 -o run.h5
+    mphdrr project scanner.xlsx --volume heart.nii.gz --mu ct-mu.nii.gz --preset tc99m-tungsten-czt --time 600
+        --write-recipe heart.toml
+    mphdrr project heart.toml --noise 1 -o counts.h5
+    mphdrr project scanner.xlsx --counts counts.npy --frames 1-80 --orientation front+v --time 600 -o run.h5
+        --mosaic check.png
+    """
     if arguments.write_recipe:
         path = output_path(arguments.write_recipe, (".toml",))
         recipe, _ = _chosen(arguments)
-        write_recipe(recipe, path)
+        mph.write_recipe(recipe, path)
         print(path)
         return
     if not arguments.output:
-        raise InputError("nothing to write: give --output FILE, or --write-recipe FILE")
+        raise mph.InputError("nothing to write: give --output FILE, or --write-recipe FILE")
     path = output_path(arguments.output, FORMATS)
     picture = output_path(arguments.mosaic) if arguments.mosaic else None
     recipe, kept = _chosen(arguments)
@@ -150,12 +143,14 @@ def _run(arguments: argparse.Namespace) -> None:
     counts = recipe["counts.files"] or ()
     for file in (*states, *counts, recipe["volume.file"], recipe["attenuation.file"]):
         if file is not None and Path(file).resolve() in outputs:
-            raise InputError(f"{file}: the projections would replace what they are made from; choose another --output")
-    for number, run in enumerate(run_recipe(recipe, **kept, stages=progress_bar), 1):
+            raise mph.InputError(
+                f"{file}: the projections would replace what they are made from; choose another --output"
+            )
+    for number, run in enumerate(mph.run_recipe(recipe, **kept, stages=progress_bar), 1):
         file = numbered_path(path, number, count)
-        write_run(run, file)
+        mph.write_run(run, file)
         if picture is not None:
             write_sheet(run, numbered_path(picture, number, count))
         views, (n_v, n_u) = len(run.views), run.views.shape
-        plural, largest = "s" * (views > 1), float(np.max(run.projections))
+        plural, largest = "s" * (views > 1), float(run.projections.max())
         print(f"{file}: {views} projection{plural} of {n_v} x {n_u} pixels, largest {largest:.4g} {run.unit}")

@@ -3,71 +3,64 @@
 import argparse
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError, naming
+from ... import core as mph
+from ..errors import naming
 from ..figures.page import SUFFIXES, Page
 from ..figures.scores import SIZE, draw
-from ..phantoms.language import read_phantom
-from ..phantoms.phantom import Phantom
-from ..reconstruction.scores.summary import score_volume
-from ..runs.files import FORMATS, read_run
+from ..runs.files import FORMATS
 from ..runs.reconstructing import flattering
-from ..runs.run import ProjectionRun
 from ..runs.run_recipe import truth_of_run
-from ..volumes.volume import UNITS, Volume
-from ..volumes.volume_files import read_volume
-from .options import add_command, output_path, print_answer, progress_bar, refuse
+from ..volumes.volume import UNITS
+from .options import add_run, output_path, print_answer, progress_bar, refuse
 from .phantom import Make, add_kinds, add_pose, read_pose
 
 
 def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     """Add the command."""
-    score = add_command(
-        subparsers,
-        "score",
-        "score a reconstructed volume beside the truth: what a run was simulated of, a phantom, or a volume",
-        "mphdrr score volume.nii.gz --truth run.h5 --picture score.png\n"
-        "example: mphdrr score volume.nii.gz derenzo --rods 8 6 5 4 3 2 --activity 100 --euler 0 90 0",
-    )
+    score = add_run(subparsers, "score", _run)
     score.add_argument("volume", metavar="VOLUME", help="to score (formats: docs/volumes.md)")
     truth = "a simulated run, a phantom's .toml, or a volume; one on another grid is resampled onto VOLUME's voxels"
     score.add_argument("--truth", metavar="FILE", help=truth)
     add_pose(score)
-    _add_options(score, {"quantity": None, "json": False, "picture": None})
-    score.set_defaults(run=_run, make=None)
+    _add_options(score)
+    score.set_defaults(make=None)
     kinds = score.add_subparsers(metavar="KIND", title="kinds of phantoms, instead of --truth", required=False)
 
     def finish(parser: argparse.ArgumentParser, make: Make, beats: bool) -> None:
-        # What was typed before the kind stays.
+        parser.argument_default = argparse.SUPPRESS  # what was typed before the kind stays
         add_pose(parser, argparse.SUPPRESS)
-        _add_options(parser, dict.fromkeys(("quantity", "json", "picture"), argparse.SUPPRESS))
-        parser.set_defaults(make=make)
+        _add_options(parser)
+        parser.set_defaults(run=_run, make=make)
 
     add_kinds(kinds, "score beside", "mphdrr score volume.nii.gz {}", finish)
 
 
-def _add_options(parser: argparse.ArgumentParser, defaults: dict[str, Any]) -> None:
+def _add_options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    quantity = "what the volumes' values are; default: what their files say"
-    add("--quantity", choices=tuple(UNITS), default=defaults["quantity"], help=quantity)
-    add("--json", action="store_true", default=defaults["json"], help="print JSON")
+    add("--quantity", choices=tuple(UNITS), help="what the volumes' values are; default: what their files say")
+    add("--json", action="store_true", help="print JSON")
     picture = f"of slices beside the truth, and profiles: {', '.join(SUFFIXES)}"
-    add("--picture", metavar="FILE", default=defaults["picture"], help=picture)
+    add("--picture", metavar="FILE", help=picture)
 
 
 def _run(arguments: argparse.Namespace) -> None:
+    """Score a reconstructed volume beside the truth: what a run was simulated of, a phantom, or a volume.
+
+    mphdrr score volume.nii.gz --truth run.h5 --picture score.png
+    mphdrr score volume.nii.gz derenzo --rods 8 6 5 4 3 2 --activity 100 --euler 0 90 0
+    """
     picture = None if arguments.picture is None else output_path(arguments.picture, SUFFIXES)
     if arguments.make is None and arguments.truth is None:
-        raise InputError("score: expected --truth FILE or a kind of phantom, see mphdrr score --help")
+        raise mph.InputError("score: expected --truth FILE or a kind of phantom, see mphdrr score --help")
     if arguments.make is not None and arguments.truth is not None:
-        raise InputError("score: expected either --truth or a kind of phantom, got both")
+        raise mph.InputError("score: expected either --truth or a kind of phantom, got both")
     truth, pose, run = _truth(arguments)
-    volume = read_volume(arguments.volume, arguments.quantity, progress=progress_bar("reading"))
-    score = score_volume(volume, truth, pose, progress_bar("truth"))
+    volume = mph.read_volume(arguments.volume, arguments.quantity, progress=progress_bar("reading"))
+    score = mph.score_volume(volume, truth, pose, progress_bar("truth"))
     if run is not None:
         score = replace(score, notes=(*flattering(run, volume.grid), *score.notes))
     if picture is not None:
@@ -77,21 +70,23 @@ def _run(arguments: argparse.Namespace) -> None:
     print_answer(arguments, score.record, score.lines, score.notes)
 
 
-def _truth(arguments: argparse.Namespace) -> tuple[Volume | Phantom, NDArray[np.float64] | None, ProjectionRun | None]:
+def _truth(
+    arguments: argparse.Namespace,
+) -> tuple[mph.Volume | mph.Phantom, NDArray[np.float64] | None, mph.ProjectionRun | None]:
     """The truth, the pose of a phantom, and the run that was simulated of it."""
     if arguments.make is not None:
         return arguments.make(arguments), read_pose(arguments), None
     file = Path(arguments.truth)
     if file.suffix.lower() == ".toml":
-        return read_phantom(file), read_pose(arguments), None
+        return mph.read_phantom(file), read_pose(arguments), None
     refuse(arguments, ("position", "euler"), "is for a kind of phantom or a .toml; a run or a volume knows its place")
     try:
-        run = read_run(file) if file.suffix.lower() in FORMATS else None
-    except InputError:  # volumes may have the same endings
+        run = mph.read_run(file) if file.suffix.lower() in FORMATS else None
+    except mph.InputError:  # volumes may have the same endings
         if file.suffix.lower() == ".pt" or not file.is_file():
             raise
         run = None
     if run is not None:
         with naming(file):
             return *truth_of_run(run), run
-    return read_volume(file, arguments.quantity, progress=progress_bar("reading the truth")), None, None
+    return mph.read_volume(file, arguments.quantity, progress=progress_bar("reading the truth")), None, None

@@ -5,19 +5,14 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import InputError
-from ..geometry.grid import Grid, grid_around
-from ..physics.ct_numbers import hu_to_mu
+from ... import core as mph
+from ..geometry.grid import grid_around
 from ..physics.isotopes import photon_energy
-from ..validation import positive, real_array
-from ..volumes.meshes.mesh import MESH_FORMATS, MILLIMETRES, read_mesh, write_mesh
-from ..volumes.meshes.surface import volume_to_mesh
-from ..volumes.meshes.voxelization import voxelize_mesh
-from ..volumes.rearranging import canonical, centered, crop_to_box, pad
-from ..volumes.resampling import resample
-from ..volumes.volume import UNITS, Volume
-from ..volumes.volume_files import VOLUME_FORMATS, read_volume, write_volume
-from .options import add_command, output_path, print_answer, progress_bar
+from ..validation import positive, real_array, shape_text
+from ..volumes.meshes.mesh import MESH_FORMATS, MILLIMETRES
+from ..volumes.volume import UNITS
+from ..volumes.volume_files import VOLUME_FORMATS
+from .options import add_command, add_run, described, one_or_three, output_path, print_answer, progress_bar
 
 _MESH_UNIT: dict[str, Any] = {
     "choices": tuple(MILLIMETRES),
@@ -30,17 +25,11 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     volume = add_command(subparsers, "volume", "look at volumes and convert them", "mphdrr volume info ct.nii.gz")
     actions = volume.add_subparsers(metavar="ACTION", required=True)
 
-    info = add_command(actions, "info", "show a volume's place, grid and values", "mphdrr volume info ct.nii.gz")
+    info = add_run(actions, "info", _info)
     _add_input(info)
     info.add_argument("--json", action="store_true", help="print JSON")
-    info.set_defaults(run=_info)
 
-    convert = add_command(
-        actions,
-        "convert",
-        "convert a volume to another format, and crop, move, resample it or convert it to attenuation",
-        "mphdrr volume convert dicom_folder --center --spacing 2 --to-mu --energy Tc-99m -o mu.nii.gz",
-    )
+    convert = add_run(actions, "convert", _convert)
     _add_input(convert)
     steps = convert.add_argument_group("changes, in this order")
     add = steps.add_argument
@@ -56,14 +45,8 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     energy = "of the photons, or an isotope's name: its strongest line (default: 140.5)"
     convert.add_argument("--energy", metavar="KEV", help=energy)
     convert.add_argument("-o", "--output", required=True, metavar="FILE", help=", ".join(VOLUME_FORMATS))
-    convert.set_defaults(run=_convert)
 
-    from_mesh = add_command(
-        actions,
-        "from-mesh",
-        "fill closed meshes with activity or attenuation",
-        "mphdrr volume from-mesh body.stl heart.stl --value 0.0154 0.0160 --quantity mu --spacing 2 -o mu.nii.gz",
-    )
+    from_mesh = add_run(actions, "from-mesh", _from_mesh)
     add = from_mesh.add_argument
     add("mesh", nargs="+", metavar="MESH", help=f"{', '.join(MESH_FORMATS)}; later ones replace earlier ones")
     add("--unit", **_MESH_UNIT)
@@ -73,20 +56,13 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     voxels = "along x y z, around the isocentre; default: around the meshes"
     add("--voxels", type=int, nargs=3, metavar="N", help=voxels)
     add("-o", "--output", required=True, metavar="FILE", help=", ".join(VOLUME_FORMATS))
-    from_mesh.set_defaults(run=_from_mesh)
 
-    to_mesh = add_command(
-        actions,
-        "to-mesh",
-        "make a closed mesh of the surface at a level, to show or to print",
-        "mphdrr volume to-mesh ct.nii.gz --level 300 -o bones.stl",
-    )
+    to_mesh = add_run(actions, "to-mesh", _to_mesh)
     _add_input(to_mesh)
     level = "in the volume's unit; default: halfway to the largest value"
     to_mesh.add_argument("--level", type=float, metavar="X", help=level)
     to_mesh.add_argument("--unit", **_MESH_UNIT)
     to_mesh.add_argument("-o", "--output", required=True, metavar="MESH", help=", ".join(MESH_FORMATS))
-    to_mesh.set_defaults(run=_to_mesh)
 
 
 def _add_input(parser: argparse.ArgumentParser) -> None:
@@ -100,25 +76,28 @@ def _add_input(parser: argparse.ArgumentParser) -> None:
     add("--affine", type=float, nargs=16, metavar="A", help=affine)
 
 
-def _input(arguments: argparse.Namespace) -> Volume:
+def _input(arguments: argparse.Namespace) -> mph.Volume:
     affine = None if arguments.affine is None else np.reshape(arguments.affine, (4, 4))
-    return read_volume(
-        arguments.file, arguments.quantity, affine=affine, series=arguments.series, progress=progress_bar("reading")
-    )
+    more: dict[str, Any] = {"affine": affine, "series": arguments.series, "progress": progress_bar("reading")}
+    return mph.read_volume(arguments.file, arguments.quantity, **more)
 
 
 def _info(arguments: argparse.Namespace) -> None:
+    """Show a volume's place, grid and values.
+
+    mphdrr volume info ct.nii.gz
+    """
+    from nibabel.orientations import aff2axcodes
+
     volume = _input(arguments)
     array, grid = volume.array, volume.grid
     corners = grid.corners()
-    # The direction of each index axis in the patient: the closest of R, L, A, P, S, I.
-    axes = [(int(np.abs(axis).argmax()), axis) for axis in grid.affine[:3, :3].T]
     facts = {
         "quantity": volume.quantity,
         "unit": volume.unit,
         "voxels": list(grid.shape),
         "spacing_mm": grid.spacing.tolist(),
-        "axes": "".join(("RAS" if axis[world] > 0 else "LPI")[world] for world, axis in axes),
+        "axes": "".join(aff2axcodes(grid.affine)),  # of R, L, A, P, S, I the closest
         "center_mm": grid.center.tolist(),
         "low_mm": corners.min(axis=0).tolist(),
         "high_mm": corners.max(axis=0).tolist(),
@@ -134,62 +113,74 @@ def _info(arguments: argparse.Namespace) -> None:
 
 
 def _convert(arguments: argparse.Namespace) -> None:
+    """Convert a volume to another format, and crop, move, resample it or convert it to attenuation.
+
+    mphdrr volume convert dicom_folder --center --spacing 2 --to-mu --energy Tc-99m -o mu.nii.gz
+    """
     path = output_path(arguments.output, VOLUME_FORMATS)
     if arguments.energy is not None and not arguments.to_mu:
-        raise InputError("--energy needs --to-mu")
+        raise mph.InputError("--energy needs --to-mu")
     if arguments.method is not None and not arguments.spacing:
-        raise InputError("--method needs --spacing")
+        raise mph.InputError("--method needs --spacing")
     energy = photon_energy(arguments.energy or "140.5")
     volume = _input(arguments)
     if arguments.canonical:
-        volume = canonical(volume)
+        volume = mph.canonical(volume)
     if arguments.crop:
-        volume = crop_to_box(volume, arguments.crop[::2], arguments.crop[1::2])
+        volume = mph.crop_to_box(volume, arguments.crop[::2], arguments.crop[1::2])
     if arguments.pad:
-        volume = pad(volume, arguments.pad, arguments.pad)
+        volume = mph.pad(volume, arguments.pad, arguments.pad)
     if arguments.center:
-        volume = centered(volume)
+        volume = mph.centered(volume)
     if arguments.spacing:
         volume = _respaced(volume, arguments.spacing, arguments.method)
     if arguments.to_mu:
-        volume = hu_to_mu(volume, energy)
-    write_volume(volume, path)
-    low, high = float(volume.array.min()), float(volume.array.max())
-    print(f"{path}: {' x '.join(map(str, volume.grid.shape))} voxels, {low:.4g} to {high:.4g} {volume.unit}")
+        volume = mph.hu_to_mu(volume, energy)
+    mph.write_volume(volume, path)
+    print(f"{path}: {described(volume)} {volume.unit}")
 
 
-def _respaced(volume: Volume, spacing: list[float], method: str | None) -> Volume:
+def _respaced(volume: mph.Volume, spacing: list[float], method: str | None) -> mph.Volume:
     """The volume on a grid with the same axes and first faces, and at least the same extent."""
     if len(spacing) not in (1, 3) or not min(spacing) > 0:
-        raise InputError(f"--spacing: expected one or three numbers above 0, got {' '.join(f'{x:g}' for x in spacing)}")
+        got = " ".join(f"{x:g}" for x in spacing)
+        raise mph.InputError(f"--spacing: expected one or three numbers above 0, got {got}")
     old = volume.grid
-    steps = np.broadcast_to(spacing, 3) / old.spacing  # in old voxels
-    n_x, n_y, n_z = (max(1, int(np.ceil(n / step - 1e-6))) for n, step in zip(old.shape, steps, strict=True))
+    steps = one_or_three(spacing) / old.spacing  # in old voxels
+    shape = np.maximum(1, np.ceil(old.shape / steps - 1e-6)).astype(int)
     index = np.diag([*steps, 1.0])
     index[:3, 3] = (steps - 1) / 2
     method = method or ("mean" if steps.max() > 1 else "linear")
     # Label files say no quantity and are taken for CT numbers, but outside them is 0 and not air.
     outside = 0.0 if method == "nearest" and volume.array.min() >= 0 else None
-    return resample(volume, Grid((n_x, n_y, n_z), old.affine @ index), method, outside, progress_bar("resampling"))
+    return mph.resample(volume, mph.Grid(shape, old.affine @ index), method, outside, progress_bar("resampling"))
 
 
 def _from_mesh(arguments: argparse.Namespace) -> None:
+    """Fill closed meshes with activity or attenuation.
+
+    mphdrr volume from-mesh body.stl heart.stl --value 0.0154 0.0160 --quantity mu --spacing 2 -o mu.nii.gz
+    """
     path = output_path(arguments.output, VOLUME_FORMATS)
     if len(arguments.value) not in (1, len(arguments.mesh)):
-        raise InputError(f"--value: expected one number, or one for each of {len(arguments.mesh)} meshes")
+        raise mph.InputError(f"--value: expected one number, or one for each of {len(arguments.mesh)} meshes")
     values = real_array(np.broadcast_to(arguments.value, len(arguments.mesh)), "--value", (None,))
-    meshes = [read_mesh(file, arguments.unit) for file in arguments.mesh]
+    meshes = [mph.read_mesh(file, arguments.unit) for file in arguments.mesh]
     spacing = positive(arguments.spacing, "--spacing", "mm")
     vertices = np.concatenate([mesh.vertices for mesh in meshes])
-    grid = Grid.centered(arguments.voxels, spacing) if arguments.voxels else grid_around(vertices, spacing)
-    volume = voxelize_mesh(meshes, grid, values, arguments.quantity, progress_bar("voxelizing"))
-    write_volume(volume, path)
+    grid = mph.Grid.centered(arguments.voxels, spacing) if arguments.voxels else grid_around(vertices, spacing)
+    volume = mph.voxelize_mesh(meshes, grid, values, arguments.quantity, progress_bar("voxelizing"))
+    mph.write_volume(volume, path)
     covered = np.count_nonzero(volume.array) * grid.voxel_volume * 1e-3
-    print(f"{path}: {' x '.join(map(str, grid.shape))} voxels, {covered:.4g} mL of them not 0")
+    print(f"{path}: {shape_text(grid.shape)} voxels, {covered:.4g} mL of them not 0")
 
 
 def _to_mesh(arguments: argparse.Namespace) -> None:
+    """Make a closed mesh of the surface at a level, to show or to print.
+
+    mphdrr volume to-mesh ct.nii.gz --level 300 -o bones.stl
+    """
     path = output_path(arguments.output, MESH_FORMATS)
-    mesh = volume_to_mesh(_input(arguments), arguments.level, progress_bar("surface"))
-    write_mesh(mesh, path, arguments.unit)
+    mesh = mph.volume_to_mesh(_input(arguments), arguments.level, progress_bar("surface"))
+    mph.write_mesh(mesh, path, arguments.unit)
     print(f"{path}: {len(mesh.faces)} triangles around {mesh.volume * 1e-3:.4g} mL")

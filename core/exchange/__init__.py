@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import InputError
-from ..files import new_folder, replacing
+from ..files import new_folder, replacing, require_ending
 from ..geometry.system import PinholeSystem
 from ..geometry.views import Views
 from ..validation import instance, one_of
@@ -49,10 +49,9 @@ def write_geometry(
     options
         The format's own: ``FORMATS[format].options``.
 
-    Raises
-    ------
-    InputError
-        For an unknown format, option or ending, and for what the format cannot express. An existing file then stays.
+    Notes
+    -----
+    Where the format cannot express a geometry, it is refused and an existing file stays.
     """
     instance(system, PinholeSystem, "write_geometry")
     one_of(format, FORMATS, "format")
@@ -64,7 +63,7 @@ def write_geometry(
     chosen, path = FORMATS[format], Path(path)
     for name in sorted(options.keys() - chosen.options.keys()):
         raise InputError(f"format {format}: no option {name!r}, it has {', '.join(chosen.options) or 'none'}")
-    if chosen.suffixes and not path.name.lower().endswith(chosen.suffixes):
-        raise InputError(f"{path}: expected a name ending in {', '.join(chosen.suffixes)}")
+    if chosen.suffixes:
+        require_ending(path, chosen.suffixes)
     with replacing(path) if chosen.suffixes else new_folder(path) as temporary:
         chosen.write(system, views, temporary, **options)

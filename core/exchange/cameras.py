@@ -218,8 +218,8 @@ def _camera_matrices(views: Views, format: str, mirrored: bool = True) -> tuple[
     World point X is seen where ``K @ (R @ X + t)`` is a multiple of (column, row, 1); 0 is the centre of pixel 0. R is a
     proper rotation to x along the columns' index, y along the rows' and z forward: the frames (u, v, k) of views are
     right-handed with k along the rays, so they are cameras as they stand, with the virtual detector and, as (-u, -v, k),
-    with the real one. The first focal length is negative for a mirror image, which no rotation can express. `InputError`
-    where pixel steps are not perpendicular, or an image is mirrored and must not be.
+    with the real one. The first focal length is negative for a mirror image, which no rotation can express, and
+    refused unless `mirrored`.
     """
     pitches, (x, y) = _pixel_axes(views, format)
     z = np.cross(x, y)
@@ -244,7 +244,7 @@ def _camera_matrices(views: Views, format: str, mirrored: bool = True) -> tuple[
 def _pixel_axes(views: Views, format: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Pixel pitches (M, 2), mm, and unit vectors (2, M, 3) along columns' and rows' index.
 
-    The second vectors are made exactly perpendicular to the first; `InputError` names the first view where they are not.
+    The second vectors are made exactly perpendicular to the first; the message names the first view where they are not.
     """
     pitches = np.stack([np.linalg.norm(views.u_steps, axis=1), np.linalg.norm(views.v_steps, axis=1)], axis=1)
     x, y = views.u_steps / pitches[:, :1], views.v_steps / pitches[:, 1:]
@@ -266,7 +266,7 @@ def _with_common_pitch(views: Views, format: str) -> tuple[Views, tuple[float, f
     """The same rays with one pixel size (pitch_u, pitch_v), mm, for all detectors; that size; and the `_pixel_axes`.
 
     Detectors with smaller pixels are moved away from their sources until their pixels are as large as the largest.
-    `InputError` where pixel steps are not perpendicular, or two views' pixels have different proportions.
+    Views whose pixels have different proportions are refused.
     """
     pitches, axes = _pixel_axes(views, format)
     proportion = pitches[:, 1] / pitches[:, 0]

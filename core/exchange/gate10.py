@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from ..geometry.system import PinholeSystem
 from ..geometry.views import Views
 from ..validation import whole_number
@@ -15,6 +17,7 @@ from .format import Format
 from .monte_carlo import REFERENCE_ENERGY, Setup, Simulation, build_setup, material_database
 
 _SCRIPT = Path(__file__).with_name("gate10_script.py")
+_KEYS = {"size": "size_mm", "centers": "centers_mm"}  # of `Placed`, in the file of numbers
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,15 +78,7 @@ def _record(system: PinholeSystem, setup: Setup, simulation: Gate10Simulation) -
         "crystals": [solids.name for solids, _ in setup.crystals],
         "modules": [modules[m] for m in range(len(system))],
         "volumes": [
-            {
-                "name": part.name,
-                "mother": part.mother,
-                "shape": part.shape,
-                "size_mm": [float(x) for x in part.size],
-                "material": part.material,
-                "centers_mm": part.centers.tolist(),
-                "rotations": part.rotations.tolist(),
-            }
+            {_KEYS.get(name, name): np.asarray(value).tolist() for name, value in part._asdict().items()}
             for part in parts
         ],
     }

@@ -61,23 +61,18 @@ def construct(simulation: Any) -> None:
 
 def add_volume(simulation: Any, units: Any, part: dict[str, Any]) -> None:
     """Add a volume at all its places. `rotations` turn the volume, as opengate's do: their columns are its axes."""
-    kinds = {"box": "Box", "trd": "Trd", "cone": "Cons", "cylinder": "Tubs"}
-    volume = simulation.add_volume(kinds[part["shape"]], part["name"])
     size = [length * units.mm for length in part["size_mm"]]
-    if part["shape"] == "box":
-        volume.size = size
-    else:
-        volume.dz = size[-1] / 2
-    if part["shape"] == "trd":
-        volume.dx1 = volume.dy1 = size[0]
-        volume.dx2 = volume.dy2 = size[1]
-    elif part["shape"] == "cone":
-        volume.rmin1 = volume.rmin2 = 0
-        volume.rmax1, volume.rmax2 = size[:2]
-    elif part["shape"] == "cylinder":
-        volume.rmin, volume.rmax = 0, size[0]
-    if part["shape"] in ("cone", "cylinder"):
-        volume.sphi, volume.dphi = 0, 360 * units.deg
+    a, b, half = size[0], size[1], size[-1] / 2
+    turn = {"sphi": 0, "dphi": 360 * units.deg}
+    kind, settings = {
+        "box": ("Box", {"size": size}),
+        "trd": ("Trd", {"dx1": a, "dy1": a, "dx2": b, "dy2": b, "dz": half}),
+        "cone": ("Cons", {"rmin1": 0, "rmax1": a, "rmin2": 0, "rmax2": b, "dz": half, **turn}),
+        "cylinder": ("Tubs", {"rmin": 0, "rmax": a, "dz": half, **turn}),
+    }[part["shape"]]
+    volume = simulation.add_volume(kind, part["name"])
+    for name, value in settings.items():
+        setattr(volume, name, value)
     volume.mother = part["mother"]
     volume.material = part["material"]
     volume.translation = [np.array(center) * units.mm for center in part["centers_mm"]]

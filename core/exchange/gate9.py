@@ -10,6 +10,7 @@ itself. So the files hold the inverse of the solid's rotation. (GateMiscFunction
 GateVVolume.cc, GateVolumePlacement.cc of GATE 9.3.)
 """
 
+import math
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -122,15 +123,11 @@ class _Folder:
 
 def angle_and_axis(rotation: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
     """Angle, 0 to pi, and unit axis of a rotation matrix (3, 3); the axis is z where it does not turn."""
-    odd = rotation - rotation.T
-    twice = np.array([odd[2, 1], odd[0, 2], odd[1, 0]])
-    sine, cosine = np.linalg.norm(twice) / 2, (np.trace(rotation) - 1) / 2
-    if cosine > 0:
-        axis = twice / (2 * sine) if sine > 0 else np.array([0.0, 0.0, 1.0])
-    else:  # near pi `twice` vanishes; the axis is also the eigenvector of the largest eigenvalue of R + R^T
-        axis = np.linalg.eigh(rotation + rotation.T)[1][:, 2]
-        axis = axis if axis @ twice >= 0 else -axis
-    return float(np.arctan2(sine, cosine)), axis
+    from nibabel.quaternions import mat2quat
+
+    cosine, *axis = mat2quat(rotation)  # of half the angle
+    sine = float(np.linalg.norm(axis))
+    return 2 * math.atan2(sine, cosine), np.array(axis) / sine if sine else np.array([0.0, 0.0, 1.0])
 
 
 def _n(*numbers: float) -> str:
@@ -147,17 +144,15 @@ def _execute(macros: Iterable[str]) -> list[str]:
 
 def _volume(part: Placed) -> list[str]:
     """The commands that make a volume, without its place."""
-    shape: str = part.shape
-    a, b, *more = part.size
-    if shape == "box":
-        settings = {"XLength": a, "YLength": b, "ZLength": more[0]}
-    elif shape == "cylinder":
-        settings = {"Rmin": 0, "Rmax": a, "Height": b}
-    elif shape == "cone":
-        settings = {"Rmin1": 0, "Rmax1": a, "Rmin2": 0, "Rmax2": b, "Height": more[0], "PhiStart": 0, "DeltaPhi": 360}
-    else:
-        square = {"Dy1": a, "Dx1": a, "Dx2": a, "Alp1": 0, "Dy2": b, "Dx3": b, "Dx4": b, "Alp2": 0}
-        shape, settings = "trap", {"Dz": more[0] / 2, "Theta": 0, "Phi": 0, **square}
+    a, b, last = part.size[0], part.size[1], part.size[-1]
+    square = {"Dy1": a, "Dx1": a, "Dx2": a, "Alp1": 0, "Dy2": b, "Dx3": b, "Dx4": b, "Alp2": 0}
+    cone = {"Rmin1": 0, "Rmax1": a, "Rmin2": 0, "Rmax2": b, "Height": last, "PhiStart": 0, "DeltaPhi": 360}
+    shape, settings = {
+        "box": ("box", {"XLength": a, "YLength": b, "ZLength": last}),
+        "cylinder": ("cylinder", {"Rmin": 0, "Rmax": a, "Height": last}),
+        "cone": ("cone", cone),
+        "trd": ("trap", {"Dz": last / 2, "Theta": 0, "Phi": 0, **square}),
+    }[part.shape]
     sizes = (f"geometry/set{key} {_n(x)} {'deg' if key in _IN_DEGREES else 'mm'}" for key, x in settings.items())
     made = _under(f"/gate/{part.mother}/daughters", f"name {part.name}", f"insert {shape}")
     return made + _under(f"/gate/{part.name}", *sizes, f"setMaterial {part.material}")

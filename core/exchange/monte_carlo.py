@@ -64,14 +64,14 @@ def material_database() -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class Simulation:
-    """The options of the Monte Carlo formats; `InputError` for an impossible one."""
+    """The options of the Monte Carlo formats."""
 
     phantom: str | DerenzoPhantom = "point"  # "point", "derenzo" of the next three numbers, or a phantom
     radius: float = 40.0  # of the phantom "derenzo", mm
     rods: tuple[float, ...] = (8.0, 6.0, 5.0, 4.0, 3.0, 2.0)  # their diameters, mm
     height: float = 40.0  # the rods' length, mm
     position: tuple[float, ...] = (0.0, 0.0, 0.0)  # middle of the point or phantom, mm
-    euler_degrees: tuple[float, ...] = (0.0, 0.0, 0.0)  # the phantom's phi, theta, psi, as of `euler_pose`
+    euler_degrees: tuple[float, ...] = (0.0, 0.0, 0.0)  # the phantom's phi, theta, psi of `euler_pose`
     pose: NDArray[np.float64] | None = None  # world from phantom (4, 4), rigid, instead of both
     isotope: str | Isotope = "Tc-99m"  # its photons are emitted, each on its own
     activity: float | None = None  # total at the start, MBq; None: 1, or that of a `DerenzoPhantom`
@@ -79,7 +79,7 @@ class Simulation:
     crystal: Literal["NaI", "CZT"] = "NaI"
     collimator: Literal["Tungsten", "Lead"] = "Tungsten"
     phantom_material: Literal["Air", "Water", "PMMA"] = "Air"  # air hardly attenuates
-    plate_thickness: float = 2.0  # mm; this and the next three as of `Construction`
+    plate_thickness: float = 2.0  # mm; this and the next three are those of `Construction`
     wall_thickness: float = 2.0  # mm
     opening_degrees: float = 90.0
     edge_at: EdgePlace = "middle"
@@ -183,8 +183,8 @@ def build_setup(system: PinholeSystem, simulation: Simulation) -> Setup:
     """The scanner and the phantom as solids.
 
     Modules of equal sizes share a collimator: the body of `core.geometry.collimator`, its outside a solid square frustum,
-    and in it, as air, the channel and the hole, a cone on each side of the knife edge. `InputError` where a collimator
-    cannot be built, or begins inside the phantom.
+    and in it, as air, the channel and the hole, a cone on each side of the knife edge. A collimator
+    may not begin inside the phantom.
     """
     poses = system.poses()
     bodies = system.collimators(simulation.construction)
@@ -266,7 +266,7 @@ def _phantom(simulation: Simulation) -> tuple[Placed | None, list[tuple[Placed, 
 
 
 def _refuse_overlap(system: PinholeSystem, bodies: list[Collimator], phantom: Placed) -> None:
-    """Raise `InputError` where a collimator's front reaches into the phantom."""
+    """Refuse a collimator whose front reaches into the phantom."""
     poses, (radius, height) = system.poses(), phantom.size
     corners = np.array([[x, y, -1, 1] for x in (-1, 1) for y in (-1, 1)], float)
     for m, body in enumerate(bodies):

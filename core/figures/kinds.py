@@ -71,6 +71,6 @@ KINDS = {
 
 
 def figure_kind(name: str) -> FigureKind:
-    """The kind of that name; `InputError` where there is none."""
+    """The kind of that name."""
     one_of(name, KINDS, "figure")
     return KINDS[name]

@@ -5,21 +5,20 @@ import os
 from collections.abc import Iterator, Sequence
 from html import escape
 from itertools import pairwise
-from pathlib import Path
 from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InputError
-from ..files import write_bytes
+from ..files import require_ending, write_bytes
 from ..runs import letters
 from ..runs.mosaic import png, write_png
 from ..runs.resizing import resized
 
 SUFFIXES = (".png", ".svg")
 SMALLEST, LARGEST = 240, 16384
-"""Of a page's sides, pixels."""
+"""Limits of a page's sides, pixels."""
 
 Point = tuple[float, float]
 Anchor = Literal["start", "middle", "end"]
@@ -109,11 +108,8 @@ class Page:
         )
 
     def write(self, path: str | os.PathLike[str]) -> None:
-        """Write the page as its name says, .png or .svg; `InputError` where it says neither or cannot be written."""
-        suffix = Path(path).suffix.lower()
-        if suffix not in SUFFIXES:
-            raise InputError(f"{path}: expected a name ending in {' or '.join(SUFFIXES)}")
-        if suffix == ".png":
+        """Write the page in the format that its name says, .png or .svg."""
+        if require_ending(path, SUFFIXES) == ".png":
             write_png(self.picture, path)
             return
         size = f'width="{self.width}" height="{self.height}" viewBox="0 0 {self.width} {self.height}"'

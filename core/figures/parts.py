@@ -1,15 +1,17 @@
 """Parts that flat figures share: their heading, axes in mm and colour bars."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..runs import letters
 from ..runs.display import Display
-from .page import Page
+from .page import Page, Point, box
 
 INK, FAINT = "#20262d", "#6b7480"
-"""Colours of text and lines, and of what is said besides."""
+"""Colours of text and lines, and of notes."""
 _STEPS = (1.0, 2.0, 2.5, 5.0, 10.0)
 
 
@@ -39,6 +41,74 @@ def ticks(low: float, high: float, most: int) -> list[float]:
     step = power * next(s for s in _STEPS if s * power >= raw * (1 - 1e-9))
     first = np.ceil(low / step - 1e-9)
     return [float(step * n) for n in np.arange(first, np.floor(high / step + 1e-9) + 1)]
+
+
+class Axes(NamedTuple):
+    """A frame (left, top, width, height) on a page, with values `x` from its left to its right and `y` upward."""
+
+    page: Page
+    frame: tuple[float, float, float, float]
+    x: tuple[float, float]
+    y: tuple[float, float]
+    em: float
+    ink: str = INK
+
+    def to(self, x: float, y: float) -> Point:
+        """Where on the page a pair of values is."""
+        left, top, width, height = self.frame
+        (first, last), (low, high) = self.x, self.y
+        return left + width * (x - first) / (last - first), top + height * (high - y) / (high - low)
+
+    def curve(self, xs: ArrayLike, ys: ArrayLike, color: str, width: float) -> None:
+        """Draw a line through pairs of values, `width` times the size of text wide."""
+        self.page.line(list(map(self.to, np.asarray(xs).tolist(), np.asarray(ys).tolist())), color, width * self.em)
+
+    def draw(self, xs: Iterable[float], ys: Iterable[float], title: str = "", below: str = "", digits: int = 4) -> None:
+        """Draw the frame with marks and numbers at the values `xs` and `ys`, a title above it and a text below."""
+        page, em, (left, top, width, height) = self.page, self.em, self.frame
+        page.line([*box(*self.frame), (left, top)], self.ink, 0.06 * em)
+        for value in xs:
+            x, bottom = self.to(value, self.y[0])
+            page.line([(x, bottom), (x, bottom + 0.3 * em)], self.ink, 0.06 * em)
+            page.text(number(value), x, bottom + 1.3 * em, 0.8 * em, INK, "middle")
+        for value in ys:
+            y = self.to(self.x[0], value)[1]
+            page.line([(left - 0.3 * em, y), (left, y)], self.ink, 0.06 * em)
+            page.text(number(value, digits), left - 0.5 * em, y + 0.3 * em, 0.8 * em, INK, "end")
+        for text, size, y in ((title, em, top - 0.6 * em), (below, 0.85 * em, top + height + 2.6 * em)):
+            if text:
+                page.text(text, left + width / 2, y, size, INK, "middle")
+
+
+def arranged(
+    sizes: Sequence[tuple[float, float]],
+    margins: tuple[float, float, float, float],
+    room: tuple[float, float, float, float],
+    *ways: Sequence[Sequence[int]],
+) -> tuple[float, list[Point]]:
+    """Arrange rectangles of `sizes`, mm, in rows: pixels per mm, and each one's left top corner.
+
+    Of the `ways`, rows of the rectangles' indices, the one is taken that shows them largest; it is centred in the `room`
+    (left, top, width, height). `margins` are free around each rectangle: left, top, right, bottom.
+    """
+    left, top, width, height = room
+    beside, beyond = margins[0] + margins[2], margins[1] + margins[3]
+
+    def scale(rows: Sequence[Sequence[int]]) -> float:
+        across = min((width - len(row) * beside) / sum(sizes[i][0] for i in row) for row in rows)
+        return min(across, (height - len(rows) * beyond) / sum(max(sizes[i][1] for i in row) for row in rows))
+
+    rows = max(ways, key=scale)
+    pixels = max(scale(rows), 1e-9)
+    talls = [max(sizes[i][1] for i in row) * pixels + beyond for row in rows]
+    corners, y = dict[int, Point](), top + max(0.0, (height - sum(talls)) / 2)
+    for row, tall in zip(rows, talls, strict=True):
+        x = left + max(0.0, (width - sum(sizes[i][0] * pixels + beside for i in row)) / 2)
+        for i in row:
+            corners[i] = x + margins[0], y + tall - margins[3] - sizes[i][1] * pixels
+            x += sizes[i][0] * pixels + beside
+        y += tall
+    return pixels, [corners[i] for i in range(len(sizes))]
 
 
 def number(value: float, digits: int = 4) -> str:

@@ -10,8 +10,8 @@ from ..geometry.grid import Grid
 from ..runs.display import Display
 from ..volumes.resampling import resample
 from ..volumes.volume import Volume
-from .page import Page, Point, box
-from .parts import FAINT, INK, bar_width, color_bar, heading, number, ticks
+from .page import Page
+from .parts import FAINT, INK, Axes, arranged, bar_width, color_bar, heading, number, ticks
 
 SIZE, SIZE_BESIDE_TRUTH = (1600, 500), (1600, 850)
 """Width and height, pixels, that suit a reconstruction alone, and one beside the truth."""
@@ -43,42 +43,29 @@ def draw(
     display = Display(colors="inferno" if volume.quantity == "activity" else "grey")
     # A hot voxel of the reconstruction must not darken all others: the truth says how bright things are.
     window = display.window(np.concatenate([picture.ravel() for picture in pictures[-1]]))
-    extent = volume.grid.spacing * volume.grid.shape
-    gap, left = 0.8 * em, 2.6 * em
-    bar = bar_width(page, display, window, volume.unit)
-    right = page.width * (1 - _PLOT if len(objective) else 1) - bar - 3.0 * em
-    height = (page.height - top - 0.6 * em) / len(rows) - 1.9 * em
-    pixels = (right - left - 2 * gap) / sum(extent[across] for _, across, _ in _SLICES)
-    pixels = max(min(pixels, height / max(extent[up] for _, _, up in _SLICES)), 1e-9)
-    y = float(top)
-    for (name, _), row in zip(rows, pictures, strict=True):
-        tall = max(extent[up] for _, _, up in _SLICES) * pixels
-        page.text(name, 1.5 * em, y + 1.5 * em + tall / 2, em, INK, "middle", upward=True)
-        x = left
-        for (axis, across, up), picture in zip(_SLICES, row, strict=True):
-            shape = max(1, round(extent[across] * pixels)), max(1, round(extent[up] * pixels))
-            place = round(x), round(y + 1.5 * em + (tall - extent[up] * pixels) / 2)
-            at = (
-                volume.grid.center[axis]
-                + (volume.grid.shape[axis] // 2 - (volume.grid.shape[axis] - 1) / 2) * (volume.grid.spacing[axis])
-            )
-            text = f"{_NAMES[across]} {_NAMES[up]},  {_NAMES[axis]} = {number(round(float(at), 2) + 0.0)} mm"
-            page.text(text, x + shape[0] / 2, y + 1.1 * em, 0.9 * em, FAINT, "middle")
-            page.image(display.colored(picture.T[::-1], window), *place, *shape)
-            x += extent[across] * pixels + gap
-        y += tall + 1.9 * em
-    _scale_bar(page, pixels, float(extent[0]), left + 0.6 * em, y - 1.0 * em)
-    first = round(top + 1.5 * em)
-    color_bar(page, display, window, volume.unit, round(x + 0.4 * em), first, max(2, round(y - 0.4 * em) - first))
+    grid, bar = volume.grid, bar_width(page, display, window, volume.unit)
+    extent = (grid.spacing * grid.shape).tolist()
+    sizes = [(extent[across], extent[up]) for _ in rows for _, across, up in _SLICES]
+    right = page.width * (1 - _PLOT if len(objective) else 1) - bar - 2.6 * em
+    room = 2.2 * em, float(top), right - 2.2 * em, page.height - top - 0.6 * em
+    in_rows = [range(i, i + 3) for i in range(0, len(sizes), 3)]
+    pixels, places = arranged(sizes, (0.4 * em, 1.5 * em, 0.4 * em, 0.4 * em), room, in_rows)
+    for i, ((x, y), (width, height)) in enumerate(zip(places, sizes, strict=True)):
+        (name, _), (axis, across, up), n = rows[i // 3], _SLICES[i % 3], grid.shape[_SLICES[i % 3][0]]
+        if i % 3 == 0:
+            page.text(name, x - 1.1 * em, y + height * pixels / 2, em, INK, "middle", upward=True)
+        at = grid.center[axis] + (n // 2 - (n - 1) / 2) * grid.spacing[axis]
+        text = f"{_NAMES[across]} {_NAMES[up]},  {_NAMES[axis]} = {number(round(float(at), 2) + 0.0)} mm"
+        page.text(text, x + width * pixels / 2, y - 0.4 * em, 0.9 * em, FAINT, "middle")
+        picture = display.colored(pictures[i // 3][i % 3].T[::-1], window)
+        page.image(picture, round(x), round(y), round(width * pixels), round(height * pixels))
+    x, y = x + width * pixels + 1.2 * em, y + height * pixels
+    first = round(min(place[1] for place in places))
+    _scale_bar(page, pixels, extent[0], places[-3][0] + 0.6 * em, y - 0.6 * em)
+    color_bar(page, display, window, volume.unit, round(x), first, max(2, round(y) - first))
     if len(objective):
-        plot_left = x + bar + 7.5 * em
-        plot = (
-            plot_left,
-            top + 1.5 * em,
-            page.width - plot_left - 1.5 * em,
-            min(0.45 * page.width * _PLOT * 2, y - top - 4.5 * em),
-        )
-        draw_objective(page, objective, plot, objective_name)
+        x, height = x + bar + 7.1 * em, min(0.9 * page.width * _PLOT, y - first - 3 * em)
+        draw_objective(page, objective, (x, first, page.width - x - 1.5 * em, height), objective_name)
 
 
 def draw_objective(
@@ -95,40 +82,22 @@ def draw_objective(
     `em` is the size of its text, which lines are in proportion to.
     """
     values = np.asarray(objective, float)
-    left, top, width, height = place
     em = em or page.em
     low, high = float(values.min()), float(values.max())
     spread = (high - low) or abs(high) or 1.0
     low, high = low - 0.06 * spread, high + 0.06 * spread
-    last = max(len(values), 2)
-
-    def at(iteration: float, value: float) -> Point:
-        return left + width * (iteration - 1) / (last - 1), top + height * (high - value) / (high - low)
-
-    page.line([*box(left, top, width, height), (left, top)], ink, 0.06 * em)
-    points = [at(i, value) for i, value in enumerate(values, 1)]
-    if len(points) > 1:
-        page.line(points, color, 0.16 * em)
-    for x, y in points if len(points) <= 30 else points[-1:]:
-        r = 0.22 * em
-        page.area([(x - r, y), (x, y - r), (x + r, y), (x, y + r)], color)
-    if not name:
-        return
-    size = 0.85 * em
-    marks = ticks(low, high, 5)
+    axes = Axes(page, place, (1, max(len(values), 2)), (low, high), em, ink)
+    marks = ticks(low, high, 5) if name else []
     # The objective changes little beside its size: as many digits as tell the numbers from each other.
     digits = max(4, math.ceil(math.log10(max(abs(low), abs(high)) / (marks[1] - marks[0]))) + 1) if marks[1:] else 4
-    for value in marks:
-        y = at(1, value)[1]
-        page.line([(left - 0.3 * em, y), (left, y)], ink, 0.06 * em)
-        page.text(number(value, digits), left - 0.5 * em, y + 0.3 * em, size, ink, "end")
-    for value in ticks(1, last, 6):
-        if value == round(value):
-            x = at(value, low)[0]
-            page.line([(x, top + height), (x, top + height + 0.3 * em)], ink, 0.06 * em)
-            page.text(number(value), x, top + height + 1.3 * em, size, ink, "middle")
-    page.text(name[:1].upper() + name[1:], left + width / 2, top - 0.5 * em, em, ink, "middle")
-    page.text("iteration", left + width / 2, top + height + 2.6 * em, size, ink, "middle")
+    whole = [n for n in ticks(*axes.x, 6) if n == round(n)] if name else []
+    axes.draw(whole, marks, name[:1].upper() + name[1:], "iteration" if name else "", digits)
+    iterations = np.arange(1, len(values) + 1)
+    if len(values) > 1:
+        axes.curve(iterations, values, color, 0.16)
+    for i in iterations if len(values) <= 30 else iterations[-1:]:
+        (x, y), r = axes.to(i, values[i - 1]), 0.22 * em
+        page.area([(x - r, y), (x, y - r), (x + r, y), (x, y + r)], color)
 
 
 def _slice(volume: Volume, grid: Grid, axis: int) -> NDArray[np.float32]:

@@ -6,14 +6,15 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..geometry.frames import moved
 from ..reconstruction.scores.derenzo import DerenzoSector
 from ..reconstruction.scores.summary import VolumeScore
 from ..runs import letters
 from ..runs.display import Display
 from ..volumes.resampling import values_at
 from ..volumes.volume import Volume
-from .page import Page, box
-from .parts import FAINT, INK, bar_width, color_bar, heading, number, ticks
+from .page import Page
+from .parts import FAINT, INK, Axes, bar_width, color_bar, heading, number, ticks
 
 SIZE = (1800, 950)
 """Width and height, pixels, of a page that suits."""
@@ -85,11 +86,10 @@ def _middle(score: VolumeScore, low: Floats, high: Floats) -> Floats:
     """Where the slices meet: in the largest sphere; else near the middle, but where there is much of the truth."""
     if score.nema is not None:
         largest = score.nema[int(score.nema.diameter.argmax())].center
-        return (np.linalg.inv(score.pose) @ [*largest, 1.0])[:3]
+        return moved(np.linalg.inv(score.pose), largest)
     shares = (np.arange(_COARSE) + 0.5) / _COARSE
     points = low + np.stack(np.meshgrid(shares, shares, shares, indexing="ij"), axis=-1).reshape(-1, 3) * (high - low)
-    world = points @ score.pose[:3, :3].T + score.pose[:3, 3]
-    values = values_at(score.truth, world, "nearest").reshape((_COARSE,) * 3).astype(float)
+    values = values_at(score.truth, moved(score.pose, points), "nearest").reshape((_COARSE,) * 3).astype(float)
     best = []
     for axis in range(3):
         sums = np.abs(values).sum(axis=tuple({0, 1, 2} - {axis}))
@@ -100,9 +100,7 @@ def _middle(score: VolumeScore, low: Floats, high: Floats) -> Floats:
 
 def _shown(score: VolumeScore) -> tuple[Floats, Floats]:
     """Opposite corners, in the axes of `score.pose`, mm, of the box that slices show."""
-    corners = score.volume.grid.corners()
-    to_axes = np.linalg.inv(score.pose)
-    inside = corners @ to_axes[:3, :3].T + to_axes[:3, 3]
+    inside = moved(np.linalg.inv(score.pose), score.volume.grid.corners())
     low, high = inside.min(axis=0), inside.max(axis=0)
     if score.phantom is not None:
         start, end = score.phantom.box
@@ -122,8 +120,7 @@ def _slice(
     points = np.empty((counts[plane[0]], counts[plane[1]], 3))
     points[:] = middle
     points[..., plane[0]], points[..., plane[1]] = at[plane[0]][:, None], at[plane[1]]
-    world = points.reshape(-1, 3) @ pose[:3, :3].T + pose[:3, 3]
-    return values_at(volume, world, "nearest").reshape(points.shape[:2])
+    return values_at(volume, moved(pose, points.reshape(-1, 3)), "nearest").reshape(points.shape[:2])
 
 
 def _lines_of_profiles(page: Page, score: VolumeScore, low: Floats, scale: float, corner: tuple[float, float]) -> None:
@@ -131,7 +128,7 @@ def _lines_of_profiles(page: Page, score: VolumeScore, low: Floats, scale: float
     to_axes = np.linalg.inv(score.pose)
     for sector in score.derenzo or ():
         for profile in sector.profiles:
-            ends = profile.points[[0, -1]] @ to_axes[:3, :3].T + to_axes[:3, 3]
+            ends = moved(to_axes, profile.points[[0, -1]])
             line = [(corner[0] + (x - low[0]) * scale, corner[1] - (y - low[1]) * scale) for x, y, _ in ends.tolist()]
             page.line(line, _ON_SLICE, 0.06 * page.em)
 
@@ -145,7 +142,7 @@ def _plots(score: VolumeScore, middle: Floats) -> list[_Plot]:
     for axis in range(3):
         points = np.tile(middle, (_MOST, 1))
         points[:, axis] = np.linspace(low[axis], high[axis], _MOST)
-        world = points @ score.pose[:3, :3].T + score.pose[:3, 3]
+        world = moved(score.pose, points)
         true, found = (values_at(volume, world).astype(float) for volume in (score.truth, score.volume))
         curves = (_Curve(points[:, axis], found, _FOUND, 0.16), _Curve(points[:, axis], true, _TRUE, 0.07))
         plots.append(_Plot(f"Along {'xyz'[axis]}, mm", curves))
@@ -188,21 +185,10 @@ def _draw_plots(page: Page, plots: Sequence[_Plot], room: tuple[int, int, int, i
 
 
 def _draw_plot(page: Page, plot: _Plot, frame: tuple[float, float, float, float], span: tuple[float, float]) -> None:
-    em, (left, top, width, height), (low, high) = page.em, frame, span
-    first, last = float(plot.curves[0].x[0]), float(plot.curves[0].x[-1])
-    page.line([*box(left, top, width, height), (left, top)], FAINT, 0.06 * em)
+    em, (left, top, width, height), xs = page.em, frame, plot.curves[0].x
+    axes = Axes(page, frame, (float(xs[0]), float(xs[-1])), span, em, FAINT)
+    axes.draw(ticks(*axes.x, max(2, int(width / (4 * em)))), ticks(*span, max(2, int(height / (2.5 * em)))))
     size = 0.8 * em * min(1.0, width / letters.width(plot.title, 0.8 * em))  # smaller where the title is too long
     page.text(plot.title, left, top - 0.5 * em, size, INK)
-    for value in ticks(low, high, max(2, int(height / (2.5 * em)))):
-        y = top + height * (high - value) / (high - low)
-        page.line([(left - 0.3 * em, y), (left, y)], FAINT, 0.06 * em)
-        page.text(number(value), left - 0.5 * em, y + 0.3 * em, 0.75 * em, INK, "end")
-    for value in ticks(first, last, max(2, int(width / (4 * em)))):
-        x = left + width * (value - first) / (last - first)
-        page.line([(x, top + height), (x, top + height + 0.3 * em)], FAINT, 0.06 * em)
-        page.text(number(value), x, top + height + 1.2 * em, 0.75 * em, INK, "middle")
     for curve in plot.curves:
-        xs, ys = (curve.x - first) / (last - first), (high - curve.y) / (high - low)
-        page.line(
-            [(left + width * x, top + height * y) for x, y in zip(xs, ys, strict=True)], curve.color, curve.width * em
-        )
+        axes.curve(*curve)

@@ -18,7 +18,7 @@ NEEDS = ("scanner", "volume", "run")
 
 
 def require(needs: Sequence[str], have: Container[str], figure: str, missing: Mapping[str, str]) -> None:
-    """Raise `InputError` unless there is all that a figure needs; `missing` says of each what to do."""
+    """Refuse a figure that needs what is missing; `missing` says for each need what to do."""
     for need in needs:
         if need not in have:
             raise InputError(f"figure {figure}: {missing[need]}")
@@ -30,7 +30,7 @@ class Subject:
 
     scanner: PinholeSystem | None = None
     construction: Construction = field(default_factory=Construction)
-    """Of the scanner's collimators."""
+    """How the scanner's collimators are built."""
     volume: Volume | None = None
     run: ProjectionRun | None = None
     name: str = ""

@@ -8,13 +8,14 @@ from ..runs.display import Display
 from ..runs.run_recipe import euler_degrees
 from ..volumes.volume import LINE_INTEGRALS, Volume, require_quantity
 from .page import Page
-from .parts import INK, bar_width, color_bar, heading, number, ticks
+from .parts import INK, Axes, arranged, bar_width, color_bar, heading, number, ticks
 from .subject import Subject
 
 # The axis summed along, and those to the right and upward: seen from the head, from the front and from the left.
 _PANELS = ((2, 0, 1), (1, 0, 2), (0, 1, 2))
 _ARRANGED = (((0, 1, 2),), ((0,), (1, 2)), ((0,), (1,), (2,)))
 _NAMES = "xyz"
+_Frame = tuple[int, int, int, int]  # left, top, width, height
 
 
 def orthogonal_sum(volume: Volume, axis: int) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
@@ -47,38 +48,19 @@ def draw(page: Page, subject: Subject) -> None:
     em = page.em
     top = heading(page, f"Orthogonal sums{': ' if subject.name else ''}{subject.name}", _placed(subject))
     bar = bar_width(page, display, window, unit)
-    width, height = page.width - round(4.0 * em) - bar, page.height - top - round(0.5 * em)
-    margins = np.array([4.2, 1.9, 1.2, 3.8]) * em  # of a panel: left, top, right, bottom
-
+    room = 0.0, float(top), page.width - round(4.0 * em) - bar, page.height - top - round(0.5 * em)
     box = sums[0][1]
-    extent = box[1] - box[0]
+    extent = (box[1] - box[0]).tolist()
     sizes = [(extent[right], extent[up]) for _, right, up in _PANELS]
-
-    def scale(rows: tuple[tuple[int, ...], ...]) -> float:
-        """Pixels per mm of an arrangement in rows."""
-        across = min(
-            (width - len(row) * (margins[0] + margins[2])) / sum(sizes[panel][0] for panel in row) for row in rows
-        )
-        down = height - len(rows) * (margins[1] + margins[3])
-        return float(min(across, down / sum(max(sizes[panel][1] for panel in row) for row in rows)))
-
-    rows = max(_ARRANGED, key=scale)
-    pixels = max(scale(rows), 1e-9)
-    used = sum(max(sizes[p][1] for p in row) * pixels + margins[1] + margins[3] for row in rows)
-    y = top + max(0.0, (height - used) / 2)
-    first = y + margins[1]
-    for row in rows:
-        tall = max(sizes[panel][1] for panel in row) * pixels
-        across = sum(sizes[panel][0] * pixels + margins[0] + margins[2] for panel in row)
-        x = max(0.0, (width - across) / 2)
-        for panel in row:
-            place = round(x + margins[0]), round(y + margins[1] + tall - sizes[panel][1] * pixels)
-            shape = round(sizes[panel][0] * pixels), round(sizes[panel][1] * pixels)
-            _panel(page, panel, display.colored(sums[panel][0].T[::-1], window), box, place, shape)
-            x += sizes[panel][0] * pixels + margins[0] + margins[2]
-        y += tall + margins[1] + margins[3]
-    last = y - margins[3]
-    color_bar(page, display, window, unit, round(width + 1.5 * em), round(first), round(last - first))
+    pixels, places = arranged(sizes, (4.2 * em, 1.9 * em, 1.2 * em, 3.8 * em), room, *_ARRANGED)
+    for panel, ((x, y), (across, tall)) in enumerate(zip(places, sizes, strict=True)):
+        frame = round(x), round(y), max(1, round(across * pixels)), max(1, round(tall * pixels))
+        _panel(page, panel, display.colored(sums[panel][0].T[::-1], window), box, frame)
+    first, last = (
+        min(y for _, y in places),
+        max(y + size[1] * pixels for (_, y), size in zip(places, sizes, strict=True)),
+    )
+    color_bar(page, display, window, unit, round(room[2] + 1.5 * em), round(first), round(last - first))
 
 
 def _placed(subject: Subject) -> list[str]:
@@ -99,32 +81,12 @@ def _numbers(values: object) -> str:
     return ", ".join(number(round(float(value), 3) + 0.0) for value in np.asarray(values))
 
 
-def _panel(
-    page: Page,
-    panel: int,
-    picture: NDArray[np.uint8],
-    box: NDArray[np.float64],
-    place: tuple[int, int],
-    shape: tuple[int, int],
-) -> None:
+def _panel(page: Page, panel: int, picture: NDArray[np.uint8], box: NDArray[np.float64], frame: _Frame) -> None:
     """One sum with its title and axes."""
-    em, (left, top), (width, height) = page.em, place, shape
+    em, (left, top, width, height) = page.em, frame
     axis, right, up = _PANELS[panel]
-    width, height = max(1, width), max(1, height)
     page.image(picture, left, top, width, height)
-    bottom, end = top + height, left + width
-    page.line([(left, top), (end, top), (end, bottom), (left, bottom), (left, top)], INK, 0.06 * em)
-    page.text(f"Sum along {_NAMES[axis]}", (left + end) / 2, top - 0.6 * em, em, INK, "middle")
-    tick, size = 0.35 * em, 0.85 * em
-    low, high = box[:, right]
-    for value in ticks(low, high, min(6, int(width / (3.5 * em)))):
-        x = left + (value - low) / (high - low) * width
-        page.line([(x, bottom), (x, bottom + tick)], INK, 0.06 * em)
-        page.text(number(value), x, bottom + 1.3 * em, size, INK, "middle")
-    page.text(f"{_NAMES[right]}, mm", (left + end) / 2, bottom + 2.7 * em, size, INK, "middle")
-    low, high = box[:, up]
-    for value in ticks(low, high, min(6, int(height / (2.5 * em)))):
-        y = bottom - (value - low) / (high - low) * height
-        page.line([(left - tick, y), (left, y)], INK, 0.06 * em)
-        page.text(number(value), left - 1.6 * tick, y + 0.3 * em, size, INK, "end")
-    page.text(f"{_NAMES[up]}, mm", left - 2.9 * em, (top + bottom) / 2, size, INK, "middle", upward=True)
+    axes = Axes(page, frame, tuple(box[:, right]), tuple(box[:, up]), em)
+    xs, ys = ticks(*axes.x, min(6, int(width / (3.5 * em)))), ticks(*axes.y, min(6, int(height / (2.5 * em))))
+    axes.draw(xs, ys, f"Sum along {_NAMES[axis]}", f"{_NAMES[right]}, mm")
+    page.text(f"{_NAMES[up]}, mm", left - 2.9 * em, top + height / 2, 0.85 * em, INK, "middle", upward=True)

@@ -15,12 +15,12 @@ from ..geometry.system import PinholeSystem
 from ..geometry.views import Views
 from ..runs import letters
 from .page import Anchor, Page, Point, box
-from .parts import FAINT, INK, heading, number
+from .parts import FAINT, INK, arranged, heading, number
 from .subject import Subject
 
 _CRYSTAL, _METAL, _ROI, _FAN = "#f0a030", "#8a929c", "#4f9bd6", "#d0502a"
-_ABOVE, _BELOW, _BESIDE = 4.4, 8.0, 3.8
-"""Room around a drawing for its texts, in units of the text's size."""
+_ROOM = (3.8, 4.4, 3.8, 8.0)
+"""Room for texts to the left of a drawing, above it, to its right and below, in units of the text's size."""
 
 
 class _Drawing(NamedTuple):
@@ -129,25 +129,13 @@ def draw(page: Page, subject: Subject) -> None:
         (min(c_arm.source, 0.0), max(c_arm.detector, m.b + m.radius)),
     ]
     half = max(pinhole.half, c_arm.half, m.radius)
-    width, height = page.width - 2 * em, page.height - top - em
-
-    def scale(columns: int) -> float:
-        """Pixels per mm with so many drawings beside each other."""
-        spans = [high - low for low, high in ranges]
-        across = (width - 2 * _BESIDE * em * columns) / (sum(spans) if columns == 2 else max(spans))
-        return min(across, (height * columns / 2 - (_ABOVE + _BELOW) * em) / (2 * half))
-
-    columns = max((2, 1), key=scale)
-    pixels = max(scale(columns), 1e-3)
-    tall = 2 * half * pixels + (_ABOVE + _BELOW) * em
-    wide = [(high - low) * pixels + 2 * _BESIDE * em for low, high in ranges]
-    y = top + max(0.0, (height - tall * 2 / columns) / 2)
-    x = em + max(0.0, (width - (sum(wide) if columns == 2 else max(wide))) / 2)
-    for across, (low, _), fan, details in zip(wide, ranges, (pinhole, c_arm), (_pinhole, _c_arm), strict=True):
-        drawing = _Drawing(page, pixels, (x + _BESIDE * em - low * pixels, y + _ABOVE * em + half * pixels))
+    sizes = [(high - low, 2 * half) for low, high in ranges]
+    room, margins = (em, float(top), page.width - 2 * em, page.height - top - em), np.array(_ROOM) * em
+    pixels, places = arranged(sizes, tuple(margins), room, ((0, 1),), ((0,), (1,)))
+    for (x, y), (low, _), fan, details in zip(places, ranges, (pinhole, c_arm), (_pinhole, _c_arm), strict=True):
+        drawing = _Drawing(page, pixels, (x - low * pixels, y + half * pixels))
         _draw_fan(drawing, m, fan)
         details(drawing, m, fan, (low, half))
-        x, y = (x + across, y) if columns == 2 else (x, y + tall)
 
 
 def _draw_fan(drawing: _Drawing, m: _Module, fan: _Fan) -> None:

@@ -97,6 +97,11 @@ def affine_matrix(linear: NDArray[np.float64], translation: ArrayLike) -> NDArra
     return matrix
 
 
+def moved(affine: NDArray[np.float64], points: NDArray[np.floating | np.integer]) -> NDArray[np.float64]:
+    """Points (..., 3) after an affine (4, 4)."""
+    return points @ affine[:3, :3].T + affine[:3, 3]
+
+
 def euler_pose(
     phi: float = 0.0, theta: float = 0.0, psi: float = 0.0, translation: ArrayLike = (0.0, 0.0, 0.0)
 ) -> NDArray[np.float64]:

@@ -7,7 +7,6 @@ from functools import cached_property
 import numpy as np
 
 from ..physics.materials import WATER_MU
-from ..validation import whole_number
 from .phantom import Phantom
 from .settings import count, require_at_most, setting
 from .shapes import Cylinder, Shape
@@ -33,11 +32,9 @@ class DefrisePhantom(Phantom):
     title = "Defrise phantom"
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "disks", whole_number(self.disks, "Defrise phantom: disks"))
         super().__post_init__()
         if self.disks > 1:
-            name = f"{self.title}: disk thickness"
-            require_at_most(self.disk_thickness, self.spacing, name, "from disk to disk")
+            require_at_most(self.disk_thickness, self.spacing, f"{self.title}: disk thickness", "from disk to disk")
 
     @cached_property
     def shapes(self) -> Sequence[Shape]:

@@ -82,12 +82,12 @@ class DerenzoRods(Shape):
 
     @property
     def n_parts(self) -> int:
-        """As of `Shape`: one for each rod."""
+        """A line may enter each rod."""
         return len(self.rods)
 
     @property
     def finest(self) -> float:
-        """As of `Shape`."""
+        """Size, mm, of the thinnest rod, or its length."""
         return min(float(self.rods[:, 3].min()), self.height)
 
     @cached_property
@@ -162,10 +162,7 @@ class DerenzoRods(Shape):
 
 @dataclass(frozen=True)
 class DerenzoPhantom(Phantom):
-    """Rods along z, centred on the origin, of one diameter in each of `sectors`; for their places see `DerenzoRods`.
-
-    `InputError` if no rod fits.
-    """
+    """Rods along z, centred on the origin, of one diameter in each of `sectors`; for their places see `DerenzoRods`."""
 
     radius: float = setting(40.0, "mm", "of the phantom")
     rod_diameters: tuple[float, ...] = setting((8.0, 6.0, 5.0, 4.0, 3.0, 2.0), "mm", "by sector; 0 for none", 0.0)
@@ -190,8 +187,7 @@ class DerenzoPhantom(Phantom):
             raise InputError(f"Derenzo activity: expected {expected}, got {self.activity:g}")
         empty = [f"{w:g}" for w, (_, n) in zip(self.rod_diameters, self._rods._rows, strict=True) if w > 0 and n == 0]
         if empty:
-            text = f"no rod of {', '.join(empty)} mm fits into a radius of {self.radius:g} mm: such sectors stay empty"
-            warn(text)
+            warn(f"no rod of {', '.join(empty)} mm fits into a radius of {self.radius:g} mm: such sectors stay empty")
         if not self.cylinder_radius:
             if self.background or self.cylinder_height:
                 raise InputError(
@@ -212,7 +208,7 @@ class DerenzoPhantom(Phantom):
 
     @property
     def box(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """As of any phantom; the rods' box is that of their `radius`, even if none of them reaches the rim."""
+        """Opposite corners, mm, of the phantom's box, in which the rods take their whole `radius`."""
         half = max(self.radius, self.cylinder_radius, self._rods.half_box[0])  # very thin rods reach beyond the rim
         corner = np.array([half, half, max(self.height, self.cylinder_height) / 2])
         return -corner, corner

@@ -1,6 +1,5 @@
 """The Jaszczak phantom: rods and spheres, cold as a rule, in a cylinder of active water."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -9,7 +8,7 @@ from ..physics.materials import WATER_MU, attenuation
 from .derenzo import DerenzoRods
 from .phantom import Phantom
 from .settings import require_apart, require_at_most, setting
-from .shapes import Cylinder, Shape, Sphere
+from .shapes import Cylinder, Shape, ring_places, spheres
 
 
 @dataclass(frozen=True)
@@ -66,14 +65,6 @@ class JaszczakPhantom(Phantom):
                 mu=self.mu if self.rod_activity else plastic,
             )  # fmt: skip
             shapes.append(rods)
+        places = [(*place, base + self.sphere_height) for place in ring_places(self.sphere_ring_radius, -90.0)]
         mu = self.mu if self.sphere_activity else plastic
-        for i, diameter in enumerate(self.sphere_diameters):
-            if diameter:
-                angle = math.radians(-90.0 + 60.0 * i)
-                x, y = self.sphere_ring_radius * math.cos(angle), self.sphere_ring_radius * math.sin(angle)
-                sphere = Sphere(
-                    radius=diameter / 2, position=(x, y, base + self.sphere_height), name=f"sphere {diameter:g} mm",
-                    activity=self.sphere_activity, mu=mu,
-                )  # fmt: skip
-                shapes.append(sphere)
-        return shapes
+        return [*shapes, *spheres(self.sphere_diameters, places, activity=self.sphere_activity, mu=mu)]

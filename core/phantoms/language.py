@@ -26,13 +26,12 @@ import dataclasses
 import math
 import os
 from collections.abc import Iterable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ..errors import InputError, naming
-from ..files import write_bytes
+from ..files import require_ending, write_bytes
 from ..toml import parse_toml, read_toml, toml_value
 from ..validation import instance
 from .derenzo import DerenzoRods
@@ -48,7 +47,7 @@ _EULER = "euler_degrees"
 
 
 def read_phantom(path: str | os.PathLike[str]) -> ShapePhantom:
-    """The phantom that a TOML file describes, see `core.phantoms.language`; `InputError` names file, shape and key."""
+    """The phantom that a TOML file describes, see `core.phantoms.language`; messages name file, shape and key."""
     return _phantom(read_toml(path), str(path))
 
 
@@ -60,9 +59,7 @@ def parse_phantom(text: str, name: str = "phantom") -> ShapePhantom:
 def write_phantom(phantom: Phantom, path: str | os.PathLike[str]) -> None:
     """Write the shapes of any phantom as a .toml file; `read_phantom` gives the same shapes back."""
     instance(phantom, Phantom, "write_phantom")
-    path = Path(path)
-    if path.suffix.lower() != ".toml":
-        raise InputError(f"{path}: expected a name ending in .toml")
+    require_ending(path, (".toml",))
     lines = [f"name = {toml_value(phantom.title)}", f"mu_energy = {toml_value(phantom.mu_energy)}"]
     for shape in phantom.shapes:
         lines += ["", "[[shape]]", f"kind = {toml_value(shape.KIND)}"]

@@ -10,7 +10,7 @@ from ..errors import InputError
 from ..physics.materials import WATER_MU
 from .phantom import Phantom
 from .settings import require_apart, require_at_most, setting
-from .shapes import Box, Cylinder, Shape, Sphere
+from .shapes import Box, Cylinder, Shape, ring_places, spheres
 
 # Inside, mm: the front is a half circle, the back a straight line between two quarter circles.
 _FRONT_RADIUS, _BACK_RADIUS, _BACK_WIDTH = 147.0, 77.0, 140.0
@@ -76,17 +76,13 @@ class NemaBody(Phantom):
         if self.lung_diameter:
             lung: dict[str, Any] = {"activity": 0.0, "mu": _LUNG_DENSITY * self.mu, "name": "lung insert"}
             shapes.append(Cylinder(radius=self.lung_diameter / 2, height=self.length, position=(0, 0, z), **lung))
-        for diameter, (x, y) in zip(self.sphere_diameters, sphere_places(), strict=True):
-            if diameter:
-                name, holds = f"sphere {diameter:g} mm", {**water, "activity": self.sphere_activity}
-                shapes.append(Sphere(radius=diameter / 2, position=(x, y, 0.0), name=name, **holds))
-        return shapes
+        places = [(*place, 0.0) for place in sphere_places()]
+        return [*shapes, *spheres(self.sphere_diameters, places, activity=self.sphere_activity, mu=self.mu)]
 
 
 def sphere_places() -> list[tuple[float, float]]:
     """x and y of the spheres' centres, mm, in the order of their diameters."""
-    angles = [math.radians(60.0 * (i - 2)) for i in range(6)]
-    return [(_RING_RADIUS * math.cos(angle), _RING_RADIUS * math.sin(angle)) for angle in angles]
+    return ring_places(_RING_RADIUS, -120.0)
 
 
 def room(x: float, y: float) -> float:

@@ -363,7 +363,7 @@ def line_integrals(layers: Sequence[Layer], starts: Points, ends: Points) -> Poi
 
 
 def _integrals_of_block(layers: Sequence[Layer], starts: Points, ends: Points) -> Points:
-    """Of lines (3, N). Each line's pieces between the surfaces that it crosses are painted in the layers' order."""
+    """Integrals (N,) along lines (3, N), whose pieces between the surfaces they cross are painted in the layers' order."""
     directions = ends - starts
     pieces: list[tuple[Any, ...]] = []
     for layer in layers:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InputError, naming, warn
-from ..geometry.frames import checked_affine
+from ..geometry.frames import checked_affine, moved
 from ..geometry.grid import Grid
 from ..geometry.views import Views
 from ..memory import require
@@ -81,7 +81,7 @@ class Phantom:
         for shape in self.shapes:
             # A cut may leave little of a shape: its polyhedron, slightly smaller than the shape, shows how much.
             corners = shape.surface()[0] if shape.cut else np.array(list(itertools.product(*_ENDS))) * shape.half_box
-            points = corners @ shape.pose[:3, :3].T + shape.pose[:3, 3]
+            points = moved(shape.pose, corners)
             low, high = np.minimum(low, points.min(axis=0)), np.maximum(high, points.max(axis=0))
         return freeze(low), freeze(high)
 
@@ -97,8 +97,7 @@ class Phantom:
         whole = self._total(quantity) * (1.0 if pose is None else abs(float(np.linalg.det(np.asarray(pose)[:3, :3]))))
         held = float(image.sum(dtype=np.float64)) * grid.voxel_volume / whole if whole > 0 else 1.0
         if held < _HELD:
-            text = f"{1 - held:.0%} of the {self.title} lies outside the grid: take larger or more voxels"
-            warn(text, 2)
+            warn(f"{1 - held:.0%} of the {self.title} lies outside the grid: take larger or more voxels", 2)
         return Volume(freeze(image), grid, quantity)
 
     def line_integrals(
@@ -141,9 +140,9 @@ class Phantom:
         meshes = []
         for i, shape in enumerate(self.shapes, 1):
             vertices, faces = shape.surface()
-            vertices = vertices @ shape.pose[:3, :3].T + shape.pose[:3, 3]
             name = shape.name or f"{shape.KIND} {i}"
-            meshes.append(PhantomMesh(name, freeze(vertices), freeze(faces), shape.activity, shape.mu))
+            vertices = freeze(moved(shape.pose, vertices))
+            meshes.append(PhantomMesh(name, vertices, freeze(faces), shape.activity, shape.mu))
         return meshes
 
     def _total(self, quantity: str) -> float:
@@ -173,8 +172,7 @@ class Phantom:
 class ShapePhantom(Phantom):
     """A phantom given as a list of shapes, in the order of painting: later ones replace what is beneath them.
 
-    `mu_energy` is the energy, keV, at which mu holds. `InputError` if there are no shapes, or negative ones make a sum
-    negative.
+    `mu_energy` is the energy, keV, at which mu holds. Negative shapes may not make a sum negative.
 
     Examples
     --------

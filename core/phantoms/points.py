@@ -9,7 +9,6 @@ from functools import cached_property
 import numpy as np
 
 from ..errors import InputError
-from ..validation import whole_shape
 from .phantom import Phantom
 from .settings import count, require_at_most, setting
 from .shapes import Shape, Sphere
@@ -34,18 +33,16 @@ class PointGrid(Phantom):
     title = "grid of points"
 
     def __post_init__(self) -> None:
-        counts = whole_shape(self.counts, "grid of points: counts", 3)
-        if math.prod(counts) > _MOST:
-            raise InputError(f"grid of points: expected at most {_MOST} points, got {math.prod(counts)}")
-        object.__setattr__(self, "counts", counts)
         super().__post_init__()
-        apart = [step for step, n in zip(self.spacing, counts, strict=True) if n > 1]
+        apart = [step for step, n in zip(self.spacing, self.counts, strict=True) if n > 1]
         if apart:
             require_at_most(self.diameter, min(apart), f"{self.title}: diameter", "from point to point")
 
     @cached_property
     def shapes(self) -> Sequence[Shape]:
         """The balls, the last index running fastest."""
+        if math.prod(self.counts) > _MOST:
+            raise InputError(f"expected at most {_MOST} points, got {math.prod(self.counts)}")
         radius = self.diameter / 2
         ball = Sphere(radius=radius, activity=self.point_activity / (4e-3 / 3 * math.pi * radius**3))  # mm^3 to mL
         middle, spacing = (np.array(self.counts) - 1) / 2, np.array(self.spacing)

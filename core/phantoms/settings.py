@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputError
-from ..validation import real_array
+from ..validation import real_array, whole_number, whole_shape
 
 
 def setting(
@@ -25,12 +25,12 @@ def setting(
 
 
 def count(default: int | tuple[int, ...], text: str) -> Any:
-    """A field of a phantom's dataclass: a whole number of at least 1, or several; the class checks it."""
+    """A field of a phantom's dataclass: a whole number of at least 1, or several."""
     return dataclasses.field(default=default, metadata={"text": text})
 
 
 def choice(default: str, choices: tuple[str, ...], text: str) -> Any:
-    """A field of a phantom's dataclass: one of several words; the class checks it."""
+    """A field of a phantom's dataclass: one of several words."""
     return dataclasses.field(default=default, metadata={"choices": choices, "text": text})
 
 
@@ -41,29 +41,37 @@ def setting_names(cls: Any) -> dict[str, str]:
 
 
 def check_settings(phantom: Any, title: str) -> None:
-    """Check every `setting` of a phantom and turn it into a float or a tuple of floats."""
+    """Check all settings of a phantom, and turn numbers into floats, whole numbers or tuples of them."""
     fields: tuple[Any, ...] = dataclasses.fields(phantom)
     for field in fields:
-        if "unit" not in field.metadata:
-            continue
-        name = f"{title}: {field.name.replace('_', ' ')}"
-        least, unit = field.metadata["least"], field.metadata["unit"]
-        shape = np.shape(field.default)
-        numbers = real_array(getattr(phantom, field.name), name, shape)
-        if np.any(numbers < least) if least is not None else np.any(numbers <= 0):
-            expected = "more than 0" if least is None else f"{least:g} or more"
-            raise InputError(f"{name}: expected {expected} {unit}, got {numbers.min():g}")
-        object.__setattr__(phantom, field.name, tuple(numbers.tolist()) if shape else float(numbers))
+        if field.metadata:
+            name = f"{title}: {field.name.replace('_', ' ')}"
+            object.__setattr__(phantom, field.name, _checked(getattr(phantom, field.name), field, name))
+
+
+def _checked(value: Any, field: Any, name: str) -> Any:
+    known, shape = field.metadata, np.shape(field.default)
+    if "choices" in known:
+        if value not in known["choices"]:
+            raise InputError(f"{name}: expected one of {', '.join(known['choices'])}, got {value!r}")
+        return value
+    if "unit" not in known:
+        return whole_shape(value, name, *shape) if shape else whole_number(value, name)
+    least, numbers = known["least"], real_array(value, name, shape)
+    if np.any(numbers < least) if least is not None else np.any(numbers <= 0):
+        expected = "more than 0" if least is None else f"{least:g} or more"
+        raise InputError(f"{name}: expected {expected} {known['unit']}, got {numbers.min():g}")
+    return tuple(numbers.tolist()) if shape else float(numbers)
 
 
 def require_at_most(value: float, most: float, name: str, where: str) -> None:
-    """Raise `InputError` if `value` exceeds `most`, mm, by more than rounding; `where` says what sets the limit."""
+    """Refuse a `value` that exceeds `most`, mm, by more than rounding; `where` says what sets the limit."""
     if value > most + 1e-9 * abs(most):
         raise InputError(f"{name}: expected at most {max(most, 0):.6g} mm {where}, got {value:.6g}")
 
 
 def require_apart(diameters: Sequence[float], ring_radius: float, name: str) -> None:
-    """Raise `InputError` if spheres, mm, overlap whose centres divide a circle evenly; a diameter of 0 is no sphere."""
+    """Refuse spheres that overlap, mm, whose centres divide a circle evenly; a diameter of 0 is no sphere."""
     for (i, first), (j, second) in itertools.combinations(enumerate(diameters), 2):
         apart = 2 * ring_radius * math.sin(math.pi * (j - i) / len(diameters))
         if first and second and first + second > 2 * apart * (1 + 1e-9):

@@ -5,6 +5,7 @@ say otherwise: a line enters and leaves them once.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, ClassVar
@@ -229,6 +230,21 @@ class Sphere(Ellipsoid):
         self._set_positive("radius")
         self._set("radii", (self.radius,) * 3)
         super()._check()
+
+
+def ring_places(radius: float, first: float) -> list[tuple[float, float]]:
+    """x and y, mm, of six places on a circle, 60 degrees apart counter-clockwise seen from +z, from `first` degrees on."""
+    angles = [math.radians(first + 60.0 * i) for i in range(6)]
+    return [(radius * math.cos(angle), radius * math.sin(angle)) for angle in angles]
+
+
+def spheres(diameters: Sequence[float], places: Sequence[Vector], **content: Any) -> list[Shape]:
+    """Spheres of these `diameters`, mm, at their places; a diameter of 0 is no sphere."""
+    return [
+        Sphere(radius=diameter / 2, position=place, name=f"sphere {diameter:g} mm", **content)
+        for diameter, place in zip(diameters, places, strict=True)
+        if diameter
+    ]
 
 
 @dataclass(frozen=True, kw_only=True)

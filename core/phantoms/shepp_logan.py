@@ -5,7 +5,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
-from ..errors import InputError
 from ..physics.materials import WATER_MU
 from .phantom import Phantom
 from .settings import choice, setting
@@ -47,11 +46,6 @@ class SheppLogan(Phantom):
     contrast: str = choice("modified", CONTRASTS, "of the activity")
 
     title = "Shepp-Logan phantom"
-
-    def __post_init__(self) -> None:
-        if self.contrast not in CONTRASTS:
-            raise InputError(f"{self.title}: contrast: expected one of {', '.join(CONTRASTS)}, got {self.contrast!r}")
-        super().__post_init__()
 
     @cached_property
     def shapes(self) -> Sequence[Shape]:

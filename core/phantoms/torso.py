@@ -110,7 +110,7 @@ class CardiacTorso(Phantom):
 
     @property
     def ventricle_volume(self) -> float:
-        """Of the left ventricle's cavity at this phase, mL."""
+        """Volume of the left ventricle's cavity at this phase, mL."""
         stroke = self.end_diastolic_volume - self.end_systolic_volume
         return self.end_diastolic_volume - stroke * self._contraction
 

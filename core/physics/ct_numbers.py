@@ -5,11 +5,11 @@ The conversion is bilinear: tissue below 0 HU is a mixture of air and water, abo
 Nucl. Sci. 50 (2003) 1510-1515).
 """
 
-from typing import Any
+import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import ArrayOrTensor, checked, namespace
 from ..errors import InputError, warn
 from ..memory import require
 from ..validation import freeze, instance, real_array
@@ -71,20 +71,25 @@ def hu_to_mu(volume: Volume, energy: float = 140.5, ct_energy: float = CT_ENERGY
     return Volume(freeze(mu), volume.grid, "mu")
 
 
-def diffdrr_density(hu: Volume | NDArray[Any], bone_attenuation_multiplier: float = 1.0) -> NDArray[np.float32]:
+def diffdrr_density(hu: Volume | ArrayOrTensor, bone_attenuation_multiplier: float = 1.0) -> ArrayOrTensor:
     """DiffDRR's conversion of CT numbers to float32 from 0 to 1: air becomes the thinnest tissue, bone is multiplied.
+
+    Of a tensor it is a tensor, with gradients.
 
     The result has no physical unit, so it is an array and not a `Volume`; a `Projector` takes either.
     `bone_attenuation_multiplier` is the factor for values above 350 HU.
     """
-    factor = np.float32(real_array(bone_attenuation_multiplier, "bone_attenuation_multiplier", ()))
+    factor = float(real_array(bone_attenuation_multiplier, "bone_attenuation_multiplier", ()))
     if isinstance(hu, Volume):
         require_quantity(hu.quantity, ("hu",), "diffdrr_density")
-    hu = hu.array if isinstance(hu, Volume) else real_array(hu, "CT numbers", None, np.float32)
-    if not hu.size:
+    hu = hu.array if isinstance(hu, Volume) else checked(hu, "CT numbers", np.shape(hu), False)
+    if not math.prod(hu.shape):
         raise InputError("CT numbers: expected at least one")
-    thinnest = hu.min(where=hu > DIFFDRR_AIR, initial=np.float32(np.inf))
-    density = np.maximum(hu, thinnest if thinnest <= DIFFDRR_BONE else hu.min())  # without tissue, air stays as it is
-    np.multiply(hu, factor, out=density, where=hu > DIFFDRR_BONE)
-    density -= density.min()
+    library = namespace(hu)
+    thinnest = library.where(hu > DIFFDRR_AIR, hu, np.inf).min()
+    density = library.maximum(
+        hu, thinnest if thinnest <= DIFFDRR_BONE else hu.min()
+    )  # without tissue, air stays as it is
+    density = library.where(hu > DIFFDRR_BONE, hu * factor, density)
+    density = density - density.min()
     return density / max(density.max(), np.finfo(np.float32).tiny)

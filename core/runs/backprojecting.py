@@ -35,7 +35,7 @@ def backproject_run(
     run : ProjectionRun
         Simulated or measured, with a recipe.
     how : str
-        "sum", "product" (the geometric mean) or "minimum", as of `backproject`.
+        "sum", "product" (the geometric mean) or "minimum", the argument of `backproject`.
     recipe : Recipe
         Its voxels, ``reconstruction.voxels``, ``spacing`` and ``center``, are those of the volume; by default the run's own.
     grid : Grid
@@ -46,13 +46,8 @@ def backproject_run(
     Returns
     -------
     Volume
-        Of "backprojection", in the unit of line integrals: of counts kBq/mL mm, of radiographs none.
-
-    Raises
-    ------
-    InputError
-        As of `run_line_integrals` and `backproject`; and for the product and the minimum, images that reach beyond the
-        crystals, where the pixels count nothing.
+        Its quantity is "backprojection", in the unit of line integrals: of counts kBq/mL mm, of radiographs none. Products
+        and minima of images that reach beyond the crystals, where pixels count nothing, are refused.
     """
     one_of(how, HOW, "how")
     images = run_line_integrals(run)
@@ -89,11 +84,7 @@ def run_line_integrals(run: ProjectionRun) -> Array:
     -------
     array (M, n_v, n_u) of float32
         In kBq/mL mm of counts; of radiographs without unit, or the volume's times mm. 0 where a pixel counts nothing.
-
-    Raises
-    ------
-    InputError
-        The run holds no recipe, or its model's images are no line integrals (inverse-square).
+        Images of the model "inverse-square" are no line integrals, and refused.
     """
     instance(run, ProjectionRun, "run_line_integrals")
     recipe = run.recipe
@@ -124,7 +115,7 @@ def _pixel_weights(run: ProjectionRun) -> NDArray[np.float64]:
 
 
 def _require_all_count(run: ProjectionRun) -> None:
-    """Raise `InputError` where pixels count nothing at all: they would make products and minima 0."""
+    """Refuse images with pixels that count nothing: they would make products and minima 0."""
     if run.recipe["model.kind"] == "emission" and not _pixel_weights(run).all():
         raise InputError(
             "the images reach beyond the crystals, where pixels count nothing, and products and minima would be 0: take the "

@@ -28,7 +28,7 @@ class Difference:
 
 
 def difference(run: ProjectionRun, other: ProjectionRun) -> Difference:
-    """`run` minus `other`; `InputError` where they are not images of the same modules, pixels and unit."""
+    """`run` minus `other`, which have to be images of the same modules, pixels and unit."""
     for what, one, two in (
         ("unit", run.unit, other.unit),
         ("pixels", *("{1} x {0}".format(*r.views.shape) for r in (run, other))),

@@ -30,7 +30,7 @@ _DECADES = 3.0
 
 @dataclass(frozen=True)
 class Display:
-    """How numbers are shown as colours; `InputError` where the settings do not go together.
+    """How numbers are shown as colours.
 
     `low` and `high` are the numbers that have the first and the last colour; None is automatic: 0, or the smallest number
     where that is negative, and the largest. On the logarithmic scale an automatic `low` is a thousandth of `high`. `half`:

@@ -13,15 +13,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError, first_line, reading
+from ..errors import InputError, reading
 from ..files import require_file
 from ..hdf5 import numbers, opened
 from ..memory import require
 from ..progress import Progress, tell
 from ..recording import recorded_warnings
-from ..validation import one_of, whole_shape
+from ..validation import one_of, shape_text, whole_shape
 from ..volumes.formats import metaimage, numpy_files
-from ..volumes.formats.dicom import is_dicom
+from ..volumes.formats.dicom import TOMOGRAMS, decoded, image_kind, is_dicom, require_grey
 
 RAW_TYPES = ("uint8", "int8", "uint16", "int16", "uint32", "int32", "uint64", "int64", "float32", "float64")
 """Types of the numbers in raw files."""
@@ -31,7 +31,6 @@ _META = (".mhd", ".mha")
 _INTERFILE = (".hdr", ".h33", ".hs")
 COUNTS_FORMATS = (*_NUMPY, *_HDF5, ".dcm", *_META, *_INTERFILE, ".raw", ".bin", ".dat")
 """Endings of files with counts; DICOM files may have any name, and so may raw ones."""
-_TOMOGRAMS = ("RECON TOMO", "RECON GATED TOMO")
 _SAME_SIZE = 1e-3  # relative; files round pixel sizes
 
 
@@ -112,12 +111,7 @@ def read_counts(
     -------
     Counts
         An array of three axes, frames, rows and columns, of the file's own type. `counts_run` checks its numbers, and
-        compares what it is told with the exposure, pixel size and energy windows that the file says.
-
-    Raises
-    ------
-    InputError
-        A file cannot be read, holds something else, or has frames of another size than the one before.
+        compares its arguments with the exposure, pixel size and energy windows in the file.
     """
     return read_frames(path, Layout(dataset, shape, type, big_endian))
 
@@ -172,8 +166,8 @@ def _reader(path: Path, ending: str) -> Callable[[Path, Layout], Counts]:
     )
 
 
-def _counts(array: NDArray[Any], kind: str = "", **said: Sequence[float]) -> Counts:
-    """Checked frames, with an axis of frames also where there is only one, and what the file has `said` about them.
+def _counts(array: NDArray[Any], kind: str = "", **known: Sequence[float]) -> Counts:
+    """Checked frames, with an axis of frames also where there is only one, and what is `known` about them from the file.
 
     That is their `time` (s), `pixel` (along a row and down the columns, mm) and energy `window` (number). Of these, fewer
     than frames are those of blocks of frames, which follow each other.
@@ -184,16 +178,16 @@ def _counts(array: NDArray[Any], kind: str = "", **said: Sequence[float]) -> Cou
     if array.dtype.kind not in "fiu":
         raise InputError(f"expected whole or real numbers, found {array.dtype}")
     counts = array.view(Counts)
-    counts.kind, counts.about[:, 1:3] = kind, said.get("pixel", math.nan)
+    counts.kind, counts.about[:, 1:3] = kind, known.get("pixel", math.nan)
     for column, name in ((0, "time"), (3, "window")):
-        each = np.array(said.get(name) or [math.nan])
+        each = np.array(known.get(name) or [math.nan])
         counts.about[:, column] = each[np.arange(len(array)) * len(each) // len(array)]
     return counts
 
 
 def _require_memory(shape: Sequence[int], itemsize: int) -> None:
     # The numbers, their float32 images, and the checks of them.
-    require((itemsize + 9.0) * math.prod(map(int, shape)), f"counts of {' x '.join(map(str, shape))}")
+    require((itemsize + 9.0) * math.prod(map(int, shape)), f"counts of {shape_text(tuple(shape))}")
 
 
 def _raw(path: Path, layout: Layout) -> NDArray[Any]:
@@ -211,9 +205,8 @@ def _numbers(path: Path, kind: np.dtype[Any], shape: tuple[int, ...], skip: int 
     """All numbers of a file behind its first `skip` bytes."""
     needed, size = skip + kind.itemsize * math.prod(shape), path.stat().st_size
     if needed != size:
-        what = f"{' x '.join(map(str, shape))} numbers of {kind.itemsize} bytes" + (
-            f" behind {skip} bytes" if skip else ""
-        )
+        behind = f" behind {skip} bytes" if skip else ""
+        what = f"{shape_text(shape)} numbers of {kind.itemsize} bytes{behind}"
         raise InputError(f"expected {needed} bytes ({what}), {path.name} has {size}")
     _require_memory(shape, kind.itemsize)
     return np.fromfile(path, kind, offset=skip).reshape(shape)
@@ -273,36 +266,36 @@ def _interfile(path: Path, layout: Layout) -> Counts:
     """
     header = _interfile_header(path)
 
-    def said(key: str, default: str = "") -> str:
+    def text(key: str, default: str = "") -> str:
         return header.get(key, [default])[0]
 
     def number(key: str, default: float | None = None) -> float:
-        text = said(key, "" if default is None else str(default))
+        found = text(key, "" if default is None else str(default))
         try:
-            value = float(text)
+            value = float(found)
         except ValueError:
             value = math.nan
         if not math.isfinite(value):
-            raise InputError(f"{key} := {text}: expected a number" if text else f"it has no {key!r}")
+            raise InputError(f"{key} := {found}: expected a number" if found else f"it has no {key!r}")
         return value
 
     columns, rows = (int(number(f"matrix size [{i}]")) for i in (1, 2))
-    size, kind = int(number("number of bytes per pixel")), said("number format", "nothing").lower()
+    size, kind = int(number("number of bytes per pixel")), text("number format", "nothing").lower()
     letter = {"unsigned integer": "u", "signed integer": "i"}.get(kind, "f" if kind.endswith("float") else "")
     if letter + str(size) not in ("u1", "u2", "u4", "u8", "i1", "i2", "i4", "i8", "f4", "f8"):
         raise InputError(f"number format {kind} of {size} bytes: expected integers, or floats of 4 or 8 bytes")
-    order = said("imagedata byte order").upper()
+    order = text("imagedata byte order").upper()
     if size > 1 and order not in ("LITTLEENDIAN", "BIGENDIAN"):
         raise InputError(f"imagedata byte order {order or 'missing'}: expected LITTLEENDIAN or BIGENDIAN")
     type_ = np.dtype((">" if order == "BIGENDIAN" else "<") + letter + str(size))
-    data = _interfile_data(path, said("name of data file"))
+    data = _interfile_data(path, text("name of data file"))
     skip = int(number("data offset in bytes", 2048 * number("data starting block", 0)))
     frame = rows * columns * size
     count = int(number("total number of images", (data.stat().st_size - skip) // frame if frame else 0))
     keys = (f"{name} (sec)" for name in ("time per projection", "image duration", "study duration"))
-    times = next(([float(text) for text in header[key]] for key in keys if any(header.get(key, ()))), [])
+    times = next((list(map(float, header[key])) for key in keys if any(header.get(key, ()))), [])
     windows = int(number("number of energy windows", 1))
-    pixel = [float(said(f"scaling factor (mm/pixel) [{i}]", "nan")) for i in (1, 2)]
+    pixel = [float(text(f"scaling factor (mm/pixel) [{i}]", "nan")) for i in (1, 2)]
     kind = f"{windows} energy windows" if windows > 1 else ""
     frames = _numbers(data, type_, (count, rows, columns), skip)
     return _counts(frames, kind, time=times, pixel=pixel, window=range(1, windows + 1))
@@ -334,22 +327,14 @@ def _dicom(path: Path, layout: Layout) -> Counts:
     import pydicom
 
     data = pydicom.dcmread(path)
-    kinds: Any = data.get("ImageType") or ()
-    kind = str(kinds[2]) if not isinstance(kinds, str) and len(kinds) > 2 else ""
-    if data.get("Modality") != "NM":
-        raise InputError(
-            f"modality {data.get('Modality') or 'unsaid'}: expected nuclear medicine (NM) with a frame a module"
-        )
-    if kind in _TOMOGRAMS or "SliceVector" in data:
+    if (modality := data.get("Modality")) != "NM":
+        raise InputError(f"modality {modality or 'missing'}: expected nuclear medicine (NM) with a frame a module")
+    if image_kind(data) in TOMOGRAMS or "SliceVector" in data:
         raise InputError("it holds a reconstructed tomogram; expected a frame a module")
-    if data.get("SamplesPerPixel", 1) != 1:
-        raise InputError(f"expected one value per pixel, found {data.SamplesPerPixel} (a colour image)")
+    require_grey(data)
     shape = int(data.get("NumberOfFrames") or 1), int(data.Rows), int(data.Columns)
     _require_memory(shape, 4)
-    try:
-        array = data.pixel_array.reshape(shape)
-    except Exception as error:  # truncated, or compressed by a method that is not installed
-        raise InputError(f"its pixels cannot be read ({first_line(error)})") from error
+    array = decoded(data).reshape(shape)
     slope, intercept = float(data.get("RescaleSlope") or 1), float(data.get("RescaleIntercept") or 0)
     if (slope, intercept) != (1.0, 0.0):
         array = array * slope + intercept
@@ -383,6 +368,6 @@ def _dicom_time(place: Any) -> float:
     return float(place.get("ActualFrameDuration") or math.nan) / 1000
 
 
-def differs(said: float, other: float) -> bool:
-    """Whether a length or time that a file says, NaN where it does not, is more than its rounding from another."""
-    return not (math.isnan(said) or math.isclose(said, other, rel_tol=_SAME_SIZE))
+def differs(recorded: float, other: float) -> bool:
+    """Whether a length or time in a file, NaN where there is none, is more than its rounding from another."""
+    return not (math.isnan(recorded) or math.isclose(recorded, other, rel_tol=_SAME_SIZE))

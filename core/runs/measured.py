@@ -7,14 +7,13 @@ import operator
 import re
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InputError, naming, warn
-from ..files import read_bytes
+from ..files import read_text
 from ..geometry.scanner import Detector, Scanner
 from ..memory import require
 from ..progress import Stages
@@ -67,7 +66,7 @@ def counts_run(
     expected
         Whether the numbers are expected means, which may be fractions.
     detector, magnification, pitch
-        Where the run's images are taken, as of `PinholeSystem.views`; a `pitch` on the real detector is the size of the
+        Where the run's images are taken, see `PinholeSystem.views`; a `pitch` on the real detector is the size of the
         crystal's pixels, by default the crystal's side divided by their number.
     recipe
         Says the rest of the model, for reconstruction: isotope, aperture, crystal, attenuation.
@@ -77,22 +76,15 @@ def counts_run(
     Returns
     -------
     ProjectionRun
-        Of counts, without a volume, its modules in the order of `system`.
-
-    Raises
-    ------
-    InputError
-        `frames`, `orientation` or `time` is missing, `frames` is not the modules' numbers in some order, or the numbers are
-        no counts.
+        A run of counts without a volume, its modules in the order of `system`.
     """
     instance(system, Scanner, "counts: system")
     array = real_numbers(counts, "counts")
     if array.ndim != 3 or not array.size or array.dtype.kind not in "fiu":
-        raise InputError(
-            f"counts: expected numbers (frames, rows, columns), got {array.dtype} {shape_text(array.shape)}"
-        )
+        got = f"{array.dtype} {shape_text(array.shape)}"
+        raise InputError(f"counts: expected numbers (frames, rows, columns), got {got}")
     found = np.asanyarray(counts).view(Counts)
-    require_told(frames, orientation, time, found)
+    require_given(frames, orientation, time, found)
     numbers = frame_numbers(frames, len(array), system)
     words = _words(orientation, len(array))
     time = positive(time, "time (--time)", "s")
@@ -107,9 +99,7 @@ def counts_run(
         images = images[:, ::-1, ::-1]
     n_v, n_u = images.shape[1:]
     views = system.views((n_v, n_u), detector, magnification, pitch)
-    given = {
-        key: value for key, value in (Recipe() if recipe is None else recipe).given.items() if key.startswith(_KEPT)
-    }
+    given = {key: value for key, value in (recipe or Recipe()).given.items() if key.startswith(_KEPT)}
     given |= {"model.kind": "emission", "model.time": time, "detector.plane": detector}
     given |= {"detector.rows": n_v, "detector.columns": n_u, "detector.magnification": float(magnification)}
     record = {
@@ -127,15 +117,12 @@ def counts_run(
 
 
 def recipe_counts(recipe: Recipe, system: Scanner, stages: Stages = lambda stage: None) -> ProjectionRun:
-    """The run of the measured counts that a recipe names; `InputError` as of `read_counts` and `counts_run`.
-
-    Warns where a file says another exposure time or pixel size than is given.
-    """
+    """The run of the measured counts that a recipe names; warns where a file has another exposure time or pixel size."""
     layout = Layout(*(recipe[f"counts.{name}"] for name in ("dataset", "raw_shape", "raw_type", "raw_big_endian")))
     found = read_frames(recipe["counts.files"], layout, stages("reading"))
     frames, orientation = recipe["counts.frames"], recipe["counts.orientation"]
     if recipe["counts.frames_file"] is not None:
-        frames = _read_numbers(Path(recipe["counts.frames_file"]))
+        frames = read_text(recipe["counts.frames_file"])
     with naming(found.name):
         run = counts_run(
             found, system, frames, orientation[0] if orientation and len(orientation) == 1 else orientation,
@@ -147,32 +134,24 @@ def recipe_counts(recipe: Recipe, system: Scanner, stages: Stages = lambda stage
     return run
 
 
-def require_told(frames: Any, orientation: Any, time: Any, found: Counts) -> None:
-    """Raise `InputError`, which says all that is missing and what is known, unless the three are given."""
+def require_given(frames: Any, orientation: Any, time: Any, found: Counts) -> None:
+    """Refuse missing arguments; the message names them all, and what is known of the counts."""
     count, rows, columns = found.shape
     times = found.exposures()
-    said = f"; the file says {_and(times)} s: confirm it" if times else ""
-    missing = [
-        text
-        for value, text in (
-            (frames, "which module each frame is of (--frames, such as 1-80 or 3,1,2)"),
-            (orientation, f"how frames lie on the crystal (--orientation, one of {', '.join(ORIENTATIONS)})"),
-            (time, f"the exposure time in seconds (--time{said})"),
-        )
-        if value is None
-    ]
-    if missing:
-        what = f"{count} frame{'s' * (count > 1)} of {rows} x {columns} pixels" + (
-            f" ({found.kind})" if found.kind else ""
-        )
+    confirm = f"; the file says {_and(times)} s: confirm it" if times else ""
+    texts = {
+        "which module each frame is of (--frames, such as 1-80 or 3,1,2)": frames,
+        f"how frames lie on the crystal (--orientation, one of {', '.join(ORIENTATIONS)})": orientation,
+        f"the exposure time in seconds (--time{confirm})": time,
+    }
+    if missing := [text for text, value in texts.items() if value is None]:
+        kind = f" ({found.kind})" if found.kind else ""
+        what = f"{count} frame{'s' * (count > 1)} of {rows} x {columns} pixels{kind}"
         raise InputError(f"{what}; say {', and '.join(missing)}")
 
 
 def frame_numbers(frames: Any, count: int, system: Scanner) -> list[int | None]:
-    """The modules' numbers in the order of `count` frames; `InputError` unless each module has one frame.
-
-    None of a frame that is not used.
-    """
+    """The modules' numbers in the order of `count` frames, None for a frame that is not used; each module has one frame."""
     found = _parsed(frames) if isinstance(frames, str) else _whole(frames)
     name = "frames (--frames)"
     if len(found) != count:
@@ -211,13 +190,6 @@ def _whole(values: Any) -> list[int | None]:
         raise InputError(f"frames (--frames): expected the modules' numbers, got {values!r:.40}") from None
 
 
-def _read_numbers(path: Path) -> str:
-    try:
-        return read_bytes(path).decode()
-    except UnicodeDecodeError:
-        raise InputError(f"{path}: not a text file") from None
-
-
 def _words(orientation: Any, count: int) -> list[str]:
     words = [orientation] * count if isinstance(orientation, str) else list(orientation)
     if len(words) != count:
@@ -228,7 +200,7 @@ def _words(orientation: Any, count: int) -> list[str]:
 
 
 def _require_counts(array: NDArray[Any], expected: bool) -> None:
-    """Raise `InputError` naming frame, row and column, from 1, unless the numbers are counts."""
+    """Refuse numbers that are no counts; the message names frame, row and column, from 1."""
     if array.dtype.kind == "f":
         require_finite(array, "counts")
     for wrong, what in (
@@ -255,20 +227,20 @@ def _warn_of_others(found: Counts, used: list[int], words: list[str], run: Proje
     """Warn where the files say another time or pixel size of the frames `used`, or that they are of several windows."""
     time, times = run.recipe["model.time"], found.exposures(used)
     if any(differs(one, time) for one in times):
-        said = "exposures" if len(times) > 1 else "an exposure"
-        warn(f"{found.name}: the file says {said} of {_and(times)} s; taken as {time:g} s, as given")
+        what = "exposures" if len(times) > 1 else "an exposure"
+        warn(f"{found.name}: the file says {what} of {_and(times)} s; taken as {time:g} s, as given")
     if len(windows := np.unique(found.about[used, 3])) > 1 and np.isfinite(windows).all():
-        said = f"{found.name}: frames of the energy windows {_and(windows.tolist())} are used"
-        warn(f"{said}; say none (--frames) for those that are not meant")
+        what = f"frames of the energy windows {_and(windows.tolist())} are used"
+        warn(f"{found.name}: {what}; say none (--frames) for those that are not meant")
     steps = np.linalg.norm([run.views.u_steps, run.views.v_steps], axis=2) / run.settings["magnification"]
     for k, along_u, along_v in zip(used, *steps, strict=True):
         size, own = found.about[k, 1:3], (along_u, along_v)
         own = own[::-1] if words[k].endswith("u") else own  # along the frame's rows, and down its columns
         if any(map(differs, size, own)):
-            said, taken = (" x ".join(f"{x:.4g}" for x in sizes) for sizes in (size, own))
+            recorded, taken = (" x ".join(f"{x:.4g}" for x in sizes) for sizes in (size, own))
             covering = "so that they cover the crystal; if the file is right, give their size (--pitch)"
             why = covering if run.settings["pitch_mm"] is None else "as given"
-            warn(f"{found.name}: the file says pixels of {said} mm; taken as {taken} mm, {why}")
+            warn(f"{found.name}: the file says pixels of {recorded} mm; taken as {taken} mm, {why}")
             return
 
 

@@ -27,7 +27,7 @@ def as_seen(images: ArrayLike) -> NDArray:
 
 
 COLUMNS = 20
-"""Images in a row, unless told otherwise."""
+"""Images in a row by default."""
 _BORDER = 64
 """Grey between the images of a sheet, 0 to 255."""
 _SMALLEST = 64
@@ -94,10 +94,10 @@ def sheet(
     """Draw the images (M, n_v, n_u) of modules with these `numbers` and `rings` (M,), a ring in a row, with a colour bar.
 
     The numbers may be texts. Rings follow each other in the order of their modules; one of more than `COLUMNS` modules
-    takes several rows. Where the
-    images have more than `pixels` together, they are shown smaller, as means over blocks of pixels; small ones are shown
-    larger, so that the numbers do not hide them. The colour bar's ends are the window of `display`, which is by default
-    that of all exact numbers. Each image has what `totals` says of the part that is shown in a corner if there is room.
+    takes several rows. Where the images have more than `pixels` together, they are shown smaller, as means over blocks of
+    pixels; small ones are shown larger, so that the numbers do not hide them. The colour bar's ends are the window of
+    `display`, which is by default that of all exact numbers. Each image has what `totals` says of the part that is shown in
+    a corner if there is room.
     """
     display = display or Display()
     window = display.window(projections)
@@ -138,14 +138,14 @@ def labels(run: ProjectionRun) -> list[str]:
 
 
 def caption(run: ProjectionRun) -> str:
-    """What was said of measured counts and how a sheet shows them, in a line; empty for other runs."""
+    """A line about measured counts and how a sheet shows them; empty for other runs."""
     if not run.is_measured:
         return ""
     words = run.settings["orientation"]
     lay = words if isinstance(words, str) else "each its own way"
     side = "crystals seen from behind" if run.settings["detector"] == "real" else "what the pinholes see"
-    said = f"{run.settings['counts']}, {run.recipe['model.time']:g} s, frames {lay}"
-    return f"{said}. Module (frame): {side}, +v at the top, +u at the left"
+    counts = f"{run.settings['counts']}, {run.recipe['model.time']:g} s, frames {lay}"
+    return f"{counts}. Module (frame): {side}, +v at the top, +u at the left"
 
 
 def _captioned(picture: NDArray[np.uint8], text: str) -> NDArray[np.uint8]:
@@ -222,7 +222,7 @@ def _write(picture: NDArray[np.uint8], text: str, row: int, column: int, size: f
 
 
 def write_png(picture: ArrayLike, path: str | os.PathLike[str]) -> None:
-    """Write a picture (`png`) to a file; `InputError` where it cannot be written."""
+    """Write a picture (`png`) to a file."""
     write_bytes(path, png(picture))
 
 

@@ -1,11 +1,10 @@
 """Changes that keep the voxels' values: crop, pad, reorient, move, and split by labels."""
 
-from itertools import permutations
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InputError
+from ..geometry.frames import moved
 from ..geometry.grid import Grid
 from ..memory import require
 from ..validation import freeze, instance, one_for_all, real_array, real_numbers
@@ -21,7 +20,7 @@ def crop(volume: Volume, start: ArrayLike, stop: ArrayLike) -> Volume:
         whole = " x ".join(map(str, shape))
         raise InputError(f"crop: from {low.tolist()} to {high.tolist()} is no part of {whole} voxels")
     part = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
-    return _moved(volume, volume.array[part], low)
+    return _part(volume, volume.array[part], low)
 
 
 def crop_to_box(volume: Volume, low: ArrayLike, high: ArrayLike) -> Volume:
@@ -31,8 +30,7 @@ def crop_to_box(volume: Volume, low: ArrayLike, high: ArrayLike) -> Volume:
     if np.any(low >= high):
         raise InputError(f"box: expected low below high, got {low.tolist()} to {high.tolist()} mm")
     corners = np.stack(np.meshgrid(*zip(low, high, strict=True), indexing="ij"), axis=-1).reshape(-1, 3)
-    back = volume.grid.index_from_world
-    index = corners @ back[:3, :3].T + back[:3, 3]
+    index = moved(volume.grid.index_from_world, corners)
     # A box that only touches a voxel's face, up to rounding, does not include the voxel.
     start = np.clip(np.floor(index.min(axis=0) + 0.5 + 1e-6), 0, volume.grid.shape).astype(int)
     stop = np.clip(np.ceil(index.max(axis=0) + 0.5 - 1e-6), 0, volume.grid.shape).astype(int)
@@ -55,22 +53,17 @@ def pad(volume: Volume, before: ArrayLike, after: ArrayLike, value: float | None
     require(4.0 * float(np.prod(shape, dtype=float)), "a volume of {} x {} x {} voxels".format(*shape))
     array = np.full(shape, value, np.float32)
     array[tuple(slice(a, a + n) for a, n in zip(low, volume.grid.shape, strict=True))] = volume.array
-    return _moved(volume, array, -low)
+    return _part(volume, array, -low)
 
 
 def canonical(volume: Volume) -> Volume:
     """The volume flipped and transposed so that its index axes are closest to right, front and head (RAS)."""
+    from nibabel.orientations import apply_orientation, inv_ornt_aff, io_orientation
+
     instance(volume, Volume, "canonical")
-    directions = volume.grid.affine[:3, :3] / volume.grid.spacing
-    # Of all assignments of index axes to world axes the one with the largest sum of cosines.
-    order = max(permutations(range(3)), key=lambda axes: sum(abs(directions[i, axis]) for i, axis in enumerate(axes)))
-    array, affine = volume.array.transpose(order), volume.grid.affine[:, [*order, 3]].copy()
-    for axis in range(3):
-        if affine[axis, axis] < 0:
-            array = np.flip(array, axis)
-            affine[:3, 3] += affine[:3, axis] * (array.shape[axis] - 1)
-            affine[:3, axis] *= -1
-    grid = Grid(array.shape, affine)  # type: ignore[arg-type]
+    turns = io_orientation(volume.grid.affine)
+    array = apply_orientation(volume.array, turns)
+    grid = Grid(array.shape, volume.grid.affine @ inv_ornt_aff(turns, volume.grid.shape))
     return Volume(freeze(np.array(array, order="C")), grid, volume.quantity)
 
 
@@ -118,6 +111,6 @@ def _indices(value: ArrayLike, name: str) -> NDArray[np.int64]:
     return numbers.astype(np.int64)
 
 
-def _moved(volume: Volume, array: NDArray[np.float32], start: NDArray[np.int64]) -> Volume:
+def _part(volume: Volume, array: NDArray[np.float32], start: NDArray[np.int64]) -> Volume:
     """`array` as a volume whose first voxel has the index `start` in `volume`."""
     return Volume(array, volume.grid.box(start, array.shape), volume.quantity)

@@ -58,7 +58,7 @@ def resample(
 
 
 def values_at(volume: Volume, points: NDArray[np.float64], method: str = "linear") -> Floats:
-    """Values (N,) at world `points` (N, 3), mm; `method` as of `resample`, but for ``"mean"``; 0 outside the grid."""
+    """Values (N,) at world `points` (N, 3), mm, by the `method` "linear" or "nearest" of `resample`; 0 outside the grid."""
     index = volume.grid.index_from_world
     return _samples(volume.array, index[:3, :3] @ points.T + index[:3, 3:], _TAPS[method])
 

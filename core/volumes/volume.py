@@ -41,7 +41,7 @@ class Volume:
 
     The float32 `array` (n_x, n_y, n_z) is read-only, in C order, and indexed ``[ix, iy, iz]``; one that is so already is
     kept, any other is copied. The `quantity` is ``"activity"`` (kBq/mL), ``"mu"`` (1/mm), ``"hu"``, or another of
-    `UNITS`. `InputError` if the array's shape is not the grid's, or a value is not finite.
+    `UNITS`.
     """
 
     array: NDArray[np.float32]
@@ -66,7 +66,7 @@ class Volume:
 
 
 def require_quantity(quantity: str, taken: Sequence[str], name: str) -> None:
-    """Raise `InputError` unless `quantity` is one of those `taken` by `name`; for CT numbers it says how to convert them."""
+    """Refuse a `quantity` that is none of those `taken` by `name`; for CT numbers the message says how to convert them."""
     if quantity not in taken:
         advice = _CONVERT if quantity == "hu" and "mu" in taken else ""
         raise InputError(f"{name}: expected a volume of {' or '.join(taken)}, got {quantity}{advice}")

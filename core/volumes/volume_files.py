@@ -7,7 +7,7 @@ from pathlib import Path
 from numpy.typing import ArrayLike
 
 from ..errors import InputError, naming, reading, refusing
-from ..files import replacing, require_file
+from ..files import ending_of, replacing, require_ending, require_file
 from ..progress import Progress
 from ..validation import instance, real_array
 from .formats import dicom, hdf5, metaimage, nifti, nrrd, numpy_files
@@ -92,9 +92,7 @@ def read_volume_of(
 def write_volume(volume: Volume, path: str | os.PathLike[str]) -> None:
     """Write a volume as NIfTI (.nii, .nii.gz; its affine is rounded to float32), .npz, .nrrd or .h5 (exact)."""
     path = Path(path)
-    write = _WRITERS.get(_ending(path, VOLUME_FORMATS))
-    if write is None:
-        raise InputError(f"{path}: expected a name ending in {', '.join(VOLUME_FORMATS)}")
+    write = _WRITERS[require_ending(path, VOLUME_FORMATS)]
     instance(volume, Volume, "write_volume")
     with replacing(path) as temporary:
         write(volume, temporary)
@@ -106,7 +104,7 @@ def _contents(path: Path, series: str | None, progress: Progress | None) -> Cont
         is_folder = path.is_dir()
     if not is_folder:
         require_file(path)
-    ending = _ending(path, READ_FORMATS)
+    ending = ending_of(path, READ_FORMATS)
     is_series = is_folder or ending == ".dcm" or (not ending and dicom.is_dicom(path))
     with naming(path):
         if not (ending or is_series):
@@ -117,9 +115,3 @@ def _contents(path: Path, series: str | None, progress: Progress | None) -> Cont
             raise InputError("only folders of DICOM files hold several series")
     with reading(path, "DICOM" if is_series else ending):
         return dicom.read(path, series, progress) if is_series else _READERS[ending](path)
-
-
-def _ending(path: Path, endings: tuple[str, ...]) -> str:
-    """Which of `endings` the name has, or ""."""
-    name = path.name.lower()
-    return next((ending for ending in endings if name.endswith(ending)), "")

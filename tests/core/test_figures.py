@@ -152,7 +152,7 @@ def test_pixels_and_svg_show_the_same_drawing(tmp_path):
     root = xml.parse(tmp_path / "figure.svg").getroot()
     assert [mark.tag.split("}")[1] for mark in root] == ["rect", "polygon", "polyline", "text", "polygon"]
     assert root[3].text == "1 < 2 & µ"
-    with pytest.raises(mph.InputError, match=r"expected a name ending in \.png or \.svg"):
+    with pytest.raises(mph.InputError, match=r"expected a name ending in \.png, \.svg"):
         page.write(tmp_path / "figure.pdf")
 
 

@@ -9,18 +9,17 @@ from ...geometry.views import Views
 from ...physics.isotopes import ISOTOPES, isotope
 from ...physics.materials import APERTURES, CRYSTALS
 from ...physics.optics import Optics
-from ..options import add_command, add_workbook, number_or_name
+from ..options import add_run, add_workbook, number_or_name
 
 MATERIAL_OPTIONS = ("aperture_mu", "opening_angle", "crystal_mu", "intrinsic_fwhm", "isotope")
 """Destinations of the options of `add_materials`."""
 
 
-def add_action(actions, name: str, summary: str, example: str, run: Any) -> argparse.ArgumentParser:  # type: ignore[no-untyped-def]
-    """The parser of an action on a workbook, with ``--json``."""
-    parser = add_command(actions, name, summary, f"mphdrr geometry {name} scanner.xlsx{example}")
+def add_action(actions: Any, name: str, run: Any) -> argparse.ArgumentParser:
+    """The parser of an action on a workbook, with ``--json``; its help is the docstring of `run`."""
+    parser = add_run(actions, name, run)
     add_workbook(parser)
     parser.add_argument("--json", action="store_true", help="print JSON")
-    parser.set_defaults(run=run)
     return parser
 
 

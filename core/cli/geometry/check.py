@@ -17,11 +17,7 @@ from .arguments import add_action, add_edge, optics_of
 
 def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     """Add the action."""
-    summary = (
-        "compare the workbook with the design formulas, and find modules that overlap, do not see their ROI, block each "
-        "other or have unsuitable plates"
-    )
-    parser = add_action(actions, "check", summary, " --wall 3 --strict", _run)
+    parser = add_action(actions, "check", _run)
     add = parser.add_argument
     add("--plate", type=float, default=2.0, metavar="MM", help="thickness of the aperture plates")
     add("--wall", type=float, default=2.0, metavar="MM", help="thickness of the collimators' walls")
@@ -33,6 +29,11 @@ def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
 
 
 def _run(arguments: argparse.Namespace) -> None:
+    """Compare the workbook with the design formulas, and find modules that overlap, do not see their ROI, block each other
+    or have unsuitable plates.
+
+    mphdrr geometry check scanner.xlsx --wall 3 --strict
+    """
     if arguments.aperture_mu is None:
         refuse(arguments, ("isotope",), "needs --aperture-mu")
     with recorded_warnings() as messages:

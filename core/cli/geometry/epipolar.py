@@ -23,11 +23,7 @@ _CHANCE = 0.01
 
 def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     """Add the action."""
-    example = (
-        " --pixel 7:120,130\nexample: mphdrr geometry epipolar scanner.xlsx --pixel 7:120,130 --pixel 31:99.4,140.2"
-    )
-    summary = "say where all modules see what a pixel of one sees; or where a point is, by its pixels in several"
-    parser = add_action(actions, "epipolar", summary, example + " --pixel 52:131,88 --sigma 0.5", _run)
+    parser = add_action(actions, "epipolar", _run)
     add = parser.add_argument
     pixel = "module number, column and row of its image, counted from 0; several: of one point, whose place is sought"
     add("--pixel", action="append", required=True, metavar="MODULE:COLUMN,ROW", help=pixel)
@@ -39,6 +35,11 @@ def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
 
 
 def _run(arguments: argparse.Namespace) -> None:
+    """Say where all modules see what a pixel of one sees; or where a point is, by its pixels in several.
+
+    mphdrr geometry epipolar scanner.xlsx --pixel 7:120,130
+    mphdrr geometry epipolar scanner.xlsx --pixel 7:120,130 --pixel 31:99.4,140.2 --pixel 52:131,88 --sigma 0.5
+    """
     system = read_workbook(arguments)
     pixels = [_pixel(system, text) for text in arguments.pixel]
     views = views_of(system, arguments)
@@ -78,11 +79,10 @@ def _print_ray(arguments: argparse.Namespace, system: PinholeSystem, views: View
     else:
         lines = [f"{text} from a depth of {near:.2f} to {far:.2f} mm: from ({start}) to ({end}) mm"]
         lines += [" module  from column, row    to column, row       epipole"]
+    shown = ("from", "epipole") if near == far else ("from", "to", "epipole")
     for row in rows:
-        shown = [_text(row[name]) for name in (("from",) if near == far else ("from", "to"))]
-        lines.append(
-            f"{row['number']:7d}" + "".join(f"{each:>18}" for each in (*shown, _text(row["epipole"]))).rstrip()
-        )
+        pixels = "".join(f"{_text(row[name]):>18}" for name in shown)
+        lines.append(f"{row['number']:7d}{pixels.rstrip()}")
     seeing = sum(row["from"] is not None for row in rows)
     lines += [f"{seeing} of {len(rows)} modules have it in their image; the epipole is where a module has the pinhole"]
     print_answer(arguments, {**record, "units": "pixels, mm"}, lines)
@@ -102,30 +102,18 @@ def _print_point(
     columns = {"number": system.numbers[index], "column": fit.residuals[:, 0], "row": fit.residuals[:, 1]}
     rows = table_rows({**columns, "misfit": fit.misfits, "p_value": fit.misfit_p_values})
     modules = [{name: None if x != x else x for name, x in row.items()} for row in rows]  # no NaN in JSON
-    record = {
-        "point": fit.point.tolist(),
-        "standard_deviations": fit.standard_deviations.tolist(),
-        "covariance": fit.covariance.tolist(),
-        "sigma": sigma,
-        "chi2": fit.chi2,
-        "degrees": fit.degrees,
-        "p_value": fit.p_value,
-        "modules": modules,
-        "misfitting": None if odd is None else numbers[odd],
-        "units": "mm, mm^2, pixels",
-    }
+    names = ("point", "standard_deviations", "covariance", "chi2", "degrees", "p_value")
+    record = {name: np.asarray(getattr(fit, name)).tolist() for name in names} | {"sigma": sigma, "modules": modules}
+    record |= {"misfitting": None if odd is None else numbers[odd], "units": "mm, mm^2, pixels"}
     axes = zip("xyz", fit.point, fit.standard_deviations, strict=True)
     lines = ["point " + "   ".join(f"{axis} {x:.3f} +- {sd:.3f}" for axis, x, sd in axes) + " mm"]
     lines += [" module  residual column       row    misfit     chance"]
-    line = "{number:7d} {column:16.3f} {row:9.3f}"
     for row in rows:
         known = row["misfit"] == row["misfit"]
-        lines += [
-            line.format(**row) + (" {misfit:9.2f} {p_value:10.2g}".format(**row) if known else "         -          -")
-        ]
-    lines += [
-        f"chi2 {fit.chi2:.2f} of {fit.degrees} degrees of freedom, a chance of {fit.p_value:.2g} if sigma is {sigma:g} px"
-    ]
+        misfit = " {misfit:9.2f} {p_value:10.2g}" if known else "         -          -"
+        lines.append(f"{{number:7d}} {{column:16.3f}} {{row:9.3f}}{misfit}".format(**row))
+    chance = f"a chance of {fit.p_value:.2g} if sigma is {sigma:g} px"
+    lines += [f"chi2 {fit.chi2:.2f} of {fit.degrees} degrees of freedom, {chance}"]
     if odd is not None:
         lines += [f"module {numbers[odd]} does not fit: without it chi2 falls by {fit.misfits[odd]:.2f}"]
     elif fit.p_value < _CHANCE:

@@ -6,26 +6,18 @@ from pathlib import Path
 from types import UnionType
 from typing import Any, Literal
 
-from ...errors import InputError
-from ...exchange import FORMATS, Format, write_geometry
-from ...geometry.grid import Grid
-from ...volumes.volume_files import read_volume
-from ..options import add_command, add_workbook, chosen_modules, output_path, read_workbook
+from .... import core as mph
+from ...exchange import FORMATS, Format
+from ..options import add_run, add_workbook, chosen_modules, output_path, read_workbook
 from .arguments import add_views, views_of
 
-_WORDS = {bool: "yes|no", int: "N", float: "NUMBER", str: "TEXT", tuple: "NUMBER,NUMBER,...", Grid: "VOLUME-FILE"}
+_WORDS = {bool: "yes|no", int: "N", float: "NUMBER", str: "TEXT", tuple: "NUMBER,NUMBER,...", mph.Grid: "VOLUME-FILE"}
 """How a value of each type is shown in the help; options of other types are for scripts."""
 
 
 def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     """Add the action."""
-    parser = add_command(
-        actions,
-        "export",
-        "write the geometry for another program",
-        "mphdrr geometry export scanner.xlsx -o scanner.xml --size 128 128 --detector real\n"
-        "example: mphdrr geometry export scanner.xlsx -o cameras.npz --format pytorch3d --set in_ndc=no",
-    )
+    parser = add_run(actions, "export", _run)
     add_workbook(parser)
     add = parser.add_argument
     add("-o", "--output", required=True, metavar="OUT", help="file, or new folder, to write")
@@ -35,15 +27,19 @@ def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     add("--modules", metavar="RANGE", help="such as 1-40 or 1-20,41; default: all")
     described = "\n".join(map(_described, FORMATS.values()))
     parser.epilog = f"formats, with their options for --set:\n{described}\n{parser.epilog}"
-    parser.set_defaults(run=_run)
 
 
 def _run(arguments: argparse.Namespace) -> None:
+    """Write the geometry for another program.
+
+    mphdrr geometry export scanner.xlsx -o scanner.xml --size 128 128 --detector real
+    mphdrr geometry export scanner.xlsx -o cameras.npz --format pytorch3d --set in_ndc=no
+    """
     format = FORMATS[arguments.format] if arguments.format else _format_of(arguments.output)
     options = dict(_option(format, text) for text in arguments.set)
     path = output_path(arguments.output, format.suffixes) if format.suffixes else Path(arguments.output)
     system = chosen_modules(read_workbook(arguments), arguments.modules)
-    write_geometry(system, path, format.name, views=views_of(system, arguments), **options)
+    mph.write_geometry(system, path, format.name, views=views_of(system, arguments), **options)
     print(f"{path}: {format.title}, {len(system)} module{'s' * (len(system) > 1)}")
 
 
@@ -54,7 +50,7 @@ def _format_of(output: str) -> Format:
         return fitting[0]
     problem = "several formats have this ending" if fitting else "no format has this ending"
     names = ", ".join(f.name for f in fitting or FORMATS.values())
-    raise InputError(f"{output}: {problem}; choose one by --format: {names}")
+    raise mph.InputError(f"{output}: {problem}; choose one by --format: {names}")
 
 
 def _options(format: Format) -> dict[str, tuple[Any, Any]]:
@@ -91,12 +87,12 @@ def _option(format: Format, text: str) -> tuple[str, Any]:
     name, equals, value = text.partition("=")
     options = _options(format)
     if not equals or name not in options:
-        raise InputError(
+        raise mph.InputError(
             f"--set {text!r}: expected NAME=VALUE, format {format.name} has {', '.join(options) or 'none'}"
         )
     type_, _ = options[name]
-    if type_ is Grid:
-        return name, read_volume(value).grid
+    if type_ is mph.Grid:
+        return name, mph.read_volume(value).grid
     try:
         if type_ is bool:
             return name, {"yes": True, "no": False}[value]
@@ -104,4 +100,4 @@ def _option(format: Format, text: str) -> tuple[str, Any]:
             return name, tuple(float(part) for part in value.split(","))
         return name, value if typing.get_origin(type_) is Literal else type_(value)  # the format knows its choices
     except (KeyError, ValueError):
-        raise InputError(f"--set {text!r}: expected {name}={_word(type_)}") from None
+        raise mph.InputError(f"--set {text!r}: expected {name}={_word(type_)}") from None

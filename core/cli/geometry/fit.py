@@ -15,11 +15,14 @@ _FOLLOWS = 0.1  # mm off the ellipse that rounding in a workbook explains
 
 def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     """Add the action."""
-    summary = "find the ellipse that each ring of modules follows, and the modules' distances from it"
-    add_action(actions, "fit", summary, "", _run)
+    add_action(actions, "fit", _run)
 
 
 def _run(arguments: argparse.Namespace) -> None:
+    """Find the ellipse that each ring of modules follows, and the modules' distances from it.
+
+    mphdrr geometry fit scanner.xlsx
+    """
     rings = [_record(fit) for fit in fit_rings(read_workbook(arguments))]
     print_answer(arguments, {"rings": rings, "units": "mm, degrees"}, _lines(rings))
 

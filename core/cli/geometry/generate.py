@@ -1,15 +1,13 @@
 """``mphdrr geometry generate SHAPE -o FILE``."""
 
 import argparse
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
-from ...errors import InputError
-from ...geometry.generators import ellipse_rings, plate_rings, regular_polygon
-from ...geometry.system import PinholeSystem
-from ...workbook import write_system
-from ..options import add_command, output_path
+from .... import core as mph
+from ..options import add_command, add_run, output_path
 
 _SIZES = {
     "--d": ("pinhole_diameter", 2.3, "pinhole diameter"),
@@ -22,20 +20,10 @@ _SIZES = {
 
 def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     """Add the action."""
-    generate = add_command(
-        actions,
-        "generate",
-        "make the workbook of a scanner from a few parameters",
-        "mphdrr geometry generate ellipse --semi-axes 273 220.5 --z -71 -24 --mirrored -o scanner.xlsx",
-    )
+    example = "mphdrr geometry generate ellipse --semi-axes 273 220.5 --z -71 -24 --mirrored -o scanner.xlsx"
+    generate = add_command(actions, "generate", "make the workbook of a scanner from a few parameters", example)
     shapes = generate.add_subparsers(metavar="SHAPE", required=True)
-    parser = add_command(
-        shapes,
-        "ellipse",
-        "rings of modules on an ellipse",
-        "mphdrr geometry generate ellipse --modules 20 --semi-axes 273 220.5 --center 42.43 -42.43 --start 14.25 "
-        "--end 255.6 --spacing arc --z -71 -24 --mirrored -o scanner.xlsx",
-    )
+    parser = add_run(shapes, "ellipse", _ellipse)
     add = parser.add_argument
     add("--modules", type=int, default=20, metavar="M", help="modules of each ring")
     add("--semi-axes", type=float, nargs="+", required=True, metavar="MM", help="along x and y, or a circle's radius")
@@ -44,13 +32,8 @@ def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     add("--start", type=float, default=0.0, metavar="DEG", help="azimuth of a ring's first module")
     add("--end", type=float, default=360.0, metavar="DEG", help="of its last; a full turn after the start: closed")
     add("--spacing", choices=("angle", "arc"), default="angle", help="equal steps in angle, or in arc")
-    _add_modules(parser, _ellipse)
-    parser = add_command(
-        shapes,
-        "plates",
-        "rings of modules on flat plates",
-        "mphdrr geometry generate plates --polygon 5 --apothem 220 --modules 4 --z -71 -24 --mirrored -o scanner.xlsx",
-    )
+    _add_modules(parser)
+    parser = add_run(shapes, "plates", _plates)
     add = parser.add_argument
     add("--modules", type=int, nargs="+", default=[4], metavar="N", help="of each plate in each ring, or one for all")
     plates = parser.add_mutually_exclusive_group(required=True)
@@ -59,44 +42,54 @@ def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     add("--apothem", type=float, metavar="MM", help="distance of the polygon's plates")
     add("--rotation", type=float, default=0.0, metavar="DEG", help="azimuth of its first plate")
     add("--open", action="store_true", help="no plate joins the last vertex to the first")
-    _add_modules(parser, _plates)
+    _add_modules(parser)
 
 
-def _add_modules(parser: argparse.ArgumentParser, generate: Any) -> None:
+def _add_modules(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--z", type=float, nargs="+", required=True, metavar="MM", help="of each ring")
     parser.add_argument("--mirrored", action="store_true", help="add the rings' mirror images at z = 0")
     group = parser.add_argument_group("the modules")
     for name, (size, default, text) in _SIZES.items():
         group.add_argument(name, dest=size, type=float, default=default, metavar="MM", help=text)
     parser.add_argument("-o", "--output", required=True, metavar="FILE", help=".xlsx")
-    parser.set_defaults(run=_run, generate=generate)
 
 
-def _run(arguments: argparse.Namespace) -> None:
+def _write(arguments: argparse.Namespace, generate: Callable[..., mph.PinholeSystem], *shape: Any, **more: Any) -> None:
     path = output_path(arguments.output, (".xlsx",))
-    sizes = {size: getattr(arguments, size) for size, _, _ in _SIZES.values()}
-    system = arguments.generate(arguments, {"z": arguments.z, "mirrored": arguments.mirrored, **sizes})
-    write_system(system, path)
+    modules = {name: getattr(arguments, name) for name in ("z", "mirrored", *(size for size, _, _ in _SIZES.values()))}
+    system = generate(*shape, **more, **modules)
+    mph.write_system(system, path)
     b, l = system.pinhole_distance, system.collimator_length
     print(f"{path}: {len(system)} modules, b {b.min():.2f} to {b.max():.2f} mm, l {l.min():.2f} to {l.max():.2f} mm")
 
 
-def _ellipse(arguments: argparse.Namespace, modules: dict[str, Any]) -> PinholeSystem:
+def _ellipse(arguments: argparse.Namespace) -> None:
+    """Rings of modules on an ellipse.
+
+    mphdrr geometry generate ellipse --modules 20 --semi-axes 273 220.5 --center 42.43 -42.43 --start 14.25 --end 255.6
+        --spacing arc --z -71 -24 --mirrored -o scanner.xlsx
+    """
     axes = arguments.semi_axes
     start, end, rotation = np.deg2rad([arguments.start, arguments.end, arguments.rotation])
     ring = {"start": start, "end": end, "spacing": arguments.spacing}
     curve = {"center": arguments.center, "rotation": rotation}
-    return ellipse_rings(arguments.modules, axes[0] if len(axes) == 1 else axes, **ring, **curve, **modules)
+    shape = arguments.modules, axes[0] if len(axes) == 1 else axes
+    _write(arguments, mph.ellipse_rings, *shape, **ring, **curve)
 
 
-def _plates(arguments: argparse.Namespace, modules: dict[str, Any]) -> PinholeSystem:
+def _plates(arguments: argparse.Namespace) -> None:
+    """Rings of modules on flat plates.
+
+    mphdrr geometry generate plates --polygon 5 --apothem 220 --modules 4 --z -71 -24 --mirrored -o scanner.xlsx
+    """
     if (arguments.polygon is None) != (arguments.apothem is None):
-        raise InputError("--polygon and --apothem: expected both, or --vertices")
+        raise mph.InputError("--polygon and --apothem: expected both, or --vertices")
     if arguments.polygon is not None:
-        vertices = regular_polygon(arguments.polygon, arguments.apothem, float(np.deg2rad(arguments.rotation)))
+        vertices = mph.regular_polygon(arguments.polygon, arguments.apothem, float(np.deg2rad(arguments.rotation)))
     elif len(arguments.vertices) % 2:
-        raise InputError(f"--vertices: expected x and y of each, got {len(arguments.vertices)} numbers")
+        raise mph.InputError(f"--vertices: expected x and y of each, got {len(arguments.vertices)} numbers")
     else:
         vertices = np.reshape(arguments.vertices, (-1, 2))
     counts = arguments.modules
-    return plate_rings(counts[0] if len(counts) == 1 else counts, vertices, closed=not arguments.open, **modules)
+    shape = counts[0] if len(counts) == 1 else counts, vertices
+    _write(arguments, mph.plate_rings, *shape, closed=not arguments.open)

@@ -5,10 +5,10 @@ from typing import Any
 
 import numpy as np
 
-from ...geometry.grid import Grid
+from .... import core as mph
 from ...physics.maps import MAPS
-from ...validation import whole_shape
-from ...volumes.volume_files import VOLUME_FORMATS, write_volume
+from ...validation import shape_text, whole_shape
+from ...volumes.volume_files import VOLUME_FORMATS
 from ..options import chosen_modules, one_or_three, output_path, print_answer, progress_bar, read_workbook, refuse
 from .arguments import MATERIAL_OPTIONS, add_action, add_materials, optics_of
 
@@ -17,8 +17,7 @@ _OF_MATERIALS = ("sensitivity", "resolution")
 
 def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     """Add the action."""
-    example = " --quantity sensitivity --voxels 64 --spacing 3 -o sensitivity.nii.gz"
-    parser = add_action(actions, "map", "make a volume of what the scanner does in every voxel", example, _run)
+    parser = add_action(actions, "map", _run)
     add = parser.add_argument
     quantity = (
         "counts per decay; number of modules that see the voxel; expected FWHM, mm; completeness of the angular "
@@ -35,6 +34,10 @@ def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
 
 
 def _run(arguments: argparse.Namespace) -> None:
+    """Make a volume of what the scanner does in every voxel.
+
+    mphdrr geometry map scanner.xlsx --quantity sensitivity --voxels 64 --spacing 3 -o sensitivity.nii.gz
+    """
     path = output_path(arguments.output, VOLUME_FORMATS)
     if arguments.quantity not in _OF_MATERIALS:
         refuse(arguments, MATERIAL_OPTIONS, f"has no effect on --quantity {arguments.quantity}")
@@ -44,11 +47,11 @@ def _run(arguments: argparse.Namespace) -> None:
     settings: dict[str, Any] = {}
     if arguments.quantity in _OF_MATERIALS:
         settings["optics"] = optics_of(arguments, system)
-    grid = Grid.centered(voxels, spacing, arguments.center)
+    grid = mph.Grid.centered(voxels, spacing, arguments.center)
     volume = MAPS[arguments.quantity](system, grid, **settings, progress=progress_bar("mapping"))
-    write_volume(volume, path)
+    mph.write_volume(volume, path)
     low, high, mean = (float(f(volume.array)) for f in (np.min, np.max, np.mean))
     record = {"file": str(path), "quantity": volume.quantity, "unit": volume.unit}
-    shape = " x ".join(map(str, volume.grid.shape))
+    shape = shape_text(volume.grid.shape)
     text = f"{path}: {shape} voxels, {volume.quantity} from {low:.4g} to {high:.4g} {volume.unit}".removesuffix(" 1")
     print_answer(arguments, {**record, "minimum": low, "maximum": high, "mean": mean}, [text])

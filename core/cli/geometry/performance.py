@@ -14,15 +14,17 @@ from .arguments import add_action, add_materials, optics_of
 
 def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     """Add the action."""
-    summary = "print each module's sensitivity, resolution and field of view at the isocentre, or at a point"
-    example = " --isotope Tc-99m --aperture-mu tungsten --crystal-mu NaI"
-    parser = add_action(actions, "performance", summary, example, _run)
+    parser = add_action(actions, "performance", _run)
     add = parser.add_argument
     add("--point", type=float, nargs=3, default=[0, 0, 0], metavar="MM", help="where the source is, x y z")
     add_materials(parser)
 
 
 def _run(arguments: argparse.Namespace) -> None:
+    """Print each module's sensitivity, resolution and field of view at the isocentre, or at a point.
+
+    mphdrr geometry performance scanner.xlsx --isotope Tc-99m --aperture-mu tungsten --crystal-mu NaI
+    """
     system = read_workbook(arguments)
     points, optics = [arguments.point], optics_of(arguments, system)
     counts = 1e6 * sensitivity(system, points, optics=optics)[0]

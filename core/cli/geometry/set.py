@@ -26,8 +26,7 @@ _DIMENSIONS = {_SHORT.get(name, name.replace("_", "-")): name for name in LENGTH
 
 def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     """Add the action."""
-    summary = "change a workbook's numbers and keep all the rest of it"
-    parser = add_action(actions, "set", summary, " --modules 1-20 --diameter 2 -o thinner.xlsx", _run)
+    parser = add_action(actions, "set", _run)
     add = parser.add_argument
     add("-o", "--output", required=True, metavar="OUT", help="workbook to write; FILE itself is replaced")
     add("--modules", metavar="RANGE", help="those to change, such as 1-40 or 1-20,41; default: all")
@@ -46,6 +45,10 @@ def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
 
 
 def _run(arguments: argparse.Namespace) -> None:
+    """Change a workbook's numbers and keep all the rest of it.
+
+    mphdrr geometry set scanner.xlsx --modules 1-20 --diameter 2 -o thinner.xlsx
+    """
     target = output_path(arguments.output, (".xlsx", ".xlsm"))
     if arguments.write_columns is not None and arguments.columns is None:
         raise InputError("--write-columns: the workbook is read by its headings, expected it with --columns")

@@ -14,7 +14,7 @@ from .arguments import add_action
 
 def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     """Add the action."""
-    parser = add_action(actions, "show", "print every module's numbers", " --modules 1-20", _run)
+    parser = add_action(actions, "show", _run)
     add = parser.add_argument
     add("--modules", metavar="RANGE", help="such as 1-40 or 1-20,41; default: all")
     columns = "instead, write a column map (.toml) of what was seen, for you to check"
@@ -22,6 +22,10 @@ def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
 
 
 def _run(arguments: argparse.Namespace) -> None:
+    """Print every module's numbers.
+
+    mphdrr geometry show scanner.xlsx --modules 1-20
+    """
     if arguments.write_columns is not None:
         _write_columns(arguments)
         return

@@ -17,7 +17,7 @@ from .subject import reorientation
 
 @dataclass(frozen=True, eq=False)
 class Detector:
-    """A C-arm's pixels, in the camera's frame; `InputError` for a size that is not above 0."""
+    """A C-arm's pixels, in the camera's frame."""
 
     sdd: float  # source to detector, mm
     height: int  # rows
@@ -62,7 +62,7 @@ class Detector:
         return torch.stack([self.width / 2 + (-column if self.reverse_x_axis else column), self.height / 2 - row], -1)
 
     def unproject(self, pixels: Tensor) -> Tensor:
-        """Points (..., 3) on the detector, in the camera's frame, of `pixels` (..., 2) as of `project`."""
+        """Points (..., 3) on the detector, in the camera's frame, of `pixels` (..., 2), the inverse of `project`."""
         column, row = pixels[..., 0] - self.width / 2, self.height / 2 - pixels[..., 1]
         if self.old:
             y, z = self.y0 - row * self.dely, -(column * self.delx + self.x0)
@@ -77,7 +77,7 @@ def drr_arguments(views: Views, m: int, orientation: str | None = "AP") -> tuple
     Parameters
     ----------
     views, m
-        The m-th of these; `InputError` where its pixels are not rectangles.
+        The m-th of these, whose pixels have to be rectangles.
     orientation
         The subject's, as given to `read`.
 

@@ -39,7 +39,7 @@ class DRR(torch.nn.Module):
     whole_line
         Integrate behind the source and beyond the detector too: the default since 0.4.
     backend
-        As of `Projector`.
+        The backend of `Projector`.
     stop_gradients_through_grid_sample
         Give no gradient to the volume.
     volume, spacing, sdr, bone_attenuation_multiplier
@@ -48,7 +48,7 @@ class DRR(torch.nn.Module):
 
     Notes
     -----
-    ``renderer="siddon"``, ``mode="nearest"`` and ``reducefn="sum"`` are the only ones; others raise `InputError`. `eps`,
+    ``renderer="siddon"``, ``mode="nearest"`` and ``reducefn="sum"`` are the only ones; others are refused. `eps`,
     `filter_intersections_outside_volume`, `patch_size`, `persistent`, `compile_renderer` and `checkpoint_gradients` are
     accepted and have no effect: integrals are exact, and rays need no memory but for their ends and sums.
 
@@ -148,7 +148,7 @@ class DRR(torch.nn.Module):
             translation (B, 3), mm, together with `parameterization`. Of one pose also (n,) and (3,); numbers may also be
             arrays or lists, and `parameterization` and `convention` may follow them without their names.
         parameterization, convention, degrees
-            As of `convert`.
+            The arguments of `convert`.
         calibration
             (4, 4), instead of sdd, delx, dely, x0, y0: from (column, row, 1) to mm.
         mask_to_channels
@@ -176,7 +176,7 @@ class DRR(torch.nn.Module):
         return RigidTransform(matrix @ self._reorient.to(matrix))
 
     def _integrals(self, vectors: Tensor, mask_to_channels: bool) -> Tensor:
-        """Integrals (B, C, N) along the rays of fans (B, 4, 3), as of `trace_fans`."""
+        """Integrals (B, C, N) along the rays of fans (B, 4, 3), see `trace_fans`."""
         if mask_to_channels and self.mask is None:
             raise InputError("mask_to_channels: the subject has no mask")
         density = self.density.detach() if self._stop_gradients else self.density
@@ -226,7 +226,7 @@ class DRR(torch.nn.Module):
         return self.detector.project(self._camera(RigidTransform(pose).to(points)).inverse()(points))
 
     def inverse_projection(self, pose: Any, points: Tensor) -> Tensor:
-        """World points (B, N, 3), mm, on the detector, of pixels `points` (B, N, 2) as of `perspective_projection`."""
+        """World points (B, N, 3), mm, on the detector, of `points` (B, N, 2): inverse to `perspective_projection`."""
         return self._camera(RigidTransform(pose).to(points))(self.detector.unproject(points))
 
     @property

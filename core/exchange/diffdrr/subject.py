@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ...errors import InputError
 from ...geometry.rotations import pose_matrix
-from ...physics.ct_numbers import DIFFDRR_AIR, DIFFDRR_BONE, diffdrr_density
+from ...physics.ct_numbers import diffdrr_density
 from ...validation import real_array, real_numbers
 from ...volumes.volume import LINE_INTEGRALS, Volume, require_quantity
 from ...volumes.volume_files import read_volume, read_volume_of
@@ -57,11 +57,6 @@ def read(
         Factor for CT numbers above 350 HU.
     center_volume
         Move the volume's middle to the world's origin.
-
-    Raises
-    ------
-    InputError
-        The volume does not hold CT numbers, the labelmap has another shape, or the orientation is unknown.
     """
     if isinstance(volume, Volume):
         require_quantity(volume.quantity, ("hu",), "read")
@@ -86,15 +81,8 @@ def read(
 
 
 def hu_to_density(hu: Tensor, bone_attenuation_multiplier: float = 1.0) -> Tensor:
-    """`diffdrr_density` for tensors, with gradients: 0 to 1, air as thin as the thinnest tissue, bone times a factor."""
-    hu = hu.to(torch.float32)
-    if not hu.requires_grad:
-        return torch.from_numpy(diffdrr_density(hu.numpy(force=True), bone_attenuation_multiplier)).to(hu.device)
-    thinnest = torch.where(hu > DIFFDRR_AIR, hu, torch.inf).amin()
-    density = torch.maximum(hu, thinnest) if thinnest <= DIFFDRR_BONE else hu
-    density = torch.where(hu > DIFFDRR_BONE, hu * bone_attenuation_multiplier, density)
-    density = density - density.min()
-    return density / density.max().clamp_min(torch.finfo(torch.float32).tiny)
+    """`diffdrr_density` of a tensor, with gradients: 0 to 1, air as thin as the thinnest tissue, bone times a factor."""
+    return diffdrr_density(hu.to(torch.float32), bone_attenuation_multiplier)
 
 
 def reorientation(orientation: str | None) -> Tensor:

@@ -47,7 +47,7 @@ class Contents:
 
 
 def require_voxels(shape: Sequence[int], kind: np.dtype[Any]) -> None:
-    """Raise `InputError` unless an image of `shape` and type `kind` is 3-D, real and fits into memory."""
+    """Refuse an image of `shape` and type `kind` that is not 3-D and real, or does not fit into memory."""
     sizes = " x ".join(map(str, shape)) or "of one value"
     if len(shape) != 3:
         raise InputError(f"expected a 3-D image, got shape {sizes}")
@@ -60,13 +60,13 @@ def require_voxels(shape: Sequence[int], kind: np.dtype[Any]) -> None:
 
 
 def refuse_several_files(field: str, where: str) -> None:
-    """Raise `InputError` if the header's `field` says that the voxels are in several files."""
+    """Refuse a header whose `field` spreads the voxels over several files."""
     if where.upper().startswith("LIST") or "%" in where:
         raise InputError(f"{field} {where}: voxels in several files are not read; convert them to one")
 
 
 def warn(path: Path, text: str) -> None:
-    """Give an `InputWarning` about a file."""
+    """Warn about a file."""
     errors.warn(f"{path}: {text}")
 
 

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...errors import InputError, first_line, reading, warn
+from ...errors import InputError, first_line, naming, reading, warn
 from ...files import require_file
 from ...geometry.frames import affine_matrix
 from ...progress import Progress, tell
@@ -29,8 +29,8 @@ _SAME_SPACING = 0.02  # relative; scanners round positions
 _UPRIGHT = 0.01  # tangent of the tilt; 0.6 degrees
 _UPRIGHT_ONLY = "expected upright slices: resample the series first"
 _UNITS = {"BQML": ("activity", 1e-3), "HU": ("hu", 1.0)}
-# Value 3 of ImageType (C.8.4.9.1.1.3).
-_TOMOGRAMS = ("RECON TOMO", "RECON GATED TOMO")
+TOMOGRAMS = ("RECON TOMO", "RECON GATED TOMO")
+"""Reconstructed ones, by value 3 of ImageType (C.8.4.9.1.1.3)."""
 _OTHERS = {
     "TOMO": "projections",
     "GATED TOMO": "gated projections",
@@ -67,6 +67,18 @@ def is_dicom(path: Path) -> bool:
     """Whether the file at `path` is DICOM, by the letters "DICM" after its first 128 bytes."""
     with open(path, "rb") as file:
         return file.read(132)[128:] == b"DICM"
+
+
+def image_kind(header: Any) -> str:
+    """Value 3 of a nuclear medicine image's ImageType, such as "TOMO", or "" where it has none."""
+    kinds: Any = header.get("ImageType") or ()
+    return str(kinds[2]) if not isinstance(kinds, str) and len(kinds) > 2 else ""
+
+
+def require_grey(header: Any) -> None:
+    """Refuse images with several values per pixel."""
+    if header.get("SamplesPerPixel", 1) != 1:
+        raise InputError(f"expected one value per pixel, found {header.SamplesPerPixel} (a colour image)")
 
 
 def read(path: Path, series: str | None = None, progress: Progress | None = None) -> Contents:
@@ -176,8 +188,7 @@ def _chosen(headers: list[tuple[Path, Any]], path: Path, series: str | None) -> 
 
 def _slices(path: Path, header: Any) -> Iterator[_Slice]:
     """The images of a file."""
-    if header.get("SamplesPerPixel", 1) != 1:
-        raise InputError(f"expected one value per pixel, found {header.SamplesPerPixel} (a colour image)")
+    require_grey(header)
     tilt = float(header.get("GantryDetectorTilt") or 0.0)
     if abs(tilt) > 0.01:
         raise InputError(f"the gantry is tilted by {tilt:g} degrees; {_UPRIGHT_ONLY}")
@@ -283,18 +294,24 @@ def _pixels(slices: list[_Slice]) -> Iterator[tuple[_Slice, NDArray[Any]]]:
     for one in slices:
         if one.path != path:
             path = one.path
-            data = pydicom.dcmread(path)
-            try:
-                frames = data.pixel_array
-            except Exception as error:  # truncated, or compressed by a method that is not installed
-                syntax = data.file_meta.TransferSyntaxUID
-                what = f"cannot be read ({first_line(error)})"
-                if syntax.is_compressed:
-                    what = f"are compressed ({syntax.name}), which cannot be decoded here; install pylibjpeg with its "
-                    what += "plugins, or save the series without compression"
-                raise InputError(f"{one.name}: its pixels {what}") from error
-            frames = frames.reshape(-1, *one.shape)
+            with naming(one.name):
+                frames = decoded(pydicom.dcmread(path)).reshape(-1, *one.shape)
         yield one, frames[one.frame]
+
+
+def decoded(data: Any) -> NDArray[Any]:
+    """The stored values of a file that is read whole."""
+    try:
+        return np.asarray(data.pixel_array)
+    except Exception as error:  # truncated, or compressed by a method that is not installed
+        syntax = data.file_meta.TransferSyntaxUID
+        what = f"cannot be read ({first_line(error)})"
+        if syntax.is_compressed:
+            what = (
+                f"are compressed ({syntax.name}), which cannot be decoded here; install pylibjpeg with its plugins, or "
+            )
+            what += "save the series without compression"
+        raise InputError(f"its pixels {what}") from error
 
 
 def _tomogram_frames(header: Any) -> list[dict[str, Any]]:
@@ -304,13 +321,11 @@ def _tomogram_frames(header: Any) -> list[dict[str, Any]]:
     directions along the rows and down the columns.
     """
     count = int(header.get("NumberOfFrames") or 1)
-    kinds: Any = header.get("ImageType") or ()
-    told = not isinstance(kinds, str) and len(kinds) > 2
-    kind = str(kinds[2]) if told else _TOMOGRAMS[0] if "SliceVector" in header else ""
-    if kind not in _TOMOGRAMS:
-        said = f"ImageType {kind or 'without a third value'}, {count} frame{'s' * (count > 1)}"
+    kind = image_kind(header) or (TOMOGRAMS[0] if "SliceVector" in header else "")
+    if kind not in TOMOGRAMS:
+        stated = f"ImageType {kind or 'without a third value'}, {count} frame{'s' * (count > 1)}"
         what = _OTHERS.get(kind, "something else")
-        raise InputError(f"it holds {what} ({said}); expected a reconstructed tomogram (RECON TOMO)")
+        raise InputError(f"it holds {what} ({stated}); expected a reconstructed tomogram (RECON TOMO)")
     if "SliceVector" in header:
         slices = _numbers(header, "SliceVector", count)
         _require_one_volume(header, count, len(np.unique(slices)))
@@ -330,7 +345,7 @@ def _tomogram_frames(header: Any) -> list[dict[str, Any]]:
 
 
 def _require_one_volume(header: Any, count: int, slices: int) -> None:
-    """Raise `InputError` unless there is one frame for each of `slices` (0 if the file does not say how many)."""
+    """Refuse a tomogram that has not one frame for each of `slices` (0 if the file does not say how many)."""
     for name, several in (
         ("TimeSlot", "gated, in {} time slots"),
         ("RRInterval", "gated, in {} R-R intervals"),

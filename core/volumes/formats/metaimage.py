@@ -101,9 +101,9 @@ def _affine(header: dict[str, str], path: Path) -> NDArray[np.float64]:
     """Index to world mm, with a warning of what the header does not say."""
     spacing, offset = ("ElementSpacing", "ElementSize"), ("Offset", "Position", "Origin")
     turned = ("TransformMatrix", "Rotation", "Orientation")
-    said = "AnatomicalOrientation"  # ITK's programs write it beside the matrix, which takes precedence
-    if not header.keys() & set(turned) and header.get(said, "RAI").upper() not in ("RAI", "???"):
-        raise InputError(f"{said} = {header[said]} without a TransformMatrix: expected the matrix, or RAI")
+    words = header.get("AnatomicalOrientation", "RAI")  # ITK writes it beside the matrix, which takes precedence
+    if not header.keys() & set(turned) and words.upper() not in ("RAI", "???"):
+        raise InputError(f"AnatomicalOrientation = {words} without a TransformMatrix: expected the matrix, or RAI")
     # Row i of the matrix is the direction of axis i.
     directions = _numbers(header, turned, np.eye(3).ravel()).reshape(3, 3)
     axes, origin = directions.T * _numbers(header, spacing, np.ones(3)), _numbers(header, offset, np.zeros(3))

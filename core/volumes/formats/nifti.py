@@ -10,6 +10,7 @@ import numpy as np
 
 from ...errors import InputError, first_line
 from ...files import require_file
+from ...geometry.frames import moved
 from ..volume import UNITS, Volume
 from .contents import Contents, require_voxels, warn
 
@@ -66,8 +67,7 @@ def _contents(image: Any, path: Path) -> Contents:
         warn(path, "it does not say where the patient lies: taken as centred, x from right to left")
     elif header["qform_code"] > 0 and header["sform_code"] > 0:
         corners = np.array(list(np.ndindex(2, 2, 2))) * (np.array(image.shape) - 1)
-        between = affine - header.get_qform()
-        apart = np.linalg.norm(corners @ between[:3, :3].T + between[:3, 3], axis=1).max() / min(header.get_zooms())
+        apart = np.linalg.norm(moved(affine - header.get_qform(), corners), axis=1).max() / min(header.get_zooms())
         if apart > _APART:
             warn(path, f"its sform and qform lie up to {apart:.3g} voxels apart: taken by the sform")
     affine[:3] *= _MILLIMETRES[header.get_xyzt_units()[0]]

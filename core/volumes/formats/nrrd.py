@@ -114,8 +114,8 @@ def _affine(header: dict[str, Any], path: Path) -> np.ndarray:
             raise InputError("units: the axes' own differ from the space's; expected space units alone")
         axes = scale[:, None] * _of_space(header, np.asarray(header["space directions"], np.float64))
     else:
-        spacings, first, said = _of_axes(header)
-        assumed += said
+        spacings, first, of_axes = _of_axes(header)
+        assumed += of_axes
         own = scale if units is None else units
         axes, first = np.diag(spacings * own), None if first is None else first * own
     if "space origin" in header:
@@ -179,7 +179,7 @@ def _of_axes(header: dict[str, Any]) -> tuple[np.ndarray, np.ndarray | None, lis
 
 
 def _numbers(header: dict[str, Any], name: str) -> np.ndarray:
-    """A field's three numbers, with NaN for those it does not say."""
+    """A field's three numbers, with NaN for those that are missing."""
     numbers = np.asarray(header.get(name, [np.nan] * 3), np.float64)
     if numbers.shape != (3,):
         raise InputError(f"{name}: expected 3 numbers, got {_text(np.atleast_1d(numbers))}")

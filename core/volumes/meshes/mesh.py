@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import InputError, reading
-from ...files import replacing, require_file
+from ...files import replacing, require_ending, require_file
 from ...validation import freeze, one_of, real_array
 
 MESH_FORMATS = (".stl", ".obj", ".ply", ".glb")
@@ -95,7 +95,7 @@ def as_mesh(given: Any) -> Mesh:
 
 
 def require_closed(mesh: Mesh) -> None:
-    """Raise `InputError` if the surface is open or its faces look to different sides; the message says where."""
+    """Refuse a surface that is open or whose faces look to different sides; the message says where."""
     vertices = mesh.vertices
     size = float(np.ptp(vertices, axis=0).max())
     # In .stl and other files every triangle has its own copy of its corners.
@@ -125,9 +125,7 @@ def require_closed(mesh: Mesh) -> None:
 
 def _suffix_and_factor(path: Path, unit: str | None) -> tuple[str, float]:
     """The path's suffix, and the millimetres per unit of length of the file."""
-    suffix = path.suffix.lower()
-    if suffix not in MESH_FORMATS:
-        raise InputError(f"{path}: expected a name ending in {', '.join(MESH_FORMATS)}")
+    suffix = require_ending(path, MESH_FORMATS)
     unit = unit or ("m" if suffix == ".glb" else "mm")
     one_of(unit, MILLIMETRES, "unit")
     return suffix, MILLIMETRES[unit]

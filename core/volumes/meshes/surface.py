@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import InputError
+from ...geometry.frames import moved
 from ...memory import require
 from ...progress import Progress, tell
 from ...validation import instance, real_array
@@ -55,11 +56,8 @@ def volume_to_mesh(volume: Volume, level: float | None = None, progress: Progres
     corner, direction = np.divmod(edges, 8)
     index = np.stack(np.unravel_index(corner, shape), axis=1) - 1.0
     index += np.concatenate(shares).reshape(-1)[first, None] * _CORNERS[direction]
-    affine = volume.grid.affine
-    faces = faces.reshape(-1, 3)
-    if np.linalg.det(affine[:3, :3]) < 0:
-        faces = faces[:, ::-1]
-    return Mesh(index @ affine[:3, :3].T + affine[:3, 3], faces)
+    mirrored = np.linalg.det(volume.grid.affine[:3, :3]) < 0
+    return Mesh(moved(volume.grid.affine, index), faces.reshape(-1, 3)[:, :: -1 if mirrored else 1])
 
 
 def _plane(array: NDArray[np.float32], i: int, outside: float) -> NDArray[np.float64]:

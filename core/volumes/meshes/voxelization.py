@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ...errors import InputError
+from ...geometry.frames import moved
 from ...geometry.grid import Grid
 from ...memory import require
 from ...progress import Progress, part_of, tell
@@ -43,7 +44,7 @@ def voxelize_mesh(
     ----------
     mesh
         A `Mesh`, a trimesh mesh or scene, ``(vertices (V, 3), faces (F, 3))`` in world mm, or the path of a file (see
-        `read_mesh`); or a list of these, in which later ones replace what they cover of earlier ones. `InputError` says
+        `read_mesh`); or a list of these, in which later ones replace what they cover of earlier ones. Messages say
         where a mesh is open or its faces look to different sides.
     grid
         Where the voxels are; any affine.
@@ -79,9 +80,8 @@ def mesh_coverage(mesh: Mesh, grid: Grid, progress: Progress | None = None) -> N
     """
     require_closed(mesh)
     coverage = np.zeros(grid.shape, np.float32)
-    back = grid.index_from_world
     # Voxel i lies between the planes i and i + 1.
-    corners = (mesh.vertices @ back[:3, :3].T + back[:3, 3] + 0.5)[mesh.faces]
+    corners = (moved(grid.index_from_world, mesh.vertices) + 0.5)[mesh.faces]
     start = np.floor(corners.min(axis=(0, 1))).clip(0, grid.shape).astype(int)
     stop = np.ceil(corners.max(axis=(0, 1))).clip(0, grid.shape).astype(int)
     if np.any(start >= stop):

@@ -17,7 +17,7 @@ METHODS = [
     ),
     pytest.param(lambda *given, **more: mph.bsrem(*given, subsets=2, **more), id="bsrem"),
     pytest.param(
-        lambda *given, **more: mph.bsrem(*given, subsets=2, prior=mph.RelativeDifference(0.1), relaxation=0.1, **more),
+        lambda *given, **more: mph.bsrem(*given, subsets=2, prior=mph.RelativeDifference(0.1), step_decay=0.1, **more),
         id="bsrem with prior",
     ),
 ]

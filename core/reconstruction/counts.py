@@ -130,7 +130,7 @@ class CountLoop(Loop):
         ones = ((part, np.ones(part.shape_out, np.float32)) for part, _ in self.parts)
         self.seen = [np.asarray(part.T(one, self.preparing()), np.float32) for part, one in ones]
         self.total: Array = sum(self.seen[1:], self.seen[0])
-        self.visible = self.inside(self.total > LEAST)
+        self.visible = self.mask & (self.total > LEAST)
         self.prior, self.penalty = prior, penalty_of(prior, A.grid, self.visible)
         self._images: Array | None = None  # of the volume whose objective was asked for last
         self.last = -np.inf  # its objective

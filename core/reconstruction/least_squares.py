@@ -192,7 +192,7 @@ class LeastSquaresLoop(Loop):
         self.images: Array = real_array(plain(images), "images", A.shape_out, np.float32) - A.background.astype(
             np.float32
         )
-        self.weights: Array = np.ones(A.shape_in, np.float32) if self.mask is None else self.mask.astype(np.float32)
+        self.weights: Array = self.mask.astype(np.float32)
 
     def record(self) -> dict[str, Any]:
         """The model, and sums of views, images and mask that depend on their order."""

@@ -91,7 +91,7 @@ class Loop:
         To begin with, float32; 0 outside the mask.
     is_given : bool
         Whether there is a `start`.
-    mask : array of bool, or None
+    mask : array of bool
     state : dict of arrays
         What a method needs besides the values to be resumed. `run` keeps it with the result; a resumed one finds here
         what its last iteration had put in, else it is empty. Steps replace its arrays, and do not change their numbers.
@@ -123,8 +123,8 @@ class Loop:
             if not isinstance(stop, StoppingRule):
                 instance(stop, StopWhen, "stop")  # the rule that users know
             stop.check(A.shape_in)
-        self.mask = None if mask is None else inside(mask, "mask", A.shape_in)
-        if self.mask is not None and not self.mask.any():
+        self.mask = np.ones(A.shape_in, bool) if mask is None else inside(mask, "mask", A.shape_in)
+        if not self.mask.any():
             warn(f"mask: 0 of {self.mask.size} voxels are inside: the volume will be 0", 4)
         self.state: dict[str, Array] = {}
         self._objective: list[float] = []
@@ -142,10 +142,6 @@ class Loop:
     def done(self) -> int:
         """Iterations done, those before a resume included."""
         return len(self._objective)
-
-    def inside(self, seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Those of the voxels `seen` that are in the mask, too."""
-        return seen if self.mask is None else seen & self.mask
 
     def preparing(self) -> Progress | None:
         """The progress callback for what is prepared before the first iteration: it only asks whether to go on."""
@@ -173,7 +169,7 @@ class Loop:
                 self._require_as_before(settings, self.objective(self.values, self.preparing()))
             for i in range(self._iterations):
                 values, reached = step(self.done, self.values, part_of(self._progress, i, self._iterations))
-                self.values = self._only_inside(values)
+                self.values = self._inside(values)
                 self._objective.append(float(reached))
                 result = self._result(settings, "cancelled")
                 if self._callback is not None and self._callback(self.done, self.values):
@@ -205,19 +201,16 @@ class Loop:
 
     def _first_values(self, start: Volume | ArrayLike | None, default: float, negative: bool) -> Array:
         if start is None:
-            return self._only_inside(np.full(self._A.shape_in, default, np.float32))
+            return self._inside(np.full(self._A.shape_in, default, np.float32))
         with naming("start"):
             array = self._A._check(start) if isinstance(start, Volume) else plain(start)
         values = real_array(array, "start", self._A.shape_in, np.float32)
         if not negative and values.min() < 0:
             raise InputError(f"start: expected 0 or more, got {values.min():g}")
-        return self._only_inside(values)
+        return self._inside(values)
 
-    def _only_inside(self, values: Array) -> Array:
-        values = np.asarray(values, np.float32)
-        if self.mask is not None:
-            values = np.where(self.mask, values, np.float32(0))
-        return freeze(np.ascontiguousarray(values))
+    def _inside(self, values: Array) -> Array:
+        return freeze(np.ascontiguousarray(np.where(self.mask, np.asarray(values, np.float32), np.float32(0))))
 
 
 def _same(one: Any, other: Any) -> bool:

@@ -1,6 +1,5 @@
 """Priors: penalties of differences between neighbouring voxels, for reconstructions with noise."""
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import KW_ONLY, dataclass, fields
 from itertools import product
@@ -46,7 +45,7 @@ class Pairs:
 
 
 @dataclass(frozen=True, eq=False)
-class Prior(ABC):
+class Prior:
     """A penalty ``weight * sum over pairs of neighbours of w_jk psi(x_j, x_k)``; `psi` is the subclass's.
 
     The w_jk are the smallest distance of two voxels divided by that of these two, so that all are 1 or less, and voxels
@@ -109,51 +108,38 @@ class Prior(ABC):
     def _similar(self) -> int:
         return self.similar or -(-self.neighbors // 4)
 
-    # Of a slab's values and its pairs of neighbours:
+    # `psi` of pairs of neighbours, its derivatives and its second derivatives, by a and by b:
 
-    @abstractmethod
-    def _value(self, x: Array, pairs: list[Pairs]) -> float: ...
+    def _psi(self, a: Array, b: Array) -> Array:
+        raise NotImplementedError
 
-    @abstractmethod
-    def _add_gradient(self, x: Array, pairs: list[Pairs], out: Array) -> None: ...
-
-    @abstractmethod
-    def _add_curvature(self, x: Array, pairs: list[Pairs], out: Array) -> None: ...
-
-
-class _PairPrior(Prior):
-    """A prior whose `psi` is a function of the two values alone."""
-
-    @abstractmethod
-    def _psi(self, a: Array, b: Array) -> Array: ...
-
-    @abstractmethod
     def _slopes(self, a: Array, b: Array) -> tuple[Array, Array]:
-        """Derivatives of psi by a and by b."""
+        raise NotImplementedError
 
-    @abstractmethod
     def _bends(self, a: Array, b: Array) -> tuple[Any, Any]:
-        """Second derivatives of psi by a and by b."""
+        raise NotImplementedError
+
+    # The penalty of a slab's values, and what adds its gradient and curvature to `out`:
 
     def _value(self, x: Array, pairs: list[Pairs]) -> float:
         return sum(float(np.sum(p.weight * self._psi(x[p.first], x[p.second]), dtype=float)) for p in pairs)
 
     def _add_gradient(self, x: Array, pairs: list[Pairs], out: Array) -> None:
-        self._add(self._slopes, x, pairs, out)
+        _add(self._slopes, x, pairs, out)
 
     def _add_curvature(self, x: Array, pairs: list[Pairs], out: Array) -> None:
-        self._add(self._bends, x, pairs, out)
+        _add(self._bends, x, pairs, out)
 
-    @staticmethod
-    def _add(of: Callable[[Array, Array], tuple[Any, Any]], x: Array, pairs: list[Pairs], out: Array) -> None:
-        for p in pairs:
-            by_first, by_second = of(x[p.first], x[p.second])
-            out[p.first] += p.weight * by_first
-            out[p.second] += p.weight * by_second
+
+def _add(of: Callable[[Array, Array], tuple[Any, Any]], x: Array, pairs: list[Pairs], out: Array) -> None:
+    for p in pairs:
+        by_first, by_second = of(x[p.first], x[p.second])
+        out[p.first] += p.weight * by_first
+        out[p.second] += p.weight * by_second
 
 
 @dataclass(frozen=True, eq=False)
-class Quadratic(_PairPrior):
+class Quadratic(Prior):
     """Penalises squares of differences, ``psi = (x_j - x_k)^2 / 2``: smooth everywhere, and blurs edges."""
 
     def _psi(self, a: Array, b: Array) -> Array:
@@ -168,7 +154,7 @@ class Quadratic(_PairPrior):
 
 
 @dataclass(frozen=True, eq=False)
-class RelativeDifference(_PairPrior):
+class RelativeDifference(Prior):
     """Penalises differences relative to the values: ``psi = (x_j - x_k)^2 / (x_j + x_k + gamma |x_j - x_k| + edge)``.
 
     Noise grows with the activity, and so may differences. For values of 0 or more.

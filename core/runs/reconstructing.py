@@ -28,12 +28,11 @@ Watch = Callable[[int, NDArray[Any], Sequence[float]], bool | None]
 """Called as ``watch(iteration, values, objective)`` after each iteration, with the volume's values and the objective after
 all iterations so far; what is true ends the reconstruction there."""
 
-_ALONG = ((-1, 1, 1), (1, -1, 1), (1, 1, -1))
 _POINTS = 7
-"""Of the hole: enough for its blur, and few enough for an iteration in a fraction of a second."""
+"""Points of the hole: enough for its blur, and few enough for an iteration in a fraction of a second."""
 
 TABLES = ("reconstruction", "model", "attenuation", "compute")
-"""Of a recipe: what says how a run is reconstructed. The other tables say how its images were made."""
+"""A recipe's tables that say how a run is reconstructed. The other tables say how its images were made."""
 
 
 def reconstruct_run(
@@ -173,11 +172,9 @@ def _rules(recipe: Recipe, grid: Grid) -> StopWhen | None:
     region = None
     if recipe["reconstruction.stop_region"] is not None:
         *middle, radius = recipe["reconstruction.stop_region"]
-        axes = [
-            origin + spacing * np.arange(n) - center
-            for origin, spacing, n, center in zip(grid.affine[:3, 3], grid.spacing, grid.shape, middle, strict=True)
-        ]
-        region = sum(np.square(axis).reshape(shape) for axis, shape in zip(axes, _ALONG, strict=True)) <= radius**2
+        places = zip(grid.affine[:3, 3], grid.spacing, grid.shape, middle, strict=True)
+        axes = np.ix_(*(origin + spacing * np.arange(n) - center for origin, spacing, n, center in places))
+        region = sum(np.square(axis) for axis in axes) <= radius**2
     return StopWhen(**given, region=region)
 
 

@@ -46,7 +46,7 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
         if setting.key.startswith("reconstruction.") or setting.key in _OTHERS:
             add_setting(parser, setting)
     add_entries(parser, "model.intrinsic_fwhm=3")
-    text = "begin with this volume, on the same voxels, instead of 1 everywhere"
+    text = "begin with this volume, on the same voxels, instead of the same value everywhere"
     start = parser.add_mutually_exclusive_group()
     start.add_argument("--start", metavar="FILE", help=text)
     text = "go on where the reconstruction in this file ended: the iterations are done in addition"

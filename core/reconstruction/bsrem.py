@@ -74,7 +74,7 @@ def bsrem(
     Raises
     ------
     InputError
-        What `mlem` refuses, or a negative `step_decay`.
+        See `mlem`; and `step_decay` is negative.
 
     References
     ----------

@@ -15,7 +15,7 @@ from .result import Array, Reconstruction
 _LEAN = 0.05
 """Cosine between a gradient of CGLS and its first, 0 in exact numbers: below it volumes are within 1e-3 of theirs."""
 _DONE = 1e-6
-"""Of the first gradient: what is left of it at the least squares in single precision."""
+"""The share of the first gradient that is left at the least squares in single precision."""
 _LEANS = "CGLS: from iteration {} on rounding puts its volumes up to a few percent beside those of exact numbers"
 
 
@@ -111,7 +111,7 @@ def cgls(
     Raises
     ------
     InputError
-        What `sirt` refuses.
+        See `sirt`.
 
     Warns
     -----

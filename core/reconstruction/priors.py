@@ -32,12 +32,12 @@ class Pairs:
 
     @property
     def weight(self) -> Any:
-        """Of psi: one number for all, or an array."""
+        """Weight of psi: one number for all, or an array."""
         return self._shared(self.closeness)
 
     @property
     def squared(self) -> Any:
-        """Of squares of differences."""
+        """Weight of squares of differences."""
         return self._shared(self.closeness**2)
 
     def _shared(self, weight: float) -> Any:
@@ -57,9 +57,9 @@ class Prior:
     weight : float
         How much it counts beside the log-likelihood, 0 or more.
     anatomy : Volume, optional
-        Of the reconstruction's grid, such as a CT or its segments: differences across its edges are not penalised. Of each
-        voxel's neighbours only those `similar` count whose anatomical values are closest to its own, and all as close as the
-        last of these (Bowsher 2004); a pair where only one chose the other counts half.
+        A volume on the reconstruction's grid, such as a CT or its segments: differences across its edges are not penalised.
+        Only those `similar` of each voxel's neighbours count whose anatomical values are closest to its own, and all that
+        are as close as the last of these (Bowsher 2004); a pair where only one chose the other counts half.
     similar : int, optional
         By default about a quarter of the neighbours.
     neighbors : int
@@ -237,7 +237,7 @@ class TotalVariation(Prior):
         object.__setattr__(self, "edge", positive(self.edge, "prior: edge", "kBq/mL"))
 
     def _sizes(self, x: Array, pairs: list[Pairs]) -> Array:
-        """Of the gradient in the slab's voxels."""
+        """Sizes of the gradient in the slab's voxels."""
         squares = np.full(x.shape, self.edge**2, x.dtype)
         for p in pairs:
             squares[p.first] += p.squared * np.square(x[p.first] - x[p.second])

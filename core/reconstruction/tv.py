@@ -46,7 +46,7 @@ def tv(
     Raises
     ------
     InputError
-        What `sirt` refuses.
+        See `sirt`.
 
     References
     ----------

@@ -63,7 +63,7 @@ def reconstruct_run(
     stages
         Begins each stage: reading, voxelizing, reconstructing.
     method : Method
-        That of the recipe, where it has been read from its file already.
+        The recipe's method, where it has been read from its file already.
 
     Returns
     -------
@@ -81,7 +81,7 @@ def reconstruct_run(
     InputWarning
         The images were made from voxels that are not at least twice as fine as those of the reconstruction, or with no
         better model of the hole: model and data then share errors that a real scanner's data does not have. Or the whole
-        hole cannot be reckoned with, and few rays take its place. Or the record of a run without a recipe contradicts the
+        hole cannot be modelled, and few rays take its place. Or the record of a run without a recipe contradicts the
         model that is given.
     """
     recipe = recipe_of(run, recipe)

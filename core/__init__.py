@@ -61,6 +61,7 @@ from .reconstruction.fbp import fbp
 from .reconstruction.fdk import fdk
 from .reconstruction.files import read_reconstruction, write_reconstruction
 from .reconstruction.least_squares import cgls, sirt
+from .reconstruction.loop import IterativeOptions
 from .reconstruction.priors import Prior, Quadratic, RelativeDifference, TotalVariation
 from .reconstruction.result import Reconstruction
 from .reconstruction.scores.derenzo import DerenzoScore, DerenzoSector, RodProfile, derenzo_score

@@ -39,11 +39,12 @@ def _draw_result(layout: bpy.types.UILayout, settings: bpy.types.PropertyGroup, 
     """The objective's plot, and the scores beside the truth."""
     box = layout.box()
     box.label(text=known["title"], translate=False, icon="OUTLINER_DATA_VOLUME")
-    split = box.split(factor=0.4)
-    split.template_icon(icon_value=plots.objective_icon(known["objective"]), scale=_PLOT)
-    column = split.column(align=True)
-    column.label(text=known["name"].capitalize())
-    column.label(text=f"{known['objective'][-1]:.7g}", translate=False)
+    if known["objective"]:  # a method may have none
+        split = box.split(factor=0.4)
+        split.template_icon(icon_value=plots.objective_icon(known["objective"]), scale=_PLOT)
+        column = split.column(align=True)
+        column.label(text=known["name"].capitalize())
+        column.label(text=f"{known['objective'][-1]:.7g}", translate=False)
     scores = box.column(align=True)
     for name, value in known["scores"]:
         row = scores.split(factor=0.3)

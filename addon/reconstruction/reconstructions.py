@@ -17,7 +17,8 @@ from ...core.errors import InputError
 from ...core.figures.page import Page
 from ...core.figures.reconstructions import SIZE, SIZE_BESIDE_TRUTH, draw
 from ...core.progress import Progress, stages_of
-from ...core.reconstruction.methods import METHODS
+from ...core.reconstruction.methods import method_of
+from ...core.reconstruction.result import iterations_text
 from ...core.reconstruction.scores.summary import score_volume
 from ...core.runs.files import read_run
 from ...core.runs.mosaic import png
@@ -54,7 +55,7 @@ def reconstructing(context: bpy.types.Context, recipe: Recipe) -> jobs.Job:
     if shown is None:
         raise InputError("nothing to reconstruct: render the projections first, or choose a run")
     path, name, folder = rendering.file_of(shown.file), shown.name, storage.folder()
-    method = METHODS[recipe["reconstruction.method"]]
+    method = method_of(recipe["reconstruction.method"])
     readers = _readers_of_mu(scene)
     uid, start = scene.session_uid, time.perf_counter()
     is_watched = _is_watched()
@@ -70,10 +71,9 @@ def reconstructing(context: bpy.types.Context, recipe: Recipe) -> jobs.Job:
         def shown_of(values: NDArray[Any], objective: Sequence[float], scores: Any = (), flatters: Any = ()) -> _Shown:
             grid = reconstruction_grid(run, recipe)
             volume = Volume(values, grid, "activity" if run.volume is None else run.volume.quantity)
-            done = f"{len(objective)} iteration{'s' * (len(objective) > 1)}"
             record = {
-                "title": f"{method.label}, {done}", "name": method.objective, "objective": list(objective),
-                "scores": list(scores), "flatters": flatters,
+                "title": ", ".join(filter(None, (method.label, iterations_text(len(objective))))),
+                "name": method.objective, "objective": list(objective), "scores": list(scores), "flatters": flatters,
             }  # fmt: skip
             picture = _picture(run, volume, record, name)
             stored = store_volume(volume, folder, None, {"reconstruction_of": name, **recipe.tables()})
@@ -87,7 +87,7 @@ def reconstructing(context: bpy.types.Context, recipe: Recipe) -> jobs.Job:
                 last = time.monotonic()
             return shelf.enough.is_set()
 
-        found = reconstruct_run(run, recipe, _mu(run, recipe, readers), watch=watch, stages=stages)
+        found = reconstruct_run(run, recipe, _mu(run, recipe, readers), watch=watch, stages=stages, method=method)
         scores = _scores(run, found.volume, stages("scoring"))
         return shown_of(found.volume.array, found.objective.tolist(), scores, found.settings["flatters"])
 
@@ -190,8 +190,8 @@ def _scores(run: ProjectionRun, volume: Volume, progress: Progress | None) -> li
     for rods in score.derenzo or ():
         lines.append((f"{rods.rod_diameter:g} mm rods", rods.words))
     for sphere in score.nema or ():
-        said = f"{sphere.contrast_recovery:.1f} % contrast, {sphere.background_variability:.1f} % variability"
-        lines.append((f"{sphere.diameter:g} mm sphere", said))
+        score_text = f"{sphere.contrast_recovery:.1f} % contrast, {sphere.background_variability:.1f} % variability"
+        lines.append((f"{sphere.diameter:g} mm sphere", score_text))
     return lines
 
 

@@ -19,7 +19,7 @@ def add_setting(parser: Any, setting: Setting, is_listed: bool = True) -> None:
         text = setting.help + (f" (default: {default})" if default not in (None, False) else "")
     details: dict[str, Any] = {"type": str} if setting.kind is str else {}
     if setting.kind is bool:
-        details["action"] = "store_true"
+        details["action"] = argparse.BooleanOptionalAction if setting.default else "store_true"
     else:
         details["metavar"] = "FILE" if setting.is_path else "NAME" if details else setting.unit.upper() or "VALUE"
     if setting.sizes is not None or setting.kind is list:

@@ -12,8 +12,8 @@ from ..figures.page import SUFFIXES, Page
 from ..figures.reconstructions import SIZE, SIZE_BESIDE_TRUTH, draw
 from ..progress import Cancelled, Progress
 from ..reconstruction.files import read_reconstruction, write_reconstruction
-from ..reconstruction.methods import METHODS
-from ..reconstruction.result import Reconstruction
+from ..reconstruction.methods import Method, method_of
+from ..reconstruction.result import Reconstruction, iterations_text
 from ..runs.files import FORMATS, read_run
 from ..runs.recipe import Recipe, read_recipe, write_recipe
 from ..runs.reconstructing import TABLES, recipe_of, reconstruct_run
@@ -46,7 +46,7 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
         if setting.key.startswith("reconstruction.") or setting.key in _OTHERS:
             add_setting(parser, setting)
     add_entries(parser, "model.intrinsic_fwhm=3")
-    text = "begin with this volume, on the same voxels, instead of 1 everywhere"
+    text = "begin with this volume, on the same voxels, instead of the same value everywhere"
     start = parser.add_mutually_exclusive_group()
     start.add_argument("--start", metavar="FILE", help=text)
     text = "go on where the reconstruction in this file ended: the iterations are done in addition"
@@ -92,10 +92,11 @@ def _run(arguments: argparse.Namespace) -> None:
         start = read_volume(arguments.start, "activity" if run.volume is None else run.volume.quantity)
     elif arguments.resume is not None:
         start = read_reconstruction(arguments.resume)
-    log = _Log(recipe, arguments.quiet, start)
+    method = method_of(recipe["reconstruction.method"])
+    log = _Log(method, recipe["reconstruction.iterations"], arguments.quiet, start)
     usual = signal.signal(signal.SIGINT, log.interrupt) if state is not None else None
     try:
-        found = reconstruct_run(run, recipe, start=start, watch=log, stages=log.stage)
+        found = reconstruct_run(run, recipe, start=start, watch=log, stages=log.stage, method=method)
     except Cancelled as cancelled:
         if state is not None and cancelled.reconstruction is not None:
             write_reconstruction(cancelled.reconstruction, state)
@@ -109,32 +110,28 @@ def _run(arguments: argparse.Namespace) -> None:
         write_reconstruction(found, state)
     if path is not None:
         write_volume(found.volume, path)
-    method = METHODS[recipe["reconstruction.method"]]
     if picture is not None:
         page = Page(*(SIZE if run.volume is None else SIZE_BESIDE_TRUTH))
         draw(page, found.volume, found.objective.tolist(), run.volume, f"{method.label} of {arguments.file}",
              [settings_line(found), *found.settings["flatters"]], method.objective)  # fmt: skip
         page.write(picture)
-    voxels = " x ".join(map(str, found.volume.grid.shape))
+    voxels = f"{' x '.join(map(str, found.volume.grid.shape))} voxels"
     largest = f"largest {float(found.volume.array.max()):.4g} {found.volume.unit}"
-    print(f"{path or picture}: {method.label}, {settings_line(found)}, {voxels} voxels, {largest}")
+    print(f"{path or picture}: {', '.join(filter(None, (method.label, settings_line(found), voxels, largest)))}")
 
 
 def settings_line(found: Reconstruction) -> str:
-    """What a picture says of a reconstruction."""
-    said = [f"{found.iterations} iteration{'s' * (found.iterations > 1)}"]
-    if found.settings.get("subsets", 1) > 1:
-        said.append(f"{found.settings['subsets']} subsets")
-    return ", ".join(said)
+    """The numbers of iterations and subsets that a picture shows of a reconstruction, where it has any."""
+    subsets = found.settings.get("subsets", 1)
+    return ", ".join(filter(None, (iterations_text(found.iterations), f"{subsets} subsets" if subsets > 1 else "")))
 
 
 class _Log:
     """A line on standard error after each iteration; before the first, the stages' bars."""
 
-    def __init__(self, recipe: Recipe, quiet: bool, start: Any) -> None:
-        method = METHODS[recipe["reconstruction.method"]]
+    def __init__(self, method: Method, iterations: int | None, quiet: bool, start: Any) -> None:
         goes_on = isinstance(start, Reconstruction) and start.settings.get("method") == method.label
-        iterations = recipe["reconstruction.iterations"] or method.iterations
+        iterations = iterations or method.own.get("iterations", 0)
         self.total, self.quiet = (start.iterations if goes_on else 0) + iterations, quiet
         self.name = method.objective
         self.begun, self.interrupted = time.monotonic(), False
@@ -156,6 +153,6 @@ class _Log:
     def __call__(self, iteration: int, values: Any, objective: Sequence[float]) -> None:
         if not self.quiet:
             seconds = time.monotonic() - self.begun
-            said = f"{self.name} {objective[-1]:.8g}, largest {float(values.max()):.4g}, {seconds:.1f} s"
-            sys.stderr.write(f"iteration {iteration} of {self.total}: {said}\n")
+            line = f"{self.name} {objective[-1]:.8g}, largest {float(values.max()):.4g}, {seconds:.1f} s"
+            sys.stderr.write(f"iteration {iteration} of {self.total}: {line}\n")
             sys.stderr.flush()

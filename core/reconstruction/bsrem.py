@@ -1,5 +1,7 @@
 """Penalised likelihood to its maximum, by relaxed steps of subsets: BSREM."""
 
+from typing import Any, Unpack
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -8,30 +10,24 @@ from ..progress import Progress, tell
 from ..projector import Projector
 from ..projector.subsets import access_order
 from ..validation import at_least_0
-from .counts import LEAST, CountData
-from .expectation import sensitivities, subsets_of, usual_subsets
-from .loop import Loop, Start, waiting
-from .priors import Prior, penalty_of
-from .result import Array, Callback, Reconstruction
-from .stopping import StoppingRule
+from .counts import LEAST, CountLoop
+from .loop import IterativeOptions, waiting
+from .priors import Prior
+from .result import Array, Reconstruction
 
-# Of a voxel's value: no update leaves less, so that one bad step can be mended.
 _LEAST_SHARE = np.float32(0.1)
-
-# Of the mean activity: voxels are moved as if they had so much more, so that those of 0 can grow.
+"""An update leaves at least this share of a voxel's value, so that one bad step can be mended."""
 _LIFT = 0.01
-
-# Of the mean activity: less is 0.
+"""Voxels are moved as if they had so much of the mean activity more, so that those of 0 can grow."""
 _NOTHING = 1e-6
-
-# Of the objective: less is rounding.
+"""Less than this share of the mean activity is 0."""
 _ROUNDING = 2e-9
-
-# Of what one step of all views promises: an iteration that gains less goes in circles, because its steps are too long.
+"""Changes of the objective by a smaller share are rounding."""
 _LEAST_GAIN = 0.5
-
-# Of the steps: after so many nothing is gained by smaller ones.
+"""An iteration that gains less than this share of what one step of all views promises goes in circles: its steps are too
+long."""
 _MOST_HALVINGS = 20
+"""After so many halvings nothing is gained by smaller steps."""
 
 
 def bsrem(
@@ -40,13 +36,10 @@ def bsrem(
     iterations: int = 30,
     subsets: int | None = None,
     prior: Prior | None = None,
-    relaxation: float = 0.0,
+    step_decay: float = 0.0,
     background: ArrayLike = 0.0,
-    start: Start = None,
-    mask: ArrayLike | None = None,
-    callback: Callback | None = None,
-    progress: Progress | None = None,
-    stop: StoppingRule | None = None,
+    *options: Any,
+    **named: Unpack[IterativeOptions],
 ) -> Reconstruction:
     """The activity with the largest penalised likelihood, ``log-likelihood - prior``: it ends there, as OSEM does not.
 
@@ -58,17 +51,19 @@ def bsrem(
 
     Parameters
     ----------
-    A, counts, iterations, background, start, mask, callback, progress, stop
-        As of `mlem`, but zeros in `start` may grow, and without `start` it begins with the mean activity. With a prior,
-        ``stop=StopWhen(change=1e-8)`` left no voxel further than 1 % of the mean activity from the maximum in our tests,
-        1e-6 some as far as 10 %.
+    A, counts, iterations, background
+        See `mlem`.
     subsets : int, optional
         By default about a fifth of the views' number.
     prior : Quadratic, RelativeDifference or TotalVariation, optional
         Without one it ends at the maximum of the likelihood, as `mlem` does, but sooner.
-    relaxation : float
-        Steps are ``1 / (1 + relaxation n)`` in iteration n, from 0. Besides, an iteration in which the objective would fall,
-        other than the first, is done again with half the step, and so are all that follow.
+    step_decay : float
+        Steps are ``1 / (1 + step_decay n)`` in iteration n, counted from 0. Besides, an iteration in which the objective
+        would fall, other than the first, is done again with half the step, and so are all that follow.
+    *options, **named
+        See `IterativeOptions`. Without `start` it begins with the mean activity; zeros in `start` may grow. With a prior,
+        ``stop=StopWhen(change=1e-8)`` left no voxel further than 1 % of the mean activity from the maximum in our tests,
+        1e-6 some as far as 10 %.
 
     Returns
     -------
@@ -79,7 +74,7 @@ def bsrem(
     Raises
     ------
     InputError
-        As of `mlem`; and `relaxation` is negative.
+        See `mlem`; and `step_decay` is negative.
 
     References
     ----------
@@ -95,39 +90,24 @@ def bsrem(
     R. Twyman et al., "An investigation of stochastic variance reduction algorithms for relative difference penalized 3D PET
     image reconstruction", IEEE Transactions on Medical Imaging 42 (2023) 29-41.
     """
-    loop = Loop("BSREM", A, iterations, start, mask, callback, progress, stop)
-    data = CountData.of("BSREM", A, counts, background)
-    relaxation = at_least_0(relaxation, "relaxation")
-    parts = subsets_of(A, data, usual_subsets(A) if subsets is None else subsets)
-    n = len(parts)
+    step_decay = at_least_0(step_decay, "step_decay")
+    loop = CountLoop("BSREM", A, counts, iterations, subsets, prior, background, *options, **named)
+    n, penalty, total = len(loop.parts), loop.penalty, loop.total
     require(8 * n * A.grid.n_voxels, f"the gradients of {n} subsets")
-    seen = sensitivities(A, parts, loop.preparing())
-    total = np.sum(seen, axis=0)
-    visible = loop.inside(total > LEAST)
-    penalty = penalty_of(prior, A.grid, visible)
     # At the maximum no voxel gives more counts than there are.
-    n_counts = data.counts.sum(dtype=float)
-    most = np.divide(np.float32(n_counts), total, out=np.zeros_like(total), where=visible)
-    mean = n_counts / max(float(total.sum(where=visible, dtype=float)), float(LEAST))
+    n_counts = loop.data.counts.sum(dtype=float)
+    most = np.divide(np.float32(n_counts), total, out=np.zeros_like(total), where=loop.visible)
+    mean = n_counts / max(float(total.sum(where=loop.visible, dtype=float)), float(LEAST))
     lift, nothing = np.float32(_LIFT * mean), np.float32(_NOTHING * mean)
-    loop.values = np.minimum(loop.values if start is not None else np.float32(mean), most)
-    images: list[Array] = []  # of the current volume in each subset, once they are known, and its objective
-    value = 0.0
+    loop.values = np.minimum(loop.values if loop.is_given else np.float32(mean), most)
 
-    def gradient(s: int, its_images: Array, asked: Progress | None) -> Array:
-        part, own = parts[s]
-        return part.T(own.ratio(its_images), asked) - seen[s]
-
-    def objective(x: Array, asked: Progress | None) -> float:
-        nonlocal images, value
-        images = [part(x, asked) for part, _ in parts]
-        value = sum(own.log_likelihood(its) for (_, own), its in zip(parts, images, strict=True))
-        value -= 0.0 if penalty is None else penalty.value(x)
-        return value
+    def gradient(s: int, x: Array, asked: Progress | None) -> Array:
+        part, own = loop.parts[s]
+        return part.T(own.ratio(loop.images(s, x, asked)), asked) - loop.seen[s]
 
     def moved(x: Array, upwards: Array, scale: Array, size: float) -> Array:
         """The volume a step further up a gradient, within its bounds."""
-        found = np.divide(x + lift, scale, out=np.zeros_like(x), where=visible)
+        found = np.divide(x + lift, scale, out=np.zeros_like(x), where=loop.visible)
         found *= np.float32(size)
         found *= upwards
         found += x
@@ -136,34 +116,32 @@ def bsrem(
         return found
 
     def step(number: int, x: Array, progress: Progress | None) -> tuple[Array, float]:
-        if not images:
-            objective(x, waiting(progress, 0, 2 * n))
         halvings = int(loop.state.get("halvings", np.zeros(()))[()])
         scale = total if penalty is None else total + (x + lift) * penalty.curvature(x)
         before, least_gain = -np.inf, 0.0
         at_start: list[Array] = []
         overall = np.zeros_like(x)
         if number:  # far from the maximum the plain steps, which are those of OSEM, get on faster
-            before = value
-            at_start = [gradient(s, images[s], waiting(progress, s, 2 * n)) for s in range(n)]
+            before = loop.last
+            at_start = [gradient(s, x, waiting(progress, s, 2 * n)) for s in range(n)]
             overall = np.sum(at_start, axis=0)
             whole = overall if penalty is None else overall - penalty.gradient(x)
             least_gain = _LEAST_GAIN * float(np.sum(whole * (moved(x, whole, scale, 1.0) - x), dtype=float))
         while True:
-            size = 0.5**halvings / (1 + relaxation * number)
+            size = 0.5**halvings / (1 + step_decay * number)
             found = x
             for k, s in enumerate(access_order(n)):
                 asked = waiting(progress, n + k, 2 * n)
                 if at_start and k == 0:  # the volume has not changed yet
                     upwards = overall
                 else:
-                    upwards = n * gradient(s, parts[s][0](found, asked), asked)
+                    upwards = n * gradient(s, found, asked)
                     if at_start:
                         upwards += overall - n * at_start[s]
                 if penalty is not None:
                     upwards = upwards - penalty.gradient(found)
                 found = moved(found, upwards, scale, size)
-            reached = objective(found, waiting(progress, 2 * n - 1, 2 * n))
+            reached = loop.objective(found, waiting(progress, 2 * n - 1, 2 * n))
             rounding = _ROUNDING * abs(reached)
             if halvings < _MOST_HALVINGS and reached < before + size * least_gain - rounding:
                 halvings += 1
@@ -173,4 +151,4 @@ def bsrem(
         tell(progress, 2 * n, 2 * n)
         return found, reached
 
-    return loop.run(step, {"subsets": n, "relaxation": relaxation, **data.record(total, prior)}, objective)
+    return loop.run(step, step_decay=step_decay)

@@ -1,4 +1,4 @@
-"""Counts with an additive background: their log-likelihood, and checks of what a reconstruction is given."""
+"""Counts with an additive background: their log-likelihood, checks of what a reconstruction is given, and its loop."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -10,10 +10,13 @@ from ..errors import InputError, warn
 from ..geometry.frames import affine_matrix
 from ..geometry.grid import Grid
 from ..geometry.system import PinholeSystem
+from ..memory import require
+from ..progress import Progress
 from ..projector import Emission, Projector
+from ..projector.subsets import balanced_subsets
 from ..validation import instance, real_array, shape_text
-from .loop import plain
-from .priors import Prior
+from .loop import Loop, plain
+from .priors import Prior, penalty_of
 from .result import Array
 
 # Less is nothing: float32 could not hold what it would be divided into.
@@ -52,20 +55,14 @@ class CountData:
         known = A.background.astype(np.float32)
         if extra.any() and known.any():
             both = f"{extra.mean():.3g} counts a pixel, besides the {known.mean():.3g} of the projector's model"
-            warn(f"background: {both}: both are expected; leave one out if they are the same")
+            warn(f"background: {both}: both are expected; leave one out if they are the same", 4)
         data = cls(measured, np.broadcast_to(extra + known, A.shape_out))
-        if isinstance(A.model, Emission) and len(A.views) > 3:  # two or three tell too little
+        if isinstance(A.model, Emission) and len(A.views) > 3:  # two or three say too little
             _warn_if_reversed(A, A.model.system, data)
         return data
 
     def __getitem__(self, which: NDArray[np.int64]) -> "CountData":
         return CountData(self.counts[which], self.background[which])
-
-    def record(self, sensitivity: Array, prior: Prior | None) -> dict[str, Any]:
-        """For a reconstruction's settings: totals, counts that one unit of activity in all voxels gives, and the prior."""
-        sums = {"counts": self.counts, "background": self.background, "sensitivity": sensitivity}
-        known = {name: float(numbers.sum(dtype=float)) for name, numbers in sums.items()}
-        return known | ({"prior": None} if prior is None else prior.record())
 
     def ratio(self, images: Array) -> Array:
         """Measured by expected counts, where a volume's are `images`; 0 where neither is above 0.
@@ -76,13 +73,87 @@ class CountData:
         return np.divide(self.counts, expected, out=np.zeros_like(expected), where=expected > LEAST)
 
     def log_likelihood(self, images: Array) -> float:
-        """Of the counts (Poisson) where a volume's images are `images`, without the terms that no volume changes.
+        """The log-likelihood (Poisson) of a volume with the images `images`, without the terms that no volume changes.
 
         Pixels with counts that nothing can have caused are left out, as in `ratio`.
         """
         expected = images.astype(np.float64) + self.background
         logs = np.log(expected, out=np.zeros_like(expected), where=expected > LEAST)
         return float(np.sum(self.counts * logs) - expected.sum())
+
+
+class CountLoop(Loop):
+    """The iterations of a method for counts: a `Loop` that knows them, in subsets of the views, and the prior's penalty.
+
+    Parameters
+    ----------
+    method, A, counts, iterations, prior, background
+        See `mlem`.
+    subsets : int, optional
+        By default about a fifth of the views' number.
+    options, named
+        See `IterativeOptions`.
+
+    Attributes
+    ----------
+    data : CountData
+    views : list of arrays (n,)
+        The views of each subset.
+    parts : list of tuples
+        Each subset's projector and counts.
+    seen : list of arrays (n_x, n_y, n_z)
+        Counts that one unit of activity in each voxel gives in each subset; `total` is their sum.
+    visible : array of bool
+        Voxels in the mask that some pixel sees.
+    penalty : Penalty or None
+    """
+
+    def __init__(
+        self,
+        method: str,
+        A: Projector,
+        counts: ArrayLike,
+        iterations: int,
+        subsets: int | None,
+        prior: Prior | None,
+        background: ArrayLike,
+        *options: Any,
+        **named: Any,
+    ) -> None:
+        super().__init__(method, A, iterations, *options, **named)
+        self.data = CountData.of(method, A, counts, background)
+        self.views = balanced_subsets(A.views, max(1, len(A.views) // 5) if subsets is None else subsets)
+        n, self.parts = len(self.views), [(A, self.data)]
+        if n > 1:
+            self.parts = [(part, self.data[own]) for part, own in zip(A.subsets(n), self.views, strict=True)]
+        require(4 * A.grid.n_voxels * n, f"the sensitivities of {n} subsets")
+        ones = ((part, np.ones(part.shape_out, np.float32)) for part, _ in self.parts)
+        self.seen = [np.asarray(part.T(one, self.preparing()), np.float32) for part, one in ones]
+        self.total: Array = sum(self.seen[1:], self.seen[0])
+        self.visible = self.mask & (self.total > LEAST)
+        self.prior, self.penalty = prior, penalty_of(prior, A.grid, self.visible)
+        self._images: Array | None = None  # of the volume whose objective was asked for last
+        self.last = -np.inf  # its objective
+
+    def images(self, s: int, values: Array, progress: Progress | None) -> Array:
+        """The images of a volume in subset `s`: known where it is what the last step gave."""
+        if values is self.values and self._images is not None:
+            return self._images[self.views[s]]
+        return np.asarray(self.parts[s][0](values, progress))
+
+    def objective(self, values: Array, progress: Progress | None) -> float:
+        """The log-likelihood of a volume, less the prior's penalty."""
+        images: Array = self._A(values, progress)
+        likelihood = self.data.log_likelihood(images)
+        self._images = images
+        self.last = likelihood if self.penalty is None else likelihood - self.penalty.value(values)
+        return self.last
+
+    def record(self) -> dict[str, Any]:
+        """The number of subsets, totals, counts that one unit of activity in all voxels gives, and the prior."""
+        sums = {"counts": self.data.counts, "background": self.data.background, "sensitivity": self.total}
+        known = {name: float(numbers.sum(dtype=float)) for name, numbers in sums.items()}
+        return {"subsets": len(self.parts), **known} | ({"prior": None} if self.prior is None else self.prior.record())
 
 
 def _warn_if_reversed(A: Projector, system: PinholeSystem, data: CountData) -> None:
@@ -99,8 +170,8 @@ def _warn_if_reversed(A: Projector, system: PinholeSystem, data: CountData) -> N
     for data in (CountData(part.counts, everywhere), CountData(part.counts[::-1], everywhere)):
         likelihoods.append(data.log_likelihood(B(even / seen * B.T(data.ratio(B(even))))))
     if (gain := likelihoods[1] - likelihoods[0]) > max(_SURE, _SURE_SHARE * total):
-        said = f"(log-likelihood {gain:.4g} higher, {total:.4g} counts of {len(chosen)} modules)"
-        warn(f"counts: likelier of the modules in reversed order {said}: are both in the same order?", 4)
+        found = f"(log-likelihood {gain:.4g} higher, {total:.4g} counts of {len(chosen)} modules)"
+        warn(f"counts: likelier of the modules in reversed order {found}: are both in the same order?", 5)
 
 
 def _require_none_below_0(numbers: Array, name: str) -> None:

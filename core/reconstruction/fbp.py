@@ -8,7 +8,7 @@ from ..geometry.grid import Grid
 from ..geometry.views import Views
 from ..progress import Progress
 from ..volumes.volume import Volume
-from .filtered import checked_images, filtered_backprojection, rows_across, shares_of_turn, warn_of_cut
+from .filtered import angular_weights, checked_images, filtered_backprojection, rows_across
 
 _IN_PLANE = np.sin(np.radians(1.0))
 
@@ -27,7 +27,7 @@ def fbp(
     Parameters
     ----------
     images : array (M, n_v, n_u)
-        Line integrals, value x mm, as of ``Projector(grid, views)``.
+        Line integrals, value x mm, such as those of ``Projector(grid, views)``.
     views : Views
         Parallel ones, whose directions lie in a plane: half a circle or more, at any angles. Each view counts for the angle
         halfway to its neighbours, so that they may be unevenly spaced; those at equal angles share what one counts for.
@@ -39,7 +39,7 @@ def fbp(
     progress
         Called as ``progress(views done, views)``; what it raises stops the work.
     quantity : str, optional
-        Of the volume, as of `Volume`; by default that of the volume whose images a projector made, else "mu".
+        What the volume is of (see `Volume`); by default that of the volume whose images a projector made, else "mu".
 
     Returns
     -------
@@ -54,15 +54,14 @@ def fbp(
     Warns
     -----
     InputWarning
-        Directions are missing: edges along them are lost. Or the images do not fall to about 0 at their edge columns, as of
-        an object that is wider, or of a displaced detector: values are wrong.
+        Directions are missing: edges along them are lost. Or the images do not fall to about 0 at their edge columns:
+        the object is wider, or the detector displaced, and values are wrong.
 
     References
     ----------
     A. C. Kak, M. Slaney, "Principles of Computerized Tomographic Imaging", IEEE Press (1988), chapter 3.
     """
-    quantity = str(quantity or getattr(images, "quantity", "mu"))
-    images = checked_images(images, views, grid, "fbp")
+    images, quantity = checked_images(images, quantity, views, grid, "fbp")
     if not views.parallel:
         raise InputError("fbp: expected parallel views (see parallel_views); views from sources are for fdk")
     along = views.detector_centers - views.sources
@@ -74,8 +73,7 @@ def fbp(
             f"fbp: view {int(out_of_plane.argmax())}: its rays do not lie in the plane in which the others turn; use sirt"
         )
     images, views = rows_across(images, views, axis, "fbp")
-    warn_of_cut(images, "fbp")
-    shares, _, gap = shares_of_turn(np.arctan2(along @ second, along @ first), np.pi)
+    shares, _, gap = angular_weights(np.arctan2(along @ second, along @ first), np.pi)
     if gap:
         empty = f"{np.degrees(gap):.0f} degrees of the half circle have no view"
         warn(f"fbp: {empty}: edges along their directions are lost", 2)

@@ -11,7 +11,7 @@ from ..geometry.grid import Grid
 from ..geometry.views import Views
 from ..progress import Progress
 from ..volumes.volume import Volume
-from .filtered import checked_images, filtered_backprojection, rows_across, shares_of_turn, warn_of_cut
+from .filtered import angular_weights, checked_images, filtered_backprojection, rows_across
 
 Array = NDArray[np.floating[Any]]
 
@@ -19,7 +19,7 @@ _OFF_CIRCLE = 0.1
 """Sources may be so far from their circle, as a share of its radius."""
 
 _LEAST_RADIUS = 1e-6
-"""Of the circle, as a share of the distance from source to detector: less is rounding."""
+"""A circle's radius as a share of the distance from source to detector: less is rounding."""
 
 
 def fdk(
@@ -39,12 +39,12 @@ def fdk(
     Parameters
     ----------
     images : array (M, n_v, n_u)
-        Line integrals, value x mm, as of ``Projector(grid, views)``.
+        Line integrals, value x mm, such as those of ``Projector(grid, views)``.
     views : Views
         From sources about on a circle, or an arc of it, around the object, at any angles and in any order. Each view counts
         for the arc halfway to its neighbours. On an arc, rays that are measured twice share their weight (Parker).
     grid, window, progress, quantity
-        As of `fbp`.
+        See `fbp`.
 
     Returns
     -------
@@ -72,13 +72,11 @@ def fdk(
     orbit with embedded misalignment correction using homogeneous coordinates", Medical Physics 28 (2001) 2050-2069.
     D. L. Parker, "Optimal short scan convolution reconstruction for fanbeam CT", Medical Physics 9 (1982) 254-257.
     """
-    quantity = str(quantity or getattr(images, "quantity", "mu"))
-    images = checked_images(images, views, grid, "fdk")
+    images, quantity = checked_images(images, quantity, views, grid, "fdk")
     if views.parallel:
         raise InputError("fdk: expected views from sources; parallel views are for fbp")
     orbit = _Orbit.of(views)
     images, views = rows_across(images, views, orbit.axis, "fdk")
-    warn_of_cut(images, "fdk")
     to_detector = views.detector_centers - views.sources
     normals = np.cross(views.u_steps, views.v_steps)
     normals /= np.linalg.norm(normals, axis=1)[:, None]
@@ -140,7 +138,7 @@ class _Orbit:
                 "that fits the sources best; fdk needs them about on a circle, sirt and osem do not"
             )
         angles = np.arctan2(y, x)
-        shares, beginning, gap = shares_of_turn(angles, 2 * np.pi)
+        shares, beginning, gap = angular_weights(angles, 2 * np.pi)
         angles = (angles - beginning) % (2 * np.pi)
         lengths = np.hypot(x, y)[:, None]
         towards = (x[:, None] * first + y[:, None] * second) / lengths

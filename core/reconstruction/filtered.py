@@ -20,9 +20,11 @@ from .ramp import ramp_matrix
 
 Array = NDArray[np.floating[Any]]
 
-_BYTES_AT_ONCE = 2**26  # of filtered images
+_BYTES_AT_ONCE = 2**26
+"""Filtered images that are held at once."""
 
-_BEHIND = 1e-3  # of the distance from source to detector: nearer to the source, nothing is taken
+_BEHIND = 1e-3
+"""Nothing is taken that is nearer to the source than this share of its distance from the detector."""
 
 _SMALL_GAP, _OUTSTANDING = np.radians(20), 3
 """A gap between neighbouring views belongs to their spacing if it is at most so large, or so many times the usual one."""
@@ -34,20 +36,24 @@ _FALLEN, _BY_NOISE = 0.05, 6
 """Images have fallen to 0 where they are less than this share of the largest value, or so many deviations of the noise."""
 
 _MOST_TILT = np.radians(15)
-"""Between an image's rows and the plane in which the views turn."""
+"""The largest angle between an image's rows and the plane in which the views turn."""
 
 
-def checked_images(images: ArrayLike, views: Views, grid: Grid, name: str) -> Array:
-    """`images` as float32, or `InputError`, also where views or grid are none, or too few."""
+def checked_images(images: ArrayLike, quantity: str | None, views: Views, grid: Grid, name: str) -> tuple[Array, str]:
+    """`images` as float32 and their volume's quantity, or `InputError`, also where views or grid are none, or too few."""
+    quantity = str(quantity or getattr(images, "quantity", "mu"))
     instance(views, Views, f"{name}: views")
     instance(grid, Grid, f"{name}: grid")
     if len(views) < 2:
         raise InputError(f"{name}: expected two views or more, got {len(views)}")
-    return real_array(plain(images), f"{name}: images", (len(views), *views.shape), np.float32)
+    return real_array(plain(images), f"{name}: images", (len(views), *views.shape), np.float32), quantity
 
 
 def rows_across(images: Array, views: Views, axis: Array, name: str) -> tuple[Array, Views]:
-    """Images and views whose rows lie about in the plane across `axis`: as they are, or rows and columns exchanged."""
+    """Images and views whose rows lie about in the plane across `axis`: as they are, or rows and columns exchanged.
+
+    Warns where the images do not fall to about 0 at their edge columns.
+    """
     along_rows, along_columns = (
         np.abs(steps @ axis) / np.linalg.norm(steps, axis=1) for steps in (views.u_steps, views.v_steps)
     )
@@ -60,10 +66,11 @@ def rows_across(images: Array, views: Views, axis: Array, name: str) -> tuple[Ar
             f"{name}: view {worst}: its rows are tilted by {np.degrees(np.arcsin(along_rows[worst])):.0f} degrees against "
             f"the plane in which the views turn, more than {np.degrees(_MOST_TILT):.0f}: turn the images, or use sirt"
         )
+    _warn_of_cut(images, name)
     return images, views
 
 
-def warn_of_cut(images: Array, name: str) -> None:
+def _warn_of_cut(images: Array, name: str) -> None:
     """Warn where the images do not fall to about 0 at their edge columns: the filter takes what is beyond them for 0."""
     edges = np.stack([images[:, :, :4], images[:, :, :-5:-1]], axis=-2, dtype=float)  # (M, n_v, 2, 4), outermost first
     noise = np.sqrt(np.mean(np.diff(edges, 3) ** 2) / 20)  # neither values nor slopes count in third differences
@@ -71,8 +78,9 @@ def warn_of_cut(images: Array, name: str) -> None:
     for means in (outermost, outermost.mean(axis=1), outermost.mean(axis=(0, 1))):  # pixels, views, both edges
         found = float(np.abs(means).max())
         if found > max(_FALLEN * largest, _BY_NOISE * noise * np.sqrt(means.size / outermost.size / 2)):
-            said = f"{name}: the images fall only to {found / largest:.0%} of their largest value at their edge columns"
-            return warn(f"{said}: what is beyond is missing, and values are wrong")
+            share = f"{found / largest:.0%} of their largest value"
+            beyond = "what is beyond is missing, and values are wrong"
+            return warn(f"{name}: the images fall only to {share} at their edge columns: {beyond}", 4)
 
 
 def filtered_backprojection(
@@ -124,7 +132,7 @@ def _columns_beyond(matrices: Array, grid: Grid, n_u: int) -> int:
     return int(np.clip(np.ceil(max(-column.min(), column.max() - (n_u - 1))), 0, n_u))
 
 
-def shares_of_turn(angles: Array, turn: float) -> tuple[Array, float, float]:
+def angular_weights(angles: Array, turn: float) -> tuple[Array, float, float]:
     """How much of a circle of circumference `turn` each angle stands for (M,): half the way to both neighbours.
 
     Equal angles share alike what one of them would stand for. Then the first angle after the largest gap, and that gap, if

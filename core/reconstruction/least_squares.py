@@ -1,23 +1,21 @@
 """Least squares by iteration: SIRT and CGLS, and what they have in common with TV."""
 
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ..errors import InputError, warn
 from ..progress import Progress, tell
 from ..projector import Projector
 from ..validation import instance, positive, real_array
-from .loop import Loop, Start, plain, waiting
-from .result import Array, Callback, Reconstruction
-from .stopping import StoppingRule
+from .loop import IterativeOptions, Loop, plain, waiting
+from .result import Array, Reconstruction
 
 _LEAN = 0.05
 """Cosine between a gradient of CGLS and its first, 0 in exact numbers: below it volumes are within 1e-3 of theirs."""
 _DONE = 1e-6
-"""Of the first gradient: what is left of it at the least squares in single precision."""
+"""The share of the first gradient that is left at the least squares in single precision."""
 _LEANS = "CGLS: from iteration {} on rounding puts its volumes up to a few percent beside those of exact numbers"
 
 
@@ -27,11 +25,8 @@ def sirt(
     iterations: int = 100,
     relaxation: float = 1.0,
     nonnegative: bool = True,
-    start: Start = None,
-    mask: ArrayLike | None = None,
-    callback: Callback | None = None,
-    progress: Progress | None = None,
-    stop: StoppingRule | None = None,
+    *options: Any,
+    **named: Unpack[IterativeOptions],
 ) -> Reconstruction:
     """The volume whose images are nearest to `images`, by SIRT: ``x <- x + relaxation C A.T(R (images - A x))``.
 
@@ -41,7 +36,7 @@ def sirt(
     Parameters
     ----------
     A : Projector
-        Of any model. Its background, if it has any, is taken off the images.
+        A projector of any model. Its background, if it has any, is taken off the images.
     images : array (M, n_v, n_u)
         Line integrals of `Transmission`, or counts of `Emission`.
     iterations : int
@@ -50,16 +45,8 @@ def sirt(
         Length of the steps, more than 0 and less than 2.
     nonnegative : bool
         Whether values below 0 become 0 after each step.
-    start : Volume, Reconstruction or array, optional
-        Begin with this; by default with 0 everywhere. A reconstruction by SIRT goes on where it ended.
-    mask : array of bool, optional
-        Of the grid's shape; outside it the volume is 0.
-    callback
-        See `Callback`.
-    progress
-        Called as ``progress(steps done, steps)``; what it raises stops the work.
-    stop : StoppingRule, optional
-        Such as `StopWhen`; ends it before the last iteration.
+    *options, **named
+        See `IterativeOptions`. Without `start` it begins with 0 everywhere.
 
     Returns
     -------
@@ -79,38 +66,28 @@ def sirt(
     Theoretical Biology 36 (1972) 105-117. J. Gregor, T. Benson, "Computational analysis and improvement of SIRT", IEEE
     Transactions on Medical Imaging 27 (2008) 918-924.
     """
-    loop = least_squares_loop("SIRT", A, iterations, start, mask, callback, progress, stop, nonnegative=nonnegative)
     relaxation = positive(relaxation, "relaxation")
     if relaxation >= 2:
         raise InputError(f"relaxation: expected less than 2, got {relaxation:g}")
-    problem = Problem.of(A, images, loop.mask)
-    per_pixel = inverse(problem.forward(problem.inside, loop.preparing()))
-    per_voxel = np.float32(relaxation) * inverse(problem.adjoint(np.ones(A.shape_out, np.float32), loop.preparing()))
+    loop = LeastSquaresLoop("SIRT", A, images, iterations, nonnegative, *options, **named)
+    per_pixel = inverse(loop.forward(loop.weights, loop.preparing()))
+    per_voxel = np.float32(relaxation) * inverse(loop.adjoint(np.ones(A.shape_out, np.float32), loop.preparing()))
     residual: Array | None = None
 
     def step(number: int, x: Array, progress: Progress | None) -> tuple[Array, float]:
         nonlocal residual
         if residual is None:
-            residual = problem.images - problem.forward(x, waiting(progress, 0, 2))
-        x = x + per_voxel * problem.adjoint(per_pixel * residual, waiting(progress, 0, 2))
-        if nonnegative:
-            x = np.maximum(x, np.float32(0))
-        residual = problem.images - problem.forward(x, waiting(progress, 1, 2))
+            residual = loop.images - loop.forward(x, waiting(progress, 0, 2))
+        x = loop.bounded(x + per_voxel * loop.adjoint(per_pixel * residual, waiting(progress, 0, 2)))
+        residual = loop.images - loop.forward(x, waiting(progress, 1, 2))
         tell(progress, 2, 2)
         return x, 0.5 * float(np.sum(per_pixel * np.square(residual, dtype=float)))
 
-    return loop.run(step, {"relaxation": relaxation, "nonnegative": nonnegative, **problem.record()})
+    return loop.run(step, relaxation=relaxation, nonnegative=nonnegative)
 
 
 def cgls(
-    A: Projector,
-    images: ArrayLike,
-    iterations: int = 10,
-    start: Start = None,
-    mask: ArrayLike | None = None,
-    callback: Callback | None = None,
-    progress: Progress | None = None,
-    stop: StoppingRule | None = None,
+    A: Projector, images: ArrayLike, iterations: int = 10, *options: Any, **named: Unpack[IterativeOptions]
 ) -> Reconstruction:
     """The volume whose images are nearest to `images`, by conjugate gradients on the normal equations (CGLS).
 
@@ -123,8 +100,8 @@ def cgls(
 
     Parameters
     ----------
-    A, images, iterations, start, mask, callback, progress, stop
-        As of `sirt`.
+    A, images, iterations, *options, **named
+        See `sirt`.
 
     Returns
     -------
@@ -134,7 +111,7 @@ def cgls(
     Raises
     ------
     InputError
-        As of `sirt`.
+        See `sirt`.
 
     Warns
     -----
@@ -147,83 +124,100 @@ def cgls(
     effectiveness of the Lanczos algorithm for the symmetric eigenproblem", Linear Algebra and its Applications 34 (1980)
     235-258.
     """
-    loop = least_squares_loop("CGLS", A, iterations, start, mask, callback, progress, stop, nonnegative=False)
-    problem = Problem.of(A, images, loop.mask)
+    loop = LeastSquaresLoop("CGLS", A, images, iterations, False, *options, **named)
 
     def step(number: int, x: Array, progress: Progress | None) -> tuple[Array, float]:
         if not loop.state:
-            residual: Array = problem.images - problem.forward(x, waiting(progress, 0, 2))
-            direction = problem.adjoint(residual, waiting(progress, 0, 2))
+            residual: Array = loop.images - loop.forward(x, waiting(progress, 0, 2))
+            direction = loop.adjoint(residual, waiting(progress, 0, 2))
             loop.state = {"residual": residual, "direction": direction, "gradient": _squares(direction)}
         residual, direction, before = (loop.state[name] for name in ("residual", "direction", "gradient"))
         first = loop.state.setdefault("first", direction)
-        change = problem.forward(direction, waiting(progress, 0, 2))
+        change = loop.forward(direction, waiting(progress, 0, 2))
         length = _squares(change)
         if length > 0:  # else the least squares are reached
             share = (before / length).astype(np.float32)
             x = x + share * direction
             residual = residual - share * change
-            gradient = problem.adjoint(residual, waiting(progress, 1, 2))
+            gradient = loop.adjoint(residual, waiting(progress, 1, 2))
             after = _squares(gradient)
             direction = gradient + (after / before).astype(np.float32) * direction
             loop.state |= {"residual": residual, "direction": direction, "gradient": after}
             first_squares = _squares(first)
             leans = float(np.vdot(first, gradient)) ** 2 > _LEAN**2 * after * first_squares
             if leans and after > _DONE**2 * first_squares:
-                loop.state["first"] = np.zeros_like(first)  # it is said once
+                loop.state["first"] = np.zeros_like(first)  # the warning is given once
                 warn(_LEANS.format(number + 1), 2)
         tell(progress, 2, 2)
         return x, 0.5 * float(_squares(residual))
 
-    return loop.run(step, problem.record())
+    return loop.run(step)
 
 
-@dataclass(frozen=True, eq=False)
-class Problem:
-    """Find x with ``A x`` near `images`, 0 outside a mask."""
+class LeastSquaresLoop(Loop):
+    """The iterations of a method that finds x with ``A x`` near images: a `Loop` that knows them and begins with 0.
 
-    A: Projector
-    images: Array
-    inside: Array  # 1 where x may be other than 0
+    Parameters
+    ----------
+    method, A, images, iterations, nonnegative
+        See `sirt`.
+    options, named
+        See `IterativeOptions`.
 
-    @classmethod
-    def of(cls, A: Projector, images: ArrayLike, mask: NDArray[np.bool_] | None) -> "Problem":
-        """Checked: the images without the model's background. Raises InputError."""
-        measured: Array = real_array(plain(images), "images", A.shape_out, np.float32) - A.background.astype(np.float32)
-        return cls(A, measured, np.ones(A.shape_in, np.float32) if mask is None else mask.astype(np.float32))
+    Attributes
+    ----------
+    images : array (M, n_v, n_u)
+        What was measured, without the model's background.
+    weights : array (n_x, n_y, n_z)
+        1 inside the mask, else 0.
+    """
+
+    def __init__(
+        self,
+        method: str,
+        A: Projector,
+        images: ArrayLike,
+        iterations: int,
+        nonnegative: bool,
+        *options: Any,
+        **named: Any,
+    ) -> None:
+        instance(A, Projector, method)
+        instance(nonnegative, bool, "nonnegative")
+        quantity = "activity" if A.model.takes == ("activity",) else "mu"
+        super().__init__(
+            method, A, iterations, *options, **named, default=0.0, negative=not nonnegative, quantity=quantity
+        )
+        self._nonnegative = nonnegative
+        self.images: Array = real_array(plain(images), "images", A.shape_out, np.float32) - A.background.astype(
+            np.float32
+        )
+        self.weights: Array = self.mask.astype(np.float32)
 
     def record(self) -> dict[str, Any]:
-        """For a reconstruction's settings: by what model, views, images and mask are known again when it is resumed."""
-        all_of = {"views": self.A.views.projection_matrices(), "images": self.images, "mask": self.inside}
-        sums = {name: numbers.sum(axis=(1, 2), dtype=float) for name, numbers in all_of.items()}  # in their order
+        """The model, and sums of views, images and mask that depend on their order."""
+        all_of = {"views": self._A.views.projection_matrices(), "images": self.images, "mask": self.weights}
+        sums = {name: numbers.sum(axis=(1, 2), dtype=float) for name, numbers in all_of.items()}
         known = {name: float(of_each @ np.linspace(1.0, 2.0, len(of_each))) for name, of_each in sums.items()}
-        return {"model": self.A.model.name, **known}
+        return {"model": self._A.model.name, **known}
 
     def forward(self, x: Array, progress: Progress | None) -> Array:
         """``A x``, float32."""
-        return np.asarray(self.A(x, progress), np.float32)
+        return np.asarray(self._A(x, progress), np.float32)
 
     def adjoint(self, y: Array, progress: Progress | None) -> Array:
         """``A.T y`` inside the mask, float32."""
-        return np.asarray(self.A.T(y, progress), np.float32) * self.inside
+        return np.asarray(self._A.T(y, progress), np.float32) * self.weights
 
-
-def quantity_of(A: Projector) -> str:
-    """Of a reconstruction: activity for projectors of emission, mu for those of line integrals."""
-    return "activity" if A.model.takes == ("activity",) else "mu"
+    def bounded(self, x: Array) -> Array:
+        """`x`, at least 0 where no negative values are wanted."""
+        return np.maximum(x, np.float32(0)) if self._nonnegative else x
 
 
 def inverse(sums: Array) -> Array:
-    """1 by sums of weights; 0 where there are none, or next to none beside the others."""
+    """1 divided by sums of weights; 0 where there are none, or next to none beside the others."""
     least = 1e-6 * sums.max(initial=0.0)
     return np.divide(1, sums, out=np.zeros_like(sums), where=sums > least)
-
-
-def least_squares_loop(name: str, A: Any, iterations: int, *arguments: Any, nonnegative: bool) -> Loop:
-    """The loop of an algorithm whose volume begins with 0. Raises InputError."""
-    instance(A, Projector, name)
-    instance(nonnegative, bool, "nonnegative")
-    return Loop(name, A, iterations, *arguments, default=0.0, negative=not nonnegative, quantity=quantity_of(A))
 
 
 def _squares(numbers: Array) -> Array:

@@ -3,10 +3,10 @@
 import math
 import time
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, TypedDict
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ..arrays import is_tensor, to_numpy
 from ..errors import InputError, naming, warn
@@ -26,45 +26,74 @@ Step = Callable[[int, Array, Progress | None], tuple[Array, float]]
 iteration's own: call it as ``progress(done, total)``, the last time with done = total.
 """
 
-Objective = Callable[[Array, Progress | None], float]
-"""Of any volume, by the data and settings of a call: ``objective(values, progress)``."""
+
+class IterativeOptions(TypedDict, total=False):
+    """The arguments that every iterative method takes after its own, by name, or by position in this order.
+
+    Attributes
+    ----------
+    start : Volume, Reconstruction, array or tensor, optional
+        What the volume begins with, on the projector's grid; by default the same value everywhere. A reconstruction by the
+        same method goes on with the same numbers as without a break, its log too; all other arguments must be what they
+        were, but for `iterations`, which are done in addition. Of one by another method the volume is taken.
+    mask : array of bool, optional
+        It has the grid's shape; outside it the volume is 0.
+    callback : callable, optional
+        See `Callback`.
+    progress : callable, optional
+        Called as ``progress(updates done, updates)``; what it raises stops the work. A `Cancelled` has what was done before
+        as its `reconstruction`.
+    stop : StoppingRule, optional
+        A rule that ends the work before the last iteration, such as `StopWhen`.
+    """
+
+    start: Start
+    mask: ArrayLike | None
+    callback: Callback | None
+    progress: Progress | None
+    stop: StoppingRule | None
 
 
 class Loop:
-    """The iterations of one call of an algorithm. Arguments are checked when it is made.
+    """The iterations of one call of a method. Arguments are checked when it is made.
 
     ::
 
-        loop = Loop("SIRT", A, iterations, start, mask, callback, progress, stop, default=0.0, negative=True)
-        weights = A.T(...)                              # what the algorithm prepares
+        loop = Loop("SIRT", A, iterations, *options, **named, default=0.0, negative=True)
+        weights = A.T(...)                              # what the method prepares
 
         def step(number, values, progress):
             ...
             return new_values, objective
 
-        return loop.run(step, {"relaxation": relaxation}, objective)
+        return loop.run(step, relaxation=relaxation)
 
     Parameters
     ----------
     method : str
-        The algorithm's name, for settings and messages. A `Reconstruction` of this method is resumed; of another, its
-        volume is the start of a new one.
-    A, iterations, start, mask, callback, progress, stop
-        Of the algorithm's caller.
+        The method's name, for settings and messages. A `Reconstruction` of this method is resumed; of another, its volume is
+        the start of a new one.
+    A : Projector
+    iterations : int
+        How many are done in this call.
+    start, mask, callback, progress, stop
+        See `IterativeOptions`.
     default : float
         The value that voxels begin with where there is no `start`.
     negative : bool
         Whether values may be below 0.
     quantity : str
-        Of the resulting volume, unless `start` has one.
+        What the resulting volume is of, unless `start` is a volume.
 
     Attributes
     ----------
     values : array (n_x, n_y, n_z)
         To begin with, float32; 0 outside the mask.
-    mask : array of bool, or None
+    is_given : bool
+        Whether there is a `start`.
+    mask : array of bool
     state : dict of arrays
-        What an algorithm needs besides the values to be resumed. `run` keeps it with the result; a resumed one finds here
+        What a method needs besides the values to be resumed. `run` keeps it with the result; a resumed one finds here
         what its last iteration had put in, else it is empty. Steps replace its arrays, and do not change their numbers.
     """
 
@@ -94,8 +123,8 @@ class Loop:
             if not isinstance(stop, StoppingRule):
                 instance(stop, StopWhen, "stop")  # the rule that users know
             stop.check(A.shape_in)
-        self.mask = None if mask is None else inside(mask, "mask", A.shape_in)
-        if self.mask is not None and not self.mask.any():
+        self.mask = np.ones(A.shape_in, bool) if mask is None else inside(mask, "mask", A.shape_in)
+        if not self.mask.any():
             warn(f"mask: 0 of {self.mask.size} voxels are inside: the volume will be 0", 4)
         self.state: dict[str, Array] = {}
         self._objective: list[float] = []
@@ -105,6 +134,7 @@ class Loop:
                 self.state, self._objective = dict(start.state), [float(number) for number in start.objective]
                 self._resumed = start.settings
             start = start.volume
+        self.is_given = start is not None
         self._quantity = start.quantity if isinstance(start, Volume) else quantity
         self.values = self._first_values(start, default, negative)
 
@@ -113,28 +143,33 @@ class Loop:
         """Iterations done, those before a resume included."""
         return len(self._objective)
 
-    def inside(self, seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Those of the voxels `seen` that are in the mask, too."""
-        return seen if self.mask is None else seen & self.mask
-
     def preparing(self) -> Progress | None:
         """The progress callback for what is prepared before the first iteration: it only asks whether to go on."""
         return waiting(self._progress, 0, self._iterations)
 
-    def run(self, step: Step, settings: Mapping[str, Any], objective: Objective | None = None) -> Reconstruction:
-        """Do the iterations; `settings` are the algorithm's arguments, and what its data are known by.
+    def record(self) -> dict[str, Any]:
+        """What the data are known by when a reconstruction is resumed: entries of its settings."""
+        return {}
 
-        Where a reconstruction is resumed, they and the objective of its volume must be what they were, else `InputError`. A
-        `Cancelled` of progress or callback takes along what was done before, as its `reconstruction`.
+    def objective(self, values: Array, progress: Progress | None) -> float | None:
+        """The objective of any volume, if a method can say it without a step."""
+        return None
+
+    def run(self, step: Step, **settings: Any) -> Reconstruction:
+        """Do the iterations; `settings` are the method's own arguments.
+
+        Where a reconstruction is resumed, they, the `record` of the data and the objective of the volume must be what they
+        were, else `InputError`. A `Cancelled` of progress or callback takes along what was done before, as its
+        `reconstruction`.
         """
+        settings |= self.record()
         result = self._result(settings, "cancelled")
         try:
             if self._objective:
-                asked = {} if objective is None else {"objective": objective(self.values, self.preparing())}
-                self._require_as_before({**settings, **asked})
+                self._require_as_before(settings, self.objective(self.values, self.preparing()))
             for i in range(self._iterations):
                 values, reached = step(self.done, self.values, part_of(self._progress, i, self._iterations))
-                self.values = self._only_inside(values)
+                self.values = self._inside(values)
                 self._objective.append(float(reached))
                 result = self._result(settings, "cancelled")
                 if self._callback is not None and self._callback(self.done, self.values):
@@ -148,13 +183,15 @@ class Loop:
             raise
         return self._result(settings, "iterations")
 
-    def _require_as_before(self, settings: Mapping[str, Any]) -> None:
-        known = {**settings, **self._resumed, "objective": self._objective[-1]}
-        said = [f"{key} {known[key]}, now {new}" for key, new in settings.items() if not _same(new, known[key])]
-        if said:
+    def _require_as_before(self, settings: Mapping[str, Any], objective: float | None) -> None:
+        last = self._objective[-1]
+        known = {**settings, **self._resumed, "objective": last}
+        asked = {**settings, "objective": last if objective is None else objective}
+        changed = [f"{key} {known[key]}, now {new}" for key, new in asked.items() if not _same(new, known[key])]
+        if changed:
             raise InputError(
                 "start: this reconstruction is of other images, views or mask, or another model or other settings "
-                f"({'; '.join(said)}): give its volume (--start) to begin with that"
+                f"({'; '.join(changed)}): give its volume (--start) to begin with that"
             )
 
     def _result(self, settings: Mapping[str, Any], stopped: str) -> Reconstruction:
@@ -164,19 +201,16 @@ class Loop:
 
     def _first_values(self, start: Volume | ArrayLike | None, default: float, negative: bool) -> Array:
         if start is None:
-            return self._only_inside(np.full(self._A.shape_in, default, np.float32))
+            return self._inside(np.full(self._A.shape_in, default, np.float32))
         with naming("start"):
             array = self._A._check(start) if isinstance(start, Volume) else plain(start)
         values = real_array(array, "start", self._A.shape_in, np.float32)
         if not negative and values.min() < 0:
             raise InputError(f"start: expected 0 or more, got {values.min():g}")
-        return self._only_inside(values)
+        return self._inside(values)
 
-    def _only_inside(self, values: Array) -> Array:
-        values = np.asarray(values, np.float32)
-        if self.mask is not None:
-            values = np.where(self.mask, values, np.float32(0))
-        return freeze(np.ascontiguousarray(values))
+    def _inside(self, values: Array) -> Array:
+        return freeze(np.ascontiguousarray(np.where(self.mask, np.asarray(values, np.float32), np.float32(0))))
 
 
 def _same(one: Any, other: Any) -> bool:

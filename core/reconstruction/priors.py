@@ -1,6 +1,5 @@
 """Priors: penalties of differences between neighbouring voxels, for reconstructions with noise."""
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import KW_ONLY, dataclass, fields
 from itertools import product
@@ -33,12 +32,12 @@ class Pairs:
 
     @property
     def weight(self) -> Any:
-        """Of psi: one number for all, or an array."""
+        """Weight of psi: one number for all, or an array."""
         return self._shared(self.closeness)
 
     @property
     def squared(self) -> Any:
-        """Of squares of differences."""
+        """Weight of squares of differences."""
         return self._shared(self.closeness**2)
 
     def _shared(self, weight: float) -> Any:
@@ -46,7 +45,7 @@ class Pairs:
 
 
 @dataclass(frozen=True, eq=False)
-class Prior(ABC):
+class Prior:
     """A penalty ``weight * sum over pairs of neighbours of w_jk psi(x_j, x_k)``; `psi` is the subclass's.
 
     The w_jk are the smallest distance of two voxels divided by that of these two, so that all are 1 or less, and voxels
@@ -58,9 +57,9 @@ class Prior(ABC):
     weight : float
         How much it counts beside the log-likelihood, 0 or more.
     anatomy : Volume, optional
-        Of the reconstruction's grid, such as a CT or its segments: differences across its edges are not penalised. Of each
-        voxel's neighbours only those `similar` count whose anatomical values are closest to its own, and all as close as the
-        last of these (Bowsher 2004); a pair where only one chose the other counts half.
+        A volume on the reconstruction's grid, such as a CT or its segments: differences across its edges are not penalised.
+        Only those `similar` of each voxel's neighbours count whose anatomical values are closest to its own, and all that
+        are as close as the last of these (Bowsher 2004); a pair where only one chose the other counts half.
     similar : int, optional
         By default about a quarter of the neighbours.
     neighbors : int
@@ -109,51 +108,38 @@ class Prior(ABC):
     def _similar(self) -> int:
         return self.similar or -(-self.neighbors // 4)
 
-    # Of a slab's values and its pairs of neighbours:
+    # `psi` of pairs of neighbours, its derivatives and its second derivatives, by a and by b:
 
-    @abstractmethod
-    def _value(self, x: Array, pairs: list[Pairs]) -> float: ...
+    def _psi(self, a: Array, b: Array) -> Array:
+        raise NotImplementedError
 
-    @abstractmethod
-    def _add_gradient(self, x: Array, pairs: list[Pairs], out: Array) -> None: ...
-
-    @abstractmethod
-    def _add_curvature(self, x: Array, pairs: list[Pairs], out: Array) -> None: ...
-
-
-class _PairPrior(Prior):
-    """A prior whose `psi` is a function of the two values alone."""
-
-    @abstractmethod
-    def _psi(self, a: Array, b: Array) -> Array: ...
-
-    @abstractmethod
     def _slopes(self, a: Array, b: Array) -> tuple[Array, Array]:
-        """Derivatives of psi by a and by b."""
+        raise NotImplementedError
 
-    @abstractmethod
     def _bends(self, a: Array, b: Array) -> tuple[Any, Any]:
-        """Second derivatives of psi by a and by b."""
+        raise NotImplementedError
+
+    # The penalty of a slab's values, and what adds its gradient and curvature to `out`:
 
     def _value(self, x: Array, pairs: list[Pairs]) -> float:
         return sum(float(np.sum(p.weight * self._psi(x[p.first], x[p.second]), dtype=float)) for p in pairs)
 
     def _add_gradient(self, x: Array, pairs: list[Pairs], out: Array) -> None:
-        self._add(self._slopes, x, pairs, out)
+        _add(self._slopes, x, pairs, out)
 
     def _add_curvature(self, x: Array, pairs: list[Pairs], out: Array) -> None:
-        self._add(self._bends, x, pairs, out)
+        _add(self._bends, x, pairs, out)
 
-    @staticmethod
-    def _add(of: Callable[[Array, Array], tuple[Any, Any]], x: Array, pairs: list[Pairs], out: Array) -> None:
-        for p in pairs:
-            by_first, by_second = of(x[p.first], x[p.second])
-            out[p.first] += p.weight * by_first
-            out[p.second] += p.weight * by_second
+
+def _add(of: Callable[[Array, Array], tuple[Any, Any]], x: Array, pairs: list[Pairs], out: Array) -> None:
+    for p in pairs:
+        by_first, by_second = of(x[p.first], x[p.second])
+        out[p.first] += p.weight * by_first
+        out[p.second] += p.weight * by_second
 
 
 @dataclass(frozen=True, eq=False)
-class Quadratic(_PairPrior):
+class Quadratic(Prior):
     """Penalises squares of differences, ``psi = (x_j - x_k)^2 / 2``: smooth everywhere, and blurs edges."""
 
     def _psi(self, a: Array, b: Array) -> Array:
@@ -168,7 +154,7 @@ class Quadratic(_PairPrior):
 
 
 @dataclass(frozen=True, eq=False)
-class RelativeDifference(_PairPrior):
+class RelativeDifference(Prior):
     """Penalises differences relative to the values: ``psi = (x_j - x_k)^2 / (x_j + x_k + gamma |x_j - x_k| + edge)``.
 
     Noise grows with the activity, and so may differences. For values of 0 or more.
@@ -251,7 +237,7 @@ class TotalVariation(Prior):
         object.__setattr__(self, "edge", positive(self.edge, "prior: edge", "kBq/mL"))
 
     def _sizes(self, x: Array, pairs: list[Pairs]) -> Array:
-        """Of the gradient in the slab's voxels."""
+        """Sizes of the gradient in the slab's voxels."""
         squares = np.full(x.shape, self.edge**2, x.dtype)
         for p in pairs:
             squares[p.first] += p.squared * np.square(x[p.first] - x[p.second])

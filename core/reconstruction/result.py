@@ -22,13 +22,18 @@ class Reconstruction:
 
     volume: Volume
     objective: NDArray[np.float64]
-    """After each iteration (n,): what the algorithm makes as large, or as small, as it can."""
+    """What the method makes as large, or as small, as it can, after each iteration (n,); (0,) of a method without one."""
     settings: Mapping[str, Any] = field(default_factory=dict)
-    """The algorithm's name ("method"), its arguments, and why it ended ("stopped"): anything JSON can hold."""
+    """The method's name ("method"), its arguments, and why it ended ("stopped"): anything JSON can hold."""
     state: Mapping[str, Array] = field(default_factory=dict)
-    """What else the algorithm needs to go on as if it had not ended, by name; most need the volume alone."""
+    """What else the method needs to go on as if it had not ended, by name; most need the volume alone."""
 
     @property
     def iterations(self) -> int:
-        """How many were done, those before it was resumed included."""
+        """How many iterations were done, those before it was resumed included."""
         return len(self.objective)
+
+
+def iterations_text(n: int) -> str:
+    """A number of iterations in words, nothing for 0."""
+    return f"{n} iteration{'s' * (n > 1)}" if n else ""

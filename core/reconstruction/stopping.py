@@ -25,7 +25,7 @@ class StoppingRule:
         objective
             After each iteration so far.
         values
-            Of the volume (n_x, n_y, n_z), read-only.
+            The volume's values (n_x, n_y, n_z), read-only.
         seconds
             Since the reconstruction was called.
         """
@@ -45,7 +45,7 @@ class StopWhen(StoppingRule):
         likelihood grows, so does the noise: this ends before it is larger than wanted. A region of zeros has no noise:
         it ends nothing, and a warning says so.
     region : array of bool, optional
-        Of the grid's shape: voxels of the same activity, some voxels away from edges, in which `noise` is measured.
+        It has the grid's shape: voxels of the same activity, some voxels away from edges, in which `noise` is measured.
     seconds : float, optional
         So many have passed since the call. An iteration that has begun is finished.
 

@@ -1,5 +1,7 @@
 """Least squares with total variation, by a primal-dual algorithm."""
 
+from typing import Any, Unpack
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -8,10 +10,9 @@ from ..memory import require
 from ..progress import Progress, tell
 from ..projector import Projector
 from ..validation import positive
-from .least_squares import Problem, inverse, least_squares_loop
-from .loop import Start, waiting
-from .result import Array, Callback, Reconstruction
-from .stopping import StoppingRule
+from .least_squares import LeastSquaresLoop, inverse
+from .loop import IterativeOptions, waiting
+from .result import Array, Reconstruction
 
 
 def tv(
@@ -20,11 +21,8 @@ def tv(
     weight: float,
     iterations: int = 200,
     nonnegative: bool = True,
-    start: Start = None,
-    mask: ArrayLike | None = None,
-    callback: Callback | None = None,
-    progress: Progress | None = None,
-    stop: StoppingRule | None = None,
+    *options: Any,
+    **named: Unpack[IterativeOptions],
 ) -> Reconstruction:
     """The volume with the least ``||A x - images||^2 / 2 + weight TV(x)``: areas of one value with sharp edges.
 
@@ -35,9 +33,10 @@ def tv(
     Parameters
     ----------
     weight : float
-        More than 0. In units of the images squared by the volume's values; too much makes all one value.
-    A, images, iterations, nonnegative, start, mask, callback, progress, stop
-        As of `sirt`.
+        How much the variation counts, more than 0, in units of the images squared by the volume's values; too much makes all
+        one value.
+    A, images, iterations, nonnegative, *options, **named
+        See `sirt`.
 
     Returns
     -------
@@ -47,7 +46,7 @@ def tv(
     Raises
     ------
     InputError
-        As of `sirt`.
+        See `sirt`.
 
     References
     ----------
@@ -57,43 +56,40 @@ def tv(
     J. H. Jorgensen, X. Pan, "Convex optimization problem prototyping for image reconstruction in computed tomography with
     the Chambolle-Pock algorithm", Physics in Medicine and Biology 57 (2012) 3065-3091.
     """
-    loop = least_squares_loop("TV", A, iterations, start, mask, callback, progress, stop, nonnegative=nonnegative)
+    loop = LeastSquaresLoop("TV", A, images, iterations, nonnegative, *options, **named)
     weight = positive(weight, "weight")
     require(4 * (30 * A.grid.n_voxels + 5 * int(np.prod(A.shape_out))), "the arrays of tv")
-    problem = Problem.of(A, images, loop.mask)
     closeness = A.grid.spacing.min() / A.grid.spacing
-    per_pixel = inverse(problem.forward(problem.inside, loop.preparing()))
-    weights = problem.adjoint(np.ones(A.shape_out, np.float32), loop.preparing())
+    per_pixel = inverse(loop.forward(loop.weights, loop.preparing()))
+    weights = loop.adjoint(np.ones(A.shape_out, np.float32), loop.preparing())
     is_seen = (weights > 0).astype(np.float32)
     pairs = (_gradient(is_seen, np.ones(3, np.float32)) == 0) * is_seen  # 1 where a voxel and the next one are seen
     # The gradient is scaled so that it has as much weight in a voxel as its rays have.
-    scale = float(weights.mean()) / max(float(problem.inside.mean()), 1e-6) / float(2 * closeness.sum()) or 1.0
+    scale = float(weights.mean()) / max(float(loop.weights.mean()), 1e-6) / float(2 * closeness.sum()) or 1.0
     factors = (scale * closeness).astype(np.float32)
-    per_voxel = inverse(weights + np.float32(2 * factors.sum()) * problem.inside)
+    per_voxel = inverse(weights + np.float32(2 * factors.sum()) * loop.weights)
     per_gradient = np.float32(1 / (2 * factors.max()))
     radius = np.float32(weight / scale)
 
     def step(number: int, x: Array, progress: Progress | None) -> tuple[Array, float]:
         if not loop.state:
-            seen = problem.forward(x, waiting(progress, 0, 2))
+            seen = loop.forward(x, waiting(progress, 0, 2))
             nothing = np.zeros((3, *x.shape), np.float32)
             loop.state = {"seen": seen, "ahead": seen, "beyond": x, "misfit": np.zeros_like(seen), "slopes": nothing}
         seen, ahead, beyond, misfit, slopes = (loop.state[s] for s in ("seen", "ahead", "beyond", "misfit", "slopes"))
-        misfit = (misfit + per_pixel * (ahead - problem.images)) / (1 + per_pixel)
+        misfit = (misfit + per_pixel * (ahead - loop.images)) / (1 + per_pixel)
         slopes = pairs * (slopes + per_gradient * _gradient(beyond, factors))
         slopes /= np.maximum(1, np.sqrt(np.sum(slopes**2, axis=0)) / radius)
-        back = problem.adjoint(misfit, waiting(progress, 0, 2)) + _gradient_adjoint(slopes, factors)
-        new = x - per_voxel * back
-        if nonnegative:
-            new = np.maximum(new, np.float32(0))
-        now = problem.forward(new, waiting(progress, 1, 2))
+        back = loop.adjoint(misfit, waiting(progress, 0, 2)) + _gradient_adjoint(slopes, factors)
+        new = loop.bounded(x - per_voxel * back)
+        now = loop.forward(new, waiting(progress, 1, 2))
         ahead, beyond = 2 * now - seen, 2 * new - x
         loop.state = {"seen": now, "ahead": ahead, "beyond": beyond, "misfit": misfit, "slopes": slopes}
         tell(progress, 2, 2)
-        squares = float(np.sum(np.square(now - problem.images, dtype=float)))
+        squares = float(np.sum(np.square(now - loop.images, dtype=float)))
         return new, 0.5 * squares + weight * total_variation(new, A.grid, pairs)
 
-    return loop.run(step, {"weight": weight, "nonnegative": nonnegative, **problem.record()})
+    return loop.run(step, weight=weight, nonnegative=nonnegative)
 
 
 def total_variation(x: Array, grid: Grid, pairs: Array | float = 1.0) -> float:

@@ -164,6 +164,8 @@ def is_met(values: Mapping[str, Any], need: str) -> bool:
 
     def holds(term: str) -> bool:
         key, _, word = term.partition("=")
+        if word and SETTINGS[key].names_file(values.get(key)):  # what its contents take is known when it is read
+            return True
         return values.get(key, SETTINGS[key].default) == word if word else values.get(key) not in (None, False)
 
     return any(map(holds, need.removeprefix("no ").split(" or "))) != need.startswith("no ")
@@ -210,6 +212,6 @@ def _with_paths(recipe: Recipe, change: Callable[[str], str]) -> Recipe:
     """The recipe with every file's name changed by a function."""
     changed = {}
     for key, value in recipe.given.items():
-        if key in SETTINGS and SETTINGS[key].is_path:
+        if key in SETTINGS and SETTINGS[key].names_file(value):
             changed[key] = tuple(map(change, value)) if isinstance(value, tuple) else change(value)
     return Recipe({**recipe.given, **changed})

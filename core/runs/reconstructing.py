@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from inspect import Parameter
 from typing import Any
 
 import numpy as np
@@ -12,8 +13,7 @@ from ..geometry.grid import Grid
 from ..memory import require
 from ..progress import Stages
 from ..projector.backends import choose
-from ..reconstruction.methods import METHODS, PRIORS
-from ..reconstruction.priors import Prior
+from ..reconstruction.methods import METHODS, PRIORS, Choice, Method, method_of
 from ..reconstruction.result import Reconstruction
 from ..reconstruction.stopping import StoppingRule, StopWhen
 from ..volumes.resampling import resample
@@ -22,18 +22,17 @@ from ..volumes.volume_files import read_volume
 from .recipe import Recipe
 from .run import ProjectionRun
 from .run_recipe import projector_of_run, recipe_model
-from .settings import SAMPLING
+from .settings import SAMPLING, SETTINGS
 
 Watch = Callable[[int, NDArray[Any], Sequence[float]], bool | None]
 """Called as ``watch(iteration, values, objective)`` after each iteration, with the volume's values and the objective after
 all iterations so far; what is true ends the reconstruction there."""
 
-_ALONG = ((-1, 1, 1), (1, -1, 1), (1, 1, -1))
 _POINTS = 7
-"""Of the hole: enough for its blur, and few enough for an iteration in a fraction of a second."""
+"""Points of the hole: enough for its blur, and few enough for an iteration in a fraction of a second."""
 
 TABLES = ("reconstruction", "model", "attenuation", "compute")
-"""Of a recipe: what says how a run is reconstructed. The other tables say how its images were made."""
+"""A recipe's tables that say how a run is reconstructed. The other tables say how its images were made."""
 
 
 def reconstruct_run(
@@ -43,6 +42,7 @@ def reconstruct_run(
     start: Volume | Reconstruction | None = None,
     watch: Watch | None = None,
     stages: Stages = lambda stage: None,
+    method: Method | None = None,
 ) -> Reconstruction:
     """Reconstruct the volume that the images of a run are of.
 
@@ -62,6 +62,8 @@ def reconstruct_run(
         See `Watch`.
     stages
         Begins each stage: reading, voxelizing, reconstructing.
+    method : Method
+        The recipe's method, where it has been read from its file already.
 
     Returns
     -------
@@ -79,18 +81,24 @@ def reconstruct_run(
     InputWarning
         The images were made from voxels that are not at least twice as fine as those of the reconstruction, or with no
         better model of the hole: model and data then share errors that a real scanner's data does not have. Or the whole
-        hole cannot be reckoned with, and few rays take its place. Or the record of a run without a recipe contradicts the
+        hole cannot be modelled, and few rays take its place. Or the record of a run without a recipe contradicts the
         model that is given.
     """
     recipe = recipe_of(run, recipe)
-    method = METHODS[recipe["reconstruction.method"]]
-    is_counts = recipe["model.kind"] == "emission"
-    if method.of_counts and not is_counts:
-        others = ", ".join(other.name for other in METHODS.values() if not other.of_counts)
-        also = f"; for these images: {others}" if others else ""
-        raise InputError(f"reconstruction.method: {method.name} needs a run of counts, not of line integrals{also}")
+    method = method or method_of(recipe["reconstruction.method"])
+    if method.of_counts and recipe["model.kind"] != "emission":
+        others = ", ".join(name for name, other in METHODS.items() if not other.of_counts)
+        raise InputError(
+            f"reconstruction.method: {recipe['reconstruction.method']} needs a run of counts, not of line integrals; for "
+            f"these images: {others}"
+        )
     grid = reconstruction_grid(run, recipe)
     require(22.0 * grid.n_voxels, "a reconstruction of {} x {} x {} voxels".format(*grid.shape))
+    rules = _rules(recipe, grid)
+    for name, value in (("start", start), ("stop", rules)):
+        if value is not None and not method.takes(name):
+            raise InputError(f"{name}: {method.label} has no {name}")
+    given = _arguments(recipe, method, grid, stages)
     if "recipe" not in run.settings:
         _compare_with_record(run, recipe, mu is not None)
     modelled = model_of(run, recipe)
@@ -100,21 +108,10 @@ def reconstruct_run(
     if recipe["reconstruction.ignore_attenuation"]:
         mu = None
     A = projector_of_run(run, grid, mu, modelled, recipe["compute.backend"], recipe["compute.threads"], stages)
-    given: dict[str, Any] = {name: recipe[f"reconstruction.{name}"] for name in method.takes}
-    if "prior" in method.takes:
-        given["prior"] = _prior(recipe, grid, stages)
-    if "weight" in method.takes:
-        given["weight"] = _weight(recipe, f"the variation in {method.label}")
-    rules = _rules(recipe, grid)
-    found = method.function(
-        A,
-        line_integrals(run, recipe),
-        iterations=recipe["reconstruction.iterations"] or method.iterations,
-        start=start,
-        stop=rules if watch is None else _Watched(watch, rules),
-        progress=stages("reconstructing"),
-        **given,
-    )
+    stop = rules if watch is None else _Watched(watch, rules)
+    asked = {"start": start, "stop": stop, "progress": stages("reconstructing")}
+    given |= {name: value for name, value in asked.items() if method.takes(name)}
+    found = method.function(A, line_integrals(run, recipe), **given)
     volume = found.volume
     if run.volume is not None:  # a radiograph's is not of activity
         volume = Volume(volume.array, grid, run.volume.quantity)
@@ -122,7 +119,7 @@ def reconstruct_run(
 
 
 class _Watched(StoppingRule):
-    """The user's rules and a watcher: of all that a reconstruction calls, its rules alone are told the objective."""
+    """The user's rules and a watcher: of all that a reconstruction calls, its rules alone are given the objective."""
 
     def __init__(self, watch: Watch, rules: StoppingRule | None) -> None:
         self._watch, self._rules = watch, rules
@@ -137,23 +134,35 @@ class _Watched(StoppingRule):
         return None if self._rules is None else self._rules.reason(objective, values, seconds)
 
 
-def _prior(recipe: Recipe, grid: Grid, stages: Stages) -> Prior | None:
-    if recipe["reconstruction.prior"] is None:
-        return None
-    kind = PRIORS[recipe["reconstruction.prior"]]
-    weight = _weight(recipe, f"the {kind.label.lower()} prior")
-    given = {name: recipe[f"reconstruction.{name}"] for name in kind.takes}
-    anatomy = recipe["reconstruction.anatomy"]
-    if anatomy is not None:
-        given["anatomy"] = resample(read_volume(anatomy, progress=stages("reading")), grid)
-    return kind.prior(weight, **{name: value for name, value in given.items() if value is not None})
+def _arguments(recipe: Recipe, method: Method, grid: Grid, stages: Stages) -> dict[str, Any]:
+    """The method's own arguments, as a recipe gives them. Raises InputError where it takes no such one, or needs another."""
+    prior = PRIORS.get(recipe["reconstruction.prior"])
+    taken = {*method.own, *(() if prior is None else prior.own)}
+    for name in (key.removeprefix("reconstruction.") for key in recipe.given):
+        if name not in taken and any(name in choice.own for choice in (*METHODS.values(), *PRIORS.values())):
+            raise InputError(f"{_option(name)}: {method.label} does not take it")
+    given = _given(recipe, method)
+    if prior is not None:
+        own = _given(recipe, prior)
+        if "anatomy" in own:
+            own["anatomy"] = resample(read_volume(own["anatomy"], progress=stages("reading")), grid)
+        given["prior"] = prior.function(**own)
+    return given
 
 
-def _weight(recipe: Recipe, of: str) -> float:
-    weight: float | None = recipe["reconstruction.weight"]
-    if weight is None:
-        raise InputError(f"reconstruction.weight (--weight): missing; say how much {of} counts")
-    return weight
+def _given(recipe: Recipe, choice: Choice) -> dict[str, Any]:
+    """The arguments of a method or prior that a recipe gives; all others have their own defaults."""
+    values = {name: recipe.given.get(f"reconstruction.{name}") for name in choice.own}
+    for name, value in values.items():
+        if value is None and choice.own[name] is Parameter.empty:
+            raise InputError(f"{_option(name)}: missing; {choice.label} needs it")
+    return {name: value for name, value in values.items() if value is not None}
+
+
+def _option(name: str) -> str:
+    """A setting in messages."""
+    key = f"reconstruction.{name}"
+    return f"{key} ({SETTINGS[key].option})"
 
 
 def _rules(recipe: Recipe, grid: Grid) -> StopWhen | None:
@@ -163,11 +172,9 @@ def _rules(recipe: Recipe, grid: Grid) -> StopWhen | None:
     region = None
     if recipe["reconstruction.stop_region"] is not None:
         *middle, radius = recipe["reconstruction.stop_region"]
-        axes = [
-            origin + spacing * np.arange(n) - center
-            for origin, spacing, n, center in zip(grid.affine[:3, 3], grid.spacing, grid.shape, middle, strict=True)
-        ]
-        region = sum(np.square(axis).reshape(shape) for axis, shape in zip(axes, _ALONG, strict=True)) <= radius**2
+        places = zip(grid.affine[:3, 3], grid.spacing, grid.shape, middle, strict=True)
+        axes = np.ix_(*(origin + spacing * np.arange(n) - center for origin, spacing, n, center in places))
+        region = sum(np.square(axis) for axis in axes) <= radius**2
     return StopWhen(**given, region=region)
 
 
@@ -210,9 +217,9 @@ def reconstruction_grid(run: ProjectionRun, recipe: Recipe) -> Grid:
 
 
 def model_of(run: ProjectionRun, recipe: Recipe) -> Recipe:
-    """The recipe of the model that a reconstruction reckons with.
+    """The recipe of a reconstruction's model.
 
-    Of the hole's blur it is, unless `recipe` says which: that of the whole hole, where the run's counts have it; else that
+    The hole's blur in it is, unless `recipe` says which, that of the whole hole, where the run's counts have it; else that
     of rays through as many points as the run has, but 7 at most.
     """
     if recipe["model.kind"] != "emission":
@@ -265,21 +272,21 @@ def flattering(run: ProjectionRun, grid: Grid, model: Recipe | None = None) -> l
     """Why figures of a reconstruction on a grid flatter: the run was simulated with hardly better voxels, or hardly a better
     model of the hole.
 
-    `model` is that of the reconstruction; without it, what is said holds if it reckons as the run was made.
+    `model` is that of the reconstruction; without it, it is taken to be the run's own.
     """
     if run.volume is None:  # measured
         return []
-    said, made = [], run.recipe if "recipe" in run.settings else Recipe()
+    reasons, made = [], run.recipe if "recipe" in run.settings else Recipe()
     fine, coarse = float(run.volume.grid.spacing.max()), float(grid.spacing.min())
     if 2 * fine > 1.001 * coarse:
-        said.append(
+        reasons.append(
             f"the run was made from voxels of {fine:.3g} mm: figures of a reconstruction in voxels of {coarse:.3g} mm "
             f"flatter, unless its voxels are {coarse / 2:.3g} mm or less"
         )
-    points, reckoned = made["model.aperture_points"], (model or made)["model.aperture_points"]
-    if None not in (points, reckoned) and 1 < points <= reckoned:
-        said.append(
-            f"the run was made with {points} points of the hole: figures of a reconstruction that reckons with as many "
+    points, modelled = made["model.aperture_points"], (model or made)["model.aperture_points"]
+    if None not in (points, modelled) and 1 < points <= modelled:
+        reasons.append(
+            f"the run was made with {points} points of the hole: figures of a reconstruction whose model has as many "
             "flatter, unless the run has more points"
         )
-    return said
+    return reasons

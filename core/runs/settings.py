@@ -6,9 +6,11 @@ same name in the model's class.
 """
 
 import operator
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
+from inspect import Parameter
 from numbers import Integral, Real
+from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
@@ -17,7 +19,7 @@ from ..phantoms.kinds import KINDS
 from ..physics.isotopes import ISOTOPES
 from ..physics.materials import APERTURES, CRYSTALS
 from ..projector.backends import BACKENDS, OLD_NAMES
-from ..reconstruction.methods import METHODS, PRIORS, taking
+from ..reconstruction.methods import METHOD_FILES, METHODS, PRIORS
 from ..validation import real_array
 from ..volumes.volume import LINE_INTEGRALS
 from .frame_files import RAW_TYPES
@@ -32,7 +34,8 @@ class Setting:
     """One setting of a run.
 
     Its `needs` are conditions without which it has no effect, each alternatives such as ``"model.aperture_mu or
-    model.within_cone"``: a setting that must be given, have one value (``key=value``), or not be given (``no key``).
+    model.within_cone"``: a setting that must be given, have one value (``key=value``; a file's name may mean it), or not be
+    given (``no key``).
     """
 
     key: str  # table and name: "model.time"
@@ -48,6 +51,7 @@ class Setting:
     slider: float | None = None  # the largest value that a slider reaches
     sizes: tuple[int, ...] | None = None  # how many values it may have, () for any number; None: one value alone
     is_path: bool = False  # whether it names a file
+    endings: Collection[str] = ()  # in lower case, of files that it may name beside its words
     needs: tuple[str, ...] = ()
     option: str = ""  # on the command line; by default made from the key, like the next
     label: str = ""  # in Blender
@@ -56,6 +60,10 @@ class Setting:
         name = self.key.partition(".")[2].removesuffix("_degrees")
         object.__setattr__(self, "option", self.option or "--" + name.replace("_", "-"))
         object.__setattr__(self, "label", self.label or name.replace("_", " ").title())
+
+    def names_file(self, value: Any) -> bool:
+        """Whether a value is a file's name."""
+        return self.is_path or (isinstance(value, str) and Path(value).suffix.lower() in self.endings)
 
     @property
     def help(self) -> str:
@@ -68,6 +76,8 @@ class Setting:
     def expected(self) -> str:
         """What one value must be, for messages."""
         words = f"one of {', '.join(self.words)}" if self.words else ""
+        if self.endings:
+            words += f" or a file ({', '.join(self.endings)})"
         if self.kind in (bool, str):
             return words or {bool: "true or false", str: "a text"}[self.kind]
         number = "a whole number" if self.kind is int else "a number"
@@ -91,7 +101,7 @@ class Setting:
         if isinstance(value, str):
             if self.key == "compute.backend":
                 value = OLD_NAMES.get(value, value)
-            good = value in self.words if self.words else self.kind is str
+            good = value in self.words or self.names_file(value) if self.words else self.kind is str
         elif self.kind in (bool, str):
             good = isinstance(value, self.kind)
         else:
@@ -108,9 +118,14 @@ def _named(names: Iterable[str], text: str) -> Words:
     return {name: (name[0].upper() + name[1:], text) for name in names}
 
 
+def _alternatives(key: str, words: Iterable[str]) -> str:
+    """The condition that a setting has one of these values."""
+    return " or ".join(f"{key}={word}" for word in words)
+
+
 _COUNTS = "model.kind=emission"
 _BY_RAYS = (_COUNTS, "no model.hole=depth")
-_METHOD_OF_COUNTS = " or ".join(f"reconstruction.method={m.name}" for m in METHODS.values() if m.of_counts)
+_METHOD_OF_COUNTS = _alternatives("reconstruction.method", [name for name, m in METHODS.items() if m.of_counts])
 _RAYS = "model.kind=transmission or model.hole=rays or model.hole=point"
 _FILE = "volume.file or volume.states"
 _MADE = "no counts.files"
@@ -122,14 +137,22 @@ _ISOTOPES = _named(ISOTOPES, "Energy window 10 % around its strongest line")
 _BY_NAME = "As it attenuates the isotope's photons"
 
 
-def _methods(argument: str) -> str:
-    """The condition that a method takes an argument."""
-    return " or ".join(f"reconstruction.method={name}" for name in taking(argument))
+def _argument(name: str, kind: type, text: str, absent: str = "", **more: Any) -> Setting:
+    """The setting of an argument of priors or methods, with their default, which has an effect where one takes it.
 
-
-def _priors(argument: str) -> str:
-    """The condition that a prior takes an argument."""
-    return " or ".join(f"reconstruction.prior={prior.name}" for prior in PRIORS.values() if argument in prior.takes)
+    Where the defaults differ the setting has none, and its help lists them.
+    """
+    needs: list[str] = []
+    defaults: dict[str, Any] = {}
+    for key, choices in (("reconstruction.prior", PRIORS), ("reconstruction.method", METHODS)):
+        takers = {word: choice for word, choice in choices.items() if name in choice.own}
+        needs += [_alternatives(key, takers)] if takers else []
+        defaults |= {choice.label: choice.own[name] for choice in takers.values()}
+    known = set(defaults.values()) - {None, Parameter.empty}
+    if len(known) > 1:
+        absent += ": " + ", ".join(f"{label} {default:g}" for label, default in defaults.items())
+    default = known.pop() if len(known) == 1 else None
+    return Setting(f"reconstruction.{name}", kind, default, text, absent, needs=(" or ".join(needs),), **more)
 
 
 _DECLARED = (
@@ -269,17 +292,16 @@ _DECLARED = (
     Setting("noise.seed", int, None, "Draw Poisson counts with this seed; of several states with SEED, SEED + 1 …",
             "their expected means", least=0, most=2**64 - 1,
             needs=("model.kind=emission or model.photons", _MADE), option="--noise"),
-    Setting("reconstruction.method", str, "osem", "How the volume is found",
-            words={method.name: (method.label, method.text) for method in METHODS.values()}),
-    Setting("reconstruction.iterations", int, None, "How often all images are used", "what suits the method: "
-            + ", ".join(f"{method.label} {method.iterations}" for method in METHODS.values()), least=1, slider=100),
-    Setting("reconstruction.subsets", int, None, "Of the modules: each of an iteration's updates uses one of them",
-            "about a fifth of the modules' number", least=1, slider=80, needs=(_methods("subsets"),)),
+    Setting("reconstruction.method", str, "osem", "How the volume is found", endings=METHOD_FILES,
+            words={name: (method.label, method.text) for name, method in METHODS.items()}),
+    _argument("iterations", int, "How often all images are used", "what suits the method", least=1, slider=100),
+    _argument("subsets", int, "Of the modules: each of an iteration's updates uses one of them",
+              "about a fifth of the modules' number", least=1, slider=80),
     Setting("reconstruction.voxels", int, (64,), "Voxels along x y z, or one number for all", least=1, sizes=(1, 3)),
     Setting("reconstruction.spacing", float, None, "Voxel size, one or three", "the voxels cover the ROI", unit="mm",
             above=0, slider=10, sizes=(1, 3), label="Voxel Size (mm)"),
     Setting("reconstruction.center", float, (0.0, 0.0, 0.0), "Middle of the volume, x y z", unit="mm", sizes=(3,)),
-    Setting("reconstruction.hole", str, "auto", "How the hole's blur is reckoned with: auto is by depth, where the run's "
+    Setting("reconstruction.hole", str, "auto", "How the hole's blur is modelled: auto is by depth, where the run's "
             "model allows it and no points are given", label="Hole's Blur", needs=(_METHOD_OF_COUNTS,), words={
         "auto": ("Automatic", "By depth, where the run's model allows it and no points are given; else by rays"),
         "depth": ("By Depth", "The whole hole, depth by depth: sharpest"),
@@ -290,22 +312,21 @@ _DECLARED = (
             needs=(_METHOD_OF_COUNTS, "no reconstruction.hole=depth"), option="--aperture-points"),
     Setting("reconstruction.pixel_points", int, 1, "Points of each pixel's area, for each point of the hole", least=1,
             slider=16, needs=(_METHOD_OF_COUNTS, "no reconstruction.hole=depth")),
-    Setting("reconstruction.ignore_attenuation", bool, False, "Reckon without the attenuation of the run",
+    Setting("reconstruction.ignore_attenuation", bool, False, "Model no attenuation",
             needs=(_METHOD_OF_COUNTS,)),
-    Setting("reconstruction.ignore_blur", bool, False, "Reckon without the detector's own blur: no recovery of it",
+    Setting("reconstruction.ignore_blur", bool, False, "Model no blur of the detector: no recovery of it",
             needs=(_METHOD_OF_COUNTS,), label="Ignore Detector Blur"),
-    Setting("reconstruction.background", float, 0.0, "Counts expected in each pixel besides those of the volume, such as "
-            "scatter", least=0, slider=100, needs=(_methods("background"),)),
-    Setting("reconstruction.prior", str, None, "Penalty on noise", "none", needs=(_methods("prior"),),
-            words={prior.name: (prior.label, prior.text) for prior in PRIORS.values()}),
-    Setting("reconstruction.weight", float, None, "How much the penalty counts beside the data", above=0, slider=1,
-            needs=(f"reconstruction.prior or {_methods('weight')}",)),
-    Setting("reconstruction.gamma", float, 2.0, "How much large differences are spared", least=0, slider=10,
-            needs=(_priors("gamma"),)),
-    Setting("reconstruction.edge", float, None, "Value below which differences count as noise", "what suits the penalty",
-            above=0, slider=10, needs=(_priors("edge"),)),
-    Setting("reconstruction.anatomy", str, None, "Volume across whose edges differences are not penalised, such as a CT",
-            is_path=True, needs=("reconstruction.prior",)),
+    _argument("background", float, "Counts expected in each pixel besides those of the volume, such as scatter", least=0,
+              slider=100),
+    _argument("relaxation", float, "Length of the steps, less than 2", above=0, slider=1.9),
+    _argument("step_decay", float, "Steps are 1 / (1 + this times the number of iterations before)", least=0, slider=1),
+    _argument("nonnegative", bool, "Values below 0 become 0"),
+    _argument("prior", str, "Penalty on noise", "none",
+              words={name: (prior.label, prior.text) for name, prior in PRIORS.items()}),
+    _argument("weight", float, "How much the penalty counts beside the data", above=0, slider=1),
+    _argument("gamma", float, "How much large differences are spared", least=0, slider=10),
+    _argument("edge", float, "Value below which differences count as noise", "what suits the penalty", above=0, slider=10),
+    _argument("anatomy", str, "Volume across whose edges differences are not penalised, such as a CT", is_path=True),
     Setting("reconstruction.stop_change", float, None, "End when an iteration changes the objective by less than this share "
             "of it, such as 1e-5", "all iterations are done", above=0, slider=0.01),
     Setting("reconstruction.stop_noise", float, None, "End when the standard deviation in the region is this share of its "

@@ -17,6 +17,7 @@ from mphdrr.addon.reconstruction.reconstruction_properties import PROPERTIES, dr
 from mphdrr.addon.scanner import scanner
 from mphdrr.addon.volumes import volumes
 from mphdrr.core.progress import Cancelled
+from mphdrr.core.reconstruction.methods import METHODS
 from mphdrr.core.runs.files import read_run
 from mphdrr.core.runs.run_recipe import truth_of_run
 from mphdrr.core.runs.settings import SETTINGS
@@ -91,16 +92,42 @@ def test_panel_settings_count_and_scripts_override_them(render, scene):
         bpy.ops.mphdrr.reconstruct(prior="QUADRATIC")
 
 
+@pytest.mark.parametrize("name", METHODS)
+def test_the_panel_untouched_gives_each_method_its_own_defaults(name, scene):
+    panel, own = scene.mphdrr_reconstruction, METHODS[name].own
+    panel.method = name.upper()
+    recipe = settings_recipe(lambda each: getattr(panel, each), lambda each: False)
+    given = {key.partition(".")[2]: value for key, value in recipe.given.items()}
+    assert given.pop("method", "osem") == name
+    assert all(value == own[each] for each, value in given.items() if each in own)
+    assert own.keys() - {"prior", "weight"} <= dict(drawn(panel)).keys()
+    assert f"OSEM 10, MLEM 50, BSREM 30, SIRT {METHODS['sirt'].own['iterations']}" in (
+        panel.bl_rna.properties["iterations"].description
+    )
+
+
 @pytest.mark.long
 def test_without_a_number_each_method_does_its_own(render, scene):
     panel = scene.mphdrr_reconstruction
     panel.voxels, panel.spacing = 6, 16.0
     assert panel.iterations == 0
-    for method, own in (("OSEM", 10), ("MLEM", 50), ("BSREM", 30)):
-        panel.method = method
-        assert bpy.ops.mphdrr.reconstruct() == {"FINISHED"}
-        assert panel.known["title"] == f"{method}, {own} iterations"
-    assert "OSEM 10, MLEM 50, BSREM 30, SIRT 100" in panel.bl_rna.properties["iterations"].description
+    for name, method in METHODS.items():
+        if method.of_counts:
+            panel.method = name.upper()
+            assert bpy.ops.mphdrr.reconstruct() == {"FINISHED"}
+            assert panel.known["title"] == f"{method.label}, {method.own['iterations']} iterations"
+
+
+def test_a_methods_own_settings_are_in_the_panel(render, scene):
+    render(model="TRANSMISSION")
+    panel = scene.mphdrr_reconstruction
+    panel.method, panel.voxels, panel.spacing, panel.iterations = "SIRT", 6, 16.0, 4
+    panel.relaxation, panel.nonnegative = 0.5, False
+    assert bpy.ops.mphdrr.reconstruct() == {"FINISHED"}
+    run = read_run(storage.absolute(scene.mphdrr_projections.run_file))
+    A = mph.projector_of_run(run, mph.Grid.centered(6, 16.0))
+    expected = mph.sirt(A, run.projections, 4, relaxation=0.5, nonnegative=False).volume.array
+    np.testing.assert_allclose(volumes.volume_from_object(reconstructed()).array, expected, rtol=1e-5, atol=1e-6)
 
 
 def test_every_setting_is_in_the_panel_or_left_to_files(scene):

@@ -179,9 +179,9 @@ def test_relaxed_steps_are_shorter_and_zeros_and_masks_are_kept(small):
     start[:3] = 0
     mask = np.ones(small.A.shape_in, bool)
     mask[:, :2] = False
-    found = mph.bsrem(small.A, small.counts, 10, 2, PRIORS[0], relaxation=0.5, start=start, mask=mask)
+    found = mph.bsrem(small.A, small.counts, 10, 2, PRIORS[0], step_decay=0.5, start=start, mask=mask)
     assert not found.volume.array[:, :2].any() and (found.volume.array[:3, 2:] > 0).any()
-    assert found.settings["relaxation"] == 0.5 and found.settings["prior"] == "Quadratic"
+    assert found.settings["step_decay"] == 0.5 and found.settings["prior"] == "Quadratic"
 
 
 def test_no_counts_are_no_activity(small):
@@ -206,8 +206,8 @@ def test_no_counts_are_no_activity(small):
 def test_what_cannot_be_is_refused(small, method, given, words):
     with pytest.raises(mph.InputError, match=words):
         method(small.A, small.counts, 1, **given)
-    with pytest.raises(mph.InputError, match="relaxation: expected 0 or more"):
-        mph.bsrem(small.A, small.counts, 1, relaxation=-1)
+    with pytest.raises(mph.InputError, match="step_decay: expected 0 or more"):
+        mph.bsrem(small.A, small.counts, 1, step_decay=-1)
 
 
 @pytest.mark.long

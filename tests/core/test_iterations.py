@@ -17,7 +17,7 @@ METHODS = [
     ),
     pytest.param(lambda *given, **more: mph.bsrem(*given, subsets=2, **more), id="bsrem"),
     pytest.param(
-        lambda *given, **more: mph.bsrem(*given, subsets=2, prior=mph.RelativeDifference(0.1), relaxation=0.1, **more),
+        lambda *given, **more: mph.bsrem(*given, subsets=2, prior=mph.RelativeDifference(0.1), step_decay=0.1, **more),
         id="bsrem with prior",
     ),
 ]
@@ -154,10 +154,10 @@ class TestEveryMethod:
         [
             (lambda A, y: {"counts": -y}, "counts: expected 0 or more, got"),
             (lambda A, y: {"counts": y * np.nan}, "counts: nan is not a finite number"),
-            (lambda A, y: {"counts": y[1:]}, "counts: expected shape 8 x 12 x 12"),
+            (lambda A, y: {"counts": y[1:]}, "counts: expected shape 5 x 12 x 12"),
             (lambda A, y: {"counts": "many"}, "counts: expected real numbers"),
             (lambda A, y: {"background": -1}, "background: expected 0 or more"),
-            (lambda A, y: {"background": [1, 2]}, "background: expected one number, 8 numbers or images"),
+            (lambda A, y: {"background": [1, 2]}, "background: expected one number, 5 numbers or images"),
             (lambda A, y: {"background": "some"}, "background: expected real numbers"),
             (lambda A, y: {"background": np.inf}, "background: inf is not a finite"),
             (lambda A, y: {"iterations": 0}, "iterations: expected a whole number"),

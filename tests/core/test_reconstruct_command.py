@@ -17,8 +17,10 @@ from mphdrr.addon.cli import main
 from mphdrr.core.cli.reconstruct import settings_line
 from mphdrr.core.figures.page import Page
 from mphdrr.core.figures.reconstructions import draw
-from mphdrr.core.reconstruction.methods import METHODS
+from mphdrr.core.reconstruction.methods import METHOD_FILES, METHODS, PRIORS, Method
+from mphdrr.core.runs.recipe import recipe_of_tables
 from mphdrr.core.runs.reconstructing import model_of, reconstruction_grid
+from mphdrr.core.runs.settings import SETTINGS
 
 COUNTS = {"model.kind": "emission", "model.time": 600.0, "model.aperture_points": 9, "model.intrinsic_fwhm": 1.0,
           "model.pixel_points": 2, "model.tolerance": 9.0, "detector.rows": 16, "detector.columns": 16,
@@ -80,7 +82,7 @@ def test_runs_of_version_0_1_0_reconstruct_when_the_model_is_given(suffix, tmp_p
     assert by_recipe.array.max() > 0
     np.testing.assert_allclose(
         A(by_recipe.array).sum(), A(found.volume.array).sum(), rtol=0.02
-    )  # the same activity; the recipe's hole is reckoned with as reconstructions do
+    )  # the same activity; the recipe's hole is modelled as reconstructions do
 
 
 @pytest.mark.parametrize(
@@ -154,31 +156,134 @@ def test_a_kept_state_goes_on_as_without_a_break(file, tmp_path, capsys):
     np.testing.assert_array_equal(rest, whole)
 
 
+@pytest.fixture(scope="module")
+def radiograph(scanner) -> mph.ProjectionRun:
+    (run,) = mph.run_recipe(mph.Recipe({"phantom.voxels": 12, "detector.rows": 6, "detector.columns": 6}), scanner[::8])
+    return run
+
+
+def projector(run: mph.ProjectionRun, recipe: mph.Recipe) -> mph.Projector:
+    recipe = run.recipe.updated(recipe.given)
+    return mph.projector_of_run(run, reconstruction_grid(run, recipe), None, model_of(run, recipe))
+
+
 @pytest.mark.parametrize("name", METHODS)
-def test_each_method_does_its_own_number_of_iterations_unless_it_is_told(name, scanner, run, tmp_path, capsys):
-    """That of its function; the help names them all, and what is resumed counts on."""
+def test_each_method_has_its_own_defaults_wherever_it_is_chosen(name, run, radiograph, tmp_path, capsys):
+    """Command line, recipe and record say what its function says where nothing is given; what is resumed counts on."""
     pytest.importorskip("h5py")
-    function, own = getattr(mph, name), METHODS[name].iterations
-    assert own == inspect.signature(function).parameters["iterations"].default
-    if not METHODS[name].of_counts:
-        (run,) = mph.run_recipe(
-            mph.Recipe({"phantom.voxels": 12, "detector.rows": 6, "detector.columns": 6}), scanner[::8]
-        )
+    method = METHODS[name]
+    run = run if method.of_counts else radiograph
     mph.write_run(run, tmp_path / "run.npz")
-    how = {"reconstruction.method": name, "reconstruction.voxels": 8, "reconstruction.spacing": 12.0,
-           **({"reconstruction.weight": 0.1} if name == "tv" else {}),
-           **({"reconstruction.hole": "rays"} if METHODS[name].of_counts else {})}  # fmt: skip
-    done = mph.reconstruct_run(run, mph.Recipe(how)).iterations
-    assert done == own == {"osem": 10, "mlem": 50, "bsrem": 30, "sirt": 100, "cgls": 10, "tv": 200}[name]
-    assert mph.reconstruct_run(run, mph.Recipe(how | {"reconstruction.iterations": 2})).iterations == 2
-    typed = [word for key, value in how.items() for word in (f"--{key.partition('.')[2]}", str(value))]
-    state = tmp_path / "s.h5"
-    command(tmp_path / "run.npz", *typed, "--iterations", "1", "--save-state", state, "-o", tmp_path / "v.npz")
+    needed = {key: 0.1 for key, default in method.own.items() if default is inspect.Parameter.empty}
+    how = {"method": name, "voxels": 8, "spacing": 12.0, **needed, **({"hole": "rays"} if method.of_counts else {})}
+    recipe = mph.Recipe({f"reconstruction.{key}": value for key, value in how.items()})
+    expected = getattr(mph, name)(projector(run, recipe), run.projections, **needed)
+    assert expected.iterations == method.own["iterations"]
+
+    typed = [word for key, value in how.items() for word in (f"--{key}", str(value))]
+    state, output = tmp_path / "s.h5", ["-o", tmp_path / "v.npz"]
+    command(tmp_path / "run.npz", *typed, "--quiet", "--save-state", state, *output)
+    by_command, by_recipe = mph.read_reconstruction(state), mph.reconstruct_run(run, recipe)
+    again = mph.reconstruct_run(run, recipe_of_tables(by_command.settings["recipe"]))
+    for found in (by_command, by_recipe, again):
+        np.testing.assert_array_equal(found.volume.array, expected.volume.array)
+        assert expected.settings.items() <= found.settings.items()
+    assert mph.reconstruct_run(run, recipe.updated({"reconstruction.iterations": 2})).iterations == 2
     capsys.readouterr()
-    command(tmp_path / "run.npz", *typed, "--resume", state, "--stop-seconds", "1e-9", "-o", tmp_path / "v.npz")
-    assert f"iteration 2 of {own + 1}: " in capsys.readouterr().err
+    command(tmp_path / "run.npz", *typed, "--resume", state, "--stop-seconds", "1e-9", *output)
+    assert f"iteration {expected.iterations + 1} of {2 * expected.iterations}: " in capsys.readouterr().err
     assert main(["reconstruct", "--help"]) == 0
-    assert f"{METHODS[name].label} {own}" in re.sub(r"\s+", " ", capsys.readouterr().out)
+    assert f"{method.label} {expected.iterations}" in re.sub(r"\s+", " ", capsys.readouterr().out)
+
+
+def test_every_argument_of_a_method_or_prior_is_a_setting():
+    """One word, one meaning: methods that take the same argument have it from the same row."""
+    assert {name: method.own["iterations"] for name, method in METHODS.items()} == {
+        "osem": 10, "mlem": 50, "bsrem": 30, "sirt": 100, "cgls": 10, "tv": 200
+    }  # fmt: skip
+    by_hand = {"neighbors", "similar"}  # Python alone has them
+    for choice in (*METHODS.values(), *PRIORS.values()):
+        for name, default in choice.own.items():
+            assert name in by_hand or f"reconstruction.{name}" in SETTINGS, (choice.label, name)
+            setting = SETTINGS.get(f"reconstruction.{name}")
+            if setting is not None and setting.default is not None:
+                assert setting.default == default, (choice.label, name)
+
+
+@pytest.mark.parametrize(
+    ("name", "typed", "given"),
+    [
+        ("sirt", ["--relaxation", "0.5", "--no-nonnegative"], {"relaxation": 0.5, "nonnegative": False}),
+        ("sirt", ["--set", "reconstruction.nonnegative=false"], {"nonnegative": False}),
+        ("tv", ["--weight", "0.1", "--no-nonnegative"], {"weight": 0.1, "nonnegative": False}),
+        ("bsrem", ["--step-decay", "0.5", "--hole", "rays"], {"step_decay": 0.5}),
+    ],
+)
+def test_a_methods_own_settings_reach_it(name, typed, given, run, radiograph, tmp_path, capsys):
+    run = run if METHODS[name].of_counts else radiograph
+    mph.write_run(run, tmp_path / "run.npz")
+    small = ["--method", name, "--voxels", "8", "--spacing", "12", "--iterations", "3"]
+    command(tmp_path / "run.npz", *small, *typed, "--write-recipe", tmp_path / "how.toml")
+    command(tmp_path / "run.npz", "--recipe", tmp_path / "how.toml", "-o", tmp_path / "v.npz")
+    A = projector(run, mph.read_recipe(tmp_path / "how.toml"))
+    expected = getattr(mph, name)(A, run.projections, iterations=3, **given)
+    np.testing.assert_array_equal(mph.read_volume(tmp_path / "v.npz").array, expected.volume.array)
+    other = refused(capsys, tmp_path / "run.npz", *small, *typed, "--method", "cgls", "-o", tmp_path / "no.npz")
+    assert " needs " in other and f"reconstruction.method = {name}" in other
+
+
+@pytest.fixture
+def toy(monkeypatch, tmp_path) -> Path:
+    """A file of a kind that methods may have: the number that all voxels become, by no iterations and no objective."""
+
+    def read(path: Path) -> Method:
+        try:
+            value = float(path.read_text(encoding="utf-8"))
+        except (OSError, ValueError):
+            raise mph.InputError("expected a number") from None
+
+        def even(A: mph.Projector, images, nonnegative: bool = True, progress=None) -> mph.Reconstruction:
+            if progress is not None:
+                progress(1, 1)
+            volume = np.full(A.shape_in, max(value, 0) if nonnegative else value, np.float32)
+            return mph.Reconstruction(mph.Volume(volume, A.grid, "mu"), np.zeros(0), {"method": "Even"})
+
+        return Method("Even", "The same everywhere", even, of_counts=False, objective="")
+
+    monkeypatch.setitem(METHOD_FILES, ".toy", read)
+    (tmp_path / "model.toy").write_text("-0.5", encoding="utf-8")
+    return tmp_path / "model.toy"
+
+
+def test_a_file_is_a_method_without_iterations_or_an_objective(toy, radiograph, tmp_path, monkeypatch, capsys):
+    pytest.importorskip("h5py")
+    mph.write_run(radiograph, tmp_path / "run.npz")
+    small = [tmp_path / "run.npz", "--voxels", "8", "--spacing", "12"]
+    command(*small, "--method", toy, "-o", tmp_path / "a.npz", "--picture", tmp_path / "p.svg", "--save-state",
+            tmp_path / "s.h5")  # fmt: skip
+    assert "Even, 8 x 8 x 8 voxels, largest 0 " in capsys.readouterr().out
+    assert "iteration" not in (tmp_path / "p.svg").read_text(encoding="utf-8")
+    kept = mph.read_reconstruction(tmp_path / "s.h5")
+    assert kept.objective.shape == (0,) and kept.iterations == 0
+    assert kept.settings["recipe"]["reconstruction"]["method"] == str(toy)
+    command(*small, "--method", toy, "--no-nonnegative", "--write-recipe", tmp_path / "how" / "r.toml")
+    monkeypatch.chdir("/")
+    assert '"../model.toy"' in (tmp_path / "how" / "r.toml").read_text(encoding="utf-8").replace("\\", "/")
+    found = mph.reconstruct_run(radiograph, mph.read_recipe(tmp_path / "how" / "r.toml"))
+    assert (found.volume.array == -0.5).all()
+    capsys.readouterr()
+    for more, words in (
+        (["--iterations", "3"], "reconstruction.iterations (--iterations): Even does not take it"),
+        (["--subsets", "3"], "reconstruction.subsets (--subsets): Even does not take it"),
+        (["--prior", "quadratic", "--weight", "1"], "reconstruction.prior (--prior): Even does not take it"),
+        (["--start", tmp_path / "a.npz"], "start: Even has no start"),
+        (["--stop-seconds", "1"], "stop: Even has no stop"),
+    ):
+        assert words in refused(capsys, *small, "--method", toy, *more, "-o", tmp_path / "no.npz")
+    toy.write_text("much", encoding="utf-8")
+    assert refused(capsys, *small, "--method", toy, "-o", tmp_path / "no.npz").endswith("model.toy: expected a number")
+    said = refused(capsys, *small, "--method", "model.pt", "-o", tmp_path / "no.npz")
+    assert "expected one of osem, mlem, bsrem, sirt, cgls, tv or a file (.toy), got 'model.pt'" in said
 
 
 def test_a_state_of_other_settings_is_refused_in_a_line(file, tmp_path, capsys):
@@ -324,7 +429,7 @@ def test_slices_lie_on_the_page_and_have_the_right_colours(size):
             ["--hole", "depth", "--aperture-points", "7"],
             "--aperture-points) does not go with reconstruction.hole = depth",
         ),
-        (["--method", "tv"], "reconstruction.weight (--weight): missing; say how much the variation in TV counts"),
+        (["--method", "tv"], "reconstruction.weight (--weight): missing; TV needs it"),
         (["--subsets", "11"], "subsets: expected at most the 10 views, got 11"),
         (
             ["--method", "mlem", "--subsets", "4"],
@@ -347,11 +452,8 @@ def test_what_cannot_be_is_refused_in_one_line(options, said, file, tmp_path, ca
     assert not (tmp_path / "v.npz").exists()
 
 
-def test_wrong_runs_are_refused(run, file, tmp_path, capsys, scanner):
+def test_wrong_runs_are_refused(radiograph, file, tmp_path, capsys, scanner):
     assert "nothing to write" in refused(capsys, file)
-    (radiograph,) = mph.run_recipe(
-        mph.Recipe({"phantom.voxels": 8, "detector.rows": 4, "detector.columns": 4}), scanner[:4]
-    )
     mph.write_run(radiograph, tmp_path / "drr.npz")
     said = refused(capsys, tmp_path / "drr.npz", "-o", tmp_path / "v.npz")
     assert "osem needs a run of counts, not of line integrals; for these images: sirt, cgls, tv" in said

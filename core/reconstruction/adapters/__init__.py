@@ -50,7 +50,7 @@ def deepinv_physics(A: Projector, **options: Any) -> Any:
     A : Projector
         From volumes to images.
     options
-        As of ``LinearPhysics``, such as ``noise_model=deepinv.physics.PoissonNoise()``.
+        Options of ``LinearPhysics``, such as ``noise_model=deepinv.physics.PoissonNoise()``.
 
     Returns
     -------

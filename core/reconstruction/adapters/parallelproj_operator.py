@@ -11,21 +11,17 @@ from ...validation import real_array
 
 
 class ParallelprojOperator:
-    """A projector with parallelproj's names: ``op(x)``, ``op.apply(x)``, ``op.adjoint(y)``, ``op.H``, ``op.norm()``."""
+    """A projector with parallelproj's names: ``op(x)``, ``op.apply(x)``, ``op.adjoint(y)``, ``op.H``, ``op.norm()``.
+
+    Attributes
+    ----------
+    in_shape, out_shape : tuple
+        Shapes of what it takes and of what it gives.
+    """
 
     def __init__(self, A: LinearOperator, scale: float = 1.0) -> None:
-        self._operator = A
+        self._operator, self.in_shape, self.out_shape = A, A.shape_in, A.shape_out
         self.scale = scale
-
-    @property
-    def in_shape(self) -> tuple[int, int, int]:
-        """Shape of what it takes."""
-        return self._operator.shape_in
-
-    @property
-    def out_shape(self) -> tuple[int, int, int]:
-        """Shape of what it gives."""
-        return self._operator.shape_out
 
     @property
     def scale(self) -> float:

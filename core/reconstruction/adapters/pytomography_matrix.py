@@ -43,7 +43,7 @@ class ProjectorMatrix(SystemMatrix):
         return self._part(subset_idx).T(proj)
 
     def get_projection_subset(self, projections: Tensor, subset_idx: int | None) -> Tensor:
-        """Those of all projections that are a subset's."""
+        """A subset's part of all projections."""
         if subset_idx is None:
             return projections
         return projections[self.subset_indices_array[subset_idx].to(projections.device)]

@@ -60,7 +60,7 @@ class RodProfile:
 
 @dataclass(frozen=True, eq=False)
 class DerenzoSector:
-    """The score of one sector. What cannot be told is NaN, and `note` says why."""
+    """The score of one sector. What is not known is NaN, and `note` says why."""
 
     rod_diameter: float
     """mm."""
@@ -88,12 +88,12 @@ class DerenzoSector:
     @property
     def words(self) -> str:
         """The score in a line: whether it is resolved, and by what; or why there is none."""
-        said = f"valley/peak {self.valley_to_peak:.2f}, contrast {np.round(100 * self.contrast_recovery) + 0.0:.0f} %"
-        return self.note or f"{'resolved' if self.resolved else 'not resolved'}, {said}"
+        score = f"valley/peak {self.valley_to_peak:.2f}, contrast {np.round(100 * self.contrast_recovery) + 0.0:.0f} %"
+        return self.note or f"{'resolved' if self.resolved else 'not resolved'}, {score}"
 
 
 class DerenzoScore(Rows[DerenzoSector]):
-    """The scores of all sectors, in the phantom's order; its attributes are arrays (S,), as of `DerenzoSector`."""
+    """The scores of all sectors, in the phantom's order; its attributes are arrays (S,) of those of `DerenzoSector`."""
 
     rod_diameter = column("rod_diameter", "mm; 0 of a sector without rods.")
     valley_to_peak = column("valley_to_peak", "Mean valley by mean peak.")
@@ -123,7 +123,7 @@ def derenzo_score(
     Parameters
     ----------
     volume
-        Of activity, kBq/mL, or mu, 1/mm, on any grid, turned or not.
+        A volume of activity, kBq/mL, or mu, 1/mm, on any grid, turned or not.
     phantom
         A `DerenzoPhantom`, or any other one with `DerenzoRods` among its shapes.
     pose

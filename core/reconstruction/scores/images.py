@@ -57,7 +57,7 @@ def psnr(volume: Values, truth: Values, data_range: float | None = None, mask: A
     Parameters
     ----------
     volume, truth, mask
-        As for `nrmse`.
+        See `nrmse`.
     data_range
         Largest minus smallest value that there can be. Default: of the truth.
     """
@@ -78,9 +78,9 @@ def ssim(volume: Values, truth: Values, data_range: float | None = None, progres
     Parameters
     ----------
     volume, truth
-        As for `nrmse`, with one voxel or at least 11 along each axis.
+        See `nrmse`; with one voxel or at least 11 along each axis.
     data_range
-        As for `psnr`.
+        See `psnr`.
     progress
         Called as ``progress(done, total)`` between slabs; may raise `Cancelled`.
     """

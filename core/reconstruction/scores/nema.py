@@ -41,7 +41,7 @@ class NemaSphere:
 
 @dataclass(frozen=True, eq=False)
 class NemaScore(Rows[NemaSphere]):
-    """The scores of all spheres, in the phantom's order; its attributes are arrays (S,), as of `NemaSphere`."""
+    """The scores of all spheres, in the phantom's order; its attributes are arrays (S,) of those of `NemaSphere`."""
 
     lung_residual: float
     """Mean in the lung insert, percent of that of the background: 0 for the truth; NaN without an insert."""
@@ -54,7 +54,7 @@ class NemaScore(Rows[NemaSphere]):
 
 
 def nema_score(volume: Volume, phantom: NemaBody, pose: ArrayLike | None = None) -> NemaScore:
-    """Percent contrast and background variability of a reconstructed NEMA body phantom, as of NEMA NU 2-2018, section 7.
+    """Percent contrast and background variability of a reconstructed NEMA body phantom, by NEMA NU 2-2018, section 7.
 
     Regions are circles in the phantom's transverse planes; parts of voxels count as such. That of a sphere lies in the plane
     of the spheres' centres and has its inner diameter. Of each diameter there are 12 background regions in each of 5 planes,
@@ -74,7 +74,7 @@ def nema_score(volume: Volume, phantom: NemaBody, pose: ArrayLike | None = None)
     Parameters
     ----------
     volume
-        Of activity, kBq/mL, on any grid that contains all regions.
+        A volume of activity, kBq/mL, on any grid that contains all regions.
     phantom
     pose
         World-from-phantom (4, 4), mm, as for ``phantom.voxelize(grid, pose)``.

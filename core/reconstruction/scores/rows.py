@@ -1,6 +1,6 @@
 """A score that is a sequence: one row for each sector or sphere, and its columns as arrays."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar, overload
 
@@ -29,9 +29,6 @@ class Rows(Sequence[Row], Generic[Row]):
     def __getitem__(self, index: slice) -> tuple[Row, ...]: ...
     def __getitem__(self, index: Any) -> Any:
         return self.rows[index]
-
-    def __iter__(self) -> Iterator[Row]:
-        return iter(self.rows)
 
 
 def column(name: str, text: str) -> Any:

@@ -59,7 +59,7 @@ class VolumeScore:
 
     @property
     def record(self) -> dict[str, Any]:
-        """The scores as JSON can hold them: what cannot be told is None."""
+        """The scores as JSON can hold them: what is not known is None."""
         record: dict[str, Any] = {"nrmse": self.nrmse, "psnr_dB": _finite(self.psnr), "ssim": self.ssim}
         if self.derenzo is not None:
             names = ("rod_diameter", "valley_to_peak", "contrast_recovery", "chance", "pairs_resolved")
@@ -83,7 +83,7 @@ def score_volume(
     Parameters
     ----------
     volume
-        Such as a reconstruction's.
+        A volume, such as a reconstruction's.
     truth
         A volume of the same quantity: one on another grid is resampled onto the volume's, as means, and a note says so. Or a
         phantom: it is voxelized on the volume's grid, and `derenzo_score` or `nema_score` are made where it has rods or

@@ -1,5 +1,8 @@
 """Siddon's line integrals on an NVIDIA GPU, one thread a ray, several views a launch: the kernels are `warp_kernels`.
 
+No GPU has run them yet: docs/gpu.md says what was tested, and how. Derivatives are those of `reference`, in torch on the same
+device.
+
 Why NVIDIA Warp: one wheel for each of Linux, Windows and macOS without bounds on numpy, which brings its own compilers
 and runs the very same kernels on the CPU, where they are tested. Triton has no official wheel for Windows, and its programs
 work on blocks, not on single rays.
@@ -14,7 +17,6 @@ from __future__ import annotations
 import atexit
 import ctypes
 import functools
-import math
 import os
 import shutil
 import sys
@@ -22,6 +24,7 @@ import tempfile
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
+from dataclasses import replace
 from types import ModuleType
 from typing import Any
 
@@ -30,10 +33,11 @@ import warp as wp
 from numpy.typing import NDArray
 
 from ... import cache
-from ...arrays import ArrayOrTensor, is_tensor, to_numpy
+from ...arrays import ArrayOrTensor, is_tensor, to_caller, to_numpy, to_tensor
 from ...errors import InputError
 from ...memory import readable_size
 from ..rays import Attenuation, IndexRays, Rays
+from . import reference
 
 DEVICE_VARIABLE = "MPHDRR_CUDA_DEVICE"
 """Environment variable: the Warp device for arrays, "cuda" if not set. "cpu" runs the kernels without a GPU: for tests."""
@@ -52,7 +56,7 @@ _loaded: set[str] = set()
 def forward(volume: ArrayOrTensor, rays: Rays, attenuation: Attenuation | None = None) -> ArrayOrTensor:
     """Line integrals (N,), value x mm, of `volume` (n_x, n_y, n_z) along `rays`, attenuated towards their sources."""
     with _Call(volume, rays, attenuation) as call:
-        return call.per_ray("integrate" if attenuation is None else "integrate_attenuated")
+        return call.integrals()
 
 
 def backproject(
@@ -60,22 +64,31 @@ def backproject(
 ) -> None:
     """Add `values` (N,), each along its ray with the weights of `forward`, to `volume` in place, in no fixed order."""
     with _Call(volume, rays, attenuation) as call:
-        call.accumulate("backproject" if attenuation is None else "backproject_attenuated", values)
+        call.add(values)
 
 
 def derivatives(volume: ArrayOrTensor, rays: Rays, attenuation: Attenuation | None = None) -> ArrayOrTensor:
-    """What the ends of `rays` do to their integrals (N, 7), or attenuated (N, 14), as `backends` describes it."""
-    name, columns = ("differentiate", 7) if attenuation is None else ("differentiate_attenuated", 14)
-    with _Call(volume, rays, attenuation) as call:
-        return call.per_ray(name, columns)
+    """Those of the reference, on the device: what the ends of `rays` do to their integrals, (N, 7) or (N, 14)."""
+    return to_caller(reference.derivatives(_tensor(volume), rays, _in_torch(attenuation)), volume)
 
 
 def mu_gradient(
     gradient: ArrayOrTensor, volume: ArrayOrTensor, values: ArrayOrTensor, rays: Rays, attenuation: Attenuation
 ) -> None:
-    """Add to `gradient`, of mu's shape, each of `values` (N,) times its line integral's derivatives by mu."""
-    with _Call(volume, rays, attenuation) as call:
-        call.accumulate("differentiate_by_mu", values, gradient)
+    """That of the reference, on the device: add to `gradient` each of `values` (N,) times its integral's by mu."""
+    total = _tensor(gradient)
+    reference.mu_gradient(total, _tensor(volume), _tensor(values), rays, _in_torch(attenuation))
+    if not is_tensor(gradient):
+        gradient[...] = to_caller(total, gradient)
+
+
+def _tensor(x: ArrayOrTensor) -> Any:
+    """`x` as a tensor on the device."""
+    return x if is_tensor(x) else to_tensor(x).to(wp.device_to_torch(device()))
+
+
+def _in_torch(attenuation: Attenuation | None) -> Any:
+    return attenuation and replace(attenuation, mu=_tensor(attenuation.mu))
 
 
 def to_backend(x: ArrayOrTensor) -> ArrayOrTensor:
@@ -135,9 +148,8 @@ class _Call:
         self._kernels = _kernels(self._device)
         self._fans, self._rows, self._columns = _table(rays)
         self._attenuation = attenuation
-        self._mu_fans = self._fans
-        if attenuation is not None and attenuation.rays is not None:
-            self._mu_fans = _table(attenuation.rays)[0]
+        has_lattice = attenuation is not None and attenuation.rays is not None
+        self._mu_fans = _table(attenuation.rays)[0] if has_lattice else None  # type: ignore[union-attr, arg-type]
 
     def __enter__(self) -> _Call:
         self._stream.__enter__()
@@ -163,58 +175,53 @@ class _Call:
             )
         return wp.array(array, dtype=wp.float32, device=self._device)
 
-    def per_ray(self, name: str, *columns: int) -> ArrayOrTensor:
-        """What a kernel writes, (N,), or (N, columns)."""
-        volumes = self._volumes()
-        shape = (len(self._fans), self._rows, self._columns, *columns)
+    def integrals(self) -> ArrayOrTensor:
+        """What `integrate` writes, (N,)."""
+        shape = (len(self._fans), self._rows, self._columns)
         result = self._volume.new_empty(shape) if is_tensor(self._volume) else np.empty(shape, np.float32)
-        for fans, rows in self._pieces(math.prod(columns)):
-            piece = result[fans, rows]
-            out = wp.from_torch(piece) if is_tensor(piece) else wp.empty(piece.shape, wp.float32, device=self._device)
-            self._launch(name, fans, rows, volumes, out)
-            _copy_back(out, piece)
-        return result.reshape(-1, *columns)
-
-    def accumulate(self, name: str, values: ArrayOrTensor, gradient: ArrayOrTensor = None) -> None:
-        """Launch a kernel that adds each ray's value of `values` (N,) to the volume, or to a gradient."""
         volumes = self._volumes()
-        if gradient is not None:
-            volumes.insert(0, self.on_device(gradient, "the gradient"))
-        values = values.reshape(len(self._fans), self._rows, self._columns)
-        for fans, rows in self._pieces(1):
-            piece = values[fans, rows]
-            if is_tensor(piece):
-                piece = wp.from_torch(to_backend(piece))
-            else:
-                piece = wp.array(np.ascontiguousarray(piece, np.float32), dtype=wp.float32, device=self._device)
-            self._launch(name, fans, rows, volumes, piece)
-        _copy_back(volumes[0], self._volume if gradient is None else gradient)
+        for part in self._pieces():
+            piece = result[part]
+            out = wp.from_torch(piece) if is_tensor(piece) else wp.empty(piece.shape, wp.float32, device=self._device)
+            self._launch(self._kernels.integrate, part, volumes, out)
+            _copy_back(out, piece)
+        return result.reshape(-1)
+
+    def add(self, values: ArrayOrTensor) -> None:
+        """Have `backproject` add the rays' `values` (N,) to the volume."""
+        volumes = self._volumes()
+        values = to_backend(values).reshape(len(self._fans), self._rows, self._columns)
+        for part in self._pieces():
+            piece = values[part]
+            numbers = wp.from_torch(piece) if is_tensor(piece) else wp.array(piece, wp.float32, device=self._device)
+            self._launch(self._kernels.backproject, part, volumes, numbers)
+        _copy_back(volumes[0], self._volume)
 
     def _volumes(self) -> list[Any]:
-        """The volume, and mu if there is any, on the device."""
-        mu = [] if self._attenuation is None else [self.on_device(self._attenuation.mu, "mu")]
-        return [self.on_device(self._volume, "the volume"), *mu]
+        """The volume and mu on the device; in place of mu, where there is none, the volume."""
+        volume = self.on_device(self._volume, "the volume")
+        return [volume, volume if self._attenuation is None else self.on_device(self._attenuation.mu, "mu")]
 
-    def _pieces(self, columns: int) -> Iterator[tuple[slice, slice]]:
+    def _pieces(self) -> Iterator[tuple[slice, slice]]:
         """Which fans, and which of their rows, are launched together."""
-        bytes_of_a_ray = 4 * columns + _BYTES_OF_A_FAN / (self._rows * self._columns)
-        affordable = max(_FEWEST_RAYS, int(self._device.free_memory / 2 / bytes_of_a_ray))
+        pixels = self._rows * self._columns
+        affordable = max(_FEWEST_RAYS, int(self._device.free_memory / 2 / (4 + _BYTES_OF_A_FAN / pixels)))
         at_once = min(_RAYS_AT_ONCE, affordable)
-        fans = max(1, at_once // (self._rows * self._columns))
+        fans = max(1, at_once // pixels)
         rows = self._rows if fans > 1 else min(self._rows, max(1, at_once // self._columns))
         for fan in range(0, len(self._fans), fans):
             for row in range(0, self._rows, rows):
                 yield slice(fan, min(fan + fans, len(self._fans))), slice(row, min(row + rows, self._rows))
 
-    def _launch(self, name: str, fans: slice, rows: slice, volumes: list[Any], numbers: Any) -> None:
-        rays = [wp.array(self._fans[fans], dtype=wp.vec3d, device=self._device)]
-        if self._attenuation is not None:
-            own_lattice = self._mu_fans is not self._fans
-            mu_rays = wp.array(self._mu_fans[fans], dtype=wp.vec3d, device=self._device) if own_lattice else rays[0]
-            rays += [mu_rays, int(own_lattice)]
+    def _launch(self, kernel: Any, part: tuple[slice, slice], volumes: list[Any], numbers: Any) -> None:
+        fans, rows = part
+        rays = wp.array(self._fans[fans], dtype=wp.vec3d, device=self._device)
+        mu_rays, attenuated = rays, int(self._attenuation is not None)
+        if self._mu_fans is not None:
+            mu_rays, attenuated = wp.array(self._mu_fans[fans], dtype=wp.vec3d, device=self._device), 2
         dim = (fans.stop - fans.start, rows.stop - rows.start, self._columns)
-        kernel = getattr(self._kernels, name)
-        wp.launch(kernel, dim, inputs=[*volumes, *rays, rows.start, numbers], device=self._device)
+        inputs = [*volumes, rays, mu_rays, attenuated, rows.start, numbers]
+        wp.launch(kernel, dim, inputs=inputs, device=self._device)
 
 
 def _table(rays: Rays) -> tuple[NDArray[np.float64], int, int]:

@@ -1,25 +1,27 @@
 """Volumes in the coordinates of views and back, and from one view's to another's."""
 
 from abc import abstractmethod
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import ArrayOrTensor, checked, to_caller, to_numpy
+from ..arrays import ArrayOrTensor, is_double, to_caller, to_numpy
 from ..errors import InputError, warn
 from ..geometry.grid import Grid
 from ..memory import require
 from ..progress import Progress, part_of, tell
 from ..projector import backends
+from ..projector.bundles import Beam, Bundle, Bundles
+from ..projector.execution import Execution
 from ..projector.operator import LinearOperator
-from ..projector.parallel import in_order, run_all, sum_of, thread_count
-from ..projector.rays import IndexFans, index_fans
+from ..projector.parallel import thread_count
+from ..projector.rays import Fan
 from ..validation import instance, one_of
 from ..volumes.volume import UNITS, Volume, require_quantity
 from .perspective_grid import PerspectiveGrid
-from .places import give, see_through, take
+from .places import give, take
 
 KEEP = ("density", "activity")
 """What resampling may keep: the values, or their sums."""
@@ -29,8 +31,6 @@ _MOST_POINTS = 8  # in a cell, along each axis
 _APART = 1.0  # cells from point to point: farther apart, cells between them get little or nothing
 _LOOKED_AT = 9  # cells along each axis, to find how many points one needs
 
-_MOST_VOLUMES = 8  # of an adjoint along rays, each of a thread: more would gain little and take much memory
-_PLANES_AT_ONCE = 8  # of each thread, before the threads wait for each other
 _GAP = 1.5  # voxels from ray to ray
 
 Lattice = Grid | PerspectiveGrid
@@ -202,10 +202,6 @@ class _Pair(LinearOperator):
         self.source, self.target = source, target
 
     @property
-    def T(self) -> "_Pair":
-        return _Adjoint(self)
-
-    @property
     def shape_in(self) -> tuple[int, int, int]:
         return self.source.shape
 
@@ -213,12 +209,11 @@ class _Pair(LinearOperator):
     def shape_out(self) -> tuple[int, int, int]:
         return self.target.shape
 
-    def _check(self, x: Any) -> ArrayOrTensor:
-        return checked(x, "array", self.shape_in, False, batch=True)
-
     def _run_one(self, x: ArrayOrTensor, progress: Progress | None = None, mu: Any = None) -> ArrayOrTensor:
-        array = _plain(x, self.shape_out)
-        return to_caller(self.forward(array, progress).astype(array.dtype, copy=False), x)
+        return _run(self.forward, x, self.shape_out, progress)
+
+    def _run_back(self, y: ArrayOrTensor, progress: Progress | None = None, mu: Any = None) -> ArrayOrTensor:
+        return _run(self.adjoint, y, self.shape_in, progress)
 
     @abstractmethod
     def forward(self, x: Array, progress: Progress | None) -> Array:
@@ -229,82 +224,51 @@ class _Pair(LinearOperator):
         """The adjoint of an array of float32 or float64."""
 
 
-class _Adjoint(_Pair):
-    """The adjoint of a pair."""
-
-    def __init__(self, pair: _Pair) -> None:
-        super().__init__(pair.target, pair.source)
-        self._pair = pair
-
-    @property
-    def T(self) -> _Pair:
-        return self._pair
-
-    def forward(self, x: Array, progress: Progress | None) -> Array:
-        return self._pair.adjoint(x, progress)
-
-    def adjoint(self, y: Array, progress: Progress | None) -> Array:
-        return self._pair.forward(y, progress)
-
-
-def _plain(x: ArrayOrTensor, result: tuple[int, int, int]) -> Array:
-    """`x` as kernels take it; there must be memory for a `result`."""
-    array = to_numpy(x, np.float64 if str(x.dtype).endswith("float64") else np.float32)
-    require(2 * array.itemsize * float(np.prod(result)), "resampling to {} x {} x {} numbers".format(*result))
-    return array
+def _run(
+    function: Callable[[Array, Progress | None], Array],
+    x: ArrayOrTensor,
+    shape: tuple[int, int, int],
+    progress: Progress | None,
+) -> ArrayOrTensor:
+    """What a function makes of an array, of this shape, as the caller's kind; there must be memory for it."""
+    array = to_numpy(x, np.float64 if is_double(x) or x.dtype == np.float64 else np.float32)
+    require(2 * array.itemsize * float(np.prod(shape)), "resampling to {} x {} x {} numbers".format(*shape))
+    return to_caller(function(array, progress).astype(array.dtype, copy=False), x)
 
 
 class _AlongRays(_Pair):
-    """Means of a volume along the rays of a perspective grid's cells."""
+    """Means of a volume along the rays of a perspective grid's cells: those of a plane are the rays of an image."""
 
     source: Grid
     target: PerspectiveGrid
 
     def forward(self, x: Array, progress: Progress | None) -> Array:
-        functions, x = self._functions(x)
-        result = np.empty(self.shape_out, x.dtype)
-
-        def work(plane: int) -> None:
-            result[..., plane] = functions.forward(x, self._rays(plane)).reshape(self.shape_out[:2])
-
-        n = self.target.n_k
-        see_through(in_order(work, range(n), thread_count(None)), 1, n, progress)
+        n, result = self.target.n_k, np.empty(self.shape_out, x.dtype)
+        for plane, image in enumerate(self._execution(x).images(x, Bundles(n, self._bundle))):
+            result[..., plane] = image
+            tell(progress, plane + 1, n)
         result /= self.target.ray_lengths()
         return result
 
     def adjoint(self, y: Array, progress: Progress | None) -> Array:
-        functions, y = self._functions(y)
-        y = y / self.target.ray_lengths().astype(y.dtype)
         n = self.target.n_k
-        workers = min(thread_count(None), _MOST_VOLUMES, n)
-        require(workers * y.itemsize * float(np.prod(self.shape_in)), f"a volume for each of {workers} threads")
-        volumes = [np.zeros(self.shape_in, y.dtype) for _ in range(workers)]
+        images = np.moveaxis(y / self.target.ray_lengths().astype(y.dtype), -1, 0)
+        bundles = Bundles(n, self._bundle)
+        return np.asarray(self._execution(y).backproject(images, bundles, None, lambda done: tell(progress, done, n)))
 
-        def work(worker: int, first: int) -> None:
-            for plane in range(first + worker, min(first + _PLANES_AT_ONCE * workers, n), workers):
-                values = np.ascontiguousarray(y[..., plane]).reshape(-1)
-                functions.backproject(volumes[worker], values, self._rays(plane))
+    def _execution(self, array: Array) -> Execution:
+        backend = backends.choose("auto")
+        float64 = backend.always_float64 or array.dtype == np.float64
+        return Execution(backend, self.source, None, float64, thread_count(None))
 
-        for first in range(0, n, _PLANES_AT_ONCE * workers):
-            run_all(lambda worker, first=first: work(worker, first), range(workers), workers)  # type: ignore[misc]
-            tell(progress, min(first + _PLANES_AT_ONCE * workers, n), n)
-        return np.asarray(sum_of(volumes, workers))
-
-    @staticmethod
-    def _functions(array: Array) -> tuple[Any, Array]:
-        """Those of the backend for arrays, and the array as it takes it."""
-        if backends.choose("auto").name == "cpu":
-            return backends.load("cpu"), array
-        return backends.load("reference"), array.astype(np.float64)
-
-    def _rays(self, plane: int) -> IndexFans:
+    def _bundle(self, plane: int) -> Bundle:
         """The cells' rays of a plane: from the plane before to the one behind, columns after columns."""
         edges = self.target.edges[plane : plane + 2]
         places = np.array([[[0, 0, edge], [1, 0, edge], [0, 1, edge]] for edge in edges], np.float64)
         (start, next_start, _), (end, next_end, above) = self.target.to_world(places)
-        follows = np.linalg.norm(next_start - start) / np.linalg.norm(next_end - end)
-        vectors = np.array([[start, end, next_end - end, above - end]])
-        return index_fans(self.source, vectors, self.shape_out[:2], float(follows))
+        follows = float(np.linalg.norm(next_start - start) / np.linalg.norm(next_end - end))
+        fan = Fan(start, end, next_end - end, above - end, self.shape_out[:2], parallel=follows)
+        return Bundle.along(self.source, Beam(fan))
 
 
 class _Taking(_Pair):

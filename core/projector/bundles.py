@@ -54,6 +54,11 @@ class Bundle:
         return self.beams[0].rays.shape if self.ends is None else self.ends.shape
 
     @property
+    def kind(self) -> tuple[bool, float]:
+        """What images whose rays make one part have in common: their orientation, and how far sources move."""
+        return self.transposed, self.beams[0].rays.parallel
+
+    @property
     def rays_of_a_pixel(self) -> int:
         """How many rays each pixel has."""
         return sum(len(beam.rays.shifts) for beam in self.beams) if self.ends is None else 1
@@ -76,7 +81,7 @@ class Part:
     transposed: bool = False
     # (F, rows, columns), weights of the integrals, with 1 row or column where all are the same; None: 1 everywhere
     weights: Array | None = None
-    parallel: bool = False  # as of `Fan`; fans of one part are all alike in this
+    parallel: float = 0.0  # as of `Fan`; fans of one part are all alike in this
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -168,11 +173,10 @@ class Bundles:
         if key not in self._parts:
             bundles = [(number, self[number]) for number in images]
             parts: list[Part] = []
-            for transposed in (False, True):
-                some = [(number, bundle) for number, bundle in bundles if bundle.transposed == transposed]
-                if some:
-                    rows, columns = some[0][1].shape
-                    parts += _parts(some, slice(0, rows), slice(0, columns), most)
+            for kind in sorted({bundle.kind for _, bundle in bundles}):
+                some = [(number, bundle) for number, bundle in bundles if bundle.kind == kind]
+                rows, columns = some[0][1].shape
+                parts += _parts(some, slice(0, rows), slice(0, columns), most)
             kept = [x for part in parts for x in (part.rays, part.weights) if isinstance(x, np.ndarray)]
             if not self._has_room(sum(x.nbytes for x in kept)):
                 return parts

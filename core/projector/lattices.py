@@ -28,7 +28,7 @@ class Lattices:
     mu_origin: Index = (0, 0, 0)
 
     def fans(
-        self, vectors: Array, shape: tuple[int, int], parallel: bool = False
+        self, vectors: Array, shape: tuple[int, int], parallel: float = 0.0
     ) -> tuple[IndexFans, Attenuation | None]:
         """Fans (F, 4, 3), as of `Fan.vectors`, of one shape in index space, and what attenuates them."""
         return self._mapped(index_fans, vectors, shape, parallel)

@@ -27,7 +27,8 @@ class Fan:
     """Rays from one point to the points of a lattice on a plane, world mm: the rays of an image.
 
     The ray of row i and column j goes from `source` to ``corner + i row_step + j column_step``; a parallel one, from
-    ``source + i row_step + j column_step``. With S shifts there are S such lattices, each moved by a number of rows and
+    ``source + i row_step + j column_step``; between both, where sources lie in a plane on the way of rays of one point, they
+    move `parallel` times as far. With S shifts there are S such lattices, each moved by a number of rows and
     columns: more points of every pixel.
     """
 
@@ -37,7 +38,7 @@ class Fan:
     column_step: Array  # (3,), mm
     shape: tuple[int, int]  # rows and columns
     shifts: Array = field(default_factory=lambda: _UNSHIFTED)  # (S, 2), in rows and columns
-    parallel: bool = False
+    parallel: float = 0.0  # 0: one source; 1: parallel rays
 
     def part(self, rows: slice, columns: slice, shifts: slice = _ALL) -> Fan:
         """Some rows, some columns of these, and some of the shifts."""
@@ -46,7 +47,7 @@ class Fan:
         offset = row * self.row_step + column * self.column_step
         return replace(
             self,
-            source=self.source + offset if self.parallel else self.source,
+            source=self.source + self.parallel * offset,
             corner=self.corner + offset,
             shape=(last_row - row, last_column - column),
             shifts=self.shifts[shifts],
@@ -68,9 +69,8 @@ class Fan:
         vectors[:] = self.source, self.corner, self.row_step, self.column_step
         if self.shifts is not _UNSHIFTED:
             moved = self.shifts @ vectors[0, 2:]
+            vectors[:, 0] += self.parallel * moved
             vectors[:, 1] += moved
-            if self.parallel:
-                vectors[:, 0] += moved
         return vectors
 
     def targets(self) -> Array:
@@ -118,9 +118,8 @@ def window(fans: Sequence[Fan], points: Array) -> tuple[slice, slice]:
     )
     w_row, w_column, w = np.einsum("kfi,fpi->kfp", across, points - source[:, None])
     volume = np.einsum("fi,fi->f", row_step, across[0])[:, None]
-    w = w / volume
-    if fans[0].parallel:  # point - source = i row_step + j column_step + w to_corner
-        w = np.ones_like(w)
+    parallel = fans[0].parallel
+    w = parallel + (1 - parallel) * w / volume  # the sources move, too: so many steps make a step where the point is
     if not (w > 1e-6 * np.abs(w).max(axis=1, keepdims=True)).all():  # some points lie beside or behind a source
         return slice(0, shape[0]), slice(0, shape[1])
     windows = []

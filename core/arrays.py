@@ -19,9 +19,9 @@ def is_tensor(value: object) -> bool:
     return torch is not None and isinstance(value, torch.Tensor)
 
 
-def namespace(value: ArrayOrTensor) -> Any:
-    """The library, torch or numpy, whose functions take `value`."""
-    return sys.modules["torch"] if is_tensor(value) else np
+def namespace(*values: ArrayOrTensor) -> Any:
+    """The library whose functions take `values`: torch if any is a tensor, else numpy."""
+    return sys.modules["torch"] if any(map(is_tensor, values)) else np
 
 
 def is_double(value: object) -> bool:

@@ -99,14 +99,14 @@ class PerspectiveGrid:
     @cached_property
     def edges(self) -> Floats:
         """The third coordinate (n_k + 1,) at the borders of planes: k, or the depth of a parallel view."""
-        return freeze(self.third_at(np.arange(self.n_k + 1) - 0.5))
+        return freeze(self.planes_at(np.arange(self.n_k + 1) - 0.5))
 
     @cached_property
     def planes(self) -> Floats:
         """The third coordinate (n_k,) of the cells' places: k, or the depth of a parallel view."""
-        return freeze(self.third_at(np.arange(self.n_k)))
+        return freeze(self.planes_at(np.arange(self.n_k)))
 
-    def third_at(self, index: ArrayLike) -> Floats:
+    def planes_at(self, index: ArrayLike) -> Floats:
         """The third coordinate, k or depth, where the third index is `index`, also between the cells' places."""
         share = (np.asarray(index, np.float64) + 0.5) / self.n_k
         depths = self.near + share * (self.far - self.near)

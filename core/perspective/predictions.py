@@ -10,7 +10,7 @@ from ..geometry.views import Views
 from ..progress import Progress, tell
 from ..validation import instance, shape_text, whole_number
 from .perspective_grid import PerspectiveGrid, depths_in_views
-from .places import take
+from .places import gather
 from .resampling import camera_to_camera
 
 _NEAREST = 1e-3  # of the farthest depth: closer to a source, nothing is predicted
@@ -156,7 +156,7 @@ def _meet(g: PerspectiveGrid, h: PerspectiveGrid) -> Any:
     """Which pixels (n_v, n_u) of `h` have cells whose places lie in `g`."""
     nothing, seen = np.zeros(h.shape, np.float32), np.zeros(h.shape, np.int32)
     zero, matrix = np.zeros((1, *g.shape), np.float32), g.index_matrix @ h.inverse
-    take(nothing, h.third_at(np.arange(h.n_k)), zero, matrix[None], seen=seen)
+    gather(nothing, h.planes_at(np.arange(h.n_k)), zero, matrix[None], seen=seen)
     return seen.any(axis=2).T
 
 

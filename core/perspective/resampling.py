@@ -21,7 +21,7 @@ from ..projector.rays import Fan
 from ..validation import instance, one_of
 from ..volumes.volume import UNITS, Volume, require_quantity
 from .perspective_grid import PerspectiveGrid
-from .places import give, take
+from .places import gather, scatter
 
 KEEP = ("density", "activity")
 """What resampling may keep: the values, or their sums."""
@@ -284,16 +284,16 @@ class _Taking(_Pair):
 
     def forward(self, x: Array, progress: Progress | None) -> Array:
         result = np.zeros(self.shape_out, x.dtype)
-        for n, (matrix, thirds) in enumerate(self._shifted()):
+        for n, (matrix, planes) in enumerate(self._shifted()):
             part = part_of(progress, n, int(self._points.prod()))
-            take(result, thirds, x[None], matrix[None], progress=part)
+            gather(result, planes, x[None], matrix[None], progress=part)
         return np.asarray(result / self._points.prod(dtype=x.dtype))
 
     def adjoint(self, y: Array, progress: Progress | None) -> Array:
         result = np.zeros(self.shape_in, y.dtype)
         y = np.asarray(y / self._points.prod(dtype=y.dtype))
-        for n, (matrix, thirds) in enumerate(self._shifted()):
-            give(y, thirds, result, matrix, part_of(progress, n, int(self._points.prod())))
+        for n, (matrix, planes) in enumerate(self._shifted()):
+            scatter(y, planes, result, matrix, part_of(progress, n, int(self._points.prod())))
         return result
 
     def _shifted(self) -> Iterator[tuple[Floats, Floats]]:
@@ -304,17 +304,17 @@ class _Taking(_Pair):
                 matrix = self._matrix.copy()
                 matrix[:, 3] += i * matrix[:, 0] + j * matrix[:, 1]
                 for k in fractions[2]:
-                    yield matrix, _thirds(self.target, np.arange(self.target.shape[2]) + k)
+                    yield matrix, _planes_at(self.target, np.arange(self.target.shape[2]) + k)
 
 
 def _with_ones(matrix: Floats) -> Floats:
-    """Rows (5, 4), as `places.take` needs them, of an affine one (4, 4)."""
+    """Rows (5, 4), as `places.gather` needs them, of an affine one (4, 4)."""
     return np.insert(matrix, 4, [0.0, 0.0, 0.0, 1.0], axis=0)
 
 
-def _thirds(lattice: Lattice, index: Floats) -> Floats:
+def _planes_at(lattice: Lattice, index: Floats) -> Floats:
     """The third coordinate, as of places, at (fractional) indices of the third axis."""
-    return index if isinstance(lattice, Grid) else lattice.third_at(index)
+    return index if isinstance(lattice, Grid) else lattice.planes_at(index)
 
 
 def _cells_covered(matrix: Floats, source: Lattice, target: Lattice) -> Floats:
@@ -339,7 +339,7 @@ def _warn_of_few_points(operator: _Taking, what: str) -> None:
 def _warn_of_gaps(g: PerspectiveGrid, grid: Grid) -> None:
     """Warn where rays are so far apart that they leave voxels out."""
     index = _some_cells(g)
-    world = g.to_world(np.column_stack([index[:, :2], g.third_at(index[:, 2])]))
+    world = g.to_world(np.column_stack([index[:, :2], g.planes_at(index[:, 2])]))
     places = world @ grid.index_from_world[:3, :3].T + grid.index_from_world[:3, 3]
     index = index[((places >= -0.5) & (places <= np.array(grid.shape) - 0.5)).all(axis=1)]
     matrix = _with_ones(grid.index_from_world) @ g.inverse
@@ -359,7 +359,7 @@ def _some_cells(lattice: Lattice) -> Floats:
 
 def _places(matrix: Floats, target: Lattice, index: Floats) -> Floats:
     """Where cells (N, 3) of `target` lie in the other lattice, as indices (N, 3); NaN of what is not in front."""
-    third = _thirds(target, index[:, 2])
+    third = _planes_at(target, index[:, 2])
     p = np.column_stack([index[:, :2], third, np.ones(len(index))]) @ matrix.T
     front = (p[:, 3] > 0) & (p[:, 4] > 0)
     with np.errstate(divide="ignore", invalid="ignore"):

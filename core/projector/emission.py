@@ -368,9 +368,8 @@ class Emission(Model):
             Rays of a pixel: along each side, a ray stands for this part of it where the crystal or a wall ends.
         """
         side, thickness = self.system.detector_side[m], self.system.detector_thickness[m]
-        of_module = length, side, thickness
-        along = along_u, along_v
-        return self.effective_time * self._optics_of(m).pixel_weights(along, pitch, *of_module, opening, layer, cells)
+        optics, *along, length = self._optics_of(m).promoted(along_u, along_v, length)
+        return self.effective_time * optics.pixel_weights(along, pitch, length, side, thickness, opening, layer, cells)
 
     def response(self, views: Views, m: int) -> tuple[Array, Array] | None:
         """The intrinsic blur of view m: matrices (n_v, n_v) along v and (n_u, n_u) along u."""

@@ -8,7 +8,7 @@ from ..geometry.grid import Grid
 from ..geometry.views import Views
 from ..progress import Progress
 from ..volumes.volume import Volume
-from .filtered import checked_images, filtered_backprojection, rows_across, shares_of_turn, warn_of_cut
+from .filtered import angular_weights, checked_images, filtered_backprojection, rows_across, warn_of_cut
 
 _IN_PLANE = np.sin(np.radians(1.0))
 
@@ -75,7 +75,7 @@ def fbp(
         )
     images, views = rows_across(images, views, axis, "fbp")
     warn_of_cut(images, "fbp")
-    shares, _, gap = shares_of_turn(np.arctan2(along @ second, along @ first), np.pi)
+    shares, _, gap = angular_weights(np.arctan2(along @ second, along @ first), np.pi)
     if gap:
         empty = f"{np.degrees(gap):.0f} degrees of the half circle have no view"
         warn(f"fbp: {empty}: edges along their directions are lost", 2)

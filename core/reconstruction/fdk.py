@@ -11,7 +11,7 @@ from ..geometry.grid import Grid
 from ..geometry.views import Views
 from ..progress import Progress
 from ..volumes.volume import Volume
-from .filtered import checked_images, filtered_backprojection, rows_across, shares_of_turn, warn_of_cut
+from .filtered import angular_weights, checked_images, filtered_backprojection, rows_across, warn_of_cut
 
 Array = NDArray[np.floating[Any]]
 
@@ -140,7 +140,7 @@ class _Orbit:
                 "that fits the sources best; fdk needs them about on a circle, sirt and osem do not"
             )
         angles = np.arctan2(y, x)
-        shares, beginning, gap = shares_of_turn(angles, 2 * np.pi)
+        shares, beginning, gap = angular_weights(angles, 2 * np.pi)
         angles = (angles - beginning) % (2 * np.pi)
         lengths = np.hypot(x, y)[:, None]
         towards = (x[:, None] * first + y[:, None] * second) / lengths

@@ -11,7 +11,7 @@ from ..errors import InputError, warn
 from ..geometry.grid import Grid
 from ..geometry.views import Views
 from ..memory import require
-from ..perspective.places import take
+from ..perspective.places import gather
 from ..progress import Progress, tell
 from ..projector.parallel import run_all, thread_count
 from ..validation import instance, real_array
@@ -107,7 +107,7 @@ def filtered_backprojection(
 
         run_all(filter_view, range(first, end), thread_count(None))
         taken = room[: end - first], of_place[first:end]
-        take(volume, planes, *taken, flat=True, by_depth=True, nearest=_BEHIND)
+        gather(volume, planes, *taken, flat=True, by_depth=True, nearest=_BEHIND)
         tell(progress, end, n)
     return volume
 
@@ -124,7 +124,7 @@ def _columns_beyond(matrices: Array, grid: Grid, n_u: int) -> int:
     return int(np.clip(np.ceil(max(-column.min(), column.max() - (n_u - 1))), 0, n_u))
 
 
-def shares_of_turn(angles: Array, turn: float) -> tuple[Array, float, float]:
+def angular_weights(angles: Array, turn: float) -> tuple[Array, float, float]:
     """How much of a circle of circumference `turn` each angle stands for (M,): half the way to both neighbours.
 
     Equal angles share alike what one of them would stand for. Then the first angle after the largest gap, and that gap, if

@@ -1,7 +1,7 @@
 """Siddon's line integrals on an NVIDIA GPU, one thread a ray, several views a launch: the kernels are `warp_kernels`.
 
-No GPU has run them yet: docs/gpu.md says what was tested, and how. Derivatives are those of `reference`, in torch on the same
-device.
+No GPU has run them yet: docs/gpu.md says what was tested, and how. Derivatives are those of `reference`, in torch on the
+same device.
 
 Why NVIDIA Warp: one wheel for each of Linux, Windows and macOS without bounds on numpy, which brings its own compilers
 and runs the very same kernels on the CPU, where they are tested. Triton has no official wheel for Windows, and its programs

@@ -1,12 +1,12 @@
 # mypy: disable-error-code="no-untyped-def, valid-type"
-# ruff: noqa: UP018, RUF046 -- to Warp 0.0 is a constant and float(0.0) a variable
+# ruff: noqa: UP018 -- to Warp 0.0 is a constant and float(0.0) a variable
 """Kernels of the "cuda" backend, for NVIDIA Warp: one thread per ray, the rays of several fans in one launch.
 
-A ray goes from voxel to voxel, through the volume and through mu at once; nothing is stored or sorted. Its place, alpha, runs
-in float64 from 0 at the source to 1 at the target, so segments are as exact far from the source as near it; sums along a ray
-are float32.
+A ray goes from voxel to voxel, through the volume and through mu at once; nothing is stored or sorted. Its place, alpha,
+runs in float64 from 0 at the source to 1 at the target, so segments are as exact far from the source as near it; sums along
+a ray are float32.
 
-An index never leaves its lattice: the first voxel is clamped into it, and the step that would lead out ends the walk instead.
+An index never leaves its lattice: the first voxel is clamped into it, and the step that would lead out ends the walk.
 """
 
 # Warp reads the annotations: they must be its types, not strings.

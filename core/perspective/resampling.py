@@ -338,12 +338,7 @@ def _warn_of_few_points(operator: _Taking, what: str) -> None:
 
 def _warn_of_gaps(g: PerspectiveGrid, grid: Grid) -> None:
     """Warn where rays are so far apart that they leave voxels out."""
-    index = _some_cells(g)
-    world = g.to_world(np.column_stack([index[:, :2], g.planes_at(index[:, 2])]))
-    places = world @ grid.index_from_world[:3, :3].T + grid.index_from_world[:3, 3]
-    index = index[((places >= -0.5) & (places <= np.array(grid.shape) - 0.5)).all(axis=1)]
-    matrix = _with_ones(grid.index_from_world) @ g.inverse
-    apart = max(_longest_step(matrix, g, index, axis) for axis in (0, 1))
+    apart = _cells_covered(_with_ones(grid.index_from_world) @ g.inverse, grid, g)[:2].max()
     if apart > _GAP:
         warn(
             f"from_perspective: rays are up to {apart:.2g} voxels apart, and voxels between them get nothing: give coarser "

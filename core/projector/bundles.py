@@ -56,7 +56,7 @@ class Bundle:
     @property
     def kind(self) -> tuple[bool, float]:
         """What images whose rays make one part have in common: their orientation, and how far sources move."""
-        return self.transposed, self.beams[0].rays.parallel
+        return self.transposed, self.beams[0].rays.parallel if self.ends is None else 0.0
 
     @property
     def rays_of_a_pixel(self) -> int:
@@ -142,7 +142,7 @@ class Bundles:
         self._n = n
         self._make = make
         self._bundles: dict[int, Bundle] = {}
-        self._parts: dict[tuple[int, ...], list[Part]] = {}
+        self._parts: dict[tuple[Any, ...], list[Part]] = {}
         self._room = KEPT_BYTES
 
     def __len__(self) -> int:
@@ -167,32 +167,25 @@ class Bundles:
     def __getstate__(self) -> dict[str, Any]:  # what is kept holds functions that cannot be pickled
         return self.__dict__ | {"_bundles": {}, "_parts": {}, "_room": KEPT_BYTES}
 
-    def parts(self, images: range, most: int) -> list[Part]:
-        """All rays of several images, at most `most` in a part unless a fan alone has more."""
-        key = images.start, images.stop, most
+    def parts(self, images: range, block: tuple[slice, slice] | None, most: int) -> Iterable[Part]:
+        """All rays of several images, or those of a block of one: at most `most` in a part unless a fan alone has more."""
+        bounds = () if block is None else tuple((some.start, some.stop) for some in block)
+        key = images.start, images.stop, bounds, most
         if key not in self._parts:
             bundles = [(number, self[number]) for number in images]
-            parts: list[Part] = []
-            for kind in sorted({bundle.kind for _, bundle in bundles}):
-                some = [(number, bundle) for number, bundle in bundles if bundle.kind == kind]
-                rows, columns = some[0][1].shape
-                parts += _parts(some, slice(0, rows), slice(0, columns), most)
-            kept = [x for part in parts for x in (part.rays, part.weights) if isinstance(x, np.ndarray)]
-            if not self._has_room(sum(x.nbytes for x in kept)):
-                return parts
-            self._parts[key] = parts
-        return self._parts[key]
-
-    def parts_of(self, number: int, rows: slice, columns: slice, most: int) -> Iterable[Part]:
-        """The rays of some rows and columns of one image, likewise."""
-        bundle = self[number]
-        key = number, rows.start, rows.stop, columns.start, columns.stop, most
-        if key not in self._parts:
-            parts = _parts([(number, bundle)], rows, columns, most)
-            if bundle.ends is not None or not self._has_room(16 * bundle.n_rays((rows, columns))):
+            parts = self._made_parts(bundles, block, most)
+            kept = sum(8 * bundle.n_rays(block) for _, bundle in bundles if bundle.ends is None)
+            if not kept or not self._has_room(kept):
                 return parts
             self._parts[key] = list(parts)
         return self._parts[key]
+
+    @staticmethod
+    def _made_parts(bundles: list[tuple[int, Bundle]], block: tuple[slice, slice] | None, most: int) -> Iterator[Part]:
+        for kind in sorted({bundle.kind for _, bundle in bundles}):
+            some = [(number, bundle) for number, bundle in bundles if bundle.kind == kind]
+            rows, columns = block or map(slice, some[0][1].shape)
+            yield from _parts(some, slice(rows.start or 0, rows.stop), slice(columns.start or 0, columns.stop), most)
 
     def _has_room(self, n_bytes: int) -> bool:
         """Whether so many bytes may be kept; if so, they are counted."""

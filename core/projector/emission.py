@@ -395,11 +395,6 @@ class Emission(Model):
         of_modules = self.system, self.effective_diameter, sides, weigh
         return WholeHoles(views, grid, *of_modules, self.mu, self.hole == "depth")
 
-    def rays(self, views: Views, m: int, grid: Grid) -> int:
-        """Rays of each pixel of view m."""
-        holes = len(self.openings(m, self.hole_points(views, m, grid)))
-        return self.depth_layers * holes * self._pixel_points(views, m, grid)
-
     def caution(self, views: Views, grid: Grid) -> str | None:
         """A warning where there are too few rays for the tolerance."""
         if self._is_by_depth:  # has none

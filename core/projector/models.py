@@ -1,9 +1,11 @@
 """What a pixel measures: which rays it takes, with which weights."""
 
+from __future__ import annotations
+
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,9 +17,11 @@ from ..geometry.views import Views
 from ..validation import freeze, positive, real_array, shape_text
 from ..volumes.volume import LINE_INTEGRALS, Volume, require_quantity
 from .bundles import Beam
-from .depth_response import DepthResponses
 from .pixel_points import TOLERANCE, offsets, points_needed, require_points, shadow_edges
 from .rays import Fan
+
+if TYPE_CHECKING:
+    from .hole_response import WholeHoles
 
 Array = NDArray[np.float64]
 
@@ -50,7 +54,7 @@ class Model(ABC):
         """A warning for users who project `grid` into `views`, if there is one."""
         return None
 
-    def of_views(self, which: NDArray[np.integer]) -> "Model":
+    def of_views(self, which: NDArray[np.integer]) -> Model:
         """The model of the views `which` (indices) alone."""
         return self
 
@@ -74,11 +78,11 @@ class Model(ABC):
         """Factors of the voxels in view m, ``grid.shape``; used if `weights_voxels`."""
         return np.ones(grid.shape)
 
-    def by_depth(self, views: Views, grid: Grid) -> DepthResponses | None:
+    def by_depth(self, views: Views, grid: Grid) -> WholeHoles | None:
         """What projects in place of rays, if the model is of that kind."""
         return None
 
-    def by_rays(self) -> "Model":
+    def by_rays(self) -> Model:
         """The model for what can only be done with rays; `InputError` where it is not to take any."""
         return self
 

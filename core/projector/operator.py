@@ -58,12 +58,17 @@ class LinearOperator(ABC):
         InputError
             Another shape or grid, not real numbers, not finite, or more memory needed than there is.
         """
-        x = self._check(x)
-        if is_tensor(x):
-            from .autograd import linear
+        return self._apply(self._check(x), progress)
 
-            return linear(lambda x: self._run(x, progress), self.T._run, x)
-        return self._run(x, progress)
+    def _apply(
+        self, x: ArrayOrTensor, progress: Progress | None = None, mu: ArrayOrTensor | None = None
+    ) -> ArrayOrTensor:
+        """Apply to a checked array or tensor, whose gradient follows; not that of mu."""
+        if not is_tensor(x):
+            return self._run(x, progress, mu)
+        from .autograd import linear
+
+        return linear(lambda x: self._run(x, progress, mu), lambda y: self.T._run(y, mu=mu), x)
 
     _names = ("array", "array")  # what messages call what it takes, and what its adjoint takes
     _float64 = False  # whether it computes in float64 whatever it is given
@@ -257,12 +262,9 @@ class Projector(LinearOperator):
         if self._depths is not None and getattr(mu, "requires_grad", False):
             return self._by_rays(x, progress, mu)
         x, mu = promote(x, require_no_negative(checked(mu, "mu", self.model.mu.grid.shape, self._float64)))
-        if not is_tensor(x):
-            return self._run(x, progress, mu)
+        if not getattr(mu, "requires_grad", False):
+            return self._apply(x, progress, mu)
         from . import autograd
-
-        if not mu.requires_grad:
-            return autograd.linear(lambda x: self._run(x, progress, mu), lambda y: self.T._run(y, mu=mu), x)
 
         def run(needs: Any) -> Any:
             def gradients(images: ArrayOrTensor, needs: Any) -> Any:
@@ -429,7 +431,7 @@ class Projector(LinearOperator):
         return Execution(backend, self.grid, mu_grid, backend.always_float64 or is_double(x), self.threads)
 
     def _depth_arguments(self, x: ArrayOrTensor) -> tuple[ArrayOrTensor, Any, int]:
-        """What `DepthResponses` takes: the array, the functions and the threads."""
+        """What `WholeHoles` takes: the array, the functions and the threads."""
         double = self._backend.always_float64 or is_double(x)
         has_kernels = self._backend.name != "numpy" and backends.choose("auto").name == "cpu"
         functions = backends.load("cpu" if has_kernels else "reference_depth")

@@ -66,14 +66,14 @@ def require_numbers(tensor: Any, name: str) -> None:
 
 
 def to_numpy(value: ArrayOrTensor, dtype: Any) -> np.ndarray[Any, Any]:
-    """As a C-ordered, aligned array (compiled kernels take no other)."""
+    """`value` as a C-ordered, aligned array (compiled kernels take no other)."""
     if is_tensor(value):
         value = value.numpy(force=True)
     return np.require(value, dtype, ["C", "A"])
 
 
 def to_tensor(value: ArrayOrTensor) -> Any:
-    """As a contiguous tensor: a tensor on its own device, an array on torch's default device."""
+    """`value` as a contiguous tensor: a tensor on its own device, an array on torch's default device."""
     import torch
 
     if is_tensor(value):

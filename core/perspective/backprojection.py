@@ -48,9 +48,9 @@ def backproject(
     ----------
     images : array (M, n_v, n_u)
         Line integrals for instance, in any unit; for the product and the minimum they should be comparable from view to
-        view, as of `run_line_integrals`.
+        view, as those of `run_line_integrals` are.
     views : Views
-        Of the images; also parallel ones.
+        The images' views; also parallel ones.
     grid : Grid or PerspectiveGrid
         Voxels, or the cells of one view's coordinates, of these or other views.
     how : str
@@ -69,14 +69,14 @@ def backproject(
     Returns
     -------
     Volume or array (n_u, n_v, n_k)
-        Of "backprojection", in the images' unit (times that of the distributions); on a perspective grid, an array of
-        float32.
+        A volume of "backprojection", in the images' unit (times that of the distributions); on a perspective grid, an array
+        of float32.
 
     Raises
     ------
     InputError
-        Images of another shape or not finite, no such `how`, negative values in a product, tensors that require a
-        gradient, distributions that are negative or of other views, or more memory needed than there is.
+        Negative values in a product, tensors that require a gradient, distributions that are negative or of other views, or
+        more memory needed than there is.
 
     Notes
     -----
@@ -127,12 +127,12 @@ def views_that_see(views: Views, grid: Grid | PerspectiveGrid, progress: Progres
     Returns
     -------
     Volume or array (n_u, n_v, n_k)
-        Of "modules"; on a perspective grid, an array of float32.
+        A volume of "modules"; on a perspective grid, an array of float32.
 
     Raises
     ------
     InputError
-        There are no views or no grid, or more memory is needed than there is.
+        More memory is needed than there is.
     """
     instance(views, Views, "views_that_see: views")
     lattice = _Lattice(grid, "views_that_see: grid")

@@ -116,7 +116,7 @@ def shifted(matrices: NDArray[np.float64], first: int) -> NDArray[np.float64]:
 def _places(
     n: tuple[int, int], planes: Array, matrix: Array, m: tuple[int, ...], flat: bool, nearest: float
 ) -> tuple[Array, Array, Array, Array]:
-    """Of all points: whether the array has them, the first of the elements around (3, …), the second ones' shares, p3."""
+    """For all points: whether the array has them, the first of the elements around (3, …), the second ones' shares, p3."""
     i, j = np.ogrid[: n[0], : n[1]]
     p = [row[0] * i[..., None] + row[1] * j[..., None] + row[2] * planes + row[3] for row in matrix]
     inside = (p[3] > nearest) & (flat | (p[4] > 0))

@@ -28,18 +28,18 @@ def spread_along_rays(image: ArrayOrTensor, distribution: ArrayOrTensor, g: Pers
         by their sum along the ray. Of a volume in the view's coordinates, `to_perspective`, it is the array times
         ``g.ray_lengths()``.
     g : PerspectiveGrid
-        Of the view.
+        The view's.
 
     Returns
     -------
     array or tensor (…, n_u, n_v, n_k)
-        Values that keep density, as of ``to_perspective``: image times share by the ray's length in the cell. A tensor's
-        gradient follows, in both arguments.
+        Values that keep density, as ``to_perspective`` makes them: image times share by the ray's length in the cell. A
+        tensor's gradient follows, in both arguments.
 
     Raises
     ------
     InputError
-        Another shape, values that are not finite, shares below 0, or only 0 along a ray whose pixel is not 0.
+        Shares below 0, or only 0 along a ray whose pixel is not 0.
     """
     instance(g, PerspectiveGrid, "spread_along_rays")
     image = checked(image, "image", g.shape[1::-1], False, batch=True)
@@ -64,13 +64,13 @@ def predict_views(
     Parameters
     ----------
     array : array or tensor (…, n_u, n_v, n_k)
-        Values that keep density, as of `to_perspective` or `spread_along_rays`.
+        Values that keep density, as `to_perspective` and `spread_along_rays` make them.
     g : PerspectiveGrid
-        Of `array`.
+        The array's.
     views : Views
         Whose images are predicted; `g`'s own may be among them.
     planes : int, optional
-        Of the perspective grids in which the views' images are summed; they reach over the depths of all that is in `g`.
+        Planes of the perspective grids in which the views' images are summed; they reach over the depths of all of `g`.
         None: as many as `g` has cells along its longest axis.
     progress
         Called as ``progress(views done, views)``; what it raises stops the work.
@@ -86,7 +86,7 @@ def predict_views(
     Raises
     ------
     InputError
-        Another shape, values that are not finite, more memory needed than there is.
+        More memory is needed than there is.
 
     Notes
     -----
@@ -129,17 +129,12 @@ def prediction_errors(images: ArrayOrTensor, predicted: ArrayOrTensor, covered: 
     images : array or tensor (…, M, n_v, n_u)
         What the views saw: line integrals, value x mm.
     predicted, covered : arrays or tensors
-        Of `predict_views`, for the same views.
+        What `predict_views` returned for the same views.
 
     Returns
     -------
     array or tensor (…, M, n_v, n_u)
         A tensor's gradient follows.
-
-    Raises
-    ------
-    InputError
-        The shapes are not the same.
     """
     images, predicted = promote(images, predicted)
     shape = tuple(predicted.shape[-3:])

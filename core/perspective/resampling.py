@@ -51,7 +51,7 @@ def to_perspective(
     Parameters
     ----------
     volume : Volume, or array or tensor (…, n_x, n_y, n_z)
-        Of an array or tensor, `grid` is the grid. It may be a batch.
+        An array or tensor lies on `grid`, and may be a batch.
     g : PerspectiveGrid
     keep : str
         "density": the mean of the volume along a pixel's ray, from the plane before a cell to the one behind. Voxels are
@@ -69,7 +69,7 @@ def to_perspective(
     Raises
     ------
     InputError
-        Another shape, values that are not finite, CT numbers, more memory needed than there is.
+        CT numbers, or more memory needed than there is.
 
     Warns
     -----
@@ -114,26 +114,21 @@ def from_perspective(
     ----------
     array : array or tensor (…, n_u, n_v, n_k)
     g : PerspectiveGrid
-        Of `array`.
+        The array's.
     grid : Grid
     keep : str
         "density": the mean over each voxel of the array's values, interpolated linearly between cells' places; 0 outside
         `g`.
-        "activity": the array holds what lies in each cell, value x mm^3, as of ``to_perspective(…, "activity")``. It is
-        spread evenly along the cell's ray over the voxels that this crosses, and divided by their volume. What lies
+        "activity": the array holds what lies in each cell, value x mm^3, as ``to_perspective(…, "activity")`` makes it. It
+        is spread evenly along the cell's ray over the voxels that this crosses, and divided by their volume. What lies
         outside `grid` is left out.
     progress
-        As of `to_perspective`.
+        The same as in `to_perspective`.
 
     Returns
     -------
     array or tensor (…, n_x, n_y, n_z)
         Values, such as kBq/mL, in both cases; of the kind of `to_perspective`.
-
-    Raises
-    ------
-    InputError
-        As of `to_perspective`.
 
     Warns
     -----
@@ -163,22 +158,17 @@ def camera_to_camera(
     ----------
     array : array or tensor (…, n_u, n_v, n_k)
     g_m, g_n : PerspectiveGrid
-        Of `array`, and of the result.
+        The array's, and the result's.
     keep : str
         "density": the mean over each cell of the values, interpolated linearly. "activity": what lies in each cell is
         shared out among the cells around it; it is the adjoint of "density" the other way, from `g_n` to `g_m`.
     progress
-        As of `to_perspective`.
+        The same as in `to_perspective`.
 
     Returns
     -------
     array or tensor (…, n_u, n_v, n_k)
-        Of the kind of `to_perspective`.
-
-    Raises
-    ------
-    InputError
-        As of `to_perspective`.
+        Of the kind that `to_perspective` returns.
 
     Warns
     -----

@@ -53,7 +53,7 @@ class Optics:
     depth_layers : int
         Depths in the crystal at which photons are recorded.
     intrinsic_fwhm
-        Of the detector's blur, mm on the crystal.
+        FWHM of the detector's blur, mm on the crystal.
     photons_per_decay
         That are counted.
     within_crystal, within_walls, within_cone : bool
@@ -62,7 +62,7 @@ class Optics:
     Raises
     ------
     InputError
-        A number is out of its range, or settings do not go together.
+        Settings do not go together.
     """
 
     aperture_mu: ArrayOrTensor = None
@@ -187,13 +187,13 @@ class Optics:
         Parameters
         ----------
         slope_u, slope_v
-            Of the photons' lines, mm along u and v per mm along the axis.
+            Slopes of the photons' lines, mm along u and v per mm along the axis.
         opening
             The point.
         thickness
-            Of the crystal, mm.
+            The crystal's, mm.
         layer
-            Of `depths`.
+            Which of `depths`.
         """
         squared_secant = 1 + slope_u**2 + slope_v**2
         cosine = 1 / squared_secant**0.5
@@ -231,7 +231,7 @@ class Optics:
         length, side, thickness
             Collimator length l, and the crystal's side and thickness, mm.
         opening, layer
-            As of `counted`.
+            The same as in `counted`.
         cells
             Rays of a pixel: along each side, a ray stands for this part of it where the crystal or a wall ends.
         """

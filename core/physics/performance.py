@@ -67,7 +67,7 @@ def sensitivity(
     points
         (P, 3), world mm.
     optics
-        Of the modules, such as `Emission.optics`. None: ideal ones.
+        The modules', such as `Emission.optics`. None: ideal ones.
     settings
         Attributes of `Optics`, in place of those of `optics`: `aperture_mu`, `opening_angle`, `crystal_mu`,
         `photons_per_decay`, `within_cone` and so on.
@@ -75,7 +75,7 @@ def sensitivity(
     Raises
     ------
     InputError
-        A number is out of its range, or there are not as many as modules.
+        There are not as many numbers as modules.
     """
     modules, optics, x_u, x_v, h = _in_modules(system, points, chosen_optics(optics, settings))
     visible = _visible(modules, x_u, x_v, h)

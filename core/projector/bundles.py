@@ -75,13 +75,13 @@ class Part:
 
     # numbers of the images to which the fans belong, and how many fans of each follow one another
     images: list[tuple[int, int]]
-    rays: Array | Ends  # (F, 4, 3), the fans' vectors, as of `Fan.vectors`; or rays from point to point
+    rays: Array | Ends  # (F, 4, 3), the fans' vectors (`Fan.vectors`); or rays from point to point
     rows: slice  # the part of an image that each fan covers, of the transposed image if `transposed`
     columns: slice
     transposed: bool = False
     # (F, rows, columns), weights of the integrals, with 1 row or column where all are the same; None: 1 everywhere
     weights: Array | None = None
-    parallel: float = 0.0  # as of `Fan`; fans of one part are all alike in this
+    parallel: float = 0.0  # that of `Fan`; fans of one part are all alike in this
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -135,7 +135,7 @@ class Bundles:
     n : int
         How many images.
     make : function
-        Of an image's number: its `Bundle`.
+        Takes an image's number and returns its `Bundle`.
     """
 
     def __init__(self, n: int, make: Callable[[int], Bundle]) -> None:

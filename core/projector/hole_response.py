@@ -1,4 +1,4 @@
-"""A hole's image without rays: voxels are shared out in a fine image, in planes of depth, and each plane is blurred.
+"""The depth-dependent pinhole response, without rays: voxels are shared out in a fine image, in planes of depth, and each plane is blurred.
 
 A point at depth h in front of the pinhole's plane is seen on the crystal as a disc of diameter ``d (1 + l / h)``. Here the
 image of a voxel is made in two steps that are each a sparse matrix, whose transposes are the adjoint. First the voxel's
@@ -72,9 +72,9 @@ class WholeHoles:
     views, grid, system
         The views, the volume's grid and the modules.
     diameters
-        Of the holes, (M,), mm.
+        The holes', (M,), mm.
     sides
-        Of the square on each crystal in which pixels count, (M,), mm.
+        Sides of the square on each crystal in which pixels count, (M,), mm.
     weigh
         ``weigh(m, u, v)`` is what a mm^2 of the crystal counts per (decay / (s mm^3) mm) along lines through the middle of
         module m's hole to these places on the crystal, mm, point-inverted.
@@ -104,7 +104,7 @@ class WholeHoles:
         self._sides, self._weigh, self._is_strict = sides, weigh, is_strict
 
     def _module(self, m: int) -> tuple[Array, Array, float, float]:
-        """Of module m the pinhole, mm, the frame u, v, k, the collimator's length and the hole's diameter, mm."""
+        """Module m's pinhole, mm, its frame u, v, k, the collimator's length and the hole's diameter, mm."""
         l, d = float(self._system.collimator_length[m]), float(self._diameters[m])
         return self._views.sources[m], self._frames[m], l, d
 
@@ -209,7 +209,7 @@ class WholeHoles:
         return far, max(nearest, near)
 
     def zones(self, m: int) -> list[tuple[float, float]]:
-        """View m's zones of depth, from far to near, mm; in each the hole's shadow grows so little that one response serves."""
+        """View m's zones of depth, from far to near, mm: in each the hole's shadow grows so little that one will do."""
         *_, l, _ = self._module(m)
         smallest, largest = (1 + l / depth for depth in self._limits(m))
         n = max(1, round(math.log(largest / smallest) / math.log(_ZONE_RATIO) + 0.4))

@@ -102,11 +102,6 @@ class Transmission(Model):
         programs for radiographs. None: as many as `tolerance` requires.
     tolerance : float
         With automatic points, the largest relative error of a single voxel's sum over the image, wherever it lies.
-
-    Raises
-    ------
-    InputError
-        An argument is of another kind or out of its range.
     """
 
     pixel_points: int | None = 1
@@ -142,14 +137,9 @@ def intensity(line_integrals: ArrayOrTensor, photons: float) -> ArrayOrTensor:
     Parameters
     ----------
     line_integrals
-        Of mu, without unit: an array, or a tensor (the result is then part of its graph).
+        Line integrals of mu, without unit: an array, or a tensor (the result is then part of its graph).
     photons
         Per pixel, where nothing attenuates (I0).
-
-    Raises
-    ------
-    InputError
-        `photons` is not a number above 0, or the line integrals are no real, finite numbers.
     """
     if not is_tensor(line_integrals):
         kind = np.float32 if getattr(line_integrals, "dtype", None) == np.float32 else np.float64
@@ -168,11 +158,6 @@ def checked_background(
         What to check, and how messages call it.
     n, pixels
         Number of views and their shape (n_v, n_u), if that is known.
-
-    Raises
-    ------
-    InputError
-        Another shape, not real, not finite, or below 0.
     """
     array = real_array(value, name, None)
     real_array(array, name, None, np.float32)  # as which it is added

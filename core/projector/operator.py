@@ -56,7 +56,7 @@ class LinearOperator(ABC):
         Raises
         ------
         InputError
-            Another shape or grid, not real numbers, not finite, or more memory needed than there is.
+            Another grid, or more memory needed than there is.
         """
         return self._apply(self._check(x), progress)
 
@@ -179,7 +179,7 @@ class Projector(LinearOperator):
     Raises
     ------
     InputError
-        An argument is of another kind, no such backend, or its library is missing.
+        There is no such backend, or its library is missing.
 
     Notes
     -----
@@ -236,7 +236,7 @@ class Projector(LinearOperator):
         Parameters
         ----------
         x, progress
-            As of `LinearOperator`; `x` may also be a `Volume`.
+            The same as for any `LinearOperator`; `x` may also be a `Volume`.
         mu
             Attenuation coefficients, 1/mm, in place of the model's: an array or tensor on the grid of its `mu`, one for a
             whole batch.
@@ -244,13 +244,13 @@ class Projector(LinearOperator):
         Returns
         -------
         array or tensor
-            As of `LinearOperator`, and a tensor also if `mu` is one: part of torch's graph if `x` or `mu` requires a
+            A tensor if `x` or `mu` is one, else a numpy array: part of torch's graph if `x` or `mu` requires a
             gradient, for every backend. Where `mu` requires one, gradients of gradients are refused.
 
         Raises
         ------
         InputError
-            As of `LinearOperator`; and the model has no mu, or `mu` has another shape, or is negative.
+            The model has no mu, or `mu` has another shape, or is negative; or more memory is needed than there is.
         """
         if mu is None:
             images = super().__call__(x, progress)

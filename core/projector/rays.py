@@ -104,7 +104,7 @@ def window(fans: Sequence[Fan], points: Array) -> tuple[slice, slice]:
     Parameters
     ----------
     fans
-        Of one shape.
+        Fans of one shape.
     points
         (P, 3), world mm.
     """
@@ -193,7 +193,7 @@ class Attenuation:
 def index_fans(
     grid: Grid, vectors: Array, shape: tuple[int, int], parallel: float = 0.0, origin: tuple[int, int, int] = (0, 0, 0)
 ) -> IndexFans:
-    """Fans (F, 4, 3) in world mm, as of `Fan.vectors`, parallel or not, in `grid`'s index space; see `index_rays`."""
+    """Fans (F, 4, 3) in world mm, vectors of `Fan.vectors`, parallel or not, in `grid`'s index space; see `index_rays`."""
     affine = _index_from_world(grid, origin)
     table = np.empty((len(vectors), 8, 3))
     table[:, 4:] = vectors

@@ -44,7 +44,7 @@ def trace_rays(
     sources, targets
         Ends of the rays, each (N, 3), or (3,) for all rays the same; world mm. Arrays or torch tensors.
     backend
-        As of `Projector`.
+        One of `Projector`'s.
     grid
         Where the voxels are, for a volume that is an array or a tensor.
     mu
@@ -106,17 +106,12 @@ def trace_fans(
     shape
         Rows and columns.
     volume, backend, grid, mu, mu_grid
-        As of `trace_rays`.
+        The same as in `trace_rays`.
 
     Returns
     -------
     array or tensor (..., rows, columns)
-        As of `trace_rays`. Gradients by the vectors cost little more than the integrals.
-
-    Raises
-    ------
-    InputError
-        As of `trace_rays`.
+        Value x mm, of the kind that `trace_rays` returns. Gradients by the vectors cost little more than the integrals.
 
     Examples
     --------

@@ -125,7 +125,7 @@ def _level() -> int:
 
 
 level = _level()
-"""Of the kernels that are used, an index of `levels`."""
+"""The level of the kernels that are used, an index of `levels`."""
 
 
 def forward(volume: Array, rays: Rays, attenuation: Attenuation | None = None) -> Array:

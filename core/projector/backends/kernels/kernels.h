@@ -7,7 +7,7 @@
 //     L int_0^1 f(alpha) exp(-L int_0^alpha mu) dalpha
 //
 // The kernels allocate nothing, keep nothing and start no thread: a job belongs to the thread that calls, which needs
-// 400 kB of stack. Nothing here is checked; cpu.py makes only jobs whose arrays are as large as said here, of
+// 400 kB of stack. Nothing here is checked; cpu.py makes only jobs whose arrays are as large as this file asks, of
 // fewer than 2^31 voxels in a lattice.
 
 #pragma once

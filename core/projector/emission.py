@@ -25,9 +25,9 @@ from ..validation import instance, positive, real_array, strict_whole
 from ..volumes.volume import Volume, require_quantity
 from .bundles import Beam
 from .hole_response import WholeHoles
-from .models import Array, Model, checked_background, view_rays
+from .models import Array, Model, checked_background
 from .pixel_points import TOLERANCE, expected_error, lattices, offsets, points_needed, require_points, shadow_edges
-from .rays import Fan
+from .rays import Fan, view_rays
 
 # Views may differ from their system by a file's rounding (mm; sine of an angle).
 _SAME_PLACE = 1e-3
@@ -86,7 +86,7 @@ class Emission(Model):
         ``"depth"``: the depth-dependent pinhole response, the blur of the whole hole without rays (`hole_response`). Every
         voxel's image is right to 1 % and its total to 0.1 %. It takes no ``edge="path"`` or `depth_layers`, no grid that
         comes close to a pinhole, and no backend cuda. ``"rays"``: through `aperture_points`. ``"point"``: through the hole's
-        middle, an ideal pinhole without blur. ``"auto"``: the depth-dependent response, voxels close to a pinhole by rays; by
+        middle, an ideal pinhole without blur. ``"auto"``: the depth-dependent response, voxels close to a pinhole by rays;
         rays alone where that cannot be or they have numbers.
     aperture_points : int, optional
         Points of the hole's disk that rays pass, all with the same weight: the blur of a hole of diameter d_e.

@@ -1,4 +1,4 @@
-"""The depth-dependent pinhole response, without rays: voxels are shared out in a fine image, in planes of depth, and each plane is blurred.
+"""The depth-dependent pinhole response: voxels are shared out in fine images, and each plane of depth is blurred.
 
 A point at depth h in front of the pinhole's plane is seen on the crystal as a disc of diameter ``d (1 + l / h)``. Here the
 image of a voxel is made in two steps that are each a sparse matrix, whose transposes are the adjoint. First the voxel's
@@ -34,8 +34,8 @@ from ..geometry.views import Views
 from ..physics.crystal import share_inside
 from ..volumes.volume import Volume
 from .depth_response import DepthResponse, Index
-from .models import view_rays
 from .parallel import in_order, run_all
+from .rays import view_rays
 from .transmittance import mean_transmittance
 
 Array = NDArray[Any]

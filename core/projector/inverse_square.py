@@ -13,7 +13,8 @@ from ..geometry.views import Views
 from ..validation import instance
 from .bundles import Beam
 from .emission import Emission
-from .models import Array, Model, view_rays
+from .models import Array, Model
+from .rays import view_rays
 
 
 @dataclass(frozen=True, eq=False)

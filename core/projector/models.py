@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,11 +17,9 @@ from ..geometry.views import Views
 from ..validation import freeze, positive, real_array, shape_text
 from ..volumes.volume import LINE_INTEGRALS, Volume, require_quantity
 from .bundles import Beam
+from .hole_response import WholeHoles
 from .pixel_points import TOLERANCE, offsets, points_needed, require_points, shadow_edges
-from .rays import Fan
-
-if TYPE_CHECKING:
-    from .hole_response import WholeHoles
+from .rays import view_rays
 
 Array = NDArray[np.float64]
 
@@ -172,24 +170,3 @@ def checked_background(
     if array.min(initial=0.0) < 0:
         raise InputError(f"{name}: expected 0 or more, got {array.min():g}")
     return freeze(array) if array.ndim else float(array)
-
-
-def view_rays(views: Views, m: int, grid: Grid | None = None) -> Fan:
-    """The rays of view m, from its source to the pixels' centres: a row for every row of pixels.
-
-    Parallel rays begin and end outside `grid`, close to it; without a grid, as those of `Views.rays`.
-    """
-    n_v, n_u = views.shape
-    u_step, v_step = views.u_steps[m], views.v_steps[m]
-    corner = views.detector_centers[m] - (n_u - 1) / 2 * u_step - (n_v - 1) / 2 * v_step
-    if not views.parallel:
-        return Fan(views.sources[m], corner, v_step, u_step, views.shape)
-    along = views.detector_centers[m] - views.sources[m]
-    if grid is None:
-        return Fan(corner - along, corner, v_step, u_step, views.shape, parallel=True)
-    along = along / np.linalg.norm(along)
-    outermost = [corner + i * (n_v - 1) * v_step + j * (n_u - 1) * u_step for i in (0, 1) for j in (0, 1)]
-    distances = (grid.corners()[:, None] - outermost) @ along  # from pixels to the grid
-    margin = float(grid.spacing.max() + np.linalg.norm(u_step) + np.linalg.norm(v_step))
-    first, last = (corner + distance * along for distance in (distances.min() - margin, distances.max() + margin))
-    return Fan(first, last, v_step, u_step, views.shape, parallel=True)

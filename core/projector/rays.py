@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..geometry.grid import Grid
+from ..geometry.views import Views
 
 Array = NDArray[np.float64]
 
@@ -76,6 +77,27 @@ class Fan:
     def targets(self) -> Array:
         """Ends of the rays (S * rows * columns, 3), shift by shift, row by row."""
         return _targets(self.vectors(), self.shape)
+
+
+def view_rays(views: Views, m: int, grid: Grid | None = None) -> Fan:
+    """The rays of view m, from its source to the pixels' centres: a row for every row of pixels.
+
+    Parallel rays begin and end outside `grid`, close to it; without a grid, as those of `Views.rays`.
+    """
+    n_v, n_u = views.shape
+    u_step, v_step = views.u_steps[m], views.v_steps[m]
+    corner = views.detector_centers[m] - (n_u - 1) / 2 * u_step - (n_v - 1) / 2 * v_step
+    if not views.parallel:
+        return Fan(views.sources[m], corner, v_step, u_step, views.shape)
+    along = views.detector_centers[m] - views.sources[m]
+    if grid is None:
+        return Fan(corner - along, corner, v_step, u_step, views.shape, parallel=True)
+    along = along / np.linalg.norm(along)
+    outermost = [corner + i * (n_v - 1) * v_step + j * (n_u - 1) * u_step for i in (0, 1) for j in (0, 1)]
+    distances = (grid.corners()[:, None] - outermost) @ along  # from pixels to the grid
+    margin = float(grid.spacing.max() + np.linalg.norm(u_step) + np.linalg.norm(v_step))
+    first, last = (corner + distance * along for distance in (distances.min() - margin, distances.max() + margin))
+    return Fan(first, last, v_step, u_step, views.shape, parallel=True)
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,8 +19,7 @@ from mphdrr.core.projector import Projector, backends
 from mphdrr.core.projector import trace_rays as trace
 from mphdrr.core.projector.backends import cuda, reference
 from mphdrr.core.projector.lattices import Lattices
-from mphdrr.core.projector.models import view_rays
-from mphdrr.core.projector.rays import Attenuation, IndexFans, IndexRays
+from mphdrr.core.projector.rays import Attenuation, IndexFans, IndexRays, view_rays
 from mphdrr.core.volumes.volume import Volume
 
 from .conftest import emission, general_grid, refused

@@ -8,8 +8,7 @@ and runs the very same kernels on the CPU, where they are tested. Triton has no 
 work on blocks, not on single rays.
 
 The volume is on the device as a whole. The rays are made there, from their fans; they are launched in pieces that leave
-half of the free memory alone. An array is copied to the device and the results back at every call, a tensor on the device
-is worked on where it is, on torch's stream.
+half of the free memory alone. Arrays become tensors on the device; these are worked on where they are, on torch's stream.
 """
 
 from __future__ import annotations
@@ -31,6 +30,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 from numpy.typing import NDArray
+from torch import Tensor
 
 from ... import cache
 from ...arrays import ArrayOrTensor, is_tensor, to_caller, to_numpy, to_tensor
@@ -55,47 +55,49 @@ _loaded: set[str] = set()
 
 def forward(volume: ArrayOrTensor, rays: Rays, attenuation: Attenuation | None = None) -> ArrayOrTensor:
     """Line integrals (N,), value x mm, of `volume` (n_x, n_y, n_z) along `rays`, attenuated towards their sources."""
-    with _Call(volume, rays, attenuation) as call:
-        return call.integrals()
+    with _Call(to_backend(volume), rays, _on_device(attenuation)) as call:
+        return to_caller(call.integrals(), volume)
 
 
 def backproject(
     volume: ArrayOrTensor, values: ArrayOrTensor, rays: Rays, attenuation: Attenuation | None = None
 ) -> None:
     """Add `values` (N,), each along its ray with the weights of `forward`, to `volume` in place, in no fixed order."""
-    with _Call(volume, rays, attenuation) as call:
-        call.add(values)
+    total = to_backend(volume)
+    with _Call(total, rays, _on_device(attenuation)) as call:
+        call.add(to_backend(values))
+    if not is_tensor(volume):
+        volume[...] = to_caller(total, volume)
 
 
 def derivatives(volume: ArrayOrTensor, rays: Rays, attenuation: Attenuation | None = None) -> ArrayOrTensor:
     """Those of the reference, on the device: what the ends of `rays` do to their integrals, (N, 7) or (N, 14)."""
-    return to_caller(reference.derivatives(_tensor(volume), rays, _in_torch(attenuation)), volume)
+    return to_caller(reference.derivatives(to_backend(volume), rays, _on_device(attenuation)), volume)
 
 
 def mu_gradient(
     gradient: ArrayOrTensor, volume: ArrayOrTensor, values: ArrayOrTensor, rays: Rays, attenuation: Attenuation
 ) -> None:
     """That of the reference, on the device: add to `gradient` each of `values` (N,) times its integral's by mu."""
-    total = _tensor(gradient)
-    reference.mu_gradient(total, _tensor(volume), _tensor(values), rays, _in_torch(attenuation))
+    total, mu = to_backend(gradient), replace(attenuation, mu=to_backend(attenuation.mu))
+    reference.mu_gradient(total, to_backend(volume), to_backend(values), rays, mu)
     if not is_tensor(gradient):
         gradient[...] = to_caller(total, gradient)
 
 
-def _tensor(x: ArrayOrTensor) -> Any:
-    """`x` as a tensor on the device."""
-    return x if is_tensor(x) else to_tensor(x).to(wp.device_to_torch(device()))
-
-
-def _in_torch(attenuation: Attenuation | None) -> Any:
-    return attenuation and replace(attenuation, mu=_tensor(attenuation.mu))
+def _on_device(attenuation: Attenuation | None) -> Attenuation | None:
+    return None if attenuation is None else replace(attenuation, mu=to_backend(attenuation.mu))
 
 
 def to_backend(x: ArrayOrTensor) -> ArrayOrTensor:
-    """`x` as float32: a tensor that is on the device stays there, all else becomes an array."""
+    """`x` as a tensor of float32 on the device; one that is there already is not copied."""
     if is_tensor(x) and (x.is_cuda or (x.device.type == "cpu" and device().is_cpu)):
         return x.detach().float().resolve_neg().contiguous()  # Warp does not see torch's lazy minus sign
-    return to_numpy(x, np.float32)
+    array, on = to_numpy(x, np.float32), device()
+    if array.nbytes > on.free_memory:
+        needed, free = readable_size(array.nbytes), readable_size(on.free_memory)
+        raise InputError(f"backend 'cuda': {needed} of numbers, but {free} are free on {on.name}")
+    return to_tensor(array).to(wp.device_to_torch(on))
 
 
 def device() -> Any:
@@ -136,14 +138,9 @@ def _loads(library: str) -> bool:
 class _Call:
     """Rays on their way through the device: what is needed of a call, and its launches."""
 
-    def __init__(self, volume: ArrayOrTensor, rays: Rays, attenuation: Attenuation | None) -> None:
-        self._stream: Any = nullcontext()
-        if is_tensor(volume):
-            self._device = wp.device_from_torch(volume.device)
-            if volume.is_cuda:
-                self._stream = wp.ScopedStream(wp.stream_from_torch(volume.device))
-        else:
-            self._device = device()
+    def __init__(self, volume: Tensor, rays: Rays, attenuation: Attenuation | None) -> None:
+        self._device = wp.device_from_torch(volume.device)
+        self._stream = wp.ScopedStream(wp.stream_from_torch(volume.device)) if volume.is_cuda else nullcontext()
         self._volume = volume
         self._kernels = _kernels(self._device)
         self._fans, self._rows, self._columns = _table(rays)
@@ -161,46 +158,27 @@ class _Call:
             free = readable_size(self._device.free_memory)
             raise InputError(f"backend 'cuda': {self._device.name} has too little free memory, {free}") from error
 
-    def on_device(self, array: ArrayOrTensor, what: str) -> Any:
-        """`array` as an array of Warp, copied only where it is not on the device."""
-        if array.shape[1] * array.shape[2] * 4 >= _BYTES_OF_A_PLANE:
-            raise InputError(f"backend 'cuda': {what} has {array.shape[1]} x {array.shape[2]} voxels a plane, too many")
-        if is_tensor(array):
-            return wp.from_torch(array)
-        free = self._device.free_memory
-        if array.nbytes > free:
-            raise InputError(
-                f"backend 'cuda': {what} takes {readable_size(array.nbytes)}, but {readable_size(free)} are free on "
-                f"{self._device.name}"
-            )
-        return wp.array(array, dtype=wp.float32, device=self._device)
-
-    def integrals(self) -> ArrayOrTensor:
+    def integrals(self) -> Tensor:
         """What `integrate` writes, (N,)."""
-        shape = (len(self._fans), self._rows, self._columns)
-        result = self._volume.new_empty(shape) if is_tensor(self._volume) else np.empty(shape, np.float32)
-        volumes = self._volumes()
-        for part in self._pieces():
-            piece = result[part]
-            out = wp.from_torch(piece) if is_tensor(piece) else wp.empty(piece.shape, wp.float32, device=self._device)
-            self._launch(self._kernels.integrate, part, volumes, out)
-            _copy_back(out, piece)
+        result = self._volume.new_empty((len(self._fans), self._rows, self._columns))
+        self._launch(self._kernels.integrate, result)
         return result.reshape(-1)
 
-    def add(self, values: ArrayOrTensor) -> None:
+    def add(self, values: Tensor) -> None:
         """Have `backproject` add the rays' `values` (N,) to the volume."""
-        volumes = self._volumes()
-        values = to_backend(values).reshape(len(self._fans), self._rows, self._columns)
-        for part in self._pieces():
-            piece = values[part]
-            numbers = wp.from_torch(piece) if is_tensor(piece) else wp.array(piece, wp.float32, device=self._device)
-            self._launch(self._kernels.backproject, part, volumes, numbers)
-        _copy_back(volumes[0], self._volume)
+        self._launch(self._kernels.backproject, values.reshape(len(self._fans), self._rows, self._columns))
 
-    def _volumes(self) -> list[Any]:
-        """The volume and mu on the device; in place of mu, where there is none, the volume."""
-        volume = self.on_device(self._volume, "the volume")
-        return [volume, volume if self._attenuation is None else self.on_device(self._attenuation.mu, "mu")]
+    def _launch(self, kernel: Any, numbers: Tensor) -> None:
+        """Launch a kernel on the rays and their `numbers`, piece by piece; where there is no mu, with the volume twice."""
+        volumes = [_array(self._volume if x is None else x.mu) for x in (None, self._attenuation)]
+        for fans, rows in self._pieces():
+            rays = wp.array(self._fans[fans], dtype=wp.vec3d, device=self._device)
+            mu_rays, attenuated = rays, int(self._attenuation is not None)
+            if self._mu_fans is not None:
+                mu_rays, attenuated = wp.array(self._mu_fans[fans], dtype=wp.vec3d, device=self._device), 2
+            piece = numbers[fans, rows]
+            inputs = [*volumes, rays, mu_rays, attenuated, rows.start, wp.from_torch(piece)]
+            wp.launch(kernel, tuple(piece.shape), inputs=inputs, device=self._device)
 
     def _pieces(self) -> Iterator[tuple[slice, slice]]:
         """Which fans, and which of their rows, are launched together."""
@@ -213,15 +191,12 @@ class _Call:
             for row in range(0, self._rows, rows):
                 yield slice(fan, min(fan + fans, len(self._fans))), slice(row, min(row + rows, self._rows))
 
-    def _launch(self, kernel: Any, part: tuple[slice, slice], volumes: list[Any], numbers: Any) -> None:
-        fans, rows = part
-        rays = wp.array(self._fans[fans], dtype=wp.vec3d, device=self._device)
-        mu_rays, attenuated = rays, int(self._attenuation is not None)
-        if self._mu_fans is not None:
-            mu_rays, attenuated = wp.array(self._mu_fans[fans], dtype=wp.vec3d, device=self._device), 2
-        dim = (fans.stop - fans.start, rows.stop - rows.start, self._columns)
-        inputs = [*volumes, rays, mu_rays, attenuated, rows.start, numbers]
-        wp.launch(kernel, dim, inputs=inputs, device=self._device)
+
+def _array(volume: Tensor) -> Any:
+    """A tensor on the device as Warp's array, not copied."""
+    if volume.shape[1] * volume.shape[2] * 4 >= _BYTES_OF_A_PLANE:
+        raise InputError(f"backend 'cuda': {volume.shape[1]} x {volume.shape[2]} voxels a plane are too many")
+    return wp.from_torch(volume)
 
 
 def _table(rays: Rays) -> tuple[NDArray[np.float64], int, int]:
@@ -236,12 +211,6 @@ def _table(rays: Rays) -> tuple[NDArray[np.float64], int, int]:
     if rays.parallel:
         table[:, 6:8], table[:, 8] = 0.0, 1.0
     return table, *rays.shape
-
-
-def _copy_back(array: Any, to: ArrayOrTensor) -> None:
-    """What is on the device into the array that it is for; a tensor has it already."""
-    if not is_tensor(to):
-        to[...] = array.numpy()
 
 
 def _kernels(device: Any) -> ModuleType:

@@ -69,7 +69,10 @@ def main() -> None:
         volume = mph.DerenzoPhantom(radius=40, rod_diameters=(8, 6, 5, 4, 3, 2), height=40).voxelize(grid)
         for name, options in MODELS.items():
             model = mph.Emission(system, **options)
-            rays = [model.rays(views, m, grid) if options else 0 for m in range(len(system))]
+            rays = [
+                sum(len(b.rays.shifts) for b in model.beams(views, m, grid)) if options else 0
+                for m in range(len(system))
+            ]
             counted = f"{min(rays)} to {max(rays)}" if max(rays) > min(rays) else str(rays[0])
             error = worst_error(system, size, views, model)
             A = mph.Projector(grid, views, model)

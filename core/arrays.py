@@ -19,9 +19,9 @@ def is_tensor(value: object) -> bool:
     return torch is not None and isinstance(value, torch.Tensor)
 
 
-def namespace(value: ArrayOrTensor) -> Any:
-    """The library, torch or numpy, whose functions take `value`."""
-    return sys.modules["torch"] if is_tensor(value) else np
+def namespace(*values: ArrayOrTensor) -> Any:
+    """The library whose functions take `values`: torch if any is a tensor, else numpy."""
+    return sys.modules["torch"] if any(map(is_tensor, values)) else np
 
 
 def is_double(value: object) -> bool:
@@ -66,14 +66,14 @@ def require_numbers(tensor: Any, name: str) -> None:
 
 
 def to_numpy(value: ArrayOrTensor, dtype: Any) -> np.ndarray[Any, Any]:
-    """As a C-ordered, aligned array (compiled kernels take no other)."""
+    """`value` as a C-ordered, aligned array (compiled kernels take no other)."""
     if is_tensor(value):
         value = value.numpy(force=True)
     return np.require(value, dtype, ["C", "A"])
 
 
 def to_tensor(value: ArrayOrTensor) -> Any:
-    """As a contiguous tensor: a tensor on its own device, an array on torch's default device."""
+    """`value` as a contiguous tensor: a tensor on its own device, an array on torch's default device."""
     import torch
 
     if is_tensor(value):

@@ -7,7 +7,11 @@ from typing import Any
 
 
 class InputError(ValueError):
-    """The user's input cannot be used: one line that names the place, what was found and what was expected."""
+    """The user's input cannot be used: one line that names the place, what was found and what was expected.
+
+    Every public function raises it where an argument is of another kind or shape, not finite or out of its range.
+    Docstrings have a section "Raises" only for what is particular to a function.
+    """
 
 
 class Cancelled(Exception):

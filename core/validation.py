@@ -39,7 +39,7 @@ def real_array(
 
 
 def radians(value: ArrayLike, name: str, shape: tuple[int | None, ...] | None = ()) -> NDArray[np.float64]:
-    """Angles in rad, as of `real_array`; warns where they are, or reach over, more than a full turn, as degrees do."""
+    """Angles in rad, checked by `real_array`; warns where they are, or reach over, more than a full turn, as degrees do."""
     angles = real_array(value, name, shape)
     most = max(float(np.ptp(angles)), float(np.abs(angles).min())) if angles.size else 0.0
     if most > 2.001 * pi:
@@ -50,11 +50,11 @@ def radians(value: ArrayLike, name: str, shape: tuple[int | None, ...] | None = 
 def real_numbers(value: ArrayLike, name: str) -> NDArray[Any]:
     """`value` as an array of real numbers of its own type and order, not copied without need, or `InputError`.
 
-    Masked numbers are refused: what stands under a mask would count, and nobody has said what does instead.
+    Masked numbers are refused: what stands under a mask would count, and it is not known what should instead.
     """
     if hidden := _masked(value):
-        said = f"{hidden} of {np.size(value)} numbers are masked"  # type: ignore[arg-type]
-        raise InputError(f"{name}: {said}; expected all of them: say what counts there, array.filled(...)")
+        found = f"{hidden} of {np.size(value)} numbers are masked"  # type: ignore[arg-type]
+        raise InputError(f"{name}: {found}; expected all of them: say what counts there, array.filled(...)")
     try:
         raw = np.asarray(value)
         if raw.dtype.kind not in "fiub":

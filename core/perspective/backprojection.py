@@ -15,7 +15,7 @@ from ..progress import Progress, part_of
 from ..validation import freeze, instance, one_of
 from ..volumes.volume import Volume
 from .perspective_grid import PerspectiveGrid
-from .places import LEAST, PRODUCT, SUM, shifted, take
+from .places import LEAST, PRODUCT, SUM, gather, shifted
 
 HOW = {"sum": SUM, "product": PRODUCT, "minimum": LEAST}
 """In which ways a voxel's values in the views may be put together."""
@@ -48,9 +48,9 @@ def backproject(
     ----------
     images : array (M, n_v, n_u)
         Line integrals for instance, in any unit; for the product and the minimum they should be comparable from view to
-        view, as of `run_line_integrals`.
+        view, as those of `run_line_integrals` are.
     views : Views
-        Of the images; also parallel ones.
+        The images' views; also parallel ones.
     grid : Grid or PerspectiveGrid
         Voxels, or the cells of one view's coordinates, of these or other views.
     how : str
@@ -69,14 +69,14 @@ def backproject(
     Returns
     -------
     Volume or array (n_u, n_v, n_k)
-        Of "backprojection", in the images' unit (times that of the distributions); on a perspective grid, an array of
-        float32.
+        A volume of "backprojection", in the images' unit (times that of the distributions); on a perspective grid, an array
+        of float32.
 
     Raises
     ------
     InputError
-        Images of another shape or not finite, no such `how`, negative values in a product, tensors that require a
-        gradient, distributions that are negative or of other views, or more memory needed than there is.
+        Negative values in a product, tensors that require a gradient, distributions that are negative or of other views, or
+        more memory needed than there is.
 
     Notes
     -----
@@ -102,14 +102,14 @@ def backproject(
         size = -(-len(points) // _PARTS)
         parts = range(0, len(points), size)  # so that what a product needs besides is small
         for number, first in enumerate(parts):
-            taken, said = [(images[..., None], shifted(matrices, first))], part_of(progress, number, len(parts))
-            _fill(points[first : first + size], kind, lattice.thirds, taken, 1, said, flat=True)
+            taken, part = [(images[..., None], shifted(matrices, first))], part_of(progress, number, len(parts))
+            _fill(points[first : first + size], kind, lattice.planes, taken, 1, part, flat=True)
     else:
         taken = (
             (np.multiply(images[m].T[None, ..., None], array, order="C"), (g.index_matrix @ lattice.to_world)[None])
             for m, (g, array) in enumerate(_distributions(depth, views))
         )
-        _fill(points, kind, lattice.thirds, taken, len(views), progress)
+        _fill(points, kind, lattice.planes, taken, len(views), progress)
     return lattice.finished(points, "backprojection")
 
 
@@ -127,12 +127,12 @@ def views_that_see(views: Views, grid: Grid | PerspectiveGrid, progress: Progres
     Returns
     -------
     Volume or array (n_u, n_v, n_k)
-        Of "modules"; on a perspective grid, an array of float32.
+        A volume of "modules"; on a perspective grid, an array of float32.
 
     Raises
     ------
     InputError
-        There are no views or no grid, or more memory is needed than there is.
+        More memory is needed than there is.
     """
     instance(views, Views, "views_that_see: views")
     lattice = _Lattice(grid, "views_that_see: grid")
@@ -141,13 +141,13 @@ def views_that_see(views: Views, grid: Grid | PerspectiveGrid, progress: Progres
     points, image = np.zeros(grid.shape, np.float32), np.zeros((1, *views.shape, 1), np.float32)
     for m, matrix in enumerate(_pixel_rows(views) @ lattice.to_world):
         part = part_of(progress, m, len(views))
-        take(points, lattice.thirds, image, matrix[None], flat=True, seen=seen, progress=part)
+        gather(points, lattice.planes, image, matrix[None], flat=True, seen=seen, progress=part)
     points[...] = seen
     return lattice.finished(points, "modules")
 
 
 class _Lattice:
-    """Where the points of a grid or perspective grid lie, as `take` needs it."""
+    """Where the points of a grid or perspective grid lie, as `gather` needs it."""
 
     def __init__(self, grid: Grid | PerspectiveGrid, name: str) -> None:
         if not isinstance(grid, Grid | PerspectiveGrid):
@@ -155,7 +155,7 @@ class _Lattice:
         self.grid = grid
         index = np.arange(float(grid.shape[2]))
         self.to_world = grid.affine if isinstance(grid, Grid) else grid.inverse
-        self.thirds: Floats = index if isinstance(grid, Grid) else grid.third_at(index)
+        self.planes: Floats = index if isinstance(grid, Grid) else grid.planes_at(index)
 
     def finished(self, points: Array, quantity: str) -> Volume | Array:
         if isinstance(self.grid, Grid):
@@ -219,7 +219,7 @@ def _is_view(g: PerspectiveGrid, views: Views, m: int) -> bool:
 def _fill(
     points: Array,
     kind: int,
-    thirds: Floats,
+    planes: Floats,
     taken: Iterable[tuple[Array, Floats]],
     n: int,
     progress: Progress | None,
@@ -230,7 +230,7 @@ def _fill(
     names = ("seen", "exponents") if kind == PRODUCT else ()
     counts: dict[str, Any] = {name: np.zeros(points.shape, np.int32) for name in names}
     for done, (arrays, matrices) in enumerate(taken):
-        take(points, thirds, arrays, matrices, how=kind, flat=flat, progress=part_of(progress, done, n), **counts)
+        gather(points, planes, arrays, matrices, how=kind, flat=flat, progress=part_of(progress, done, n), **counts)
     if kind == LEAST:
         for plane in points:  # in little memory
             plane[np.isinf(plane)] = 0.0

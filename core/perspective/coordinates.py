@@ -3,7 +3,6 @@
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..errors import InputError
 from ..validation import real_array
 
 Floats = NDArray[np.float64]
@@ -43,25 +42,6 @@ def transform_lines(matrix: ArrayLike, lines: ArrayLike) -> Floats:
     """
     matrix = real_array(matrix, "transform", (4, 4))
     return np.asarray(matrix @ real_array(lines, "lines", (4, 4), batch=True) @ matrix.T)
-
-
-def distance_to_line(points: ArrayLike, line: ArrayLike) -> Floats:
-    """Distances (…) of points (…, 3) to a line, a Plücker matrix (4, 4); in the points' unit.
-
-    Raises
-    ------
-    InputError
-        The line is at infinity, or no line.
-    """
-    points = real_array(points, "points", (3,), batch=True)
-    line = real_array(line, "line", (4, 4))
-    direction = line[:3, 3]
-    length = np.linalg.norm(direction)
-    if length == 0:
-        raise InputError("line: expected a Plücker matrix of a line that is not at infinity")
-    moment = np.array([line[1, 2], line[2, 0], line[0, 1]])  # a x b
-    # a x b = x x (b - a) for all points x of the line, and the matrix holds a - b.
-    return np.asarray(np.linalg.norm(moment + np.cross(points, direction), axis=-1) / length)
 
 
 def _homogeneous(points: Floats) -> Floats:

@@ -43,7 +43,7 @@ def samples_along_rays(images: ArrayLike, grid: PerspectiveGrid, pixels: ArrayLi
     Parameters
     ----------
     images : array (M, n_v, n_u)
-        Of all views of the grid.
+        Those of all views of the grid.
     grid : PerspectiveGrid
         Its view and planes: their depths are ``grid.depths``.
     pixels : array (…, 2)
@@ -54,11 +54,6 @@ def samples_along_rays(images: ArrayLike, grid: PerspectiveGrid, pixels: ArrayLi
     array (…, M, n_k)
         Interpolated linearly between pixels; NaN outside an image, which ends half a pixel beyond the outermost pixels'
         centres, and behind a source. In the grid's own view the value is the same at all planes.
-
-    Raises
-    ------
-    InputError
-        Images of another shape than the views'.
     """
     images = _images(images, grid)
     pixels = real_array(pixels, "pixels", (2,), batch=True)
@@ -91,7 +86,7 @@ def find_correspondences(
     Parameters
     ----------
     images : array (M, n_v, n_u)
-        Of all views of the grid.
+        Those of all views of the grid.
     grid : PerspectiveGrid
         The view of `pixels`, and the planes to look at.
     pixels : array (…, 2)
@@ -111,7 +106,7 @@ def find_correspondences(
     Raises
     ------
     InputError
-        Images of another shape than the views', no other views, or the grid's own among them.
+        There are no other views, or the grid's own is among them.
     """
     images = _images(images, grid)
     pixels = real_array(pixels, "pixels", (2,), batch=True)

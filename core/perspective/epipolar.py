@@ -54,7 +54,7 @@ def fundamental_matrix(views: Views, m: Indices, n: Indices) -> Floats:
     Raises
     ------
     InputError
-        No such view, or the two have the same source: each point has one ray in both.
+        The two have the same source: each point has one ray in both.
     """
     first, second = _pair(views, m, n, "fundamental matrix")
     if views.parallel:
@@ -87,7 +87,7 @@ def essential_matrix(views: Views, m: Indices, n: Indices) -> Floats:
     Raises
     ------
     InputError
-        No such view, the two have the same source, or the views are parallel.
+        The two have the same source, or the views are parallel.
     """
     first, second = _pair(views, m, n, "essential matrix")
     views.require_pinholes("essential matrix")
@@ -109,7 +109,7 @@ def epipole(views: Views, m: Indices, n: Indices) -> Floats:
     Raises
     ------
     InputError
-        No such view, or the two have the same source.
+        The two have the same source.
     """
     first, second = _pair(views, m, n, "epipole")
     matrices = views.projection_matrices()[second]
@@ -125,11 +125,6 @@ def epipolar_lines(views: Views, m: int, n: int, pixels: ArrayLike) -> Floats:
 
     A line is (a, b, c) with ``a^2 + b^2 = 1``, so that ``a column + b row + c`` is, with a sign, a pixel's distance from it,
     in pixels. NaN where there is no line: the ray leads through view n's source, or the line is at infinity.
-
-    Raises
-    ------
-    InputError
-        As `fundamental_matrix`.
     """
     matrix = fundamental_matrix(views, m, n)
     if matrix.ndim != 2:
@@ -166,7 +161,7 @@ def epipolar_segments(views: Views, m: int, pixel: ArrayLike, near: float, far: 
     Raises
     ------
     InputError
-        No such view, or depths that are not in this order or begin behind the source.
+        Depths are not in this order or begin behind the source.
     """
     index = view_indices(views, m, "epipolar segments")
     if index.ndim:

@@ -79,7 +79,7 @@ class PerspectiveGrid:
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        """Of arrays: (n_u, n_v, n_k)."""
+        """The shape of arrays, (n_u, n_v, n_k)."""
         n_v, n_u = self.views.shape
         return n_u, n_v, self.n_k
 
@@ -99,14 +99,14 @@ class PerspectiveGrid:
     @cached_property
     def edges(self) -> Floats:
         """The third coordinate (n_k + 1,) at the borders of planes: k, or the depth of a parallel view."""
-        return freeze(self.third_at(np.arange(self.n_k + 1) - 0.5))
+        return freeze(self.planes_at(np.arange(self.n_k + 1) - 0.5))
 
     @cached_property
     def planes(self) -> Floats:
         """The third coordinate (n_k,) of the cells' places: k, or the depth of a parallel view."""
-        return freeze(self.third_at(np.arange(self.n_k)))
+        return freeze(self.planes_at(np.arange(self.n_k)))
 
-    def third_at(self, index: ArrayLike) -> Floats:
+    def planes_at(self, index: ArrayLike) -> Floats:
         """The third coordinate, k or depth, where the third index is `index`, also between the cells' places."""
         share = (np.asarray(index, np.float64) + 0.5) / self.n_k
         depths = self.near + share * (self.far - self.near)
@@ -152,8 +152,8 @@ class PerspectiveGrid:
     def image(self, array: ArrayOrTensor) -> ArrayOrTensor:
         """Line integrals (…, n_v, n_u) along the pixels' rays, value x mm: sums over planes of values times rays' lengths.
 
-        `array` (…, n_u, n_v, n_k), numpy or torch, holds values that keep density, as of `to_perspective`. A tensor's
-        gradient follows.
+        `array` (…, n_u, n_v, n_k), numpy or torch, holds values that keep density, as `to_perspective` makes them. A
+        tensor's gradient follows.
         """
         double = str(getattr(array, "dtype", None)).endswith("float64")
         array = checked(array, "perspective array", self.shape, double, batch=True)
@@ -193,7 +193,7 @@ class PerspectiveGrid:
 def perspective_grids(
     views: Views, n_k: int, near: ArrayLike, far: ArrayLike, uniform: str = "k"
 ) -> tuple[PerspectiveGrid, ...]:
-    """A `PerspectiveGrid` of every view; `near` and `far` are depths, mm, one for all or (M,), as of `depth_ranges`."""
+    """A `PerspectiveGrid` of every view; `near` and `far`: depths, mm, one or (M,), such as those of `depth_ranges`."""
     instance(views, Views, "perspective grids")
     nears, fars = (one_for_all(each, name, len(views)) for each, name in ((near, "near"), (far, "far")))
     return tuple(PerspectiveGrid(views, m, n_k, nears[m], fars[m], uniform) for m in range(len(views)))

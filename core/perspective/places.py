@@ -1,4 +1,4 @@
-"""Numbers of arrays at the places of a lattice's points, under homogeneous transforms, and the exact adjoint.
+"""Gathering: numbers of arrays at the places of a lattice's points, under homogeneous transforms; scattering: the adjoint.
 
 All resampling to and from perspective grids, and all backprojections, are this; in C, or else in numpy.
 """
@@ -13,10 +13,10 @@ from ..progress import Progress, tell
 from ..projector.parallel import in_order, thread_count
 
 try:
-    from ..projector.backends.cpu import give_at as _give_kernel
-    from ..projector.backends.cpu import take_at as _take_kernel
+    from ..projector.backends.cpu import gather as _gather_kernel
+    from ..projector.backends.cpu import scatter as _scatter_kernel
 except (ImportError, OSError):  # no kernels for this platform
-    _take_kernel = _give_kernel = None  # type: ignore[assignment]
+    _gather_kernel = _scatter_kernel = None  # type: ignore[assignment]
 
 Array = NDArray[np.floating[Any]]
 
@@ -26,9 +26,9 @@ SUM, LEAST, PRODUCT = 0, 1, 2
 _SLABS = 4  # of points or of an array's planes, for each thread: none waits long for the others
 
 
-def take(
+def gather(
     points: Array,
-    thirds: NDArray[np.float64],
+    planes: NDArray[np.float64],
     arrays: Array,
     matrices: NDArray[np.float64],
     *,
@@ -42,7 +42,7 @@ def take(
 ) -> None:
     """Combine each point's number with what every array has at its place, interpolated linearly.
 
-    The place of point (i, j, k) in an array is given by its matrix: with ``p = matrix @ (i, j, thirds[k], 1)`` it is at the
+    The place of point (i, j, k) in an array is given by its matrix: with ``p = matrix @ (i, j, planes[k], 1)`` it is at the
     indices ``(p0 / p3, p1 / p3, p2 / p4)``. Up to half an element outside, the outermost elements count; farther out, or
     where p3 or p4 is not above 0, the array does not have the point, and the point's number stays.
 
@@ -50,7 +50,7 @@ def take(
     ----------
     points : array (n_x, n_y, n_z) of float32 or float64
         Changed in place.
-    thirds : array (n_z,)
+    planes : array (n_z,)
         Third coordinates of the points, ascending or descending.
     arrays : array (M, m_x, m_y, m_z) of the points' type
     matrices : array (M, 5, 4)
@@ -71,33 +71,33 @@ def take(
     """
     n, workers = len(points), thread_count(None)
     size = max(1, -(-n // (_SLABS * workers)))
-    kernel = _take_in_numpy if _take_kernel is None else _take_kernel
+    kernel = _gather_in_numpy if _gather_kernel is None else _gather_kernel
 
     def work(first: int) -> None:
         part = slice(first, first + size)
         counts = [None if each is None else each[part] for each in (seen, exponents)]
         own = shifted(matrices, first)
-        kernel(points[part], thirds, arrays, own, how, *counts, flat=flat, by_depth=by_depth, nearest=nearest)
+        kernel(points[part], planes, arrays, own, how, *counts, flat=flat, by_depth=by_depth, nearest=nearest)
 
     see_through(in_order(work, range(0, n, size), workers), size, n, progress)
 
 
-def give(
+def scatter(
     points: Array,
-    thirds: NDArray[np.float64],
+    planes: NDArray[np.float64],
     array: Array,
     matrix: NDArray[np.float64],
     progress: Progress | None = None,
 ) -> None:
-    """Add to `array` (m_x, m_y, m_z) the points' numbers, shared out at their places: the adjoint of `take`'s sum.
+    """Add to `array` (m_x, m_y, m_z) the points' numbers, shared out at their places: the adjoint of `gather`'s sum.
 
     Each thread has planes of the array of its own, so the result does not depend on their number.
     """
     m, workers = len(array), thread_count(None)
     size = max(1, -(-m // (_SLABS * workers)))
-    kernel = _give_in_numpy if _give_kernel is None else _give_kernel
+    kernel = _scatter_in_numpy if _scatter_kernel is None else _scatter_kernel
     parts = (slice(first, first + size) for first in range(0, m, size))
-    see_through(in_order(lambda part: kernel(points, thirds, array, matrix, part), parts, workers), size, m, progress)
+    see_through(in_order(lambda part: kernel(points, planes, array, matrix, part), parts, workers), size, m, progress)
 
 
 def see_through(parts: Iterator[None], size: int, total: int, progress: Progress | None) -> None:
@@ -114,11 +114,11 @@ def shifted(matrices: NDArray[np.float64], first: int) -> NDArray[np.float64]:
 
 
 def _places(
-    n: tuple[int, int], thirds: Array, matrix: Array, m: tuple[int, ...], flat: bool, nearest: float
+    n: tuple[int, int], planes: Array, matrix: Array, m: tuple[int, ...], flat: bool, nearest: float
 ) -> tuple[Array, Array, Array, Array]:
-    """Of all points: whether the array has them, the first of the elements around (3, …), the second ones' shares, p3."""
+    """For all points: whether the array has them, the first of the elements around (3, …), the second ones' shares, p3."""
     i, j = np.ogrid[: n[0], : n[1]]
-    p = [row[0] * i[..., None] + row[1] * j[..., None] + row[2] * thirds + row[3] for row in matrix]
+    p = [row[0] * i[..., None] + row[1] * j[..., None] + row[2] * planes + row[3] for row in matrix]
     inside = (p[3] > nearest) & (flat | (p[4] > 0))
     depth = np.where(inside, p[3], 1.0)
     at, share = [], []
@@ -140,9 +140,9 @@ def _corners(at: Array, share: Array, m: tuple[int, ...]) -> Any:
         yield index, weight
 
 
-def _take_in_numpy(
+def _gather_in_numpy(
     points: Array,
-    thirds: Array,
+    planes: Array,
     arrays: Array,
     matrices: NDArray[np.float64],
     how: int,
@@ -153,7 +153,7 @@ def _take_in_numpy(
     flat, by_depth, nearest = others["flat"], others["by_depth"], others["nearest"]
     for array, matrix in zip(arrays, matrices, strict=True):
         for i in range(len(points)):  # plane by plane, in little memory
-            places = _places((1, points.shape[1]), thirds, shifted(matrix, i), array.shape, flat, nearest)
+            places = _places((1, points.shape[1]), planes, shifted(matrix, i), array.shape, flat, nearest)
             inside, at, share, depth = (each[..., 0, :, :] for each in places)
             with np.errstate(invalid="ignore"):  # infinity times a share of 0
                 value = sum(array[index] * weight for index, weight in _corners(at, share, array.shape))
@@ -173,11 +173,11 @@ def _take_in_numpy(
                 seen[i] += inside
 
 
-def _give_in_numpy(points: Array, thirds: Array, array: Array, matrix: NDArray[np.float64], slab: slice) -> None:
+def _scatter_in_numpy(points: Array, planes: Array, array: Array, matrix: NDArray[np.float64], slab: slice) -> None:
     part = array[slab]
     first = slab.indices(len(array))[0]
     for i in range(len(points)):
-        places = _places((1, points.shape[1]), thirds, shifted(matrix, i), array.shape, False, 0.0)
+        places = _places((1, points.shape[1]), planes, shifted(matrix, i), array.shape, False, 0.0)
         inside, at, share, _ = (each[..., 0, :, :] for each in places)
         for index, weight in _corners(at, share, array.shape):
             mine = inside & (index[0] >= first) & (index[0] < first + len(part))

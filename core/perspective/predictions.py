@@ -10,7 +10,7 @@ from ..geometry.views import Views
 from ..progress import Progress, tell
 from ..validation import instance, shape_text, whole_number
 from .perspective_grid import PerspectiveGrid, depths_in_views
-from .places import take
+from .places import gather
 from .resampling import camera_to_camera
 
 _NEAREST = 1e-3  # of the farthest depth: closer to a source, nothing is predicted
@@ -28,18 +28,18 @@ def spread_along_rays(image: ArrayOrTensor, distribution: ArrayOrTensor, g: Pers
         by their sum along the ray. Of a volume in the view's coordinates, `to_perspective`, it is the array times
         ``g.ray_lengths()``.
     g : PerspectiveGrid
-        Of the view.
+        The view's.
 
     Returns
     -------
     array or tensor (…, n_u, n_v, n_k)
-        Values that keep density, as of ``to_perspective``: image times share by the ray's length in the cell. A tensor's
-        gradient follows, in both arguments.
+        Values that keep density, as ``to_perspective`` makes them: image times share by the ray's length in the cell. A
+        tensor's gradient follows, in both arguments.
 
     Raises
     ------
     InputError
-        Another shape, values that are not finite, shares below 0, or only 0 along a ray whose pixel is not 0.
+        Shares below 0, or only 0 along a ray whose pixel is not 0.
     """
     instance(g, PerspectiveGrid, "spread_along_rays")
     image = checked(image, "image", g.shape[1::-1], False, batch=True)
@@ -64,13 +64,13 @@ def predict_views(
     Parameters
     ----------
     array : array or tensor (…, n_u, n_v, n_k)
-        Values that keep density, as of `to_perspective` or `spread_along_rays`.
+        Values that keep density, as `to_perspective` and `spread_along_rays` make them.
     g : PerspectiveGrid
-        Of `array`.
+        The array's.
     views : Views
         Whose images are predicted; `g`'s own may be among them.
     planes : int, optional
-        Of the perspective grids in which the views' images are summed; they reach over the depths of all that is in `g`.
+        Planes of the perspective grids in which the views' images are summed; they reach over the depths of all of `g`.
         None: as many as `g` has cells along its longest axis.
     progress
         Called as ``progress(views done, views)``; what it raises stops the work.
@@ -86,7 +86,7 @@ def predict_views(
     Raises
     ------
     InputError
-        Another shape, values that are not finite, more memory needed than there is.
+        More memory is needed than there is.
 
     Notes
     -----
@@ -129,17 +129,12 @@ def prediction_errors(images: ArrayOrTensor, predicted: ArrayOrTensor, covered: 
     images : array or tensor (…, M, n_v, n_u)
         What the views saw: line integrals, value x mm.
     predicted, covered : arrays or tensors
-        Of `predict_views`, for the same views.
+        What `predict_views` returned for the same views.
 
     Returns
     -------
     array or tensor (…, M, n_v, n_u)
         A tensor's gradient follows.
-
-    Raises
-    ------
-    InputError
-        The shapes are not the same.
     """
     images, predicted = promote(images, predicted)
     shape = tuple(predicted.shape[-3:])
@@ -156,7 +151,7 @@ def _meet(g: PerspectiveGrid, h: PerspectiveGrid) -> Any:
     """Which pixels (n_v, n_u) of `h` have cells whose places lie in `g`."""
     nothing, seen = np.zeros(h.shape, np.float32), np.zeros(h.shape, np.int32)
     zero, matrix = np.zeros((1, *g.shape), np.float32), g.index_matrix @ h.inverse
-    take(nothing, h.third_at(np.arange(h.n_k)), zero, matrix[None], seen=seen)
+    gather(nothing, h.planes_at(np.arange(h.n_k)), zero, matrix[None], seen=seen)
     return seen.any(axis=2).T
 
 

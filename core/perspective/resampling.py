@@ -1,25 +1,27 @@
 """Volumes in the coordinates of views and back, and from one view's to another's."""
 
 from abc import abstractmethod
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import ArrayOrTensor, checked, to_caller, to_numpy
+from ..arrays import ArrayOrTensor, is_double, to_caller, to_numpy
 from ..errors import InputError, warn
 from ..geometry.grid import Grid
 from ..memory import require
 from ..progress import Progress, part_of, tell
 from ..projector import backends
+from ..projector.bundles import Beam, Bundle, Bundles
+from ..projector.execution import Execution
 from ..projector.operator import LinearOperator
-from ..projector.parallel import in_order, run_all, sum_of, thread_count
-from ..projector.rays import IndexFans, index_fans
+from ..projector.parallel import thread_count
+from ..projector.rays import Fan
 from ..validation import instance, one_of
 from ..volumes.volume import UNITS, Volume, require_quantity
 from .perspective_grid import PerspectiveGrid
-from .places import give, see_through, take
+from .places import gather, scatter
 
 KEEP = ("density", "activity")
 """What resampling may keep: the values, or their sums."""
@@ -29,8 +31,6 @@ _MOST_POINTS = 8  # in a cell, along each axis
 _APART = 1.0  # cells from point to point: farther apart, cells between them get little or nothing
 _LOOKED_AT = 9  # cells along each axis, to find how many points one needs
 
-_MOST_VOLUMES = 8  # of an adjoint along rays, each of a thread: more would gain little and take much memory
-_PLANES_AT_ONCE = 8  # of each thread, before the threads wait for each other
 _GAP = 1.5  # voxels from ray to ray
 
 Lattice = Grid | PerspectiveGrid
@@ -51,7 +51,7 @@ def to_perspective(
     Parameters
     ----------
     volume : Volume, or array or tensor (…, n_x, n_y, n_z)
-        Of an array or tensor, `grid` is the grid. It may be a batch.
+        An array or tensor lies on `grid`, and may be a batch.
     g : PerspectiveGrid
     keep : str
         "density": the mean of the volume along a pixel's ray, from the plane before a cell to the one behind. Voxels are
@@ -69,7 +69,7 @@ def to_perspective(
     Raises
     ------
     InputError
-        Another shape, values that are not finite, CT numbers, more memory needed than there is.
+        CT numbers, or more memory needed than there is.
 
     Warns
     -----
@@ -114,26 +114,21 @@ def from_perspective(
     ----------
     array : array or tensor (…, n_u, n_v, n_k)
     g : PerspectiveGrid
-        Of `array`.
+        The array's.
     grid : Grid
     keep : str
         "density": the mean over each voxel of the array's values, interpolated linearly between cells' places; 0 outside
         `g`.
-        "activity": the array holds what lies in each cell, value x mm^3, as of ``to_perspective(…, "activity")``. It is
-        spread evenly along the cell's ray over the voxels that this crosses, and divided by their volume. What lies
+        "activity": the array holds what lies in each cell, value x mm^3, as ``to_perspective(…, "activity")`` makes it. It
+        is spread evenly along the cell's ray over the voxels that this crosses, and divided by their volume. What lies
         outside `grid` is left out.
     progress
-        As of `to_perspective`.
+        The same as in `to_perspective`.
 
     Returns
     -------
     array or tensor (…, n_x, n_y, n_z)
         Values, such as kBq/mL, in both cases; of the kind of `to_perspective`.
-
-    Raises
-    ------
-    InputError
-        As of `to_perspective`.
 
     Warns
     -----
@@ -163,22 +158,17 @@ def camera_to_camera(
     ----------
     array : array or tensor (…, n_u, n_v, n_k)
     g_m, g_n : PerspectiveGrid
-        Of `array`, and of the result.
+        The array's, and the result's.
     keep : str
         "density": the mean over each cell of the values, interpolated linearly. "activity": what lies in each cell is
         shared out among the cells around it; it is the adjoint of "density" the other way, from `g_n` to `g_m`.
     progress
-        As of `to_perspective`.
+        The same as in `to_perspective`.
 
     Returns
     -------
     array or tensor (…, n_u, n_v, n_k)
-        Of the kind of `to_perspective`.
-
-    Raises
-    ------
-    InputError
-        As of `to_perspective`.
+        Of the kind that `to_perspective` returns.
 
     Warns
     -----
@@ -202,10 +192,6 @@ class _Pair(LinearOperator):
         self.source, self.target = source, target
 
     @property
-    def T(self) -> "_Pair":
-        return _Adjoint(self)
-
-    @property
     def shape_in(self) -> tuple[int, int, int]:
         return self.source.shape
 
@@ -213,12 +199,11 @@ class _Pair(LinearOperator):
     def shape_out(self) -> tuple[int, int, int]:
         return self.target.shape
 
-    def _check(self, x: Any) -> ArrayOrTensor:
-        return checked(x, "array", self.shape_in, False, batch=True)
-
     def _run_one(self, x: ArrayOrTensor, progress: Progress | None = None, mu: Any = None) -> ArrayOrTensor:
-        array = _plain(x, self.shape_out)
-        return to_caller(self.forward(array, progress).astype(array.dtype, copy=False), x)
+        return _run(self.forward, x, self.shape_out, progress)
+
+    def _run_back(self, y: ArrayOrTensor, progress: Progress | None = None, mu: Any = None) -> ArrayOrTensor:
+        return _run(self.adjoint, y, self.shape_in, progress)
 
     @abstractmethod
     def forward(self, x: Array, progress: Progress | None) -> Array:
@@ -229,82 +214,51 @@ class _Pair(LinearOperator):
         """The adjoint of an array of float32 or float64."""
 
 
-class _Adjoint(_Pair):
-    """The adjoint of a pair."""
-
-    def __init__(self, pair: _Pair) -> None:
-        super().__init__(pair.target, pair.source)
-        self._pair = pair
-
-    @property
-    def T(self) -> _Pair:
-        return self._pair
-
-    def forward(self, x: Array, progress: Progress | None) -> Array:
-        return self._pair.adjoint(x, progress)
-
-    def adjoint(self, y: Array, progress: Progress | None) -> Array:
-        return self._pair.forward(y, progress)
-
-
-def _plain(x: ArrayOrTensor, result: tuple[int, int, int]) -> Array:
-    """`x` as kernels take it; there must be memory for a `result`."""
-    array = to_numpy(x, np.float64 if str(x.dtype).endswith("float64") else np.float32)
-    require(2 * array.itemsize * float(np.prod(result)), "resampling to {} x {} x {} numbers".format(*result))
-    return array
+def _run(
+    function: Callable[[Array, Progress | None], Array],
+    x: ArrayOrTensor,
+    shape: tuple[int, int, int],
+    progress: Progress | None,
+) -> ArrayOrTensor:
+    """What a function makes of an array, of this shape, as the caller's kind; there must be memory for it."""
+    array = to_numpy(x, np.float64 if is_double(x) or x.dtype == np.float64 else np.float32)
+    require(2 * array.itemsize * float(np.prod(shape)), "resampling to {} x {} x {} numbers".format(*shape))
+    return to_caller(function(array, progress).astype(array.dtype, copy=False), x)
 
 
 class _AlongRays(_Pair):
-    """Means of a volume along the rays of a perspective grid's cells."""
+    """Means of a volume along the rays of a perspective grid's cells: those of a plane are the rays of an image."""
 
     source: Grid
     target: PerspectiveGrid
 
     def forward(self, x: Array, progress: Progress | None) -> Array:
-        functions, x = self._functions(x)
-        result = np.empty(self.shape_out, x.dtype)
-
-        def work(plane: int) -> None:
-            result[..., plane] = functions.forward(x, self._rays(plane)).reshape(self.shape_out[:2])
-
-        n = self.target.n_k
-        see_through(in_order(work, range(n), thread_count(None)), 1, n, progress)
+        n, result = self.target.n_k, np.empty(self.shape_out, x.dtype)
+        for plane, image in enumerate(self._execution(x).images(x, Bundles(n, self._bundle))):
+            result[..., plane] = image
+            tell(progress, plane + 1, n)
         result /= self.target.ray_lengths()
         return result
 
     def adjoint(self, y: Array, progress: Progress | None) -> Array:
-        functions, y = self._functions(y)
-        y = y / self.target.ray_lengths().astype(y.dtype)
         n = self.target.n_k
-        workers = min(thread_count(None), _MOST_VOLUMES, n)
-        require(workers * y.itemsize * float(np.prod(self.shape_in)), f"a volume for each of {workers} threads")
-        volumes = [np.zeros(self.shape_in, y.dtype) for _ in range(workers)]
+        images = np.moveaxis(y / self.target.ray_lengths().astype(y.dtype), -1, 0)
+        bundles = Bundles(n, self._bundle)
+        return np.asarray(self._execution(y).backproject(images, bundles, None, lambda done: tell(progress, done, n)))
 
-        def work(worker: int, first: int) -> None:
-            for plane in range(first + worker, min(first + _PLANES_AT_ONCE * workers, n), workers):
-                values = np.ascontiguousarray(y[..., plane]).reshape(-1)
-                functions.backproject(volumes[worker], values, self._rays(plane))
+    def _execution(self, array: Array) -> Execution:
+        backend = backends.choose("auto")
+        float64 = backend.always_float64 or array.dtype == np.float64
+        return Execution(backend, self.source, None, float64, thread_count(None))
 
-        for first in range(0, n, _PLANES_AT_ONCE * workers):
-            run_all(lambda worker, first=first: work(worker, first), range(workers), workers)  # type: ignore[misc]
-            tell(progress, min(first + _PLANES_AT_ONCE * workers, n), n)
-        return np.asarray(sum_of(volumes, workers))
-
-    @staticmethod
-    def _functions(array: Array) -> tuple[Any, Array]:
-        """Those of the backend for arrays, and the array as it takes it."""
-        if backends.choose("auto").name == "cpu":
-            return backends.load("cpu"), array
-        return backends.load("reference"), array.astype(np.float64)
-
-    def _rays(self, plane: int) -> IndexFans:
+    def _bundle(self, plane: int) -> Bundle:
         """The cells' rays of a plane: from the plane before to the one behind, columns after columns."""
         edges = self.target.edges[plane : plane + 2]
         places = np.array([[[0, 0, edge], [1, 0, edge], [0, 1, edge]] for edge in edges], np.float64)
         (start, next_start, _), (end, next_end, above) = self.target.to_world(places)
-        follows = np.linalg.norm(next_start - start) / np.linalg.norm(next_end - end)
-        vectors = np.array([[start, end, next_end - end, above - end]])
-        return index_fans(self.source, vectors, self.shape_out[:2], float(follows))
+        follows = float(np.linalg.norm(next_start - start) / np.linalg.norm(next_end - end))
+        fan = Fan(start, end, next_end - end, above - end, self.shape_out[:2], parallel=follows)
+        return Bundle.along(self.source, Beam(fan))
 
 
 class _Taking(_Pair):
@@ -320,16 +274,16 @@ class _Taking(_Pair):
 
     def forward(self, x: Array, progress: Progress | None) -> Array:
         result = np.zeros(self.shape_out, x.dtype)
-        for n, (matrix, thirds) in enumerate(self._shifted()):
+        for n, (matrix, planes) in enumerate(self._shifted()):
             part = part_of(progress, n, int(self._points.prod()))
-            take(result, thirds, x[None], matrix[None], progress=part)
+            gather(result, planes, x[None], matrix[None], progress=part)
         return np.asarray(result / self._points.prod(dtype=x.dtype))
 
     def adjoint(self, y: Array, progress: Progress | None) -> Array:
         result = np.zeros(self.shape_in, y.dtype)
         y = np.asarray(y / self._points.prod(dtype=y.dtype))
-        for n, (matrix, thirds) in enumerate(self._shifted()):
-            give(y, thirds, result, matrix, part_of(progress, n, int(self._points.prod())))
+        for n, (matrix, planes) in enumerate(self._shifted()):
+            scatter(y, planes, result, matrix, part_of(progress, n, int(self._points.prod())))
         return result
 
     def _shifted(self) -> Iterator[tuple[Floats, Floats]]:
@@ -340,17 +294,17 @@ class _Taking(_Pair):
                 matrix = self._matrix.copy()
                 matrix[:, 3] += i * matrix[:, 0] + j * matrix[:, 1]
                 for k in fractions[2]:
-                    yield matrix, _thirds(self.target, np.arange(self.target.shape[2]) + k)
+                    yield matrix, _planes_at(self.target, np.arange(self.target.shape[2]) + k)
 
 
 def _with_ones(matrix: Floats) -> Floats:
-    """Rows (5, 4), as `places.take` needs them, of an affine one (4, 4)."""
+    """Rows (5, 4), as `places.gather` needs them, of an affine one (4, 4)."""
     return np.insert(matrix, 4, [0.0, 0.0, 0.0, 1.0], axis=0)
 
 
-def _thirds(lattice: Lattice, index: Floats) -> Floats:
+def _planes_at(lattice: Lattice, index: Floats) -> Floats:
     """The third coordinate, as of places, at (fractional) indices of the third axis."""
-    return index if isinstance(lattice, Grid) else lattice.third_at(index)
+    return index if isinstance(lattice, Grid) else lattice.planes_at(index)
 
 
 def _cells_covered(matrix: Floats, source: Lattice, target: Lattice) -> Floats:
@@ -374,12 +328,7 @@ def _warn_of_few_points(operator: _Taking, what: str) -> None:
 
 def _warn_of_gaps(g: PerspectiveGrid, grid: Grid) -> None:
     """Warn where rays are so far apart that they leave voxels out."""
-    index = _some_cells(g)
-    world = g.to_world(np.column_stack([index[:, :2], g.third_at(index[:, 2])]))
-    places = world @ grid.index_from_world[:3, :3].T + grid.index_from_world[:3, 3]
-    index = index[((places >= -0.5) & (places <= np.array(grid.shape) - 0.5)).all(axis=1)]
-    matrix = _with_ones(grid.index_from_world) @ g.inverse
-    apart = max(_longest_step(matrix, g, index, axis) for axis in (0, 1))
+    apart = _cells_covered(_with_ones(grid.index_from_world) @ g.inverse, grid, g)[:2].max()
     if apart > _GAP:
         warn(
             f"from_perspective: rays are up to {apart:.2g} voxels apart, and voxels between them get nothing: give coarser "
@@ -395,7 +344,7 @@ def _some_cells(lattice: Lattice) -> Floats:
 
 def _places(matrix: Floats, target: Lattice, index: Floats) -> Floats:
     """Where cells (N, 3) of `target` lie in the other lattice, as indices (N, 3); NaN of what is not in front."""
-    third = _thirds(target, index[:, 2])
+    third = _planes_at(target, index[:, 2])
     p = np.column_stack([index[:, :2], third, np.ones(len(index))]) @ matrix.T
     front = (p[:, 3] > 0) & (p[:, 4] > 0)
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -46,7 +46,7 @@ class MarkerFit:
 
     @property
     def standard_deviations(self) -> Floats:
-        """Of the place along x, y and z (3,), mm."""
+        """The place's along x, y and z (3,), mm."""
         return np.sqrt(np.diag(self.covariance))
 
     @property
@@ -187,7 +187,7 @@ def _fitted(
 def _residuals(
     matrices: Floats, offsets: Floats, shift: Floats, pixels: Floats, whitening: Floats
 ) -> tuple[Floats, Floats] | None:
-    """Of a place: pixels less its own, in units of sigma (N, 2), and slopes of its own (N, 2, 3); None behind a source."""
+    """For a place: pixels less its own, in units of sigma (N, 2), and slopes of its own (N, 2, 3); None behind a source."""
     homogeneous = matrices[:, :, :3] @ shift + offsets
     factor = homogeneous[:, 2:]
     if not (factor > 0).all():

@@ -107,7 +107,7 @@ def points_at_depths(views: Views, m: int, pixels: ArrayLike, depths: ArrayLike)
 
 
 def rays_by_depth(views: Views, m: int | NDArray[np.intp], pixels: Floats) -> tuple[Floats, Floats]:
-    """Of pixels (…, 2): where their rays begin, at depth 0, and how far they lead per mm of depth: (…, 3) each.
+    """For pixels (…, 2): where their rays begin, at depth 0, and how far they lead per mm of depth: (…, 3) each.
 
     m is the view of all pixels, or an array that broadcasts with them.
     """

@@ -1,17 +1,19 @@
 """The pinhole: sample points in the hole and in its knife edge, and what they transmit.
 
-All lengths, slopes and coefficients may be numbers, arrays or tensors that broadcast.
+All lengths, slopes and coefficients may be numbers, arrays or tensors that broadcast; functions that need to know are given
+the `library` whose functions take them, numpy or torch.
 """
 
 import functools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import ArrayOrTensor, namespace
+from ..arrays import ArrayOrTensor
 from ..errors import InputError
 
 Array = NDArray[np.float64]
@@ -101,14 +103,13 @@ class KnifeEdge:
     tangent: ArrayOrTensor  # tan(alpha / 2)
 
     def transmission(
-        self, x: ArrayOrTensor, y: ArrayOrTensor, slope_u: ArrayOrTensor, slope_v: ArrayOrTensor
+        self, x: ArrayOrTensor, y: ArrayOrTensor, slope_u: ArrayOrTensor, slope_v: ArrayOrTensor, library: Any = np
     ) -> ArrayOrTensor:
         """Fraction exp(-mu path) of the photons that pass the edge on lines that cross z = 0 outside the hole.
 
         Such a line is inside the material between the two cones; one that is steeper than the cone never leaves it. It
         crosses at (x, y), mm from the hole's centre, and goes by the slopes, mm along u and v per mm along the axis.
         """
-        library = namespace(slope_u)
         slope = slope_u**2 + slope_v**2
         along = x * slope_u + y * slope_v
         beyond = x * x + y * y - self.radius**2
@@ -117,8 +118,8 @@ class KnifeEdge:
         depth = 0.0
         for side in (along, -along):  # |(x, y) + z slope| = radius + z tangent, solved for z, on either side
             closing = self.radius * self.tangent - side
-            depth = depth + beyond / (library.sqrt(closing**2 + opens * beyond) + closing)
-        return library.where(passes, library.exp(-self.mu * depth * library.sqrt(1 + slope)), 0.0)
+            depth = depth + beyond / ((closing**2 + opens * beyond) ** 0.5 + closing)
+        return library.where(passes, library.exp(-self.mu * depth * (1 + slope) ** 0.5), 0.0)
 
     def points(self, n: int) -> list[tuple[ArrayOrTensor, ArrayOrTensor, ArrayOrTensor]]:
         """Sample points beyond the rim: (x, y) in mm, and the area, mm^2, that each represents.
@@ -148,13 +149,13 @@ class Opening:
     knife: KnifeEdge | None = None  # without one the hole is open to every direction
     beyond: Sequence[tuple[ArrayOrTensor, ...]] = ()  # represented points of the edge: x, y, area
 
-    def area(self, slope_u: ArrayOrTensor, slope_v: ArrayOrTensor) -> ArrayOrTensor:
+    def area(self, slope_u: ArrayOrTensor, slope_v: ArrayOrTensor, library: Any = np) -> ArrayOrTensor:
         """Area, mm^2, open to photons with slopes in mm along u and v per mm along the axis."""
         if self.knife is None:
             return self.hole
-        area = self.hole * within_cone(slope_u, slope_v, self.knife.tangent)
+        area = self.hole * within_cone(slope_u, slope_v, self.knife.tangent, library)
         for x, y, size in self.beyond:
-            area = area + size * self.knife.transmission(x, y, slope_u, slope_v)
+            area = area + size * self.knife.transmission(x, y, slope_u, slope_v, library)
         return area
 
 
@@ -168,7 +169,9 @@ def openings(n: int, diameter: ArrayOrTensor, knife: KnifeEdge | None = None) ->
     return in_hole + [Opening(x, y, 0.0, knife, ((x, y, area),)) for x, y, area in beyond]
 
 
-def within_cone(slope_u: ArrayOrTensor, slope_v: ArrayOrTensor, tangent: ArrayOrTensor) -> ArrayOrTensor:
+def within_cone(
+    slope_u: ArrayOrTensor, slope_v: ArrayOrTensor, tangent: ArrayOrTensor, library: Any = np
+) -> ArrayOrTensor:
     """1 where lines are less steep than the cone, tan(psi) < tangent, else 0."""
     slope = slope_u**2 + slope_v**2
-    return namespace(slope).ones_like(slope) * (slope < tangent**2)
+    return library.ones_like(slope) * (slope < tangent**2)

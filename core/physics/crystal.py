@@ -1,19 +1,25 @@
 """The crystal: the photons it stops and at which depth, its pixels' shares, and its blur.
 
-Functions of cosines and positions take arrays or tensors.
+Functions of cosines and positions take arrays, or tensors and their `library`, torch.
 """
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import ArrayOrTensor, namespace
+from ..arrays import ArrayOrTensor
 
 
 def absorbed_share(
-    cosine: ArrayOrTensor, mu: ArrayOrTensor, thickness: ArrayOrTensor, depths: Sequence[ArrayOrTensor], layer: int
+    cosine: ArrayOrTensor,
+    mu: ArrayOrTensor,
+    thickness: ArrayOrTensor,
+    depths: Sequence[ArrayOrTensor],
+    layer: int,
+    library: Any = np,
 ) -> ArrayOrTensor:
     """Fraction of the photons that are assigned to ``depths[layer]``: of 0 alone, or of depths from 0 to `thickness`.
 
@@ -21,7 +27,7 @@ def absorbed_share(
     between them by linear interpolation, so the total, ``1 - exp(-mu thickness / cosine)``, and the mean depth are
     exact at every angle. `cosine` is that of the angle to the crystal's normal; `mu` is in 1/mm and `thickness` in mm.
     """
-    exp, expm1 = namespace(cosine).exp, namespace(cosine).expm1
+    exp, expm1 = library.exp, library.expm1
     rate = mu / cosine
 
     def reached(first: int) -> ArrayOrTensor:

@@ -1,23 +1,13 @@
-"""Isotopes of nuclear medicine, their half-lives and photons.
-
-Half-lives and gamma rays: ENSDF, the Evaluated Nuclear Structure Data File of the National Nuclear Data Center,
-Brookhaven (nndc.bnl.gov/ensdf), as distributed with paceENSDF 0.6.3. The x rays of Tl-201 and Xe-133 and Tc-99m's gamma
-ray: the decay library UKDD-12, as distributed with actigamma 0.1.5. F-18's photons: European Pharmacopoeia, chapter
-5.7.
-
-Lines are the gamma rays of more than 1 % of decays and the K x rays of Tl-201 and Xe-133. X rays that are not imaged
-are left out: the other isotopes' below 35 keV, and Lu-177's (54 to 63 keV, 6 % of decays).
-Evaluations differ by as much as 3 % (Tc-99m: 0.885 to 0.891; Xe-133's 81 keV: 0.369 to 0.380).
-"""
+"""Isotopes of nuclear medicine, their half-lives and photons: the table in isotopes.txt."""
 
 import math
 from dataclasses import dataclass
 
 from ..errors import InputError
 from ..validation import one_of, positive
+from .mass_attenuation import table_lines
 
-_HOUR = 3600.0
-_DAY = 24 * _HOUR
+_SECONDS = {"min": 60.0, "h": 3600.0, "d": 24 * 3600.0}
 
 
 @dataclass(frozen=True)
@@ -48,27 +38,14 @@ class Isotope:
         return -math.expm1(-rate * positive(duration, "duration", "s")) / rate
 
 
-ISOTOPES = {
-    isotope.name: isotope
-    for isotope in (
-        Isotope("F-18", 109.77 * 60, ((511.0, 1.935),)),
-        Isotope(
-            "Ga-67",
-            3.2617 * _DAY,
-            ((91.3, 0.031), (93.3, 0.388), (184.6, 0.214), (209.0, 0.025), (300.2, 0.166), (393.5, 0.046)),
-        ),
-        Isotope("Tc-99m", 6.007 * _HOUR, ((140.5, 0.891),)),
-        Isotope("In-111", 2.8047 * _DAY, ((171.3, 0.907), (245.4, 0.941))),
-        Isotope("I-123", 13.223 * _HOUR, ((159.0, 0.836), (529.0, 0.013))),
-        Isotope(
-            "I-131", 8.0252 * _DAY, ((80.2, 0.026), (284.3, 0.061), (364.5, 0.815), (637.0, 0.072), (722.9, 0.018))
-        ),
-        # The x rays of caesium after xenon's decay are seldom imaged, those of mercury after thallium's always.
-        Isotope("Xe-133", 5.2475 * _DAY, ((30.6, 0.133), (31.0, 0.245), (35.0, 0.088), (81.0, 0.369))),
-        Isotope("Lu-177", 6.6443 * _DAY, ((112.9, 0.062), (208.4, 0.104))),
-        Isotope("Tl-201", 3.042 * _DAY, ((68.9, 0.277), (70.8, 0.471), (80.3, 0.207), (135.3, 0.026), (167.4, 0.100))),
-    )
-}
+def _read(line: str) -> Isotope:
+    """A line of the table: name, half-life and its unit, then energy and photons per decay of each line."""
+    name, half_life, unit, *numbers = line.split()
+    energies, photons = map(float, numbers[::2]), map(float, numbers[1::2])
+    return Isotope(name, float(half_life) * _SECONDS[unit], tuple(zip(energies, photons, strict=True)))
+
+
+ISOTOPES = {isotope.name: isotope for isotope in map(_read, table_lines("isotopes.txt"))}
 """The isotopes by name."""
 
 

@@ -30,13 +30,18 @@ def mass_attenuation(symbol: str, energy: float) -> float:
     return float(np.exp(curve[-1]))  # its value at log(1)
 
 
+def table_lines(name: str) -> list[str]:
+    """The lines of one of the tables in this folder, without its comments."""
+    text = Path(__file__).with_name(name).read_text(encoding="ascii")
+    return [line for line in text.splitlines() if not line.startswith("#")]
+
+
 @cache
 def table() -> dict[str, tuple[list[Point], list[tuple[float, float, float]]]]:
     """For each element's symbol its points, and its absorption edges: energy, coefficient below and above."""
     elements: dict[str, tuple[list[Point], list[tuple[float, float, float]]]] = {}
     energies: list[float] = []
-    text = Path(__file__).with_name("mass_attenuation.txt").read_text(encoding="ascii")
-    for name, *values in (line.split() for line in text.splitlines() if not line.startswith("#")):
+    for name, *values in map(str.split, table_lines("mass_attenuation.txt")):
         if name == "keV":
             energies = [float(x) for x in values]
         elif values[0] == "edge":

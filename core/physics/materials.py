@@ -1,4 +1,4 @@
-"""Materials of apertures, crystals, bodies and phantoms, and their attenuation coefficients.
+"""Materials of apertures, crystals, bodies and phantoms (materials.txt), and their attenuation coefficients.
 
 A material's coefficient at any energy is the sum of its elements' `mass_attenuation` coefficients, weighted by mass.
 """
@@ -15,7 +15,7 @@ from ..errors import InputError, naming, warn
 from ..geometry.collimator import edge_slope
 from ..geometry.system import PinholeSystem
 from ..validation import positive
-from .mass_attenuation import HIGHEST_ENERGY, LOWEST_ENERGY, mass_attenuation
+from .mass_attenuation import HIGHEST_ENERGY, LOWEST_ENERGY, mass_attenuation, table_lines
 
 
 @dataclass(frozen=True)
@@ -26,51 +26,14 @@ class Material:
     composition: dict[str, float]
 
 
-# ICRU Report 46 (1992): vertebral column with its cartilage (D6, L3).
-_VERTEBRA = {
-    "H": 0.07, "C": 0.287, "N": 0.038, "O": 0.437, "Mg": 0.001, "P": 0.051, "S": 0.002, "Cl": 0.001, "K": 0.001, "Ca": 0.111,
-    "Fe": 0.001,
-}  # fmt: skip
+def _read(line: str) -> tuple[str, Material]:
+    """A line of the table: "name: density symbol share symbol share …"."""
+    name, _, numbers = line.partition(":")
+    density, *composition = numbers.split()
+    return name, Material(float(density), dict(zip(composition[::2], map(float, composition[1::2]), strict=True)))
 
-MATERIALS = {
-    # Elements and their densities: NIST Standard Reference Database 126, table 1.
-    "tungsten": Material(19.3, {"W": 1.0}),
-    "lead": Material(11.35, {"Pb": 1.0}),
-    "gold": Material(19.32, {"Au": 1.0}),
-    "uranium": Material(18.95, {"U": 1.0}),  # depleted or not
-    # Crystals: formulas, and densities given by the makers; without dopants.
-    "NaI": Material(3.67, {"Na": 0.15338, "I": 0.84662}),
-    "CsI": Material(4.51, {"Cs": 0.51157, "I": 0.48843}),
-    "CZT": Material(5.78, {"Cd": 0.42994, "Zn": 0.02778, "Te": 0.54227}),  # Cd0.9 Zn0.1 Te
-    "CdTe": Material(5.85, {"Cd": 0.46836, "Te": 0.53164}),
-    "BGO": Material(7.13, {"Bi": 0.67099, "Ge": 0.1749, "O": 0.15411}),  # Bi4 Ge3 O12
-    "LYSO": Material(7.1, {"Lu": 0.71448, "Y": 0.04034, "Si": 0.06371, "O": 0.18147}),  # Lu1.8 Y0.2 Si O5
-    "GAGG": Material(6.63, {"Gd": 0.50897, "Al": 0.05822, "Ga": 0.22567, "O": 0.20714}),  # Gd3 Al2 Ga3 O12
-    # NIST's table 2: tissues of ICRU Report 44 (1989); bone is cortical, lung inflated.
-    "water": Material(1.0, {"H": 0.111898, "O": 0.888102}),
-    "air": Material(1.20479e-3, {"C": 0.000124, "N": 0.755268, "O": 0.231781, "Ar": 0.012827}),
-    "PMMA": Material(1.19, {"H": 0.080541, "C": 0.599846, "O": 0.319613}),
-    "soft tissue": Material(
-        1.06,
-        {"H": 0.102, "C": 0.143, "N": 0.034, "O": 0.708, "Na": 0.002, "P": 0.003, "S": 0.003, "Cl": 0.002, "K": 0.003},
-    ),
-    "muscle": Material(
-        1.05,
-        {"H": 0.102, "C": 0.143, "N": 0.034, "O": 0.71, "Na": 0.001, "P": 0.002, "S": 0.003, "Cl": 0.001, "K": 0.004},
-    ),
-    "adipose tissue": Material(
-        0.95, {"H": 0.114, "C": 0.598, "N": 0.007, "O": 0.278, "Na": 0.001, "S": 0.001, "Cl": 0.001}
-    ),
-    "lung": Material(
-        0.26,
-        {"H": 0.103, "C": 0.105, "N": 0.031, "O": 0.749, "Na": 0.002, "P": 0.002, "S": 0.003, "Cl": 0.003, "K": 0.002},
-    ),
-    "vertebra": Material(1.33, _VERTEBRA),
-    "bone": Material(
-        1.92,
-        {"H": 0.034, "C": 0.155, "N": 0.042, "O": 0.435, "Na": 0.001, "Mg": 0.002, "P": 0.103, "S": 0.003, "Ca": 0.225},
-    ),
-}
+
+MATERIALS = dict(map(_read, table_lines("materials.txt")))
 """The materials by name."""
 
 # Linear attenuation coefficients at Tc-99m's 140.5 keV and no other energy, 1/mm, rounded: density times the total mass

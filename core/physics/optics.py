@@ -53,7 +53,7 @@ class Optics:
     depth_layers : int
         Depths in the crystal at which photons are recorded.
     intrinsic_fwhm
-        Of the detector's blur, mm on the crystal.
+        FWHM of the detector's blur, mm on the crystal.
     photons_per_decay
         That are counted.
     within_crystal, within_walls, within_cone : bool
@@ -62,7 +62,7 @@ class Optics:
     Raises
     ------
     InputError
-        A number is out of its range, or settings do not go together.
+        Settings do not go together.
     """
 
     aperture_mu: ArrayOrTensor = None
@@ -76,6 +76,8 @@ class Optics:
     within_walls: bool = False
     within_cone: bool = False
 
+    library = np  # whose functions take the numbers, and all that is computed with them: set where values enter
+
     def __post_init__(self) -> None:
         for name in _NUMBERS:
             object.__setattr__(self, name, _checked(getattr(self, name), name))
@@ -88,6 +90,7 @@ class Optics:
             raise InputError("depth_layers needs crystal_mu, of the crystal's material")
         for name in ("within_crystal", "within_walls", "within_cone"):
             object.__setattr__(self, name, bool(getattr(self, name)))
+        object.__setattr__(self, "library", namespace(*self.numbers.values()))
 
     @classmethod
     def of(cls, system: PinholeSystem, lines: Sequence[tuple[float, float]] = (), **settings: Any) -> Self:
@@ -112,15 +115,15 @@ class Optics:
     def with_numbers(self, numbers: Mapping[str, ArrayOrTensor]) -> Self:
         """The same with other numbers, which are not checked."""
         changed = copy.copy(self)
-        for name, value in numbers.items():
-            object.__setattr__(changed, name, value)
+        changed.__dict__.update(numbers, library=namespace(*{**self.numbers, **numbers}.values()))
         return changed
 
     def promoted(self, *values: ArrayOrTensor) -> tuple[Any, ...]:
         """The optics and `values`, their numbers as tensors of one type and device if any is a tensor."""
         own = {name: value for name, value in self.numbers.items() if not isinstance(value, float)}
         promoted = promote(*values, *own.values())
-        optics = self.with_numbers(dict(zip(own, promoted[len(values) :], strict=True))) if own else self
+        optics = self.with_numbers(dict(zip(own, promoted[len(values) :], strict=True)))
+        optics.__dict__["library"] = namespace(*promoted)
         return optics, *promoted[: len(values)]
 
     def of_modules(self, which: Any, n: int) -> Self:
@@ -136,7 +139,7 @@ class Optics:
     def tangent(self) -> ArrayOrTensor:
         """``tan(alpha / 2)`` of the knife edge's cone."""
         angle = self.opening_angle
-        return edge_slope(angle) if isinstance(angle, float) else namespace(angle).tan(angle / 2)
+        return edge_slope(angle) if isinstance(angle, float) else self.library.tan(angle / 2)
 
     def effective_diameter(self, diameter: ArrayOrTensor) -> ArrayOrTensor:
         """d_e, mm, of holes of a diameter d, mm: opaque holes that let as many photons pass along the axis.
@@ -184,27 +187,31 @@ class Optics:
         Parameters
         ----------
         slope_u, slope_v
-            Of the photons' lines, mm along u and v per mm along the axis.
+            Slopes of the photons' lines, mm along u and v per mm along the axis.
         opening
             The point.
         thickness
-            Of the crystal, mm.
+            The crystal's, mm.
         layer
-            Of `depths`.
+            Which of `depths`.
         """
         squared_secant = 1 + slope_u**2 + slope_v**2
-        cosine = 1 / namespace(squared_secant).sqrt(squared_secant)
+        cosine = 1 / squared_secant**0.5
         squared = cosine * cosine  # many times faster than a power
-        counted = self.photons_per_decay / (4 * math.pi) * (squared * squared) * opening.area(slope_u, slope_v)
+        counted = (
+            self.photons_per_decay / (4 * math.pi) * (squared * squared) * opening.area(slope_u, slope_v, self.library)
+        )
         if self.crystal_mu is not None:
-            counted = counted * absorbed_share(cosine, self.crystal_mu, thickness, self.depths(thickness), layer)
+            counted = counted * absorbed_share(
+                cosine, self.crystal_mu, thickness, self.depths(thickness), layer, self.library
+            )
         if self.within_cone:
-            counted = counted * within_cone(slope_u, slope_v, self.tangent)
+            counted = counted * within_cone(slope_u, slope_v, self.tangent, self.library)
         return counted, cosine
 
     def pixel_weights(
         self,
-        along: tuple[ArrayOrTensor, ArrayOrTensor],
+        along: Sequence[ArrayOrTensor],
         pitch: tuple[ArrayOrTensor, ArrayOrTensor],
         length: ArrayOrTensor,
         side: ArrayOrTensor,
@@ -224,7 +231,7 @@ class Optics:
         length, side, thickness
             Collimator length l, and the crystal's side and thickness, mm.
         opening, layer
-            As of `counted`.
+            The same as in `counted`.
         cells
             Rays of a pixel: along each side, a ray stands for this part of it where the crystal or a wall ends.
         """

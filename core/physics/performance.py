@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..arrays import ArrayOrTensor, checked, is_tensor, namespace
+from ..arrays import ArrayOrTensor, checked, is_tensor
 from ..geometry.design_formulas import roi_radius_seen
 from ..geometry.system import PinholeSystem
 from ..validation import instance, real_array
@@ -46,8 +46,8 @@ def seen(system: PinholeSystem | Modules, points: ArrayOrTensor) -> ArrayOrTenso
 
 def magnification(system: PinholeSystem | Modules, points: ArrayOrTensor) -> ArrayOrTensor:
     """Magnification l / h (P, M) at each of the `points` (P, 3), world mm; NaN behind the pinhole."""
-    modules, _, _, _, h = _in_modules(system, points)
-    where = namespace(h).where
+    modules, optics, _, _, h = _in_modules(system, points)
+    where = optics.library.where
     return where(h > 0, modules.collimator_length / where(h > 0, h, 1.0), np.nan)
 
 
@@ -67,7 +67,7 @@ def sensitivity(
     points
         (P, 3), world mm.
     optics
-        Of the modules, such as `Emission.optics`. None: ideal ones.
+        The modules', such as `Emission.optics`. None: ideal ones.
     settings
         Attributes of `Optics`, in place of those of `optics`: `aperture_mu`, `opening_angle`, `crystal_mu`,
         `photons_per_decay`, `within_cone` and so on.
@@ -75,11 +75,11 @@ def sensitivity(
     Raises
     ------
     InputError
-        A number is out of its range, or there are not as many as modules.
+        There are not as many numbers as modules.
     """
     modules, optics, x_u, x_v, h = _in_modules(system, points, chosen_optics(optics, settings))
     visible = _visible(modules, x_u, x_v, h)
-    h = namespace(h).where(visible, h, 1.0)  # avoids dividing by zero
+    h = optics.library.where(visible, h, 1.0)  # avoids dividing by zero
     slope_u, slope_v = x_u / h, x_v / h
     (opening,) = optics.openings(modules.pinhole_diameter)
     counts: Any = 0.0
@@ -103,7 +103,7 @@ def resolution(
     """
     modules, optics, x_u, x_v, h = _in_modules(system, points, chosen_optics(optics, settings))
     fwhm = _fwhm(h / modules.collimator_length, modules.pinhole_diameter, optics)
-    return namespace(fwhm).where(_visible(modules, x_u, x_v, h), fwhm, np.nan)
+    return optics.library.where(_visible(modules, x_u, x_v, h), fwhm, np.nan)
 
 
 class ModulePerformance(NamedTuple):

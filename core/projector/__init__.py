@@ -9,11 +9,11 @@ is needed.
 from .emission import Emission
 from .inverse_square import InverseSquareSum
 from .models import Model, Transmission, intensity
-from .operator import AdjointProjector, Projector
+from .operator import Adjoint, Projector
 from .tracing import trace_rays
 
 __all__ = [
-    "AdjointProjector",
+    "Adjoint",
     "Emission",
     "InverseSquareSum",
     "Model",

@@ -41,8 +41,8 @@ def step(run: Callable[[Sequence[bool]], tuple[Tensor, Gradients]], *inputs: Any
     Parameters
     ----------
     run
-        Of which inputs need a gradient: the result, and a function of the result's gradient and of which inputs need one
-        that returns their gradients, None for the others.
+        Takes which inputs need a gradient, and returns the result and another function: that takes the result's gradient
+        and which inputs need one, and returns their gradients, None for the others.
     """
     return _Step.apply(run, *inputs)
 

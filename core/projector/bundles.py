@@ -54,6 +54,11 @@ class Bundle:
         return self.beams[0].rays.shape if self.ends is None else self.ends.shape
 
     @property
+    def kind(self) -> tuple[bool, float]:
+        """What images whose rays make one part have in common: their orientation, and how far sources move."""
+        return self.transposed, self.beams[0].rays.parallel if self.ends is None else 0.0
+
+    @property
     def rays_of_a_pixel(self) -> int:
         """How many rays each pixel has."""
         return sum(len(beam.rays.shifts) for beam in self.beams) if self.ends is None else 1
@@ -70,13 +75,13 @@ class Part:
 
     # numbers of the images to which the fans belong, and how many fans of each follow one another
     images: list[tuple[int, int]]
-    rays: Array | Ends  # (F, 4, 3), the fans' vectors, as of `Fan.vectors`; or rays from point to point
+    rays: Array | Ends  # (F, 4, 3), the fans' vectors (`Fan.vectors`); or rays from point to point
     rows: slice  # the part of an image that each fan covers, of the transposed image if `transposed`
     columns: slice
     transposed: bool = False
     # (F, rows, columns), weights of the integrals, with 1 row or column where all are the same; None: 1 everywhere
     weights: Array | None = None
-    parallel: bool = False  # as of `Fan`; fans of one part are all alike in this
+    parallel: float = 0.0  # that of `Fan`; fans of one part are all alike in this
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -130,14 +135,14 @@ class Bundles:
     n : int
         How many images.
     make : function
-        Of an image's number: its `Bundle`.
+        Takes an image's number and returns its `Bundle`.
     """
 
     def __init__(self, n: int, make: Callable[[int], Bundle]) -> None:
         self._n = n
         self._make = make
         self._bundles: dict[int, Bundle] = {}
-        self._parts: dict[tuple[int, ...], list[Part]] = {}
+        self._parts: dict[tuple[Any, ...], list[Part]] = {}
         self._room = KEPT_BYTES
 
     def __len__(self) -> int:
@@ -162,33 +167,25 @@ class Bundles:
     def __getstate__(self) -> dict[str, Any]:  # what is kept holds functions that cannot be pickled
         return self.__dict__ | {"_bundles": {}, "_parts": {}, "_room": KEPT_BYTES}
 
-    def parts(self, images: range, most: int) -> list[Part]:
-        """All rays of several images, at most `most` in a part unless a fan alone has more."""
-        key = images.start, images.stop, most
+    def parts(self, images: range, block: tuple[slice, slice] | None, most: int) -> Iterable[Part]:
+        """All rays of several images, or those of a block of one: at most `most` in a part unless a fan alone has more."""
+        bounds = () if block is None else tuple((some.start, some.stop) for some in block)
+        key = images.start, images.stop, bounds, most
         if key not in self._parts:
             bundles = [(number, self[number]) for number in images]
-            parts: list[Part] = []
-            for transposed in (False, True):
-                some = [(number, bundle) for number, bundle in bundles if bundle.transposed == transposed]
-                if some:
-                    rows, columns = some[0][1].shape
-                    parts += _parts(some, slice(0, rows), slice(0, columns), most)
-            kept = [x for part in parts for x in (part.rays, part.weights) if isinstance(x, np.ndarray)]
-            if not self._has_room(sum(x.nbytes for x in kept)):
-                return parts
-            self._parts[key] = parts
-        return self._parts[key]
-
-    def parts_of(self, number: int, rows: slice, columns: slice, most: int) -> Iterable[Part]:
-        """The rays of some rows and columns of one image, likewise."""
-        bundle = self[number]
-        key = number, rows.start, rows.stop, columns.start, columns.stop, most
-        if key not in self._parts:
-            parts = _parts([(number, bundle)], rows, columns, most)
-            if bundle.ends is not None or not self._has_room(16 * bundle.n_rays((rows, columns))):
+            parts = self._made_parts(bundles, block, most)
+            kept = sum(8 * bundle.n_rays(block) for _, bundle in bundles if bundle.ends is None)
+            if not kept or not self._has_room(kept):
                 return parts
             self._parts[key] = list(parts)
         return self._parts[key]
+
+    @staticmethod
+    def _made_parts(bundles: list[tuple[int, Bundle]], block: tuple[slice, slice] | None, most: int) -> Iterator[Part]:
+        for kind in sorted({bundle.kind for _, bundle in bundles}):
+            some = [(number, bundle) for number, bundle in bundles if bundle.kind == kind]
+            rows, columns = block or map(slice, some[0][1].shape)
+            yield from _parts(some, slice(rows.start or 0, rows.stop), slice(columns.start or 0, columns.stop), most)
 
     def _has_room(self, n_bytes: int) -> bool:
         """Whether so many bytes may be kept; if so, they are counted."""

@@ -19,7 +19,7 @@ _ABOVE_BONE, _ABOVE_METALS = 2.0, 1.2
 
 
 def doubts(grid: Grid, views: Views, model: Model) -> Iterator[str]:
-    """Of a projector's arguments."""
+    """The warnings about a projector's arguments."""
     if caution := model.caution(views, grid):
         yield caution
     wide = float(np.ptp(grid.corners(), axis=0).max())

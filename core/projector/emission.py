@@ -25,9 +25,9 @@ from ..validation import instance, positive, real_array, strict_whole
 from ..volumes.volume import Volume, require_quantity
 from .bundles import Beam
 from .hole_response import WholeHoles
-from .models import Array, Model, checked_background, view_rays
+from .models import Array, Model, checked_background
 from .pixel_points import TOLERANCE, expected_error, lattices, offsets, points_needed, require_points, shadow_edges
-from .rays import Fan
+from .rays import Fan, view_rays
 
 # Views may differ from their system by a file's rounding (mm; sine of an angle).
 _SAME_PLACE = 1e-3
@@ -39,7 +39,7 @@ _BOX_PER_SIGMA = math.sqrt(12)
 
 Hole = Literal["auto", "depth", "rays", "point"]
 
-# Rays that are not told how many points of the hole to pass keep a voxel's image this close to that of the whole hole.
+# Without a number of points of the hole, rays keep a voxel's image this close to that of the whole hole.
 _APERTURE_TOLERANCE = 0.1
 
 
@@ -67,7 +67,7 @@ class Emission(Model):
         result is exact for piecewise constant volumes: nothing is resampled, the planes of both grids cut the rays, and
         ``exp(-integral of mu)`` is integrated in closed form inside a voxel. None: no attenuation.
     time : float
-        Of the acquisition, s.
+        The acquisition's, s.
     isotope : Isotope or str, optional
         Its photons are counted, and the volume is its activity at the start, which decays during `time`. None: one photon
         per decay, and constant activity.
@@ -83,10 +83,11 @@ class Emission(Model):
         Largest relative error of the total counts of a single voxel in any module, wherever it lies between the rays: 2 %
         by default. Larger sources are more accurate.
     hole : str
-        ``"depth"``: the blur of the whole hole, without rays (`hole_response`). Every voxel's image is right to 1 % and its
-        total to 0.1 %. It takes no ``edge="path"`` or `depth_layers`, no grid that comes close to a pinhole, and no backend
-        cuda. ``"rays"``: through `aperture_points`. ``"point"``: through the hole's middle, an ideal pinhole without blur.
-        ``"auto"``: by depth, voxels close to a pinhole by rays; by rays alone where that cannot be or they have numbers.
+        ``"depth"``: the depth-dependent pinhole response, the blur of the whole hole without rays (`hole_response`). Every
+        voxel's image is right to 1 % and its total to 0.1 %. It takes no ``edge="path"`` or `depth_layers`, no grid that
+        comes close to a pinhole, and no backend cuda. ``"rays"``: through `aperture_points`. ``"point"``: through the hole's
+        middle, an ideal pinhole without blur. ``"auto"``: the depth-dependent response, voxels close to a pinhole by rays;
+        rays alone where that cannot be or they have numbers.
     aperture_points : int, optional
         Points of the hole's disk that rays pass, all with the same weight: the blur of a hole of diameter d_e.
         With 1 all rays pass the centre and there is no blur; otherwise at least 3. None: by `aperture_tolerance`.
@@ -116,7 +117,7 @@ class Emission(Model):
         recorded (parallax). From 2 on, counts and mean depth are exact for every angle. With 1 all photons are recorded
         where they enter.
     intrinsic_fwhm : float
-        Of the detector's Gaussian blur, mm on the crystal. Counts blurred over the image's edge are lost.
+        FWHM of the detector's Gaussian blur, mm on the crystal. Counts blurred over the image's edge are lost.
     within_crystal : bool
         Whether pixels, or parts of them, outside the crystal's side Ld count nothing.
     within_walls : bool
@@ -127,11 +128,6 @@ class Emission(Model):
     background : float or array (M,) or (M, n_v, n_u)
         Counts of each pixel in the whole acquisition besides those of the volume, such as scatter and dark counts. ``A(x)``
         leaves them out; runs add them before noise is drawn, and reconstructions expect them.
-
-    Raises
-    ------
-    InputError
-        An argument is of another kind or out of its range.
 
     References
     ----------
@@ -363,14 +359,13 @@ class Emission(Model):
         opening
             The point.
         layer
-            Of `depth_layers`, from the front: where photons are recorded.
+            Which of `depth_layers`, from the front: where photons are recorded.
         cells
             Rays of a pixel: along each side, a ray stands for this part of it where the crystal or a wall ends.
         """
         side, thickness = self.system.detector_side[m], self.system.detector_thickness[m]
-        of_module = length, side, thickness
-        along = along_u, along_v
-        return self.effective_time * self._optics_of(m).pixel_weights(along, pitch, *of_module, opening, layer, cells)
+        optics, *along, length = self._optics_of(m).promoted(along_u, along_v, length)
+        return self.effective_time * optics.pixel_weights(along, pitch, length, side, thickness, opening, layer, cells)
 
     def response(self, views: Views, m: int) -> tuple[Array, Array] | None:
         """The intrinsic blur of view m: matrices (n_v, n_v) along v and (n_u, n_u) along u."""
@@ -395,11 +390,6 @@ class Emission(Model):
 
         of_modules = self.system, self.effective_diameter, sides, weigh
         return WholeHoles(views, grid, *of_modules, self.mu, self.hole == "depth")
-
-    def rays(self, views: Views, m: int, grid: Grid) -> int:
-        """Rays of each pixel of view m."""
-        holes = len(self.openings(m, self.hole_points(views, m, grid)))
-        return self.depth_layers * holes * self._pixel_points(views, m, grid)
 
     def caution(self, views: Views, grid: Grid) -> str | None:
         """A warning where there are too few rays for the tolerance."""

@@ -1,6 +1,6 @@
 """The one driver of rays: cuts images into what a backend takes at once, and runs it on several threads."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -193,12 +193,9 @@ class Execution:
         wanted = max(_FEWEST_RAYS // rays, n // (2 * self.workers))
         return max(1, min(self.backend.rays_of_images // rays, wanted))
 
-    def _parts(self, task: _Task, bundles: Bundles) -> Any:
+    def _parts(self, task: _Task, bundles: Bundles) -> Iterable[Part]:
         """The rays of a task, as many at once as the backend takes."""
-        most = self.backend.rays_at_once
-        if task.block is None:
-            return bundles.parts(task.images, most)
-        return bundles.parts_of(task.images.start, *task.block, most)
+        return bundles.parts(task.images, task.block, self.backend.rays_at_once)
 
     def _lattices(self, volume: ArrayOrTensor, mu: ArrayOrTensor, bundles: Bundles, whole_mu: bool = False) -> Lattices:
         """The filled parts of volume and mu, as the backend computes with them, or the whole volume."""

@@ -1,4 +1,4 @@
-"""A hole's image without rays: voxels are shared out in a fine image, in planes of depth, and each plane is blurred.
+"""The depth-dependent pinhole response: voxels are shared out in fine images, and each plane of depth is blurred.
 
 A point at depth h in front of the pinhole's plane is seen on the crystal as a disc of diameter ``d (1 + l / h)``. Here the
 image of a voxel is made in two steps that are each a sparse matrix, whose transposes are the adjoint. First the voxel's
@@ -19,22 +19,28 @@ discs. M. Unser, A. Aldroubi, M. Eden, "B-spline signal processing", IEEE Transa
 import functools
 import itertools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from types import ModuleType
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arrays import cropped
 from ..errors import InputError
 from ..geometry.grid import Grid
 from ..geometry.system import PinholeSystem
 from ..geometry.views import Views
 from ..physics.crystal import share_inside
 from ..volumes.volume import Volume
-from .depth_response import DepthResponse, DepthResponses, VoxelBox
-from .models import view_rays
+from .depth_response import DepthResponse, Index
+from .parallel import in_order, run_all
+from .rays import view_rays
 from .transmittance import mean_transmittance
 
-Array = NDArray[np.float64]
+Array = NDArray[Any]
+VoxelBox = tuple[tuple[slice, ...], NDArray[np.bool_]]
+"""A box of a grid, and which of its voxels."""
 Weigh = Callable[[int, Array, Array], Array]
 
 # In units of the geometric mean of the two largest of the widths of pixel, voxel and the hole's shadow on the crystal:
@@ -48,21 +54,27 @@ _LARGE_VOXELS = 0.6
 _PAIR_SMEAR = 0.366 * math.sqrt(12)
 # Larger voxels, mm, are cut into parts of this size at most: kernels as wide as their shadows would take longer.
 _LARGEST = 6.0
+# Layers of voxels that a thread adds to before it takes others, and bytes of the views' cells that are in memory.
+_SLAB, _CELLS_AT_ONCE = 4, 2**28
+# Bytes of transmittances that are kept from call to call.
+_KEPT = 2**30
 # Largest ratio of the largest and the smallest shadow of the hole in a grid, and about so much in a zone.
 _MOST_RATIO, _ZONE_RATIO = 2.5, 1.4
 
 
-class WholeHoles(DepthResponses):
+class WholeHoles:
     """What views count of a volume through the whole holes of their modules.
+
+    Each view has a response for every zone of depth, made when first needed.
 
     Parameters
     ----------
     views, grid, system
         The views, the volume's grid and the modules.
     diameters
-        Of the holes, (M,), mm.
+        The holes', (M,), mm.
     sides
-        Of the square on each crystal in which pixels count, (M,), mm.
+        Sides of the square on each crystal in which pixels count, (M,), mm.
     weigh
         ``weigh(m, u, v)`` is what a mm^2 of the crystal counts per (decay / (s mm^3) mm) along lines through the middle of
         module m's hole to these places on the crystal, mm, point-inverted.
@@ -83,17 +95,101 @@ class WholeHoles(DepthResponses):
         mu: Volume | None,
         is_strict: bool,
     ) -> None:
-        super().__init__(len(views), views.shape, grid, mu)
+        self.n, self.pixels, self.grid, self.mu = len(views), views.shape, grid, mu
+        self._made: dict[tuple[int, float], DepthResponse] = {}
+        self._zones: dict[int, list[tuple[float, float]]] = {}
+        self._passing: dict[int, tuple[Index, Array]] = {}
+        self._room = _KEPT
         self._views, self._system, self._diameters, self._frames = views, system, diameters, system.frames()
         self._sides, self._weigh, self._is_strict = sides, weigh, is_strict
 
     def _module(self, m: int) -> tuple[Array, Array, float, float]:
-        """Of module m the pinhole, mm, the frame u, v, k, the collimator's length and the hole's diameter, mm."""
+        """Module m's pinhole, mm, its frame u, v, k, the collimator's length and the hole's diameter, mm."""
         l, d = float(self._system.collimator_length[m]), float(self._diameters[m])
         return self._views.sources[m], self._frames[m], l, d
 
+    def images(self, volume: Array, functions: ModuleType, workers: int, mu: Volume | None = None) -> Iterator[Array]:
+        """The images of `volume` one by one; `mu` may attenuate in place of the usual."""
+        (filled,), origin = cropped(volume)
+        filled = np.ascontiguousarray(filled)
+
+        def image(m: int) -> Array:
+            image, parts = np.zeros(self.pixels, volume.dtype), self._of_part(m, origin, filled.shape)
+            passes = self._passes(m, origin, filled, mu) if parts else None
+            for of, pixels in parts:
+                cells = functions.voxels_to_cells(filled, of, passes)
+                image[pixels] += functions.cells_to_pixels(cells, of)
+            return image
+
+        return in_order(image, range(self.n), workers)
+
+    def backproject(
+        self,
+        images: Array,
+        functions: ModuleType,
+        workers: int,
+        report: Callable[[int], None],
+        mu: Volume | None = None,
+    ) -> Array:
+        """The adjoint. Each thread has a slab of the volume, so the result does not depend on their number."""
+        volume = np.zeros(self.grid.shape, images.dtype)
+        slabs = [slice(x, x + _SLAB) for x in range(0, len(volume), _SLAB)]
+        whole = (0, 0, 0), self.grid.shape
+
+        def give(m: int) -> tuple[Array | None, list[tuple[DepthResponse, Array]]]:
+            given = [(of, functions.pixels_to_cells(images[m][pixels], of)) for of, pixels in self._of_part(m, *whole)]
+            return self._passes(m, whole[0], volume, mu) if given else None, given
+
+        n, first = len(images), 0
+        while first < n:
+            size = sum(4 * math.prod(of.shape) for of, _ in self._of_part(first, *whole))
+            last = min(first + max(workers, _CELLS_AT_ONCE // max(size, 1)), n)
+            given = list(in_order(give, range(first, last), workers))
+
+            def take(slab: slice, given: list[Any] = given) -> None:
+                for passes, cells in given:
+                    for of, own in cells:
+                        functions.cells_to_voxels(volume, own, of, passes, slab)
+
+            run_all(take, slabs, workers)
+            first = last
+            report(first)
+        return volume
+
+    def _of_part(self, m: int, origin: Index, shape: Index) -> list[tuple[DepthResponse, tuple[slice, slice]]]:
+        """View m's responses to a part of the volume, of the zones that it reaches into, and the pixels that may see it."""
+        row = self.depths(m)
+        depths = [row @ (*np.add(origin, corner), 1) for corner in itertools.product(*((0, n - 1) for n in shape))]
+        if m not in self._zones:
+            self._zones[m] = self.zones(m)
+        reached = [(far, near) for far, near in self._zones[m] if max(depths) > near and min(depths) <= far]
+        return [self._response(m, far, near).of_part(origin, shape) for far, near in reached]
+
+    def _response(self, m: int, far: float, near: float) -> DepthResponse:
+        if (m, far) not in self._made:
+            self._made[m, far] = self.make(m, far, near)
+        return self._made[m, far]
+
+    def _passes(self, m: int, origin: Index, part: Array, mu: Volume | None) -> Array | None:
+        """What attenuation leaves of the photons from each voxel of a part of the volume."""
+        if mu is None and self.mu is None:
+            return None
+        grid = self.grid.box(origin, part.shape)
+        if mu is not None:
+            return self.transmittance(m, mu, grid).astype(part.dtype, copy=False)
+        start, kept = self._passing.get(m, (origin, None))
+        first = np.subtract(origin, start)
+        if kept is None or first.min() < 0 or (first + part.shape > kept.shape).any():
+            self._room += self._passing.pop(m)[1].nbytes if m in self._passing else 0
+            first, kept = np.zeros(3, int), self.transmittance(m, self.mu, grid)  # type: ignore[arg-type]
+            if kept.nbytes <= self._room:
+                self._room -= kept.nbytes
+                self._passing[m] = origin, kept
+        inside = tuple(slice(a, a + n) for a, n in zip(first.tolist(), part.shape, strict=True))
+        return np.ascontiguousarray(kept[inside], part.dtype)
+
     def depths(self, m: int) -> Array:
-        """As of `DepthResponses`."""
+        """The row (4,) that gives the depth of a voxel (x, y, z, 1) before view m's pinhole, mm."""
         pinhole, (_, _, k), *_ = self._module(m)
         row: Array = k @ self.grid.affine[:3]
         row[3] -= k @ pinhole
@@ -113,14 +209,14 @@ class WholeHoles(DepthResponses):
         return far, max(nearest, near)
 
     def zones(self, m: int) -> list[tuple[float, float]]:
-        """As of `DepthResponses`; in each the hole's shadow grows so little that one response serves."""
+        """View m's zones of depth, from far to near, mm: in each the hole's shadow grows so little that one will do."""
         *_, l, _ = self._module(m)
         smallest, largest = (1 + l / depth for depth in self._limits(m))
         n = max(1, round(math.log(largest / smallest) / math.log(_ZONE_RATIO) + 0.4))
         return list(itertools.pairwise((l / (np.geomspace(smallest, largest, n + 1) - 1)).tolist()))
 
     def close(self, m: int) -> VoxelBox | None:
-        """As of `DepthResponses`."""
+        """Voxels before view m's pinhole that are nearer than all zones; None where it may see none."""
         (_, near), (pinhole, frame, l, d) = self._limits(m), self._module(m)
         # A pyramid before the pinhole, wider by the hole: its corners at the pinhole's plane and at `near`.
         signs = np.array(list(itertools.product((-1, 1), repeat=2)))
@@ -137,7 +233,7 @@ class WholeHoles(DepthResponses):
         return (tuple(map(slice, low.tolist(), high.tolist())), close) if close.any() else None
 
     def transmittance(self, m: int, mu: Volume, part: Grid) -> NDArray[np.float32]:
-        """As of `DepthResponses`."""
+        """What `mu` leaves of the photons from each voxel of a part of the grid, on their way to view m's pinhole."""
         _, frame, l, d = self._module(m)
         margin = d / 2 * (1 / l + 1 / self._limits(m)[1])
         return mean_transmittance(mu, self.grid, part, self._views, m, frame, margin)
@@ -148,7 +244,7 @@ class WholeHoles(DepthResponses):
         return self._weigh(m, u, v) * np.sqrt(1 + (u**2 + v**2) / self._module(m)[2] ** 2)
 
     def make(self, m: int, far: float, near: float) -> DepthResponse:
-        """As of `DepthResponses`."""
+        """View m's response to voxels in a zone from far to near, mm."""
         views, grid, (pinhole, frame, l, d) = self._views, self.grid, self._module(m)
         u, v, k = frame
         rays = view_rays(views, m)

@@ -13,7 +13,8 @@ from ..geometry.views import Views
 from ..validation import instance
 from .bundles import Beam
 from .emission import Emission
-from .models import Array, Model, view_rays
+from .models import Array, Model
+from .rays import view_rays
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,11 +28,6 @@ class InverseSquareSum(Model):
     It is not what a camera counts. The density of a pixel grid's rays already falls as 1/h^2: a point source farther away
     covers fewer pixels. Weighting the segments with 1/h^2 again makes the total counts of a point source fall as 1/h^4,
     and far parts of an object too dark by (h_near / h_far)^2. `Emission` follows the law of the pinhole.
-
-    Raises
-    ------
-    InputError
-        The system is none.
     """
 
     system: PinholeSystem  # the modules, as many as the views and in their order

@@ -28,9 +28,9 @@ class Lattices:
     mu_origin: Index = (0, 0, 0)
 
     def fans(
-        self, vectors: Array, shape: tuple[int, int], parallel: bool = False
+        self, vectors: Array, shape: tuple[int, int], parallel: float = 0.0
     ) -> tuple[IndexFans, Attenuation | None]:
-        """Fans (F, 4, 3), as of `Fan.vectors`, of one shape in index space, and what attenuates them."""
+        """Fans (F, 4, 3), vectors of `Fan.vectors`, of one shape in index space, and what attenuates them."""
         return self._mapped(index_fans, vectors, shape, parallel)
 
     def between(self, rays: Ends) -> tuple[IndexRays, Attenuation | None]:

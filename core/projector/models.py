@@ -1,5 +1,7 @@
 """What a pixel measures: which rays it takes, with which weights."""
 
+from __future__ import annotations
+
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -15,9 +17,9 @@ from ..geometry.views import Views
 from ..validation import freeze, positive, real_array, shape_text
 from ..volumes.volume import LINE_INTEGRALS, Volume, require_quantity
 from .bundles import Beam
-from .depth_response import DepthResponses
+from .hole_response import WholeHoles
 from .pixel_points import TOLERANCE, offsets, points_needed, require_points, shadow_edges
-from .rays import Fan
+from .rays import view_rays
 
 Array = NDArray[np.float64]
 
@@ -50,7 +52,7 @@ class Model(ABC):
         """A warning for users who project `grid` into `views`, if there is one."""
         return None
 
-    def of_views(self, which: NDArray[np.integer]) -> "Model":
+    def of_views(self, which: NDArray[np.integer]) -> Model:
         """The model of the views `which` (indices) alone."""
         return self
 
@@ -74,11 +76,11 @@ class Model(ABC):
         """Factors of the voxels in view m, ``grid.shape``; used if `weights_voxels`."""
         return np.ones(grid.shape)
 
-    def by_depth(self, views: Views, grid: Grid) -> DepthResponses | None:
+    def by_depth(self, views: Views, grid: Grid) -> WholeHoles | None:
         """What projects in place of rays, if the model is of that kind."""
         return None
 
-    def by_rays(self) -> "Model":
+    def by_rays(self) -> Model:
         """The model for what can only be done with rays; `InputError` where it is not to take any."""
         return self
 
@@ -98,11 +100,6 @@ class Transmission(Model):
         programs for radiographs. None: as many as `tolerance` requires.
     tolerance : float
         With automatic points, the largest relative error of a single voxel's sum over the image, wherever it lies.
-
-    Raises
-    ------
-    InputError
-        An argument is of another kind or out of its range.
     """
 
     pixel_points: int | None = 1
@@ -138,14 +135,9 @@ def intensity(line_integrals: ArrayOrTensor, photons: float) -> ArrayOrTensor:
     Parameters
     ----------
     line_integrals
-        Of mu, without unit: an array, or a tensor (the result is then part of its graph).
+        Line integrals of mu, without unit: an array, or a tensor (the result is then part of its graph).
     photons
         Per pixel, where nothing attenuates (I0).
-
-    Raises
-    ------
-    InputError
-        `photons` is not a number above 0, or the line integrals are no real, finite numbers.
     """
     if not is_tensor(line_integrals):
         kind = np.float32 if getattr(line_integrals, "dtype", None) == np.float32 else np.float64
@@ -164,11 +156,6 @@ def checked_background(
         What to check, and how messages call it.
     n, pixels
         Number of views and their shape (n_v, n_u), if that is known.
-
-    Raises
-    ------
-    InputError
-        Another shape, not real, not finite, or below 0.
     """
     array = real_array(value, name, None)
     real_array(array, name, None, np.float32)  # as which it is added
@@ -183,24 +170,3 @@ def checked_background(
     if array.min(initial=0.0) < 0:
         raise InputError(f"{name}: expected 0 or more, got {array.min():g}")
     return freeze(array) if array.ndim else float(array)
-
-
-def view_rays(views: Views, m: int, grid: Grid | None = None) -> Fan:
-    """The rays of view m, from its source to the pixels' centres: a row for every row of pixels.
-
-    Parallel rays begin and end outside `grid`, close to it; without a grid, as those of `Views.rays`.
-    """
-    n_v, n_u = views.shape
-    u_step, v_step = views.u_steps[m], views.v_steps[m]
-    corner = views.detector_centers[m] - (n_u - 1) / 2 * u_step - (n_v - 1) / 2 * v_step
-    if not views.parallel:
-        return Fan(views.sources[m], corner, v_step, u_step, views.shape)
-    along = views.detector_centers[m] - views.sources[m]
-    if grid is None:
-        return Fan(corner - along, corner, v_step, u_step, views.shape, parallel=True)
-    along = along / np.linalg.norm(along)
-    outermost = [corner + i * (n_v - 1) * v_step + j * (n_u - 1) * u_step for i in (0, 1) for j in (0, 1)]
-    distances = (grid.corners()[:, None] - outermost) @ along  # from pixels to the grid
-    margin = float(grid.spacing.max() + np.linalg.norm(u_step) + np.linalg.norm(v_step))
-    first, last = (corner + distance * along for distance in (distances.min() - margin, distances.max() + margin))
-    return Fan(first, last, v_step, u_step, views.shape, parallel=True)

@@ -56,19 +56,27 @@ class LinearOperator(ABC):
         Raises
         ------
         InputError
-            Another shape or grid, not real numbers, not finite, or more memory needed than there is.
+            Another grid, or more memory needed than there is.
         """
-        x = self._check(x)
-        if is_tensor(x):
-            from .autograd import linear
+        return self._apply(self._check(x), progress)
 
-            return linear(lambda x: self._run(x, progress), self.T._run, x)
-        return self._run(x, progress)
+    def _apply(
+        self, x: ArrayOrTensor, progress: Progress | None = None, mu: ArrayOrTensor | None = None
+    ) -> ArrayOrTensor:
+        """Apply to a checked array or tensor, whose gradient follows; not that of mu."""
+        if not is_tensor(x):
+            return self._run(x, progress, mu)
+        from .autograd import linear
 
-    @property
-    @abstractmethod
+        return linear(lambda x: self._run(x, progress, mu), lambda y: self.T._run(y, mu=mu), x)
+
+    _names = ("array", "array")  # what messages call what it takes, and what its adjoint takes
+    _float64 = False  # whether it computes in float64 whatever it is given
+
+    @functools.cached_property
     def T(self) -> LinearOperator:
         """The exact adjoint, <A x, y> = <x, A.T y>."""
+        return Adjoint(self)
 
     @property
     @abstractmethod
@@ -80,8 +88,8 @@ class LinearOperator(ABC):
     def shape_out(self) -> tuple[int, int, int]:
         """Shape of what it gives."""
 
-    @abstractmethod
-    def _check(self, x: Any) -> ArrayOrTensor: ...
+    def _check(self, x: Any) -> ArrayOrTensor:
+        return checked(x, self._names[0], self.shape_in, self._float64, batch=True)
 
     def _run(
         self, x: ArrayOrTensor, progress: Progress | None = None, mu: ArrayOrTensor | None = None
@@ -102,6 +110,49 @@ class LinearOperator(ABC):
         self, x: ArrayOrTensor, progress: Progress | None = None, mu: ArrayOrTensor | None = None
     ) -> ArrayOrTensor:
         """Apply to an array or tensor of `shape_in`."""
+
+    @abstractmethod
+    def _run_back(
+        self, y: ArrayOrTensor, progress: Progress | None = None, mu: ArrayOrTensor | None = None
+    ) -> ArrayOrTensor:
+        """Apply the adjoint to an array or tensor of `shape_out`."""
+
+
+class Adjoint(LinearOperator):
+    """The adjoint of an operator, ``A.T``."""
+
+    def __init__(self, operator: LinearOperator) -> None:
+        self._operator = operator
+        self._names = operator._names[::-1]
+        self._float64 = operator._float64
+
+    @property
+    def T(self) -> LinearOperator:  # type: ignore[override]
+        """The operator."""
+        return self._operator
+
+    @property
+    def shape_in(self) -> tuple[int, int, int]:
+        """Shape of what the operator gives."""
+        return self._operator.shape_out
+
+    @property
+    def shape_out(self) -> tuple[int, int, int]:
+        """Shape of what the operator takes."""
+        return self._operator.shape_in
+
+    def __repr__(self) -> str:
+        return f"{self._operator!r}.T"
+
+    def _run_one(
+        self, x: ArrayOrTensor, progress: Progress | None = None, mu: ArrayOrTensor | None = None
+    ) -> ArrayOrTensor:
+        return self._operator._run_back(x, progress, mu)
+
+    def _run_back(
+        self, y: ArrayOrTensor, progress: Progress | None = None, mu: ArrayOrTensor | None = None
+    ) -> ArrayOrTensor:
+        return self._operator._run_one(y, progress, mu)
 
 
 class Projector(LinearOperator):
@@ -128,7 +179,7 @@ class Projector(LinearOperator):
     Raises
     ------
     InputError
-        An argument is of another kind, no such backend, or its library is missing.
+        There is no such backend, or its library is missing.
 
     Notes
     -----
@@ -149,6 +200,8 @@ class Projector(LinearOperator):
     (64, 64, 64)
     """
 
+    _names = ("volume", "images")
+
     def __init__(
         self, grid: Grid, views: Views, model: Model | None = None, backend: str = "auto", threads: int | None = None
     ) -> None:
@@ -164,6 +217,7 @@ class Projector(LinearOperator):
         self.views = views
         self._asked, self._auto = backend, backend == "auto"
         self._backend = backends.choose(backend)
+        self._float64 = self._backend.always_float64 and not self._auto
         if self._backend.name == "cuda":
             model = model.by_rays()
         self.model = model
@@ -173,7 +227,6 @@ class Projector(LinearOperator):
         self.threads = thread_count(threads)
         self._bundles = Bundles(len(views), self._bundle)
         self._depths = model.by_depth(views, grid)
-        self._adjoint = AdjointProjector(self)
 
     def __call__(
         self, x: Volume | ArrayOrTensor, progress: Progress | None = None, mu: ArrayOrTensor | None = None
@@ -183,7 +236,7 @@ class Projector(LinearOperator):
         Parameters
         ----------
         x, progress
-            As of `LinearOperator`; `x` may also be a `Volume`.
+            The same as for any `LinearOperator`; `x` may also be a `Volume`.
         mu
             Attenuation coefficients, 1/mm, in place of the model's: an array or tensor on the grid of its `mu`, one for a
             whole batch.
@@ -191,13 +244,13 @@ class Projector(LinearOperator):
         Returns
         -------
         array or tensor
-            As of `LinearOperator`, and a tensor also if `mu` is one: part of torch's graph if `x` or `mu` requires a
+            A tensor if `x` or `mu` is one, else a numpy array: part of torch's graph if `x` or `mu` requires a
             gradient, for every backend. Where `mu` requires one, gradients of gradients are refused.
 
         Raises
         ------
         InputError
-            As of `LinearOperator`; and the model has no mu, or `mu` has another shape, or is negative.
+            The model has no mu, or `mu` has another shape, or is negative; or more memory is needed than there is.
         """
         if mu is None:
             images = super().__call__(x, progress)
@@ -209,12 +262,9 @@ class Projector(LinearOperator):
         if self._depths is not None and getattr(mu, "requires_grad", False):
             return self._by_rays(x, progress, mu)
         x, mu = promote(x, require_no_negative(checked(mu, "mu", self.model.mu.grid.shape, self._float64)))
-        if not is_tensor(x):
-            return self._run(x, progress, mu)
+        if not getattr(mu, "requires_grad", False):
+            return self._apply(x, progress, mu)
         from . import autograd
-
-        if not mu.requires_grad:
-            return autograd.linear(lambda x: self._run(x, progress, mu), lambda y: self.T._run(y, mu=mu), x)
 
         def run(needs: Any) -> Any:
             def gradients(images: ArrayOrTensor, needs: Any) -> Any:
@@ -245,11 +295,6 @@ class Projector(LinearOperator):
         """What the model expects besides the volume's images, (M, n_v, n_u), read-only: ``A(x) + A.background``."""
         values = np.asarray(self.model.background)
         return np.broadcast_to(values[:, None, None] if values.ndim == 1 else values, self.shape_out)
-
-    @property
-    def T(self) -> AdjointProjector:
-        """The exact adjoint: images (M, n_v, n_u) to an array of ``grid.shape``."""
-        return self._adjoint
 
     def iter_views(self, volume: Volume | ArrayOrTensor) -> Iterator[ArrayOrTensor]:
         """The images one by one, each (n_v, n_u): work between which a job can stop. Gradients are not recorded.
@@ -300,6 +345,32 @@ class Projector(LinearOperator):
         if images is None:
             images = np.zeros(self.shape_out, np.float64 if self._float64 else np.float32)
         return to_caller(images, x)
+
+    def _run_back(
+        self, y: ArrayOrTensor, progress: Progress | None = None, mu: ArrayOrTensor | None = None
+    ) -> ArrayOrTensor:
+        execution = self._execution(y)
+        given = images = execution.to_backend(y)
+        needed = images.itemsize * self.grid.n_voxels + self._extra_bytes(images.itemsize)
+        require(needed, f"the adjoint into {_times(self.grid.shape)} voxels")
+        self._require_rays()
+        n = len(self.views)
+        tell(progress, 0, n)
+        images = self._responded(images)
+        if self._depths is not None:
+            arguments = *self._depth_arguments(images), lambda done: tell(progress, done, n), self._mu_volume(mu)
+            volume = self._depths.backproject(*arguments)
+            for m, box, close, of_part in self._close_parts:
+                volume[box] += np.where(close, of_part.T._run(to_numpy(given[m : m + 1], None), mu=mu), 0)
+        elif not self.model.weights_voxels:
+            volume = execution.backproject(images, self._bundles, self._mu(mu), lambda done: tell(progress, done, n))
+        else:  # each view's volume is weighted before it is added to the total
+            volume = zeros(self.grid.shape, images)
+            for m in range(n):
+                of_view = execution.backproject(images[m : m + 1], self._bundles_of(m))
+                volume += of_view * self._voxel_weights(m, of_view)
+                tell(progress, m + 1, n)
+        return to_caller(self._finished(volume, y), y)
 
     def _images(self, x: ArrayOrTensor, mu: ArrayOrTensor = None) -> Iterator[ArrayOrTensor]:
         """Images of a checked volume, as the backend computes them."""
@@ -360,7 +431,7 @@ class Projector(LinearOperator):
         return Execution(backend, self.grid, mu_grid, backend.always_float64 or is_double(x), self.threads)
 
     def _depth_arguments(self, x: ArrayOrTensor) -> tuple[ArrayOrTensor, Any, int]:
-        """What `DepthResponses` takes: the array, the functions and the threads."""
+        """What `WholeHoles` takes: the array, the functions and the threads."""
         double = self._backend.always_float64 or is_double(x)
         has_kernels = self._backend.name != "numpy" and backends.choose("auto").name == "cpu"
         functions = backends.load("cpu" if has_kernels else "reference_depth")
@@ -414,65 +485,6 @@ class Projector(LinearOperator):
         if self._float64 or is_tensor(result) or is_double(x):
             return result
         return result.astype(np.float32, copy=False)
-
-    @property
-    def _float64(self) -> bool:
-        return self._backend.always_float64 and not self._auto
-
-
-class AdjointProjector(LinearOperator):
-    """The adjoint of a projector, ``A.T``: backprojects images along their rays, with the weights of ``A``."""
-
-    def __init__(self, projector: Projector) -> None:
-        self._projector = projector
-
-    @property
-    def T(self) -> Projector:
-        """The projector."""
-        return self._projector
-
-    @property
-    def shape_in(self) -> tuple[int, int, int]:
-        """Shape of the images, (M, n_v, n_u)."""
-        return self._projector.shape_out
-
-    @property
-    def shape_out(self) -> tuple[int, int, int]:
-        """Shape of a volume, (n_x, n_y, n_z)."""
-        return self._projector.shape_in
-
-    def __repr__(self) -> str:
-        return f"{self._projector!r}.T"
-
-    def _check(self, x: ArrayOrTensor) -> ArrayOrTensor:
-        return checked(x, "images", self.shape_in, self._projector._float64, batch=True)
-
-    def _run_one(
-        self, x: ArrayOrTensor, progress: Progress | None = None, mu: ArrayOrTensor | None = None
-    ) -> ArrayOrTensor:
-        A = self._projector
-        execution = A._execution(x)
-        given = images = execution.to_backend(x)
-        needed = images.itemsize * A.grid.n_voxels + A._extra_bytes(images.itemsize)
-        require(needed, f"the adjoint into {_times(A.grid.shape)} voxels")
-        A._require_rays()
-        n = len(A.views)
-        tell(progress, 0, n)
-        images = A._responded(images)
-        if A._depths is not None:
-            arguments = *A._depth_arguments(images), lambda done: tell(progress, done, n), A._mu_volume(mu)
-            volume = A._depths.backproject(*arguments)
-            for m, box, close, of_part in A._close_parts:
-                volume[box] += np.where(close, of_part.T._run(to_numpy(given[m : m + 1], None), mu=mu), 0)
-        elif not A.model.weights_voxels:
-            volume = execution.backproject(images, A._bundles, A._mu(mu), lambda done: tell(progress, done, n))
-        else:  # each view's volume is weighted before it is added to the total
-            volume = zeros(A.grid.shape, images)
-            for m in range(n):
-                of_view = execution.backproject(images[m : m + 1], A._bundles_of(m))
-                volume += of_view * A._voxel_weights(m, of_view)
-                tell(progress, m + 1, n)
-        return to_caller(A._finished(volume, x), x)
 
 
 def _describe(grid: Grid) -> str:

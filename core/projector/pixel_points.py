@@ -27,7 +27,7 @@ TOLERANCE = 0.02
 """By default the total counts of a single voxel are right to this share of them."""
 
 MOST_POINTS = 2584
-"""Of a pixel: its rays would take hours."""
+"""The most points of a pixel: its rays would take hours."""
 
 _FIBONACCI = (1, 2, 3, 5, 8, 13, 21, 34, 55, 89, 144, 233, 377, 610, 987, 1597, MOST_POINTS)
 
@@ -126,7 +126,7 @@ def _points_needed(edges: bytes, n_voxels: int, tolerance: float, hole_points: i
 def shadow_edges(views: Views, m: int, grid: Grid) -> Array:
     """Edges (D, 3, 2) of the shadows of some voxels on view m's detector, pixels: those that ask for most points.
 
-    Of the voxels in front of the source and within the image; where none is, of those in front of it.
+    They are among the voxels in front of the source and within the image; where none is, among those in front of it.
     """
     ticks = [np.unique(np.linspace(0, n - 1, min(n, _VOXELS_ALONG)).round()) for n in grid.shape]
     index = np.stack(np.meshgrid(*ticks, indexing="ij"), axis=-1).reshape(-1, 3)

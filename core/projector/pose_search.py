@@ -95,7 +95,7 @@ def register_pose(
     initial
         The first guess, (4, 4): world from camera, columns u, v, k and the pinhole (as ``system.poses()``).
     distance, pitch, offset
-        The camera as of `pinhole_images`, mm.
+        The camera's, as in `pinhole_images`, mm.
     levels
         Pixels are joined to squares of these sides, one after the other.
     steps
@@ -103,14 +103,10 @@ def register_pose(
     learning_rate
         Radians (and tenths of m) of the first steps; it falls to a hundredth over all levels.
     similarity
-        Of two images, larger when they are more alike.
+        A function of two images, larger when they are more alike.
     progress
         Called as ``progress(steps done, steps)``.
 
-    Raises
-    ------
-    InputError
-        The image or the pose is not of that shape.
     """
     if image.ndim != 2:
         raise InputError(f"image: expected n_v x n_u, got {' x '.join(map(str, image.shape))}")
@@ -134,7 +130,7 @@ def register_pose(
         seen = avg_pool2d(image.detach().to(torch.float64)[None], level)[0]
         # What is left over at the image's end shifts its middle.
         lost = torch.tensor([n % level for n in reversed(image.shape)], dtype=torch.float64)
-        # Rays of float32 are good to 0.1 um, and a step takes two thirds of the time.
+        # Rays of float32 are good to 0.1 um, and a step is half as long again in float64.
         camera = (distance, (level * pitch).float(), tuple(seen.shape), (offset - lost / 2 * pitch).float())
         for _ in range(steps):
             pose = middle @ se3_exp(scale * motion) @ from_middle

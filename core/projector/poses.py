@@ -60,10 +60,6 @@ def pinhole_rays(
     sources, targets : tensors (..., n_v * n_u, 3)
         Ends of the rays to the pixels' centres, row by row, world mm.
 
-    Raises
-    ------
-    InputError
-        Shapes that do not fit.
     """
     n_v, n_u = whole_shape(shape, "image shape", 2)
     positions, rotations, distance, pitch, offset = _cameras(positions, rotations, distance, pitch, offset)
@@ -75,7 +71,7 @@ def pinhole_rays(
 
 
 def _cameras(positions: Tensor, rotations: Numbers, *numbers: Numbers) -> list[Tensor]:
-    """What is said of the cameras (...), as tensors of one type: positions (..., 3), rotations (..., 3, 3), numbers (...).
+    """The numbers of cameras (...) as tensors of one type: positions (..., 3), rotations (..., 3, 3), numbers (...).
 
     The last two of the numbers are pitch and offset, (..., 2).
     """
@@ -126,9 +122,9 @@ def pinhole_images(
     backend: str = "auto",
     grid: Grid | None = None,
 ) -> Tensor:
-    """Line integrals (..., n_v, n_u), value x mm, of a volume seen by cameras as of `pinhole_rays`.
+    """Line integrals (..., n_v, n_u), value x mm, of a volume seen by the cameras of `pinhole_rays`.
 
-    Differentiable by the volume (a tensor on `grid`) and by all the cameras' numbers; `backend` as of `Projector`.
+    Differentiable by the volume (a tensor on `grid`) and by all the cameras' numbers; `backend` is one of `Projector`'s.
 
     Examples
     --------
@@ -176,33 +172,29 @@ def emission_images(
     volume
         Activity, kBq/mL: a `Volume`, or a tensor on `grid`.
     positions, rotations
-        Pinholes and world from camera, as of `pinhole_rays`.
+        Pinholes and world from camera, as in `pinhole_rays`.
     collimator_length
         Pinhole to crystal, mm, (...) or one number.
     pitch, offset
-        As of `pinhole_rays`, on the upright image at `collimator_length` in front of the pinhole: mm of the crystal.
+        Those of `pinhole_rays`, on the upright image at `collimator_length` in front of the pinhole: mm of the crystal.
     shape
         Pixels (n_v, n_u): rows, columns.
     diameter
-        Of the hole, mm, (...) or one number: the effective one, unless `aperture_mu` says how photons penetrate the edge.
+        The hole's, mm, (...) or one number: the effective one, unless `aperture_mu` says how photons penetrate the edge.
     aperture_points, pixel_points, tolerance
-        As of `Emission`; without a number of pixel points all cameras get as many as the one that needs most. All rays of
+        Those of `Emission`; without a number of pixel points all cameras get as many as the one that needs most. All rays of
         a camera are in the graph: many points of small images take less memory than few of large ones.
     crystal_thickness, crystal_side
-        Of the crystal, mm, (...) or one number: needed with `crystal_mu`, and with `within_crystal` or `within_walls`.
+        The crystal's, mm, (...) or one number: needed with `crystal_mu`, and with `within_crystal` or `within_walls`.
     time
-        As of `Emission`, (...) or one number.
+        The acquisition's, s, (...) or one number.
     mu, mu_grid
-        What attenuates, as of `trace_rays`.
+        What attenuates, as in `trace_rays`.
     backend, grid
-        As of `trace_rays`.
+        The same as in `trace_rays`.
     optics, settings
-        As of `sensitivity`: `crystal_mu`, `photons_per_decay` and so on, each (...) or one number, but no `intrinsic_fwhm`.
-
-    Raises
-    ------
-    InputError
-        Shapes that do not fit, what `Optics` or what `trace_rays` refuses.
+        The same as in `sensitivity`: `crystal_mu`, `photons_per_decay` and so on, each (...) or one number, without
+        `intrinsic_fwhm`.
 
     Examples
     --------

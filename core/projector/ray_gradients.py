@@ -25,9 +25,9 @@ def by_geometry(part: Part, gradient: Array, derivatives: Array, grid: Grid, mu_
     gradient
         By the images, (images, rows, columns).
     derivatives
-        Of the backend, (7 or 14, rays).
+        What the backend returned, (7 or 14, rays).
     grid, mu_grid
-        Of the volume and of mu.
+        The volume's and mu's.
 
     Returns
     -------
@@ -100,7 +100,7 @@ def _rays(part: Part) -> list[tuple[Array, Array]]:
 
 
 def _numbers(part: Part) -> Array:
-    """Of the rays of a fan: 1, the row's number and the column's, (3, n), counted from the part's corner."""
+    """For each ray of a fan: 1, the row's number and the column's, (3, n), counted from the part's corner."""
     rows, columns = part.shape
     numbers = np.ones((3, rows, columns))
     numbers[1], numbers[2] = np.arange(rows)[:, None], np.arange(columns)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..geometry.grid import Grid
+from ..geometry.views import Views
 
 Array = NDArray[np.float64]
 
@@ -27,7 +28,8 @@ class Fan:
     """Rays from one point to the points of a lattice on a plane, world mm: the rays of an image.
 
     The ray of row i and column j goes from `source` to ``corner + i row_step + j column_step``; a parallel one, from
-    ``source + i row_step + j column_step``. With S shifts there are S such lattices, each moved by a number of rows and
+    ``source + i row_step + j column_step``; between both, where sources lie in a plane on the way of rays of one point, they
+    move `parallel` times as far. With S shifts there are S such lattices, each moved by a number of rows and
     columns: more points of every pixel.
     """
 
@@ -37,7 +39,7 @@ class Fan:
     column_step: Array  # (3,), mm
     shape: tuple[int, int]  # rows and columns
     shifts: Array = field(default_factory=lambda: _UNSHIFTED)  # (S, 2), in rows and columns
-    parallel: bool = False
+    parallel: float = 0.0  # 0: one source; 1: parallel rays
 
     def part(self, rows: slice, columns: slice, shifts: slice = _ALL) -> Fan:
         """Some rows, some columns of these, and some of the shifts."""
@@ -46,7 +48,7 @@ class Fan:
         offset = row * self.row_step + column * self.column_step
         return replace(
             self,
-            source=self.source + offset if self.parallel else self.source,
+            source=self.source + self.parallel * offset,
             corner=self.corner + offset,
             shape=(last_row - row, last_column - column),
             shifts=self.shifts[shifts],
@@ -68,14 +70,34 @@ class Fan:
         vectors[:] = self.source, self.corner, self.row_step, self.column_step
         if self.shifts is not _UNSHIFTED:
             moved = self.shifts @ vectors[0, 2:]
+            vectors[:, 0] += self.parallel * moved
             vectors[:, 1] += moved
-            if self.parallel:
-                vectors[:, 0] += moved
         return vectors
 
     def targets(self) -> Array:
         """Ends of the rays (S * rows * columns, 3), shift by shift, row by row."""
         return _targets(self.vectors(), self.shape)
+
+
+def view_rays(views: Views, m: int, grid: Grid | None = None) -> Fan:
+    """The rays of view m, from its source to the pixels' centres: a row for every row of pixels.
+
+    Parallel rays begin and end outside `grid`, close to it; without a grid, as those of `Views.rays`.
+    """
+    n_v, n_u = views.shape
+    u_step, v_step = views.u_steps[m], views.v_steps[m]
+    corner = views.detector_centers[m] - (n_u - 1) / 2 * u_step - (n_v - 1) / 2 * v_step
+    if not views.parallel:
+        return Fan(views.sources[m], corner, v_step, u_step, views.shape)
+    along = views.detector_centers[m] - views.sources[m]
+    if grid is None:
+        return Fan(corner - along, corner, v_step, u_step, views.shape, parallel=True)
+    along = along / np.linalg.norm(along)
+    outermost = [corner + i * (n_v - 1) * v_step + j * (n_u - 1) * u_step for i in (0, 1) for j in (0, 1)]
+    distances = (grid.corners()[:, None] - outermost) @ along  # from pixels to the grid
+    margin = float(grid.spacing.max() + np.linalg.norm(u_step) + np.linalg.norm(v_step))
+    first, last = (corner + distance * along for distance in (distances.min() - margin, distances.max() + margin))
+    return Fan(first, last, v_step, u_step, views.shape, parallel=True)
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +126,7 @@ def window(fans: Sequence[Fan], points: Array) -> tuple[slice, slice]:
     Parameters
     ----------
     fans
-        Of one shape.
+        Fans of one shape.
     points
         (P, 3), world mm.
     """
@@ -118,9 +140,8 @@ def window(fans: Sequence[Fan], points: Array) -> tuple[slice, slice]:
     )
     w_row, w_column, w = np.einsum("kfi,fpi->kfp", across, points - source[:, None])
     volume = np.einsum("fi,fi->f", row_step, across[0])[:, None]
-    w = w / volume
-    if fans[0].parallel:  # point - source = i row_step + j column_step + w to_corner
-        w = np.ones_like(w)
+    parallel = fans[0].parallel
+    w = parallel + (1 - parallel) * w / volume  # the sources move, too: so many steps make a step where the point is
     if not (w > 1e-6 * np.abs(w).max(axis=1, keepdims=True)).all():  # some points lie beside or behind a source
         return slice(0, shape[0]), slice(0, shape[1])
     windows = []
@@ -194,7 +215,7 @@ class Attenuation:
 def index_fans(
     grid: Grid, vectors: Array, shape: tuple[int, int], parallel: float = 0.0, origin: tuple[int, int, int] = (0, 0, 0)
 ) -> IndexFans:
-    """Fans (F, 4, 3) in world mm, as of `Fan.vectors`, parallel or not, in `grid`'s index space; see `index_rays`."""
+    """Fans (F, 4, 3) in world mm, vectors of `Fan.vectors`, parallel or not, in `grid`'s index space; see `index_rays`."""
     affine = _index_from_world(grid, origin)
     table = np.empty((len(vectors), 8, 3))
     table[:, 4:] = vectors

@@ -15,11 +15,6 @@ def balanced_subsets(views: Views, n: int) -> list[NDArray[np.int64]]:
 
     The views are dealt out like cards, ring by ring along z, each ring by the sources' angle around z; each ring begins
     farther on than the one before, so that a subset does not have the same angle of every ring.
-
-    Raises
-    ------
-    InputError
-        `n` is no whole number from 1 to the number of views.
     """
     n = whole_number(n, "subsets")
     if n > len(views):

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..arrays import ArrayOrTensor, checked, is_double, is_tensor, namespace, promote, require_numbers, to_caller
+from ..arrays import ArrayOrTensor, checked, is_double, is_tensor, namespace, promote, to_caller
 from ..errors import InputError
 from ..geometry.grid import Grid
-from ..validation import instance, real_array, whole_shape
+from ..validation import instance, shape_text, whole_shape
 from ..volumes.volume import LINE_INTEGRALS, Volume, require_quantity
 from . import backends, ray_gradients
 from .bundles import Beam, Bundle, Bundles, Part
@@ -44,7 +44,7 @@ def trace_rays(
     sources, targets
         Ends of the rays, each (N, 3), or (3,) for all rays the same; world mm. Arrays or torch tensors.
     backend
-        As of `Projector`.
+        One of `Projector`'s.
     grid
         Where the voxels are, for a volume that is an array or a tensor.
     mu
@@ -77,7 +77,7 @@ def trace_rays(
     """
     array, mu, execution = _execution(volume, backend, grid, mu, mu_grid, (sources, targets))
     in_torch = any(is_tensor(value) for value in (array, sources, targets))
-    starts, ends = (_numbers(x, name, 3, in_torch) for x, name in ((sources, "sources"), (targets, "targets")))
+    starts, ends = (_points(x, name, in_torch) for x, name in ((sources, "sources"), (targets, "targets")))
     if len(starts) != len(ends) and 1 not in (len(starts), len(ends)):
         raise InputError(f"trace_rays: {len(starts)} sources but {len(ends)} targets")
     n = len(ends) if len(starts) == 1 else len(starts)
@@ -106,17 +106,12 @@ def trace_fans(
     shape
         Rows and columns.
     volume, backend, grid, mu, mu_grid
-        As of `trace_rays`.
+        The same as in `trace_rays`.
 
     Returns
     -------
     array or tensor (..., rows, columns)
-        As of `trace_rays`. Gradients by the vectors cost little more than the integrals.
-
-    Raises
-    ------
-    InputError
-        As of `trace_rays`.
+        Value x mm, of the kind that `trace_rays` returns. Gradients by the vectors cost little more than the integrals.
 
     Examples
     --------
@@ -178,30 +173,24 @@ def _field(value: Volume | ArrayOrTensor, name: str, grid: Grid | None, float64:
     return checked(value, name, grid.shape, float64), grid
 
 
-def _numbers(value: Any, name: str, last: int | tuple[int, int], in_torch: bool) -> Any:
-    """Points (n, 3), of one (3,) or many, or vectors (..., 4, 3); in torch a tensor of float64 on the CPU, in its graph."""
-    data = value
-    if is_tensor(value):
-        require_numbers(value, name)
-        value = value.to("cpu", namespace(value).float64)
-        data = value.numpy(force=True)
-    try:
-        shape = np.shape(data)
-    except (ValueError, RuntimeError):  # ragged, or tensors of a graph in a list: `real_array` says so
-        shape = ()
-    if isinstance(last, tuple):
-        if shape[-2:] != last:
-            raise InputError(f"{name}: expected ... x 4 x 3, got shape {shape}")
-        array = real_array(data, name, shape)
-    elif shape == (0,):  # an empty list
-        array = np.empty((0, 3))
-    else:
-        array = real_array(data, name, (3,) if len(shape) == 1 else (None, 3)).reshape(-1, 3)
+def _numbers(value: Any, name: str, last: tuple[int, ...], in_torch: bool) -> Any:
+    """Numbers (..., *last), as float64; in torch a tensor on the CPU, in its graph."""
+    value = checked(value, name, last, True, batch=True)
     if not in_torch:
-        return array
+        return value
     import torch
 
-    return value.reshape(array.shape) if is_tensor(value) else torch.from_numpy(array)
+    return value.to("cpu") if is_tensor(value) else torch.from_numpy(value.copy())
+
+
+def _points(value: Any, name: str, in_torch: bool) -> Any:
+    """Points (n, 3), of one (3,) or many."""
+    if isinstance(value, list | tuple) and not len(value):
+        value = np.empty((0, 3))
+    points = _numbers(value, name, (3,), in_torch)
+    if points.ndim > 2:
+        raise InputError(f"{name}: expected shape any x 3, got {shape_text(tuple(points.shape))}")
+    return points.reshape(-1, 3)
 
 
 def _traced(

@@ -29,7 +29,7 @@ def mean_transmittance(
 ) -> NDArray[np.float32]:
     """The mean over each voxel of a `part` of `grid` of ``exp(-integral of mu)`` from there to the pinhole, ``part.shape``.
 
-    Of every ray through a voxel the mean over its chord is exact; that over the voxel is the mean over the rays that meet
+    The mean over the chord of every ray through a voxel is exact; that over the voxel is the mean over the rays that meet
     it, weighted by their chords, up to 16 where it is farthest.
 
     Parameters

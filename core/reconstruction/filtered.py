@@ -11,7 +11,7 @@ from ..errors import InputError, warn
 from ..geometry.grid import Grid
 from ..geometry.views import Views
 from ..memory import require
-from ..perspective.places import take
+from ..perspective.places import gather
 from ..progress import Progress, tell
 from ..projector.parallel import run_all, thread_count
 from ..validation import instance, real_array
@@ -115,7 +115,7 @@ def filtered_backprojection(
 
         run_all(filter_view, range(first, end), thread_count(None))
         taken = room[: end - first], of_place[first:end]
-        take(volume, planes, *taken, flat=True, by_depth=True, nearest=_BEHIND)
+        gather(volume, planes, *taken, flat=True, by_depth=True, nearest=_BEHIND)
         tell(progress, end, n)
     return volume
 

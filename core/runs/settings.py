@@ -237,8 +237,8 @@ _DECLARED = (
             label="Window (keV)"),
     Setting("model.hole", str, "auto", "What photons pass: the whole hole (auto; depth, never by rays), points "
             "of it (rays), or its middle alone (point)", label="Hole", option="--hole", words={
-        "auto": ("Automatic", "The blur of the whole hole, by depth; by rays where that cannot be"),
-        "depth": ("By Depth", "The blur of the whole hole, depth by depth, without rays"),
+        "auto": ("Automatic", "The depth-dependent pinhole response; rays where that cannot be"),
+        "depth": ("Depth-Dependent Response", "The depth-dependent pinhole response: the whole hole's blur, without rays"),
         "rays": ("Rays", "The blur of rays through points of the hole"),
         "point": ("Point", "An ideal pinhole: rays through the middle of the hole, no blur"),
     }, needs=(_COUNTS,)),

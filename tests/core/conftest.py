@@ -157,3 +157,11 @@ def event_set(tmp_path_factory: pytest.TempPathFactory) -> events.EventSet:
     """Five events of 8 modules, tiny."""
     folder = tmp_path_factory.mktemp("events")
     return events.make(small_recipe(folder, EVENT_RECIPE), folder / "set", 5)
+
+
+def distance_to_line(points: np.ndarray, line: np.ndarray) -> np.ndarray:
+    """Distances (…) of points (…, 3) to a line, a Plücker matrix (4, 4), that is not at infinity."""
+    direction = line[:3, 3]
+    moment = np.array([line[1, 2], line[2, 0], line[0, 1]])  # a x b
+    # a x b = x x (b - a) for all points x of the line, and the matrix holds a - b.
+    return np.linalg.norm(moment + np.cross(points, direction), axis=-1) / np.linalg.norm(direction)

@@ -87,7 +87,7 @@ def lattices(grid: mph.Grid, views: mph.Views) -> list[mph.Grid | mph.Perspectiv
 @pytest.mark.parametrize(("kernel", "parallel"), [("compiled", False), ("compiled", True), ("numpy", False)])
 def test_it_is_what_the_views_say_of_each_place(rng, grid, monkeypatch, kernel, parallel, how):
     if kernel == "numpy":
-        monkeypatch.setattr(places, "_take_kernel", None)
+        monkeypatch.setattr(places, "_gather_kernel", None)
     views = odd_views(parallel)
     images = rng.random((4, 23, 26)).astype(np.float32)
     for lattice in lattices(grid, views):

@@ -12,6 +12,7 @@ from mphdrr.core.runs.presets import PRESETS
 from .conftest import emission
 
 CENTER, SIDE, PIXELS, PITCH = np.array([9.0, -6.0, 13.0]), 3.0, 600, 0.0033
+SIZES = ("pinhole_diameter", "collimator_length", "detector_side", "detector_thickness")
 REAL = {
     "aperture_mu": 3.1, "opening_angle": 1.3, "crystal_mu": 0.2, "photons_per_decay": 0.8, "within_cone": True,
     "within_crystal": True, "within_walls": True,
@@ -42,6 +43,56 @@ def test_in_every_preset_points_maps_and_images_count_the_same(name, system):
     assert total / model.effective_time == pytest.approx(counts * grid.voxel_volume, rel=1e-6)
     by_map = mph.sensitivity_map(system[:1], grid, optics=model.optics).array
     assert by_map.item() == pytest.approx(mph.sensitivity(system[:1], [CENTER], optics=model.optics).item(), rel=1e-6)
+    sizes = (getattr(system[:1], name) for name in ("pinhole_distance", *SIZES))
+    at_isocentre = mph.isocentre_performance(*sizes, optics=model.optics).sensitivity
+    np.testing.assert_allclose(
+        at_isocentre, mph.sensitivity(system[:1], [[0, 0, 0]], optics=model.optics)[0], rtol=1e-6
+    )
+
+
+@pytest.mark.filterwarnings("ignore::mphdrr.core.errors.InputWarning")
+@pytest.mark.parametrize("name", PRESETS)
+def test_in_every_preset_gradients_are_the_central_differences(name, system):
+    """By a module's dimensions: of sensitivity, of performance at the isocentre, and of the total counts of a camera."""
+    torch = pytest.importorskip("torch", reason="torch is not installed")
+    from mphdrr.core.projector.poses import emission_images
+
+    one = system[4:5]
+    model = emission(one, **{**PRESETS[name].model, "intrinsic_fwhm": 0.0, "hole": "point", "pixel_points": 3})
+    optics = model.optics
+    grid = mph.Grid.centered((5, 4, 6), 4.0)
+    activity = mph.Volume(np.random.default_rng(1).random(grid.shape), grid, "activity")
+    poses, points = torch.tensor(one.poses()), [[3.0, -8.0, 5.0], [-11.0, 2.0, -9.0]]
+    given = [torch.tensor(getattr(one, size)) for size in SIZES]
+
+    def counts(d, l, side, thickness):
+        modules = Modules(torch.tensor(one.centers), torch.tensor(one.frames()), d, l, side, thickness)
+        at_isocentre = mph.isocentre_performance(
+            torch.tensor(one.pinhole_distance), d, l, side, thickness, optics=optics
+        )
+        crystal = {} if optics.crystal_mu is None else {"crystal_thickness": thickness, "crystal_side": side}
+        images = emission_images(
+            activity, poses[:, :3, 3], poses[:, :3, :3], l, 3.0, (9, 8), diameter=d, pixel_points=3, optics=optics,
+            time=model.effective_time, backend="numpy", **crystal,
+        )  # fmt: skip
+        return torch.stack(
+            [mph.sensitivity(modules, points, optics=optics).sum(), at_isocentre.sensitivity[0], images.sum()]
+        )
+
+    total = mph.Projector(grid, one.views((9, 8), "virtual", 1.0, pitch=3.0), model, "numpy")(activity).sum()
+    expected = (
+        mph.sensitivity(one, points, optics=optics).sum(),
+        mph.sensitivity(one, [[0, 0, 0]], optics=optics)[0, 0],
+        total,
+    )
+    np.testing.assert_allclose(counts(*given), expected, rtol=1e-6)
+    for i in (0, 1) if optics.crystal_mu is None else (0, 1, 3):  # by d, l and Td; the side only says what is seen
+        tried = [x.clone().requires_grad_(j == i) for j, x in enumerate(given)]
+        found = [torch.autograd.grad(y, tried[i], retain_graph=True)[0] for y in counts(*tried)]
+        ahead, back = (counts(*(x + step * (j == i) for j, x in enumerate(given))) for step in (1e-5, -1e-5))
+        differences = ((ahead - back) / 2e-5).tolist()
+        for slope, difference, size in zip(found, differences, expected, strict=True):
+            assert float(slope) == pytest.approx(difference, rel=1e-6, abs=1e-10 * size)  # rounding
 
 
 @pytest.mark.parametrize("edge", ["paix", "path"])

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 import mphdrr.core as mph
-from mphdrr.core.perspective.coordinates import distance_to_line
 from mphdrr.core.perspective.view_rays import pixels_of
 
-from .conftest import refused
+from .conftest import distance_to_line, refused
 from .odd_views import odd_views
 
 BOTH = pytest.mark.parametrize("parallel", [False, True])

@@ -124,13 +124,13 @@ def test_a_volume_larger_than_the_images_is_empty_beside_the_object():
 
 
 def test_the_kernel_is_numpys_and_threads_change_nothing(monkeypatch):
-    if places._take_kernel is None:
+    if places._gather_kernel is None:
         pytest.skip("no compiled kernels here")
     views = views_of(np.arange(7) * np.pi / 7)
     images = np.random.default_rng(3).random((7, 3, 64)).astype(np.float32)
     grid = mph.Grid((13, 9, 11), mph.euler_pose(0.3, 0.2, 0.1) @ mph.Grid.centered((13, 9, 11), (4.0, 6.0, 0.4)).affine)
     compiled = mph.fbp(images, views, grid).array
-    monkeypatch.setattr(places, "_take_kernel", None)
+    monkeypatch.setattr(places, "_gather_kernel", None)
     np.testing.assert_allclose(mph.fbp(images, views, grid).array, compiled, atol=1e-4 * np.abs(compiled).max())
 
 

@@ -165,15 +165,15 @@ def test_gradcheck():
 
 @pytest.mark.filterwarnings("ignore::mphdrr.core.errors.InputWarning")
 def test_the_kernels_are_numpys_and_threads_change_nothing(monkeypatch):
-    if places._take_kernel is None:
+    if places._gather_kernel is None:
         pytest.skip("no compiled kernels here")
     rng = np.random.default_rng(3)
     for forward, adjoint, shape_in, shape_out in maps(odd_views(coarse=11), 9):
         x, y = rng.random(shape_in, dtype=np.float32), rng.random(shape_out, dtype=np.float32)
         compiled = forward(x), adjoint(y)
         with monkeypatch.context() as patch:
-            patch.setattr(places, "_take_kernel", None)
-            patch.setattr(places, "_give_kernel", None)
+            patch.setattr(places, "_gather_kernel", None)
+            patch.setattr(places, "_scatter_kernel", None)
             for found, expected in zip((forward(x), adjoint(y)), compiled, strict=True):
                 np.testing.assert_allclose(found, expected, atol=3e-5 * np.abs(expected).max())
         with monkeypatch.context() as patch:
@@ -266,15 +266,15 @@ def test_work_says_how_far_it_is_and_can_be_stopped():
 @pytest.mark.parametrize("kind", [np.float32, np.float64])
 def test_what_is_not_finite_is_not_lost(monkeypatch, compiled, kind):
     """Of two arrays, whose numbers meet in one point each, in both orders."""
-    if compiled and places._take_kernel is None:
+    if compiled and places._gather_kernel is None:
         pytest.skip("no compiled kernels here")
     if not compiled:
-        monkeypatch.setattr(places, "_take_kernel", None)
+        monkeypatch.setattr(places, "_gather_kernel", None)
     for how, strange in ((places.LEAST, np.nan), (places.PRODUCT, np.nan), (places.PRODUCT, np.inf)):
         for order in (1, -1):
             points, arrays = np.ones((1, 1, 1), kind), np.array([strange, 3.0][::order], kind).reshape(2, 1, 1, 1)
             matrix = np.zeros((2, 5, 4))
             matrix[:, 3:, 3] = 1
             with np.errstate(invalid="ignore"):
-                places.take(points, np.zeros(1), arrays, matrix, how=how, exponents=np.zeros((1, 1, 1), np.int32))
+                places.gather(points, np.zeros(1), arrays, matrix, how=how, exponents=np.zeros((1, 1, 1), np.int32))
             assert not np.isfinite(points).any()

@@ -81,7 +81,7 @@ def test_bad_input_is_one_clear_line():
     refused(lambda: trace_rays(volume, [0, 0, 0], [[1, 1, np.nan]]), "targets", "(0, 2)")
     refused(lambda: trace_rays(volume, np.zeros((2, 3)), np.zeros((4, 3))), "2 sources", "4 targets")
     refused(lambda: trace_rays(volume, [[0, 0, 0], [1]], [1, 1, 1]), "sources")
-    refused(lambda: trace_rays(volume, np.zeros((2, 2)), np.zeros((2, 3))), "sources", "any x 3")
+    refused(lambda: trace_rays(volume, np.zeros((2, 2)), np.zeros((2, 3))), "sources", "expected shape 2 x 3")
 
 
 def test_no_rays_give_no_integrals():

@@ -14,8 +14,7 @@ from mphdrr.core.errors import InputError
 from mphdrr.core.geometry.grid import Grid
 from mphdrr.core.projector.backends import cpu, reference
 from mphdrr.core.projector.lattices import Lattices
-from mphdrr.core.projector.models import view_rays
-from mphdrr.core.projector.rays import Ends
+from mphdrr.core.projector.rays import Ends, view_rays
 
 from .conftest import run_python
 from .test_projector import LINEAR, SHAPES, affine, nasty_rays, random_rays, some_views

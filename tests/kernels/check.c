@@ -91,14 +91,14 @@ static void run_rays(int64_t level) {
     fwrite(job.gradient, real, mus, results);
 }
 
-// With a PlacesJob come the points' numbers, thirds, values and matrices; its `seen` and `exponents` are 1 where there shall
+// With a PlacesJob come the points' numbers, planes, values and matrices; its `seen` and `exponents` are 1 where there shall
 // be such arrays. Writes points, values, seen and exponents.
 static void run_places(int64_t level, void (*kernel)(int64_t, const PlacesJob *)) {
     PlacesJob job;
     if (!fread(&job, sizeof job, 1, jobs)) abort();
     const size_t real = job.is_double ? 8 : 4, points = job.n[0] * job.n[1] * job.n[2];
     const size_t numbers = job.arrays * job.m[0] * job.m[1] * job.m[2];
-    job.points = taken(points * real), job.thirds = taken(job.n[2] * real);
+    job.points = taken(points * real), job.planes = taken(job.n[2] * real);
     job.values = taken(numbers * real), job.matrices = taken(job.arrays * 160);
     if (job.seen) job.seen = block(points * 4);
     if (job.exponents) job.exponents = block(points * 4);

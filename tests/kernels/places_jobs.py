@@ -1,4 +1,4 @@
-"""Hostile jobs of take_at and give_at, and what the reference in numpy makes of them."""
+"""Hostile jobs of gather and scatter, and what the reference in numpy makes of them."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from mphdrr.core.perspective.places import LEAST, PRODUCT, SUM, _give_in_numpy, _places, _take_in_numpy
+from mphdrr.core.perspective.places import LEAST, PRODUCT, SUM, _gather_in_numpy, _places, _scatter_in_numpy
 from mphdrr.core.projector.backends.cpu import _PlacesJob
 
 from .jobs import BAD, Array, Made, Read, close, packed
@@ -48,7 +48,7 @@ def _matrix(rng: np.random.Generator, kind: str, n: Array, m: Array, middle: flo
     return matrix
 
 
-def _rounding(job: dict[str, Any], thirds: Array, relative: Array, matrix: Array) -> tuple[Array, Array, Array]:
+def _rounding(job: dict[str, Any], planes: Array, relative: Array, matrix: Array) -> tuple[Array, Array, Array]:
     """Of all points: whether numbers are within rounding of a border or out of range, by what share a value may be off.
 
     A value's share is of the largest number of the array, divided by p3^2 where the job says so. A point is compared where
@@ -59,9 +59,9 @@ def _rounding(job: dict[str, Any], thirds: Array, relative: Array, matrix: Array
     i, j = np.ogrid[: n[0], : n[1]]
     at = [np.abs(row[0] * i + row[1] * j + row[2] * job["middle"] + row[3])[..., None] for row in matrix]
     size = [a + np.abs(row[2] * relative) for a, row in zip(at, matrix, strict=True)]
-    terms = [(np.abs(r[0]) * i + np.abs(r[1]) * j)[..., None] + np.abs(r[2]) * np.abs(thirds) for r in matrix]
+    terms = [(np.abs(r[0]) * i + np.abs(r[1]) * j)[..., None] + np.abs(r[2]) * np.abs(planes) for r in matrix]
     full = [t + np.abs(r[2] * job["middle"]) + np.abs(r[3]) for t, r in zip(terms, matrix, strict=True)]
-    p = [row[0] * i[..., None] + row[1] * j[..., None] + row[2] * thirds + row[3] for row in matrix]
+    p = [row[0] * i[..., None] + row[1] * j[..., None] + row[2] * planes + row[3] for row in matrix]
     exact = job["exact"]
     off = [0 * f if exact else 4 * (e * s + double * f) for s, f in zip(size, full, strict=True)]
     used = (0, 1, 3) if flat else (0, 1, 2, 3, 4)
@@ -99,7 +99,7 @@ def _job(rng: np.random.Generator, number: int) -> Made:
     third = (third + rng.integers(-50, 50))[:: rng.choice([-1, 1])]
     middle = float(third[n[2] // 2])
     relative = (third - middle).astype(kind)
-    thirds = relative.astype(float) + middle
+    planes = relative.astype(float) + middle
     matrices = np.stack([_matrix(rng, what, n, m, middle) for _ in range(arrays)])
     nearest = float(np.median(np.abs(matrices[:, 3, 3]))) if rng.random() < 0.1 else 0.0
     nearest = nearest if np.isfinite(nearest) and what != "wild" else 0.0
@@ -115,7 +115,7 @@ def _job(rng: np.random.Generator, number: int) -> Made:
         "exact": what == "border",
     }  # fmt: skip
     others = {"flat": flat, "by_depth": by_depth, "nearest": nearest}
-    rounding = [_rounding(job, thirds, relative, matrix) for matrix in matrices]
+    rounding = [_rounding(job, planes, relative, matrix) for matrix in matrices]
     doubtful = np.any([each[0] for each in rounding], axis=0)
     not_finite = rng.random() < 0.1  # numbers: only that memory is left alone is looked at
     if not_finite:
@@ -138,9 +138,9 @@ def _job(rng: np.random.Generator, number: int) -> Made:
         matrix = matrices[0].copy()
         if flat:
             matrix[2], matrix[4] = 0, [0, 0, 0, 1]
-        inside, _, _, depth = _places((n[0], n[1]), thirds, matrix, tuple(m), flat, nearest)
+        inside, _, _, depth = _places((n[0], n[1]), planes, matrix, tuple(m), flat, nearest)
         given = np.where(inside, right_points / (depth**2 if by_depth else 1), 0)
-        _give_in_numpy(given, thirds, right_values[0], matrix, part)
+        _scatter_in_numpy(given, planes, right_values[0], matrix, part)
         sums = np.abs(given).sum() + np.nanmax(np.abs(right_values))
         off_values = float(np.sum(np.abs(given) * share * ~doubtful) + 8 * np.finfo(kind).eps * sums)
         if (doubtful & (points != 0)).any():
@@ -150,8 +150,8 @@ def _job(rng: np.random.Generator, number: int) -> Made:
         shifted[..., 3] += first * shifted[..., 0]
         for array, matrix, (_, share, p3) in zip(right_values, shifted, rounding, strict=True):
             old, before = right_points[part].copy(), powers[part].copy()
-            taken = (right_points[part], thirds, array[None], matrix[None], how, counts[part], powers[part])
-            _take_in_numpy(*taken, **others)
+            taken = (right_points[part], planes, array[None], matrix[None], how, counts[part], powers[part])
+            _gather_in_numpy(*taken, **others)
             weight = 1 / p3[part] ** 2 if by_depth else 1.0
             off = np.where(share[part] > 0, share[part] * weight * array.max(), 0.0)
             e, new, more = np.finfo(kind).eps, right_points[part], powers[part] - before

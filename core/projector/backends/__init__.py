@@ -81,7 +81,9 @@ _ROWS = (
     Backend("cpu", "CPU", "Compiled, on the processor", "cpu", 2**14, 2**14, _array),
     Backend("torch", "PyTorch", "On the processor or the graphics card", "reference", 2**18, 2**12, _tensor, True),
     Backend("numpy", "NumPy", "Float64 reference, slow", "reference", 2**12, 2**12, _array, False, True),
-    Backend("cuda", "CUDA", "On an NVIDIA graphics card; needs warp-lang", "cuda", 2**22, 2**22, _on_gpu, True),
+    Backend(
+        "cuda", "CUDA", "On an NVIDIA graphics card; needs warp-lang and torch", "cuda", 2**22, 2**22, _on_gpu, True
+    ),
 )
 BACKENDS = {backend.name: backend for backend in _ROWS}
 """The backends by name."""
@@ -92,7 +94,7 @@ _AUTOMATIC = ("cpu", "torch", "numpy")
 OLD_NAMES = {"numba": "cpu"}
 """What files and scripts of version 0.1 call a backend."""
 
-_PACKAGES = {"torch": "torch", "cuda": "warp-lang"}
+_PACKAGES = {"torch": "torch", "cuda": "warp-lang torch"}
 
 # A library may be absent, not be made for this platform, or fail to load its binaries.
 _CANNOT_LOAD = (ImportError, OSError)

@@ -76,10 +76,17 @@ class _DepthJob(Structure):
 class _PlacesJob(Structure):
     _fields_ = [
         ("is_double", c_int64), ("how", c_int64), ("flat", c_int64), ("by_depth", c_int64), ("points", c_void_p),
-        ("n", c_int64 * 3), ("first", c_int64), ("last", c_int64), ("thirds", c_void_p), ("middle", c_double),
+        ("n", c_int64 * 3), ("first", c_int64), ("last", c_int64), ("planes", c_void_p), ("middle", c_double),
         ("nearest", c_double), ("values", c_void_p), ("arrays", c_int64), ("m", c_int64 * 3), ("matrices", c_void_p),
         ("seen", c_void_p), ("exponents", c_void_p),
     ]  # fmt: skip
+
+
+_KERNELS = {
+    _Job: ("forward", "backproject", "differentiate", "differentiate_by_mu"),
+    _DepthJob: ("voxels_to_cells", "cells_to_voxels", "cells_to_pixels", "pixels_to_cells"),
+    _PlacesJob: ("take_at", "give_at"),
+}
 
 
 def _load() -> ctypes.CDLL:
@@ -95,15 +102,10 @@ def _load() -> ctypes.CDLL:
         raise ImportError(f"{path} belongs to another version of mphDRR: install it anew")
     library.best_level.restype, library.level_name.restype = c_int64, c_char_p
     library.level_name.argtypes = [c_int64]
-    for name in ("forward", "backproject", "differentiate", "differentiate_by_mu"):
-        function = getattr(library, name)
-        function.argtypes, function.restype = [c_int64, POINTER(_Job)], None
-    for name in ("voxels_to_cells", "cells_to_voxels", "cells_to_pixels", "pixels_to_cells"):
-        function = getattr(library, name)
-        function.argtypes, function.restype = [c_int64, POINTER(_DepthJob)], None
-    for name in ("take_at", "give_at"):
-        function = getattr(library, name)
-        function.argtypes, function.restype = [c_int64, POINTER(_PlacesJob)], None
+    for job, names in _KERNELS.items():
+        for name in names:
+            function = getattr(library, name)
+            function.argtypes, function.restype = [c_int64, POINTER(job)], None
     return library
 
 
@@ -123,7 +125,7 @@ def _level() -> int:
 
 
 level = _level()
-"""Of the kernels that are used, an index of `levels`."""
+"""The level of the kernels that are used, an index of `levels`."""
 
 
 def forward(volume: Array, rays: Rays, attenuation: Attenuation | None = None) -> Array:
@@ -152,72 +154,64 @@ def mu_gradient(gradient: Array, volume: Array, values: Array, rays: Rays, atten
     _run(_library.differentiate_by_mu, volume, rays, attenuation, values, integrals=integrals, gradient=gradient)
 
 
-def take_at(
+def gather(
     points: Array,
-    thirds: NDArray[np.float64],
+    planes: NDArray[np.float64],
     arrays: Array,
     matrices: NDArray[np.float64],
-    how: int = 0,
-    seen: Array | None = None,
-    exponents: Array | None = None,
+    how: int,
+    seen: Array | None,
+    exponents: Array | None,
     **others: Any,
 ) -> None:
-    """Combine `points` in place with what `arrays` have at their places, as `perspective.places.take` describes it."""
-    _run_places(_library.take_at, points, thirds, arrays, matrices, len(points), how, seen, exponents, **others)
+    """Combine `points` in place with what `arrays` have at their places, as `perspective.places.gather` describes it."""
+    counts = [each for each in (seen, exponents) if each is not None]
+    if any(each.dtype != np.int32 or each.shape != points.shape for each in counts):
+        raise TypeError("expected counts of int32 and of the points' shape")
+    if how == _PRODUCT and exponents is None:
+        raise ValueError("expected exponents, which a product needs")
+    others |= {"seen": None if seen is None else seen.ctypes.data, "how": how, "last": len(points)}
+    others["exponents"] = None if exponents is None else exponents.ctypes.data
+    _run_places(_library.take_at, points, planes, arrays, matrices, [points, *counts], **others)
 
 
-def give_at(
-    points: Array, thirds: NDArray[np.float64], array: Array, matrix: NDArray[np.float64], slab: slice, **others: Any
-) -> None:
-    """Add to the `slab` of `array` along its first axis, in place, what the adjoint of `take_at` gives."""
+def scatter(points: Array, planes: NDArray[np.float64], array: Array, matrix: NDArray[np.float64], slab: slice) -> None:
+    """Add to the `slab` of `array` along its first axis, in place, what the adjoint of `gather` gives."""
     first, last, _ = slab.indices(len(array))
-    _run_places(_library.give_at, points, thirds, array[None], matrix[None], last, first=first, **others)
+    _run_places(_library.give_at, points, planes, array[None], matrix[None], [array], first=first, last=last)
 
 
 def _run_places(
     kernel: Any,
     points: Array,
-    thirds: NDArray[np.float64],
+    planes: NDArray[np.float64],
     arrays: Array,
     matrices: NDArray[np.float64],
-    last: int,
-    how: int = 0,
-    seen: Array | None = None,
-    exponents: Array | None = None,
-    first: int = 0,
-    flat: bool = False,
-    by_depth: bool = False,
-    nearest: float = 0.0,
+    written: list[Array],
+    **others: Any,
 ) -> None:
-    kind, written = points.dtype, points if kernel is _library.take_at else arrays
+    kind, shape = points.dtype, arrays.shape[1:]
     if kind not in (np.float32, np.float64) or arrays.dtype != kind or matrices.dtype != np.float64:
         raise TypeError("expected points and arrays of one type, float32 or float64, and matrices of float64")
-    counts = [each for each in (seen, exponents) if each is not None]
-    if any(each.dtype != np.int32 or each.shape != points.shape for each in counts):
-        raise TypeError("expected counts of int32 and of the points' shape")
-    if not all(each.flags.c_contiguous for each in (points, arrays, matrices, *counts)) or not written.flags.writeable:
+    in_order = all(each.flags.c_contiguous for each in (points, arrays, matrices, *written))
+    if not in_order or not written[0].flags.writeable:
         raise ValueError("expected arrays in C order, that can be written")
-    if matrices.shape != (len(arrays), 5, 4) or thirds.shape != points.shape[2:] or (flat and arrays.shape[3] != 1):
+    has_planes = planes.shape == points.shape[2:] and not (others.get("flat") and shape[2] != 1)
+    if matrices.shape != (len(arrays), 5, 4) or not has_planes:
         raise ValueError("expected a matrix (5, 4) for each array, a third coordinate for each plane of points")
-    if how == _PRODUCT and exponents is None:
-        raise ValueError("expected exponents, which a product needs")
     if not points.size or not arrays.size:
         return
     most_along = _MOST_PLACES_ALONG if kind == np.float32 else _MOST_VOXELS
-    if arrays[0].size > _MOST_VOXELS or max(arrays.shape[1:]) > most_along:
+    if arrays[0].size > _MOST_VOXELS or max(shape) > most_along:
         raise InputError(
             f"expected an array of at most {_MOST_VOXELS} numbers, and {most_along} along an axis in {kind}; got "
-            f"{' x '.join(map(str, arrays.shape[1:]))}"
+            f"{' x '.join(map(str, shape))}"
         )
-    middle = float(thirds[len(thirds) // 2])
-    relative = np.ascontiguousarray(thirds - middle, kind)
+    middle = float(planes[len(planes) // 2])
+    relative = np.ascontiguousarray(planes - middle, kind)
     job = _PlacesJob(
-        is_double=kind == np.float64, how=how, flat=flat, by_depth=by_depth,
-        points=points.ctypes.data, n=points.shape, first=first, last=last,
-        thirds=relative.ctypes.data, middle=middle, nearest=nearest,
-        values=arrays.ctypes.data, arrays=len(arrays), m=arrays.shape[1:], matrices=matrices.ctypes.data,
-        seen=None if seen is None else seen.ctypes.data,
-        exponents=None if exponents is None else exponents.ctypes.data,
+        is_double=kind == np.float64, points=points.ctypes.data, n=points.shape, planes=relative.ctypes.data, middle=middle,
+        values=arrays.ctypes.data, arrays=len(arrays), m=shape, matrices=matrices.ctypes.data, **others,
     )  # fmt: skip
     kernel(level, job)
 

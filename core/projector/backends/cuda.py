@@ -1,12 +1,14 @@
 """Siddon's line integrals on an NVIDIA GPU, one thread a ray, several views a launch: the kernels are `warp_kernels`.
 
+No GPU has run them yet: docs/gpu.md says what was tested, and how. Derivatives are those of `reference`, in torch on the
+same device.
+
 Why NVIDIA Warp: one wheel for each of Linux, Windows and macOS without bounds on numpy, which brings its own compilers
 and runs the very same kernels on the CPU, where they are tested. Triton has no official wheel for Windows, and its programs
 work on blocks, not on single rays.
 
 The volume is on the device as a whole. The rays are made there, from their fans; they are launched in pieces that leave
-half of the free memory alone. An array is copied to the device and the results back at every call, a tensor on the device
-is worked on where it is, on torch's stream.
+half of the free memory alone. Arrays become tensors on the device; these are worked on where they are, on torch's stream.
 """
 
 from __future__ import annotations
@@ -14,7 +16,6 @@ from __future__ import annotations
 import atexit
 import ctypes
 import functools
-import math
 import os
 import shutil
 import sys
@@ -22,18 +23,21 @@ import tempfile
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
+from dataclasses import replace
 from types import ModuleType
 from typing import Any
 
 import numpy as np
 import warp as wp
 from numpy.typing import NDArray
+from torch import Tensor
 
 from ... import cache
-from ...arrays import ArrayOrTensor, is_tensor, to_numpy
+from ...arrays import ArrayOrTensor, is_tensor, to_caller, to_numpy, to_tensor
 from ...errors import InputError
 from ...memory import readable_size
 from ..rays import Attenuation, IndexRays, Rays
+from . import reference
 
 DEVICE_VARIABLE = "MPHDRR_CUDA_DEVICE"
 """Environment variable: the Warp device for arrays, "cuda" if not set. "cpu" runs the kernels without a GPU: for tests."""
@@ -51,38 +55,49 @@ _loaded: set[str] = set()
 
 def forward(volume: ArrayOrTensor, rays: Rays, attenuation: Attenuation | None = None) -> ArrayOrTensor:
     """Line integrals (N,), value x mm, of `volume` (n_x, n_y, n_z) along `rays`, attenuated towards their sources."""
-    with _Call(volume, rays, attenuation) as call:
-        return call.per_ray("integrate" if attenuation is None else "integrate_attenuated")
+    with _Call(to_backend(volume), rays, _on_device(attenuation)) as call:
+        return to_caller(call.integrals(), volume)
 
 
 def backproject(
     volume: ArrayOrTensor, values: ArrayOrTensor, rays: Rays, attenuation: Attenuation | None = None
 ) -> None:
     """Add `values` (N,), each along its ray with the weights of `forward`, to `volume` in place, in no fixed order."""
-    with _Call(volume, rays, attenuation) as call:
-        call.accumulate("backproject" if attenuation is None else "backproject_attenuated", values)
+    total = to_backend(volume)
+    with _Call(total, rays, _on_device(attenuation)) as call:
+        call.add(to_backend(values))
+    if not is_tensor(volume):
+        volume[...] = to_caller(total, volume)
 
 
 def derivatives(volume: ArrayOrTensor, rays: Rays, attenuation: Attenuation | None = None) -> ArrayOrTensor:
-    """What the ends of `rays` do to their integrals (N, 7), or attenuated (N, 14), as `backends` describes it."""
-    name, columns = ("differentiate", 7) if attenuation is None else ("differentiate_attenuated", 14)
-    with _Call(volume, rays, attenuation) as call:
-        return call.per_ray(name, columns)
+    """Those of the reference, on the device: what the ends of `rays` do to their integrals, (N, 7) or (N, 14)."""
+    return to_caller(reference.derivatives(to_backend(volume), rays, _on_device(attenuation)), volume)
 
 
 def mu_gradient(
     gradient: ArrayOrTensor, volume: ArrayOrTensor, values: ArrayOrTensor, rays: Rays, attenuation: Attenuation
 ) -> None:
-    """Add to `gradient`, of mu's shape, each of `values` (N,) times its line integral's derivatives by mu."""
-    with _Call(volume, rays, attenuation) as call:
-        call.accumulate("differentiate_by_mu", values, gradient)
+    """That of the reference, on the device: add to `gradient` each of `values` (N,) times its integral's by mu."""
+    total, mu = to_backend(gradient), replace(attenuation, mu=to_backend(attenuation.mu))
+    reference.mu_gradient(total, to_backend(volume), to_backend(values), rays, mu)
+    if not is_tensor(gradient):
+        gradient[...] = to_caller(total, gradient)
+
+
+def _on_device(attenuation: Attenuation | None) -> Attenuation | None:
+    return None if attenuation is None else replace(attenuation, mu=to_backend(attenuation.mu))
 
 
 def to_backend(x: ArrayOrTensor) -> ArrayOrTensor:
-    """`x` as float32: a tensor that is on the device stays there, all else becomes an array."""
+    """`x` as a tensor of float32 on the device; one that is there already is not copied."""
     if is_tensor(x) and (x.is_cuda or (x.device.type == "cpu" and device().is_cpu)):
         return x.detach().float().resolve_neg().contiguous()  # Warp does not see torch's lazy minus sign
-    return to_numpy(x, np.float32)
+    array, on = to_numpy(x, np.float32), device()
+    if array.nbytes > on.free_memory:
+        needed, free = readable_size(array.nbytes), readable_size(on.free_memory)
+        raise InputError(f"backend 'cuda': {needed} of numbers, but {free} are free on {on.name}")
+    return to_tensor(array).to(wp.device_to_torch(on))
 
 
 def device() -> Any:
@@ -123,21 +138,15 @@ def _loads(library: str) -> bool:
 class _Call:
     """Rays on their way through the device: what is needed of a call, and its launches."""
 
-    def __init__(self, volume: ArrayOrTensor, rays: Rays, attenuation: Attenuation | None) -> None:
-        self._stream: Any = nullcontext()
-        if is_tensor(volume):
-            self._device = wp.device_from_torch(volume.device)
-            if volume.is_cuda:
-                self._stream = wp.ScopedStream(wp.stream_from_torch(volume.device))
-        else:
-            self._device = device()
+    def __init__(self, volume: Tensor, rays: Rays, attenuation: Attenuation | None) -> None:
+        self._device = wp.device_from_torch(volume.device)
+        self._stream = wp.ScopedStream(wp.stream_from_torch(volume.device)) if volume.is_cuda else nullcontext()
         self._volume = volume
         self._kernels = _kernels(self._device)
         self._fans, self._rows, self._columns = _table(rays)
         self._attenuation = attenuation
-        self._mu_fans = self._fans
-        if attenuation is not None and attenuation.rays is not None:
-            self._mu_fans = _table(attenuation.rays)[0]
+        has_lattice = attenuation is not None and attenuation.rays is not None
+        self._mu_fans = _table(attenuation.rays)[0] if has_lattice else None  # type: ignore[union-attr, arg-type]
 
     def __enter__(self) -> _Call:
         self._stream.__enter__()
@@ -149,72 +158,45 @@ class _Call:
             free = readable_size(self._device.free_memory)
             raise InputError(f"backend 'cuda': {self._device.name} has too little free memory, {free}") from error
 
-    def on_device(self, array: ArrayOrTensor, what: str) -> Any:
-        """`array` as an array of Warp, copied only where it is not on the device."""
-        if array.shape[1] * array.shape[2] * 4 >= _BYTES_OF_A_PLANE:
-            raise InputError(f"backend 'cuda': {what} has {array.shape[1]} x {array.shape[2]} voxels a plane, too many")
-        if is_tensor(array):
-            return wp.from_torch(array)
-        free = self._device.free_memory
-        if array.nbytes > free:
-            raise InputError(
-                f"backend 'cuda': {what} takes {readable_size(array.nbytes)}, but {readable_size(free)} are free on "
-                f"{self._device.name}"
-            )
-        return wp.array(array, dtype=wp.float32, device=self._device)
+    def integrals(self) -> Tensor:
+        """What `integrate` writes, (N,)."""
+        result = self._volume.new_empty((len(self._fans), self._rows, self._columns))
+        self._launch(self._kernels.integrate, result)
+        return result.reshape(-1)
 
-    def per_ray(self, name: str, *columns: int) -> ArrayOrTensor:
-        """What a kernel writes, (N,), or (N, columns)."""
-        volumes = self._volumes()
-        shape = (len(self._fans), self._rows, self._columns, *columns)
-        result = self._volume.new_empty(shape) if is_tensor(self._volume) else np.empty(shape, np.float32)
-        for fans, rows in self._pieces(math.prod(columns)):
-            piece = result[fans, rows]
-            out = wp.from_torch(piece) if is_tensor(piece) else wp.empty(piece.shape, wp.float32, device=self._device)
-            self._launch(name, fans, rows, volumes, out)
-            _copy_back(out, piece)
-        return result.reshape(-1, *columns)
+    def add(self, values: Tensor) -> None:
+        """Have `backproject` add the rays' `values` (N,) to the volume."""
+        self._launch(self._kernels.backproject, values.reshape(len(self._fans), self._rows, self._columns))
 
-    def accumulate(self, name: str, values: ArrayOrTensor, gradient: ArrayOrTensor = None) -> None:
-        """Launch a kernel that adds each ray's value of `values` (N,) to the volume, or to a gradient."""
-        volumes = self._volumes()
-        if gradient is not None:
-            volumes.insert(0, self.on_device(gradient, "the gradient"))
-        values = values.reshape(len(self._fans), self._rows, self._columns)
-        for fans, rows in self._pieces(1):
-            piece = values[fans, rows]
-            if is_tensor(piece):
-                piece = wp.from_torch(to_backend(piece))
-            else:
-                piece = wp.array(np.ascontiguousarray(piece, np.float32), dtype=wp.float32, device=self._device)
-            self._launch(name, fans, rows, volumes, piece)
-        _copy_back(volumes[0], self._volume if gradient is None else gradient)
+    def _launch(self, kernel: Any, numbers: Tensor) -> None:
+        """Launch a kernel on the rays and their `numbers`, piece by piece; where there is no mu, with the volume twice."""
+        volumes = [_array(self._volume if x is None else x.mu) for x in (None, self._attenuation)]
+        for fans, rows in self._pieces():
+            rays = wp.array(self._fans[fans], dtype=wp.vec3d, device=self._device)
+            mu_rays, attenuated = rays, int(self._attenuation is not None)
+            if self._mu_fans is not None:
+                mu_rays, attenuated = wp.array(self._mu_fans[fans], dtype=wp.vec3d, device=self._device), 2
+            piece = numbers[fans, rows]
+            inputs = [*volumes, rays, mu_rays, attenuated, rows.start, wp.from_torch(piece)]
+            wp.launch(kernel, tuple(piece.shape), inputs=inputs, device=self._device)
 
-    def _volumes(self) -> list[Any]:
-        """The volume, and mu if there is any, on the device."""
-        mu = [] if self._attenuation is None else [self.on_device(self._attenuation.mu, "mu")]
-        return [self.on_device(self._volume, "the volume"), *mu]
-
-    def _pieces(self, columns: int) -> Iterator[tuple[slice, slice]]:
+    def _pieces(self) -> Iterator[tuple[slice, slice]]:
         """Which fans, and which of their rows, are launched together."""
-        bytes_of_a_ray = 4 * columns + _BYTES_OF_A_FAN / (self._rows * self._columns)
-        affordable = max(_FEWEST_RAYS, int(self._device.free_memory / 2 / bytes_of_a_ray))
+        pixels = self._rows * self._columns
+        affordable = max(_FEWEST_RAYS, int(self._device.free_memory / 2 / (4 + _BYTES_OF_A_FAN / pixels)))
         at_once = min(_RAYS_AT_ONCE, affordable)
-        fans = max(1, at_once // (self._rows * self._columns))
+        fans = max(1, at_once // pixels)
         rows = self._rows if fans > 1 else min(self._rows, max(1, at_once // self._columns))
         for fan in range(0, len(self._fans), fans):
             for row in range(0, self._rows, rows):
                 yield slice(fan, min(fan + fans, len(self._fans))), slice(row, min(row + rows, self._rows))
 
-    def _launch(self, name: str, fans: slice, rows: slice, volumes: list[Any], numbers: Any) -> None:
-        rays = [wp.array(self._fans[fans], dtype=wp.vec3d, device=self._device)]
-        if self._attenuation is not None:
-            own_lattice = self._mu_fans is not self._fans
-            mu_rays = wp.array(self._mu_fans[fans], dtype=wp.vec3d, device=self._device) if own_lattice else rays[0]
-            rays += [mu_rays, int(own_lattice)]
-        dim = (fans.stop - fans.start, rows.stop - rows.start, self._columns)
-        kernel = getattr(self._kernels, name)
-        wp.launch(kernel, dim, inputs=[*volumes, *rays, rows.start, numbers], device=self._device)
+
+def _array(volume: Tensor) -> Any:
+    """A tensor on the device as Warp's array, not copied."""
+    if volume.shape[1] * volume.shape[2] * 4 >= _BYTES_OF_A_PLANE:
+        raise InputError(f"backend 'cuda': {volume.shape[1]} x {volume.shape[2]} voxels a plane are too many")
+    return wp.from_torch(volume)
 
 
 def _table(rays: Rays) -> tuple[NDArray[np.float64], int, int]:
@@ -229,12 +211,6 @@ def _table(rays: Rays) -> tuple[NDArray[np.float64], int, int]:
     if rays.parallel:
         table[:, 6:8], table[:, 8] = 0.0, 1.0
     return table, *rays.shape
-
-
-def _copy_back(array: Any, to: ArrayOrTensor) -> None:
-    """What is on the device into the array that it is for; a tensor has it already."""
-    if not is_tensor(to):
-        to[...] = array.numpy()
 
 
 def _kernels(device: Any) -> ModuleType:

@@ -209,7 +209,7 @@ def _voxels(lattice: _Lattice, alpha: Array) -> tuple[Array, Array]:
 
 
 def _voxels_beyond(lattice: _Lattice, axis: Array) -> tuple[Array, Array]:
-    """As `_voxels`, of the segments beyond all but the last of the planes crossed, whose axes are `axis` (n, S + 1).
+    """What `_voxels` returns, for segments beyond all but the last of the planes crossed, whose axes are `axis` (n, S + 1).
 
     A voxel follows from the number of planes crossed. Where planes of two lattices, or an edge, are met, the segment
     between has no length, and its midpoint would tell nothing.

@@ -47,7 +47,7 @@ def pixels_to_cells(image: Array, of: DepthResponse) -> Array:
 
 
 def _pixels(of: DepthResponse) -> tuple[slice, ...]:
-    """Of the cells of a plane those from which on pixels sum."""
+    """The cells of a plane from which on pixels sum."""
     return tuple(slice(0, step * (n - 1) + 1, step) for step, n in zip(of.steps, of.after.shape, strict=True))
 
 

@@ -7,7 +7,7 @@
 //     L int_0^1 f(alpha) exp(-L int_0^alpha mu) dalpha
 //
 // The kernels allocate nothing, keep nothing and start no thread: a job belongs to the thread that calls, which needs
-// 400 kB of stack. Nothing here is checked; cpu.py makes only jobs whose arrays are as large as said here, of
+// 400 kB of stack. Nothing here is checked; cpu.py makes only jobs whose arrays are as large as this file asks, of
 // fewer than 2^31 voxels in a lattice.
 
 #pragma once
@@ -88,7 +88,7 @@ typedef struct {
 } DepthJob;
 
 // Arrays that are interpolated linearly at the places of a lattice's points, or that are given the points' numbers, shared out with
-// the same weights. The place of point (i, j, k) is that of (i, j, middle + thirds[k], 1) under an array's matrix: of the five
+// the same weights. The place of point (i, j, k) is that of (i, j, middle + planes[k], 1) under an array's matrix: of the five
 // numbers p that it makes, (p0 / p3, p1 / p3, p2 / p4) are indices in the array. Places up to half an element outside belong to
 // the outermost elements; others, and those with p3 <= nearest or p4 <= 0, are not in the array. There are points and elements, of
 // elements at most 2^16 along an axis if they are float. In a product, what is less than the least normal number counts as 0.
@@ -102,7 +102,7 @@ typedef struct {
     void *points;    // (n[0], n[1], n[2])
     int64_t n[3];
     int64_t first, last; // take_at: of the points' first axis; give_at: of the array's, which alone are written
-    const void *thirds;  // (n[2]), ascending or descending
+    const void *planes;  // (n[2]), ascending or descending
     double middle, nearest;
     void *values; // (arrays, m[0], m[1], m[2]), an array of fewer than 2^31 numbers
     int64_t arrays, m[3];

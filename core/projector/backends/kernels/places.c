@@ -141,7 +141,7 @@ INLINE void combine(const PlacesJob *job, const REAL *array, const double *matri
     for (int64_t k = 0; k < n; k += LANES) {
         const int lanes = (int)MIN((int64_t)LANES, n - k);
         Places p;
-        find_places(job, &line, some((const REAL *)job->thirds + k, lanes), flat, &p);
+        find_places(job, &line, some((const REAL *)job->planes + k, lanes), flat, &p);
         if (!ANY(p.inside)) continue;
         const F value = value_at(job, array, &p, flat) * p.weight, old = some(values + k, lanes);
         I exponent = 0;
@@ -178,7 +178,7 @@ void KERNEL(take_at)(const PlacesJob *job) {
 INLINE int may_give(const PlacesJob *job, const Line *line) {
     double place[2];
     UNROLLED for (int end = 0; end < 2; end++) {
-        const double third = ((const REAL *)job->thirds)[end ? job->n[2] - 1 : 0];
+        const double third = ((const REAL *)job->planes)[end ? job->n[2] - 1 : 0];
         const double depth = line->at[3] + third * line->step[3];
         if (!(depth > 0)) return 1; // a part of it may: between points in front, places change in one direction
         place[end] = (line->at[0] + third * line->step[0]) / depth;
@@ -201,7 +201,7 @@ INLINE void give_all(const PlacesJob *job, const int flat) {
             const F f = some(given + k, lanes);
             if (!ANY(f != (F)0)) continue;
             Places p;
-            find_places(job, &line, some((const REAL *)job->thirds + k, lanes), flat, &p);
+            find_places(job, &line, some((const REAL *)job->planes + k, lanes), flat, &p);
             const F value = p.inside ? f * p.weight : (F)0;
             for (int a = 0; a < lanes; a++) {
                 if (value[a] == 0) continue;

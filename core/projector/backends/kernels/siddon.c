@@ -96,7 +96,7 @@ INLINE void listed_rays(const RayList *list, const int64_t first, const int own,
     }
 }
 
-// Rays whose ends are not numbers, or too far away for voxels to be told apart, are made to miss.
+// Rays whose ends are not numbers, or so far away that voxels cannot be distinguished, are made to miss.
 INLINE void make_miss(D start[3], D direction[3], D *mm) {
     B sound = *mm < (D)NEVER;
     EACH_AXIS(a) sound &= ABS(start[a]) + ABS(direction[a]) < (D)FAR;

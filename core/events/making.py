@@ -3,24 +3,23 @@
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError, naming
+from ..errors import InputError, naming, warn
 from ..geometry.grid import Grid
 from ..geometry.parallel_views import parallel_views
 from ..geometry.system import PinholeSystem, chosen_modules
 from ..geometry.views import Views
 from ..memory import readable_size, require
-from ..physics.isotopes import photon_energy
 from ..progress import Progress, tell
-from ..projector import Emission, Projector, intensity
+from ..projector import Emission, Model, Projector
 from ..recording import recorded_warnings
-from ..runs.projecting import warn_of_energy, warn_of_images
-from ..runs.recipe import Recipe
-from ..runs.run_recipe import recipe_model, recipe_views, require_mu
+from ..runs.projecting import Imaging, warn_of_energy
+from ..runs.run_recipe import recipe_imaging, recipe_model, recipe_views, require_mu
 from ..validation import freeze
 from ..volumes.rearranging import centered
 from ..volumes.resampling import resample
@@ -43,7 +42,7 @@ class EventArrays:
     units: dict[str, str]  # by model
     radon: dict[int, NDArray[np.float32]]  # by number of angles, (n, n_v, n_u), value x mm
     gains: NDArray[np.float64]  # (M,)
-    warnings: tuple[str, ...] = ()  # of the truth, such as a phantom that lies outside its grid in part
+    warnings: tuple[str, ...] = ()  # those of a run of the same settings
 
 
 class EventMaker:
@@ -96,11 +95,11 @@ class EventMaker:
             tell(progress, done, steps)
 
         tell(progress, 0, steps)
-        with naming(f"event {number}"):
-            with recorded_warnings() as warnings:
-                truth = self.truth(planned)
+        system = self.system  # whose warnings are about the set
+        with naming(f"event {number}"), recorded_warnings() as warnings:
+            truth = self.truth(planned)
             step()
-            gains = planned.gains(len(self.system))
+            gains = planned.gains(len(system))
             images, units = {}, {}
             for name in recipe.models:
                 with naming(name):
@@ -110,10 +109,12 @@ class EventMaker:
             for count, projector in self._radon.items():
                 radon[count] = projector(truth)
                 step()
-        return EventArrays(planned, truth, images, units, radon, gains, tuple(warnings))
+        return EventArrays(planned, truth, images, units, radon, gains, tuple(dict.fromkeys(warnings)))
 
     def truth(self, planned: PlannedEvent) -> Volume:
         """The event's volume."""
+        for text in planned.warnings:
+            warn(text)
         factor = planned.activity_factor
         volume = self._voxels(planned, self.recipe.quantity)
         if factor == 1.0:
@@ -148,39 +149,41 @@ class EventMaker:
         self, name: str, planned: PlannedEvent, truth: Volume, gains: NDArray[np.float64]
     ) -> tuple[NDArray[np.float32], str]:
         """A model's images, and their unit."""
-        recipe = self.recipe.models[name]
-        own_mu = recipe["attenuation.of_phantom"]
-        if own_mu and planned.phantom is not None:
-            require_mu(planned.phantom, recipe_model(recipe, self.system))
-        projector = self._projectors[name]
-        images = projector(truth, mu=self._voxels(planned, "mu").array) if own_mu else projector(truth)
-        warn_of_images(truth, self.system, self.views, recipe["detector.magnification"], projector.model)
-        photons, unit = recipe["model.photons"], projector.model.unit(truth)
-        if photons is not None:
-            images, unit = intensity(images, photons), "photons"
-        images = np.asarray(images, np.float32) + projector.background.astype(np.float32)
-        if isinstance(projector.model, Emission) and self.recipe.augmentation.module_gain:
+        recipe, (imaging, warnings) = self.recipe.models[name], self._imaging[name]
+        for text in warnings:
+            warn(text)
+        mu = None
+        if recipe["attenuation.of_phantom"]:
+            self._check_mu(planned, imaging.model)
+            mu = self._voxels(planned, "mu").array
+        images = imaging.images(truth, mu)
+        if isinstance(imaging.model, Emission) and self.recipe.augmentation.module_gain:
             images *= gains.astype(np.float32)[:, None, None]
-        return images, unit
+        return images, imaging.unit(truth)
+
+    def _check_mu(self, planned: PlannedEvent, model: Model) -> None:
+        """Raise `InputError` where nothing attenuates; warn where it holds at another energy than the model's."""
+        if planned.phantom is not None:
+            require_mu(planned.phantom, model)
+        elif planned.mu_file is not None:
+            warn_of_energy(model, planned.entry.energy, f"the mu of {Path(planned.mu_file).name}")
 
     @cached_property
-    def _projectors(self) -> dict[str, Projector]:
+    def _imaging(self) -> dict[str, tuple[Imaging, list[str]]]:
+        """What makes each model's images, and the warnings of it, which hold for all events."""
         found = {}
         for name, recipe in self.recipe.models.items():
-            with naming(f"models.{name}"):
-                found[name] = self._projector(recipe)
+            with naming(f"models.{name}"), recorded_warnings() as warnings:
+                mu, grid = None, self.recipe.grid
+                if recipe["attenuation.of_phantom"]:  # each event has its own: here, to say on which grid
+                    mu = Volume(freeze(np.zeros(grid.shape, np.float32)), grid, "mu")
+                elif (file := recipe["attenuation.file"]) is not None:
+                    what = f"the mu of {Path(file).name}"
+                    warn_of_energy(recipe_model(recipe, self.system), recipe["attenuation.energy"], what)
+                    mu = self.recipe.input(file).volume()
+                imaging = recipe_imaging(recipe, self.system, self.views, grid, mu, threads=self.threads)
+            found[name] = imaging, warnings
         return found
-
-    def _projector(self, recipe: Recipe) -> Projector:
-        mu, grid = None, self.recipe.grid
-        if recipe["attenuation.of_phantom"]:  # each event has its own: here, to say on which grid
-            mu = Volume(freeze(np.zeros(grid.shape, np.float32)), grid, "mu")
-        elif recipe["attenuation.file"] is not None:
-            mu = self.recipe.input(recipe["attenuation.file"]).volume()
-        model = recipe_model(recipe, self.system, mu)
-        if (energy := recipe["attenuation.energy"]) is not None:
-            warn_of_energy(model, photon_energy(energy), f"the mu of {recipe['attenuation.file']}")
-        return Projector(grid, self.views, model, threads=self.threads)
 
     @cached_property
     def _radon(self) -> dict[int, Projector]:

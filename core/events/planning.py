@@ -63,17 +63,27 @@ class PlannedEvent:
         placement: NDArray[np.float64] = self.pose @ scale
         return placement
 
-    @cached_property
+    @property
     def phantom(self) -> Phantom | None:
         """The phantom; None where it is a volume's file. `InputError` where the drawn settings do not go together."""
-        entry = self.entry
-        with naming(f"event {self.number}"), recorded_warnings():
-            if entry.kind is not None:
-                names = setting_names(entry.kind.phantom)
+        return self._phantom[0]
+
+    @property
+    def warnings(self) -> list[str]:
+        """What was warned of when the phantom was made."""
+        return self._phantom[1]
+
+    @cached_property
+    def _phantom(self) -> tuple[Phantom | None, list[str]]:
+        phantom, kind = None, self.entry.kind
+        with naming(f"event {self.number}"), recorded_warnings() as warnings:
+            if kind is not None:
+                names = setting_names(kind.phantom)
                 given = {names[key]: _tuples(value) for key, value in self.settings.items()}
-                phantom: Phantom = entry.kind.phantom(**{**entry.kind.usual, **given})
-                return phantom
-            return None if entry.is_volume or self.file is None else read_phantom(self.recipe.input(self.file).path)
+                phantom = kind.phantom(**{**kind.usual, **given})
+            elif self.file is not None and not self.entry.is_volume:
+                phantom = read_phantom(self.recipe.input(self.file).path)
+        return phantom, warnings
 
     @property
     def phantoms(self) -> list[Phantom]:

@@ -26,7 +26,7 @@ from ..volumes.volume import Volume
 from ..volumes.volume_files import read_volume, read_volume_of
 from ..workbook import read_system
 from .measured import recipe_counts
-from .projecting import project_run, warn_of_energy
+from .projecting import Imaging, project_run, warn_of_energy
 from .recipe import Recipe, recorded_recipe
 from .run import ProjectionRun
 
@@ -59,7 +59,7 @@ def run_recipe(
     Raises
     ------
     InputError
-        A file cannot be read, the recipe names no system, or as `project_run`; all but the volumes is checked first.
+        A file cannot be read, the recipe names no system, or see `project_run`; all but the volumes is checked first.
     """
     if system is None:
         if recipe["system.file"] is None:
@@ -141,7 +141,7 @@ def projector_of_run(
     recipe
         Instead of the run's own, such as ``run.recipe.updated({"model.aperture_points": 19})``.
     backend, threads
-        As of `Projector`.
+        As for `Projector`.
     stages
         Begins each stage: reading, voxelizing.
 
@@ -161,7 +161,16 @@ def projector_of_run(
             )
         else:
             mu = _attenuation(recipe, model, stages)
-    return Projector(grid, run.views, recipe_model(recipe, run.system, mu), backend, threads)
+    return recipe_imaging(recipe, run.system, run.views, grid, mu, backend, threads).projector
+
+
+def recipe_imaging(
+    recipe: Recipe, system: PinholeSystem, views: Views, grid: Grid, mu: Volume | None = None, backend: str = "auto",
+    threads: int | None = None,
+) -> Imaging:  # fmt: skip
+    """What makes a recipe's images of volumes on a grid; `mu` is what attenuates."""
+    model = recipe_model(recipe, system, mu)
+    return Imaging(system, views, grid, model, recipe["model.photons"], backend, threads)
 
 
 def _volume_name(record: Recipe) -> str:
@@ -179,10 +188,8 @@ def _attenuation(recipe: Recipe, model: Model, stages: Stages) -> Volume | None:
         raise InputError(f"attenuation.object: {name!r} is in a Blender scene; give --mu FILE instead")
     if path is None:
         return None
-    mu = _read_mu(path, energy, recipe["attenuation.series"], stages("reading"))
-    if energy is not None:
-        warn_of_energy(model, photon_energy(energy), f"the mu of {Path(path).name}")
-    return mu
+    warn_of_energy(model, energy, f"the mu of {Path(path).name}")
+    return read_mu(path, energy, recipe["attenuation.series"], stages("reading"))
 
 
 def _from_files(recipe: Recipe, record: Recipe, mu: Volume | None, stages: Stages) -> Iterator[_Source]:
@@ -212,7 +219,7 @@ def _read(path: str, recipe: Recipe, progress: Progress | None) -> Volume:
             raise InputError(f"{path}: {values}; --quantity activity takes them as such")
         return volume
     if recipe["model.photons"] is not None or recipe["volume.energy"] is not None:
-        return _read_mu(path, recipe["volume.energy"], series, progress)
+        return read_mu(path, recipe["volume.energy"], series, progress)
     volume = read_volume(path, series=series, progress=progress)
     if volume.quantity == "hu":
         raise InputError(
@@ -222,20 +229,22 @@ def _read(path: str, recipe: Recipe, progress: Progress | None) -> Volume:
     return volume
 
 
-def _read_mu(path: str, energy: float | str | None, series: str | None, progress: Progress | None) -> Volume:
-    """The volume of mu in a file: as it is, or from CT numbers at `energy`."""
+def read_mu(
+    path: str | Path, energy: float | str | None, series: str | None = None, progress: Progress | None = None
+) -> Volume:
+    """The volume of mu in a file: as it is, or from CT numbers at `energy` (keV, or an isotope's)."""
     if energy is not None:
         volume = read_volume(path, series=series, progress=progress)
         if volume.quantity != "hu":
-            raise InputError(f"{path}: it holds {volume.quantity}; --energy is for CT numbers (hu)")
+            raise InputError(f"{path}: it holds {volume.quantity}; an energy (--energy) is for CT numbers (hu)")
         return hu_to_mu(volume, photon_energy(energy))
-    advice = "; of CT numbers, give --energy to convert them"
+    advice = "; of CT numbers, give the energy (--energy) to convert them"
     volume = read_volume_of(path, "mu", advice, series=series, progress=progress)
     lowest, highest = float(volume.array.min()), float(volume.array.max())
     if lowest < -1 or highest > _MOST_MU:  # interpolation may leave values a little below 0
         raise InputError(
             f"{path}: {lowest if lowest < -1 else highest:g} is no attenuation in 1/mm; if it holds CT numbers, give "
-            "--energy to convert them"
+            "the energy (--energy) to convert them"
         )
     return volume
 

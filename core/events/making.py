@@ -2,14 +2,14 @@
 
 import math
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError, naming, warn
+from ..errors import InputError, naming
 from ..geometry.grid import Grid
 from ..geometry.parallel_views import parallel_views
 from ..geometry.system import PinholeSystem, chosen_modules
@@ -17,8 +17,9 @@ from ..geometry.views import Views
 from ..memory import readable_size, require
 from ..progress import Progress, tell
 from ..projector import Emission, Model, Projector
-from ..recording import recorded_warnings
+from ..recording import Remembered, recorded_warnings, remembered
 from ..runs.projecting import Imaging, warn_of_energy
+from ..runs.recipe import Recipe
 from ..runs.run_recipe import recipe_imaging, recipe_model, recipe_views, require_mu
 from ..validation import freeze
 from ..volumes.rearranging import centered
@@ -53,7 +54,7 @@ class EventMaker:
 
     def __init__(self, recipe: EventRecipe, threads: int | None = None) -> None:
         self.recipe, self.threads = recipe, threads
-        self._volumes: dict[str, Volume] = {}
+        self._volumes: dict[str, Remembered[Volume]] = {}
 
     @cached_property
     def system(self) -> PinholeSystem:
@@ -113,8 +114,7 @@ class EventMaker:
 
     def truth(self, planned: PlannedEvent) -> Volume:
         """The event's volume."""
-        for text in planned.warnings:
-            warn(text)
+        planned.made_phantom.again()
         factor = planned.activity_factor
         volume = self._voxels(planned, self.recipe.quantity)
         if factor == 1.0:
@@ -142,17 +142,14 @@ class EventMaker:
         if file not in self._volumes:
             while len(self._volumes) >= _KEPT_VOLUMES:
                 del self._volumes[next(iter(self._volumes))]
-            self._volumes[file] = self.recipe.input(file).volume()
-        return self._volumes[file]
+            self._volumes[file] = remembered(self.recipe.input(file).volume)
+        return self._volumes[file].again()
 
     def _images(
         self, name: str, planned: PlannedEvent, truth: Volume, gains: NDArray[np.float64]
     ) -> tuple[NDArray[np.float32], str]:
         """A model's images, and their unit."""
-        recipe, (imaging, warnings) = self.recipe.models[name], self._imaging[name]
-        for text in warnings:
-            warn(text)
-        mu = None
+        recipe, imaging, mu = self.recipe.models[name], self._imaging[name].again(), None
         if recipe["attenuation.of_phantom"]:
             self._check_mu(planned, imaging.model)
             mu = self._voxels(planned, "mu").array
@@ -166,24 +163,25 @@ class EventMaker:
         if planned.phantom is not None:
             require_mu(planned.phantom, model)
         elif planned.mu_file is not None:
-            warn_of_energy(model, planned.entry.energy, f"the mu of {Path(planned.mu_file).name}")
+            warn_of_energy(model, planned.entry.energy, Path(planned.mu_file).name)
 
     @cached_property
-    def _imaging(self) -> dict[str, tuple[Imaging, list[str]]]:
-        """What makes each model's images, and the warnings of it, which hold for all events."""
+    def _imaging(self) -> dict[str, Remembered[Imaging]]:
+        """What makes each model's images."""
         found = {}
         for name, recipe in self.recipe.models.items():
-            with naming(f"models.{name}"), recorded_warnings() as warnings:
-                mu, grid = None, self.recipe.grid
-                if recipe["attenuation.of_phantom"]:  # each event has its own: here, to say on which grid
-                    mu = Volume(freeze(np.zeros(grid.shape, np.float32)), grid, "mu")
-                elif (file := recipe["attenuation.file"]) is not None:
-                    what = f"the mu of {Path(file).name}"
-                    warn_of_energy(recipe_model(recipe, self.system), recipe["attenuation.energy"], what)
-                    mu = self.recipe.input(file).volume()
-                imaging = recipe_imaging(recipe, self.system, self.views, grid, mu, threads=self.threads)
-            found[name] = imaging, warnings
+            with naming(f"models.{name}"):
+                found[name] = remembered(partial(self._imaging_of, recipe))
         return found
+
+    def _imaging_of(self, recipe: Recipe) -> Imaging:
+        mu, grid = None, self.recipe.grid
+        if recipe["attenuation.of_phantom"]:  # each event has its own: here, to say on which grid
+            mu = Volume(freeze(np.zeros(grid.shape, np.float32)), grid, "mu")
+        elif (file := recipe["attenuation.file"]) is not None:
+            warn_of_energy(recipe_model(recipe, self.system), recipe["attenuation.energy"], Path(file).name)
+            mu = self.recipe.input(file).volume()
+        return recipe_imaging(recipe, self.system, self.views, grid, mu, threads=self.threads)
 
     @cached_property
     def _radon(self) -> dict[int, Projector]:

@@ -14,7 +14,7 @@ from ..phantoms.language import read_phantom
 from ..phantoms.phantom import Phantom
 from ..phantoms.settings import setting_names
 from ..phantoms.torso import CardiacTorso
-from ..recording import recorded_warnings
+from ..recording import Remembered, remembered
 from .draws import Dice, options
 from .entries import PhantomEntry, as_settings
 from .recipe import EventRecipe
@@ -66,24 +66,24 @@ class PlannedEvent:
     @property
     def phantom(self) -> Phantom | None:
         """The phantom; None where it is a volume's file. `InputError` where the drawn settings do not go together."""
-        return self._phantom[0]
-
-    @property
-    def warnings(self) -> list[str]:
-        """What was warned of when the phantom was made."""
-        return self._phantom[1]
+        return self.made_phantom.value
 
     @cached_property
-    def _phantom(self) -> tuple[Phantom | None, list[str]]:
-        phantom, kind = None, self.entry.kind
-        with naming(f"event {self.number}"), recorded_warnings() as warnings:
-            if kind is not None:
-                names = setting_names(kind.phantom)
-                given = {names[key]: _tuples(value) for key, value in self.settings.items()}
-                phantom = kind.phantom(**{**kind.usual, **given})
-            elif self.file is not None and not self.entry.is_volume:
-                phantom = read_phantom(self.recipe.input(self.file).path)
-        return phantom, warnings
+    def made_phantom(self) -> Remembered[Phantom | None]:
+        """The phantom, and what was warned of when it was made."""
+        with naming(f"event {self.number}"):
+            return remembered(self._make_phantom)
+
+    def _make_phantom(self) -> Phantom | None:
+        kind = self.entry.kind
+        if kind is None:
+            return (
+                None if self.entry.is_volume or self.file is None else read_phantom(self.recipe.input(self.file).path)
+            )
+        names = setting_names(kind.phantom)
+        given = {names[key]: _tuples(value) for key, value in self.settings.items()}
+        phantom: Phantom = kind.phantom(**{**kind.usual, **given})
+        return phantom
 
     @property
     def phantoms(self) -> list[Phantom]:

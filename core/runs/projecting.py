@@ -158,14 +158,18 @@ def project_run(
     )  # fmt: skip
 
 
-def warn_of_energy(model: Model, energy: float | str | None, what: str) -> None:
-    """Warn where the model counts no photons of the energy (keV, or an isotope's) at which mu holds; `what` names the mu."""
+def warn_of_energy(model: Model, energy: float | str | None, source: str) -> None:
+    """Warn where mu holds at an energy (keV, or an isotope's) whose photons the model does not count.
+
+    `source` names what the mu is of.
+    """
     window = model.window if isinstance(model, Emission) else None
     if window is None or energy is None:
         return
     energy = photon_energy(energy)
     if not window[0] <= energy <= window[1]:
-        warn(f"{what} holds at {energy:g} keV, photons of {window[0]:g} to {window[1]:g} keV are counted")
+        counted = f"photons of {window[0]:g} to {window[1]:g} keV are counted"
+        warn(f"the mu of {source} holds at {energy:g} keV, {counted}")
 
 
 def warn_of_images(volume: Volume, system: PinholeSystem, views: Views, model: Model) -> None:

@@ -188,7 +188,7 @@ def _attenuation(recipe: Recipe, model: Model, stages: Stages) -> Volume | None:
         raise InputError(f"attenuation.object: {name!r} is in a Blender scene; give --mu FILE instead")
     if path is None:
         return None
-    warn_of_energy(model, energy, f"the mu of {Path(path).name}")
+    warn_of_energy(model, energy, Path(path).name)
     return read_mu(path, energy, recipe["attenuation.series"], stages("reading"))
 
 
@@ -304,7 +304,7 @@ def require_mu(phantom: Phantom, model: Model) -> None:
     """Raise `InputError` where a phantom attenuates nothing; warn where the model counts photons of another energy."""
     if all(shape.mu is None for shape in phantom.shapes):
         raise InputError(f"attenuation.of_phantom (--phantom-mu): no shape of the {phantom.title} has a mu")
-    warn_of_energy(model, phantom.mu_energy, f"the mu of the {phantom.title}")
+    warn_of_energy(model, phantom.mu_energy, f"the {phantom.title}")
 
 
 def phantom_pose(recipe: Recipe) -> NDArray[np.float64]:

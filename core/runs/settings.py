@@ -5,6 +5,8 @@ and operator, and the record in a run file follow from it. A new setting of a mo
 same name in the model's class.
 """
 
+import dataclasses
+import functools
 import operator
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
@@ -13,7 +15,8 @@ from types import MappingProxyType
 from typing import Any
 
 from ..errors import InputError
-from ..phantoms.kinds import KINDS
+from ..phantoms.kinds import KINDS, Kind
+from ..phantoms.settings import setting_names
 from ..physics.isotopes import ISOTOPES
 from ..physics.materials import APERTURES, CRYSTALS
 from ..projector.backends import BACKENDS, OLD_NAMES
@@ -53,7 +56,7 @@ class Setting:
     label: str = ""  # in Blender
 
     def __post_init__(self) -> None:
-        name = self.key.partition(".")[2].removesuffix("_degrees")
+        name = self.key.rpartition(".")[2].removesuffix("_degrees")
         object.__setattr__(self, "option", self.option or "--" + name.replace("_", "-"))
         object.__setattr__(self, "label", self.label or name.replace("_", " ").title())
 
@@ -61,8 +64,8 @@ class Setting:
     def help(self) -> str:
         """The text with unit, words and what leaving it out means."""
         words = f"one of {', '.join(self.words)}" if self.words else ""
-        said = ", ".join(filter(None, (self.text, self.unit, words)))
-        return said + (f"; without it, {self.absent}" if self.absent else "")
+        text = ", ".join(filter(None, (self.text, self.unit, words)))
+        return text + (f"; without it, {self.absent}" if self.absent else "")
 
     @property
     def expected(self) -> str:
@@ -72,7 +75,7 @@ class Setting:
             return words or {bool: "true or false", str: "a text"}[self.kind]
         number = "a whole number" if self.kind is int else "a number"
         bounds = {"of {:g} or more": self.least, "above {:g}": self.above, "and at most {:g}": self.most}
-        number += "".join(" " + said.format(bound) for said, bound in bounds.items() if bound is not None)
+        number += "".join(" " + text.format(bound) for text, bound in bounds.items() if bound is not None)
         return " or ".join(filter(None, (words, number + (f" ({self.unit})" if self.unit else ""))))
 
     def checked(self, value: Any) -> Any:
@@ -104,6 +107,28 @@ class Setting:
         return value
 
 
+@dataclass(frozen=True)
+class OwnSetting(Setting):
+    """A setting of one kind of phantoms, whose class checks its values."""
+
+    def checked(self, value: Any) -> Any:
+        """`value` as a recipe keeps it, lists as tuples."""
+        value = value.tolist() if hasattr(value, "tolist") else value
+        return tuple(value) if isinstance(value, list) else value
+
+
+def own_settings(kind: Kind, row: type[Setting] = OwnSetting, **common: Any) -> list[Setting]:
+    """The settings of a kind of phantoms, as rows of a class; `common` is what all of them have."""
+    fields = {field.name: field for field in dataclasses.fields(kind.phantom)}
+    found = []
+    for key, name in setting_names(kind.phantom).items():
+        default, about = kind.usual.get(name, fields[name].default), fields[name].metadata
+        is_tuple = isinstance(default, tuple)
+        of_one = type(default[0] if is_tuple else default)
+        found.append(row(key, of_one, default, about.get("text", ""), sizes=() if is_tuple else None, **common))
+    return found
+
+
 def _named(names: Iterable[str], text: str) -> Words:
     return {name: (name[0].upper() + name[1:], text) for name in names}
 
@@ -115,6 +140,7 @@ _RAYS = "model.kind=transmission or model.hole=rays or model.hole=point"
 _FILE = "volume.file or volume.states"
 _MADE = "no counts.files"
 _PHANTOM = ("no volume.file", "no volume.states", _MADE)
+_PHANTOM_NUMBER = (*_PHANTOM, "no phantom.file", "no phantom.text")
 _NO_PHANTOM = ("no phantom.kind", "no phantom.file", "no phantom.text")
 _SERIES = "The DICOM series with this number, description or UID, where the folder holds several"
 _AT_ENERGY = "Convert CT numbers to attenuation (1/mm) at this energy, or at an isotope's strongest line"
@@ -321,7 +347,15 @@ _DECLARED = (
 )  # fmt: skip
 
 SETTINGS: Mapping[str, Setting] = MappingProxyType({setting.key: setting for setting in _DECLARED})
-"""Every setting by its key, table by table. A phantom's own numbers come beside them, from the class of its kind."""
+"""Every setting by its key, table by table; `settings_with` has those of a kind of phantoms, too."""
+
+
+@functools.cache
+def settings_with(kind: str) -> Mapping[str, Setting]:
+    """Every setting by its key, with those of a kind of phantoms."""
+    own = [row for known in KINDS if known.name == kind for row in own_settings(known, needs=_PHANTOM_NUMBER)]
+    return MappingProxyType(SETTINGS | {f"phantom.{row.key}": row for row in own})
+
 
 TABLES = tuple(dict.fromkeys(key.partition(".")[0] for key in SETTINGS))
 

@@ -128,7 +128,7 @@ class EventMaker:
             file = planned.file if quantity == self.recipe.quantity else planned.mu_file
             assert file is not None  # the recipe refuses attenuation by a volume without a mu_file
             volume = self._read(file)
-            if planned.entry.center and planned.file is not None:  # what attenuates moves as far as the activity
+            if planned.entry["center"] and planned.file is not None:  # what attenuates moves as far as the activity
                 volume = centered(volume, volume.grid.center - self._read(planned.file).grid.center)
             return _placed(volume, placement, grid)
         volumes = [phantom.voxelize(grid, placement, quantity=quantity) for phantom in planned.phantoms]
@@ -154,7 +154,7 @@ class EventMaker:
             self._check_mu(planned, imaging.model)
             mu = self._voxels(planned, "mu").array
         images = imaging.images(truth, mu)
-        if isinstance(imaging.model, Emission) and self.recipe.augmentation.module_gain:
+        if isinstance(imaging.model, Emission) and self.recipe["augmentation.module_gain"]:
             images *= gains.astype(np.float32)[:, None, None]
         return images, imaging.unit(truth)
 
@@ -163,7 +163,7 @@ class EventMaker:
         if planned.phantom is not None:
             require_mu(planned.phantom, model)
         elif planned.mu_file is not None:
-            warn_of_energy(model, planned.entry.energy, Path(planned.mu_file).name)
+            warn_of_energy(model, planned.entry["energy"], Path(planned.mu_file).name)
 
     @cached_property
     def _imaging(self) -> dict[str, Remembered[Imaging]]:

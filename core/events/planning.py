@@ -90,8 +90,8 @@ class PlannedEvent:
         """The phantoms whose mean the event is: one, or the gates of a beating torso; none of a volume's file."""
         if self.phantom is None:
             return []
-        if isinstance(self.phantom, CardiacTorso) and self.entry.gates > 1:
-            return list(self.phantom.beating(self.entry.gates))
+        if isinstance(self.phantom, CardiacTorso) and self.entry["gates"] > 1:
+            return list(self.phantom.beating(self.entry["gates"]))
         return [self.phantom]
 
     @property
@@ -103,7 +103,7 @@ class PlannedEvent:
 
     def gains(self, count: int) -> NDArray[np.float64]:
         """Factors (count,) of the modules' sensitivities."""
-        deviation, dice = self.recipe.augmentation.module_gain, Dice(self.recipe.seed, self.number)
+        deviation, dice = self.recipe["augmentation.module_gain"], Dice(self.recipe.seed, self.number)
         return np.array([math.exp(deviation * dice.normal(f"module gain {m}")) for m in range(count)])
 
     def row(self) -> dict[str, Any]:
@@ -125,36 +125,32 @@ def plan(recipe: EventRecipe, number: int) -> PlannedEvent:
         raise InputError(f"event: expected a whole number of at least 0, got {number!r}")
     number = int(number)
     dice = Dice(recipe.seed, number)
-    entry = recipe.phantoms[dice.choice("phantom", [entry.odds for entry in recipe.phantoms])]
+    entry = recipe.phantoms[dice.choice("phantom", [entry["odds"] for entry in recipe.phantoms])]
     own = f"{entry.name}: "
-    settings = {key: dice.draw(value, f"{own}{key}", entry.is_whole(key)) for key, value in entry.settings.items()}
-    file = mu_file = None
-    if entry.file is not None:
-        file = dice.draw(entry.file, f"{own}file")
-        if entry.mu_file is not None:
-            mu_file = options(entry.mu_file)[options(entry.file).index(file)]
-    position = dice.draw(entry.position, f"{own}pose.position")
-    if entry.turn_uniform:
+    settings = {
+        key: dice.draw(value, f"{own}{key}", entry.rows[key].kind is int) for key, value in entry.settings.items()
+    }
+    file, mu_file = dice.draw(entry["file"], f"{own}file"), None
+    if entry["mu_file"] is not None:
+        mu_file = options(entry["mu_file"])[options(entry["file"]).index(file)]
+    position = dice.draw(entry["pose.position"], f"{own}pose.position")
+    if entry["pose.turn"] is not None:
         u, v, w = (dice.unit(f"{own}pose.turn {axis}") for axis in range(3))
         angles = [360 * u, math.degrees(math.acos(1 - 2 * v)), 360 * w]
     else:
-        angles = dice.draw(entry.euler_degrees, f"{own}pose.euler_degrees")
-    change = recipe.augmentation
-    size = float(dice.draw(change.size, "augmentation.size"))
-    factor = float(dice.draw(change.activity, "augmentation.activity"))
-    for value, name in ((size, "size"), (factor, "activity")):
-        if not 0 < value < math.inf:
-            raise InputError(f"augmentation.{name}: expected factors above 0, got {value:g} for event {number}")
+        angles = dice.draw(entry["pose.euler_degrees"], f"{own}pose.euler_degrees")
+    with naming(f"event {number}"):
+        size, factor = (recipe.drawn(key, dice) for key in ("augmentation.size", "augmentation.activity"))
     return PlannedEvent(
         number=number,
         entry=entry,
-        split=entry.split or _split(recipe, number),
+        split=entry["split"] or _split(recipe, number),
         settings=settings,
         file=file,
         mu_file=mu_file,
         position=_three(position),
         euler_degrees=_three(angles),
-        mirror=dice.unit("augmentation.mirror") < change.mirror,
+        mirror=dice.unit("augmentation.mirror") < recipe["augmentation.mirror"],
         size=size,
         activity_factor=factor,
         noise_seed=dice.bits("noise") >> 32,

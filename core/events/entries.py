@@ -73,8 +73,8 @@ def _as_earlier(row: Setting, value: Any) -> Any:
     """A value, other where earlier versions took true for 1.0, "60" for an energy of 60.0, and 8.0 for 8."""
     if isinstance(value, list):
         return [_as_earlier(row, each) for each in value]
-    is_text = isinstance(value, str) and row.words and value not in row.words
-    if row.kind is float and (is_text or isinstance(value, bool)):
+    is_number = isinstance(value, str) and row.words and value not in row.words
+    if row.kind is float and (is_number or isinstance(value, bool)):
         with suppress(ValueError):
             return float(value)
     return int(value) if row.kind is int and isinstance(value, float) and value.is_integer() else value
@@ -106,17 +106,12 @@ class PhantomEntry(Values):
     @property
     def name(self) -> str:
         """What the recipe calls it."""
-        name: str = self["name"]
-        return name
+        return str(self["name"])
 
     @property
     def is_volume(self) -> bool:
         """Whether the files are volumes."""
-        return self["file"] is not None and not _is_text(self["file"])
-
-    def what(self, quantity: str) -> str:
-        """What a volume is read as: its quantity, and the energy at which CT numbers become mu."""
-        return quantity if self["energy"] is None or quantity != "mu" else f"mu at {self['energy']}"
+        return self["file"] is not None and not is_text(self["file"])
 
 
 def phantom_entry(values: dict[str, Any], number: int, quantity: str) -> PhantomEntry:
@@ -125,8 +120,10 @@ def phantom_entry(values: dict[str, Any], number: int, quantity: str) -> Phantom
     with naming(f"phantoms: {values.get('name', f'phantom {number}' if kind is None else kind)}"):
         if ("kind" in values) == ("file" in values):
             raise InputError('expected either kind = "…" or file = "…"')
+        if kind is not None:
+            _rows("")["kind"].checked(kind)
         named = {"name": f"file-{number}" if kind is None else str(kind), **values}
-        own = {key: value for key, value in values.items() if key not in by_key(_ROWS) and key != "pose"}
+        own = {key: value for key, value in values.items() if key not in _rows("") and key != "pose"}
         entry = PhantomEntry(flat(named, _rows(str(kind)), "pose"), own)
         if not entry.name:
             raise InputError("name: expected a text, got ''")
@@ -142,7 +139,7 @@ def phantom_entry(values: dict[str, Any], number: int, quantity: str) -> Phantom
 @functools.cache
 def _rows(kind: str) -> Mapping[str, Setting]:
     """The settings of a phantom of a kind, or of a file."""
-    return by_key([*_ROWS, *(row for known in KINDS if known.name == kind for row in own_settings(known, Drawn))])
+    return by_key([*(row for known in KINDS if known.name == kind for row in own_settings(known, Drawn)), *_ROWS])
 
 
 def _check_files(entry: PhantomEntry, quantity: str) -> None:
@@ -150,7 +147,7 @@ def _check_files(entry: PhantomEntry, quantity: str) -> None:
     files, others = options(entry["file"]), options(entry["mu_file"])
     if "" in (*files, *others):
         raise InputError("file: expected a file's name, got ''")
-    if any(len(set(map(_is_text, names))) > 1 for names in (files, others)):
+    if any(len(set(map(is_text, names))) > 1 for names in (files, others)):
         raise InputError("file: volumes and phantoms (.toml) do not go together: make two [[phantoms]] of them")
     for key in ("mu_file", "center", "energy"):
         if key in entry.given and not entry.is_volume:
@@ -162,7 +159,7 @@ def _check_files(entry: PhantomEntry, quantity: str) -> None:
         raise InputError("energy: it converts CT numbers to mu, but the truth is activity and there is no mu_file")
 
 
-def _is_text(file: Any) -> bool:
+def is_text(file: Any) -> bool:
     """Whether a file, or the first that may be drawn, is a phantom's description."""
     return str(options(file)[0]).lower().endswith(".toml")
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ..errors import InputError, naming
 from ..geometry.grid import Grid
 from ..geometry.parallel_views import parallel_views
-from ..geometry.system import PinholeSystem, chosen_modules
+from ..geometry.system import PinholeSystem
 from ..geometry.views import Views
 from ..memory import readable_size, require
 from ..progress import Progress, tell
@@ -20,12 +20,11 @@ from ..projector import Emission, Model, Projector
 from ..recording import Remembered, recorded_warnings, remembered
 from ..runs.projecting import Imaging, warn_of_energy
 from ..runs.recipe import Recipe
-from ..runs.run_recipe import recipe_imaging, recipe_model, recipe_views, require_mu
+from ..runs.run_recipe import recipe_imaging, recipe_model, recipe_system, recipe_views, require_mu
 from ..validation import freeze
 from ..volumes.rearranging import centered
 from ..volumes.resampling import resample
 from ..volumes.volume import Volume
-from ..workbook import read_system
 from .planning import PlannedEvent, plan
 from .recipe import EventRecipe
 
@@ -59,7 +58,7 @@ class EventMaker:
     @cached_property
     def system(self) -> PinholeSystem:
         """The scanner."""
-        return recipe_system(self.recipe)
+        return recipe_system(self.recipe.system, lambda name: self.recipe.input(name).path)
 
     @cached_property
     def views(self) -> Views:
@@ -189,15 +188,6 @@ class EventMaker:
         if radon is None:
             return {}
         return {n: Projector(self.recipe.grid, radon_views(self.recipe, n), threads=self.threads) for n in radon.counts}
-
-
-def recipe_system(recipe: EventRecipe) -> PinholeSystem:
-    """The scanner that a recipe names."""
-    given = recipe.system
-    columns = given["system.columns"]
-    path = recipe.input(given["system.file"]).path
-    system = read_system(path, columns=None if columns is None else recipe.input(columns).path)
-    return chosen_modules(system, given["system.modules"], "system.modules")
 
 
 def radon_views(recipe: EventRecipe, count: int) -> Views:

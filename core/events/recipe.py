@@ -18,8 +18,8 @@ from ..geometry.grid import Grid
 from ..runs.recipe import Recipe, Values
 from ..runs.settings import Setting
 from ..toml import parse_toml, toml_text
-from .draws import Dice, Drawn, check_odds, options
-from .entries import PhantomEntry, by_key, flat, like, phantom_entry, plain_name, required, table
+from .draws import Dice, Drawn, check_odds
+from .entries import PhantomEntry, by_key, flat, is_text, like, phantom_entry, plain_name, required, table
 from .inputs import Input, original_input
 
 VERSION = 1
@@ -36,8 +36,6 @@ def _words(**words: str) -> dict[str, tuple[str, str]]:
 
 
 _ROWS = by_key((
-    Setting("version", int, None, "Version of the recipes' language"),
-    like("seed", "noise.seed", default=0, text="Seed of everything that is random"),
     like("truth.voxels", "phantom.voxels"),
     like("truth.spacing", "phantom.spacing"),
     like("truth.center", "phantom.position", text="Middle of the truth, x y z"),
@@ -55,11 +53,12 @@ _ROWS = by_key((
     Drawn("augmentation.size", float, 1.0, "Factor of the phantom's lengths", above=0),
     Drawn("augmentation.activity", float, 1.0, "Factor of all values", above=0, needs=("truth.quantity=activity",)),
     Setting("augmentation.module_gain", float, 0.0, "Relative standard deviation of the modules' sensitivities", least=0,
-            most=math.nextafter(1, 0)),
+            below=1),
     Setting("noise.levels", float, (1.0,), "Shares of the acquisition time at which noise is drawn", above=0, sizes=()),
     Setting("storage.images", str, "float32", "How images are stored", words=_words(
         float32="As they are computed", float16="In half precision")),
 ))  # fmt: skip
+_SEED = like("seed", "noise.seed", default=0, text="Seed of everything that is random")
 _TABLES = ("truth", "radon", "augmentation", "noise", "storage")
 _KNOWN = ("version", "seed", "system", "detector", "phantoms", "models", "splits", *_TABLES)
 
@@ -112,7 +111,7 @@ class EventRecipe:
             for key in values:
                 if key not in _KNOWN:
                     raise InputError(f"{key}: no such entry; expected {', '.join(_KNOWN)}")
-            _ = self._settings, self.system, self.grid, self.phantoms, self.models, self.radon, self.splits
+            _ = self.seed, self._settings, self.system, self.grid, self.phantoms, self.models, self.radon, self.splits
 
     def __getitem__(self, key: str) -> Any:
         """The value of a setting, such as "truth.store", or its default."""
@@ -125,18 +124,16 @@ class EventRecipe:
 
     @cached_property
     def _settings(self) -> Values:
-        own = {key: value for key, value in self.values.items() if key in (*_ROWS, *_TABLES)}
-        return _Settings(flat(own, _ROWS, *_TABLES))
+        return _Settings(flat({name: table(self.values, name) for name in _TABLES}, _ROWS, *_TABLES))
 
     def drawn(self, key: str, dice: Dice) -> Any:
         """What is drawn of a setting, within its limits."""
         return self._settings.rows[key].checked(dice.draw(self[key], key))
 
-    @property
+    @cached_property
     def seed(self) -> int:
         """The seed of all random numbers."""
-        seed: int = self["seed"]
-        return seed
+        return int(_SEED.checked(self.values.get("seed", _SEED.default)))
 
     @cached_property
     def system(self) -> Recipe:
@@ -149,8 +146,7 @@ class EventRecipe:
     @property
     def quantity(self) -> str:
         """What the truth is of: "activity" or "mu"."""
-        quantity: str = self["truth.quantity"]
-        return quantity
+        return str(self["truth.quantity"])
 
     @cached_property
     def grid(self) -> Grid:
@@ -212,8 +208,7 @@ class EventRecipe:
     @property
     def levels(self) -> tuple[float, ...]:
         """Shares of the acquisition time at which noise is to be drawn."""
-        levels: tuple[float, ...] = self["noise.levels"]
-        return levels
+        return tuple(self["noise.levels"])
 
     @cached_property
     def splits(self) -> dict[str, float]:
@@ -284,15 +279,19 @@ class EventRecipe:
         for entry, checked in zip(values["phantoms"], self.phantoms, strict=True):
             for key in ("file", "mu_file"):
                 if key in entry:
-                    is_text = all(str(name).lower().endswith(".toml") for name in options(entry[key]))
                     quantity = "mu" if key == "mu_file" else self.quantity
-                    entry[key] = changed(entry[key], "copy" if is_text else checked.what(quantity))
+                    entry[key] = changed(
+                        entry[key], "copy" if is_text(entry[key]) else _what(quantity, checked["energy"])
+                    )
         for name, model in self.models.items():
-            if model["attenuation.file"] is not None:
-                energy = model["attenuation.energy"]
-                what = "mu" if energy is None else f"mu at {energy}"
-                values["models"][name]["attenuation"] = change(model["attenuation.file"], what)
+            if (file := model["attenuation.file"]) is not None:
+                values["models"][name]["attenuation"] = change(file, _what("mu", model["attenuation.energy"]))
         return values
+
+
+def _what(quantity: str, energy: Any) -> str:
+    """What a volume's file is read as: its quantity, and the energy at which CT numbers become mu."""
+    return quantity if energy is None or quantity != "mu" else f"mu at {energy}"
 
 
 def read_recipe(path: str | os.PathLike[str], inputs: Mapping[str, Input] | None = None) -> EventRecipe:

@@ -1,13 +1,13 @@
 """From a system and a volume to images and to a projection run: the main job, as one call."""
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InputError, warn
-from ..geometry.grid import Grid
 from ..geometry.system import Detector, PinholeSystem
 from ..geometry.views import Views
 from ..memory import require
@@ -21,43 +21,18 @@ from ..volumes.volume import Volume
 from .run import ProjectionRun
 
 
+@dataclass(frozen=True, eq=False)
 class Imaging:
-    """Makes images of volumes: the one route of runs, reconstructions and events, with the same warnings for all.
+    """Makes images of volumes: the one route of runs, reconstructions and events, with the same warnings for all."""
 
-    Parameters
-    ----------
-    system, views
-        The scanner and its images.
-    grid
-        The voxels of the volumes.
-    model, photons, backend, threads
-        As for `project_run`.
+    system: PinholeSystem  # whose images are the projector's views
+    projector: Projector
+    photons: float | None = None  # as for `project_run`
 
-    Attributes
-    ----------
-    projector : Projector
-        From volumes on `grid` to `views`.
-
-    Raises
-    ------
-    InputError
-        The arguments do not go together, or are out of range.
-    """
-
-    def __init__(
-        self,
-        system: PinholeSystem,
-        views: Views,
-        grid: Grid,
-        model: Model | None = None,
-        photons: float | None = None,
-        backend: str = "auto",
-        threads: int | None = None,
-    ) -> None:
-        self.system = system
-        self.photons = None if photons is None else positive(photons, "photons")
-        self.projector = Projector(grid, views, model, backend, threads)
-        self.model = self.projector.model
+    @property
+    def model(self) -> Model:
+        """What a pixel measures."""
+        return self.projector.model
 
     def images(
         self, volume: Volume, mu: NDArray[np.float32] | None = None, progress: Progress | None = None
@@ -68,7 +43,10 @@ class Imaging:
         `InputError` where the model has no meaning for the volume. Warnings say where images hardly are what is wanted.
         """
         A = self.projector
-        self.check_volume(volume)
+        self.model.check_volume(volume)
+        if self.photons is not None and not (isinstance(self.model, Transmission) and volume.quantity == "mu"):
+            what = f"{self.model.name} of {volume.quantity}"
+            raise InputError(f"photons: expected the transmission of a volume of mu, got {what}")
         warn_of_images(volume, self.system, A.views, self.model)
         if mu is not None and isinstance(self.model, Emission):
             for doubt in doubts_of_mu(mu, self.model):
@@ -79,21 +57,9 @@ class Imaging:
             image[...] = passed + background.astype(image.dtype)
         return images.astype(np.float32, copy=False)
 
-    def check_volume(self, volume: Volume) -> None:
-        """Raise `InputError` where the model has no meaning for a volume."""
-        self.model.check_volume(volume)
-        if self.photons is not None and not (isinstance(self.model, Transmission) and volume.quantity == "mu"):
-            what = f"{self.model.name} of {volume.quantity}"
-            raise InputError(f"photons: expected the transmission of a volume of mu, got {what}")
-
     def unit(self, volume: Volume) -> str:
         """The unit of a volume's images."""
         return self.model.unit(volume) if self.photons is None else "photons"
-
-    def record(self) -> dict[str, Any]:
-        """What a run records of the model and what computes it."""
-        photons = {} if self.photons is None else {"photons": self.photons}
-        return {"model": self.model.name, **self.model.record(), **photons, "backend": self.projector.backend}
 
 
 def project_run(
@@ -136,6 +102,7 @@ def project_run(
     InputError
         A setting is out of range, the volume holds what the model has no meaning for, or the images do not fit into memory.
     """
+    photons = None if photons is None else positive(photons, "photons")
     if noise_seed is not None:
         if photons is None and not isinstance(model, Emission):
             raise InputError("noise_seed: only the counts of an Emission, or photons that pass, have noise")
@@ -144,17 +111,19 @@ def project_run(
     n_v, n_u = views.shape
     each = 4.0 if noise_seed is None else 20.0  # bytes; counts are drawn from float64, as int64
     require(each * len(views) * n_v * n_u, f"a set of {len(views)} projections of {n_v} x {n_u} pixels")
-    imaging = Imaging(system, views, volume.grid, model, photons, backend, threads)
+    imaging = Imaging(system, Projector(volume.grid, views, model, backend, threads), photons)
+    model = imaging.model
     images = imaging.images(volume, progress=progress)
     if noise_seed is not None:
         images = sample_counts(images, noise_seed).astype(np.float32)
     record = {
         "detector": detector, "magnification": float(magnification),
-        "pitch_mm": None if pitch is None else np.broadcast_to(pitch, 2).tolist(), **imaging.record(), **(settings or {}),
+        "pitch_mm": None if pitch is None else np.broadcast_to(pitch, 2).tolist(), "model": model.name, **model.record(),
+        **({} if photons is None else {"photons": photons}), "backend": imaging.projector.backend, **(settings or {}),
     }  # fmt: skip
     return ProjectionRun(
         images, system, views, volume, unit=imaging.unit(volume), settings=record, seed=noise_seed,
-        background=imaging.model.background,
+        background=model.background,
     )  # fmt: skip
 
 

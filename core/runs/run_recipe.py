@@ -1,7 +1,7 @@
 """From a recipe to projection runs: the main job, for the command line, the demo, scripts and Blender."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +31,7 @@ from .recipe import Recipe, recorded_recipe
 from .run import ProjectionRun
 
 _MODELS: dict[str, Any] = {"transmission": Transmission, "emission": Emission, "inverse-square": InverseSquareSum}
+_MODULES = "system.modules"
 _MOST_MU = 500.0
 """1/mm: more than any material of the tables attenuates photons of 10 keV or more."""
 
@@ -61,11 +62,7 @@ def run_recipe(
     InputError
         A file cannot be read, the recipe names no system, or see `project_run`; all but the volumes is checked first.
     """
-    if system is None:
-        if recipe["system.file"] is None:
-            raise InputError("system.file: missing; name the geometry workbook")
-        system = read_system(recipe["system.file"], columns=recipe["system.columns"])
-    system = chosen_modules(system, recipe["system.modules"], "system.modules")
+    system = recipe_system(recipe) if system is None else chosen_modules(system, recipe["system.modules"], _MODULES)
     model = recipe_model(recipe, system)
     if mu is None:
         mu = _attenuation(recipe, model, stages)
@@ -89,20 +86,32 @@ def run_recipe(
         if seed is not None:  # noise of its own for each state
             record = record.updated({"noise.seed": seed + number})
         yield project_run(
-            system, source, (recipe["detector.rows"], recipe["detector.columns"]), detector=recipe["detector.plane"],
-            magnification=recipe["detector.magnification"], pitch=recipe["detector.pitch"],
-            backend=recipe["compute.backend"], threads=recipe["compute.threads"],
+            system, source, **_detector(recipe), backend=recipe["compute.backend"], threads=recipe["compute.threads"],
             settings={"volume": _volume_name(record), **converted, "recipe": record.tables()},
             model=recipe_model(recipe, system, mu_of_it), photons=recipe["model.photons"],
             noise_seed=record["noise.seed"], progress=stages("projecting"),
         )  # fmt: skip
 
 
+def recipe_system(recipe: Recipe, path: Callable[[str], str | Path] = Path) -> PinholeSystem:
+    """The scanner that a recipe names; `path` says where its files are."""
+    file, columns = recipe["system.file"], recipe["system.columns"]
+    if file is None:
+        raise InputError("system.file: missing; name the geometry workbook")
+    system = read_system(path(file), columns=None if columns is None else path(columns))
+    return chosen_modules(system, recipe["system.modules"], _MODULES)
+
+
 def recipe_views(recipe: Recipe, system: PinholeSystem) -> Views:
     """The views of a recipe's detector."""
+    return system.views(**_detector(recipe))
+
+
+def _detector(recipe: Recipe) -> dict[str, Any]:
+    """The arguments of `PinholeSystem.views`."""
+    given = {name: recipe[f"detector.{name}"] for name in ("magnification", "pitch")}
     shape = recipe["detector.rows"], recipe["detector.columns"]
-    plane, magnification, pitch = (recipe[f"detector.{name}"] for name in ("plane", "magnification", "pitch"))
-    return system.views(shape, plane, magnification, pitch)
+    return {"shape": shape, "detector": recipe["detector.plane"], **given}
 
 
 def recipe_model(recipe: Recipe, system: PinholeSystem, mu: Volume | None = None) -> Model:
@@ -169,8 +178,8 @@ def recipe_imaging(
     threads: int | None = None,
 ) -> Imaging:  # fmt: skip
     """What makes a recipe's images of volumes on a grid; `mu` is what attenuates."""
-    model = recipe_model(recipe, system, mu)
-    return Imaging(system, views, grid, model, recipe["model.photons"], backend, threads)
+    projector = Projector(grid, views, recipe_model(recipe, system, mu), backend, threads)
+    return Imaging(system, projector, recipe["model.photons"])
 
 
 def _volume_name(record: Recipe) -> str:

@@ -8,7 +8,7 @@ same name in the model's class.
 import dataclasses
 import functools
 import operator
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from numbers import Integral, Real
 from types import MappingProxyType
@@ -30,6 +30,14 @@ Words = Mapping[str, tuple[str, str]]
 """The words that a setting may be, each with its label and description."""
 
 
+_LIMITS = (
+    ("least", "of {:g} or more", operator.ge),
+    ("above", "above {:g}", operator.gt),
+    ("most", "and at most {:g}", operator.le),
+    ("below", "and below {:g}", operator.lt),
+)
+
+
 @dataclass(frozen=True)
 class Setting:
     """One setting of a run.
@@ -48,6 +56,7 @@ class Setting:
     least: float | None = None
     above: float | None = None  # it must exceed this
     most: float | None = None
+    below: float | None = None  # it must be less than this
     slider: float | None = None  # the largest value that a slider reaches
     sizes: tuple[int, ...] | None = None  # how many values it may have, () for any number; None: one value alone
     is_path: bool = False  # whether it names a file
@@ -68,14 +77,19 @@ class Setting:
         return text + (f"; without it, {self.absent}" if self.absent else "")
 
     @property
+    def _bounds(self) -> list[tuple[float, str, Callable[[Any, Any], bool]]]:
+        """The limits that there are, with words and what holds of values within them."""
+        known = [(getattr(self, name), text, holds) for name, text, holds in _LIMITS]
+        return [limit for limit in known if limit[0] is not None]
+
+    @property
     def expected(self) -> str:
         """What one value must be, for messages."""
         words = f"one of {', '.join(self.words)}" if self.words else ""
         if self.kind in (bool, str):
             return words or {bool: "true or false", str: "a text"}[self.kind]
         number = "a whole number" if self.kind is int else "a number"
-        bounds = {"of {:g} or more": self.least, "above {:g}": self.above, "and at most {:g}": self.most}
-        number += "".join(" " + text.format(bound) for text, bound in bounds.items() if bound is not None)
+        number += "".join(f" {text.format(bound)}" for bound, text, _ in self._bounds)
         return " or ".join(filter(None, (words, number + (f" ({self.unit})" if self.unit else ""))))
 
     def checked(self, value: Any) -> Any:
@@ -98,9 +112,8 @@ class Setting:
         elif self.kind in (bool, str):
             good = isinstance(value, self.kind)
         else:
-            bounds = ((self.least, operator.ge), (self.above, operator.gt), (self.most, operator.le))
             good = isinstance(value, Integral if self.kind is int else Real) and not isinstance(value, bool)
-            good = good and abs(value) < 1e308 and all(b is None or holds(value, b) for b, holds in bounds)
+            good = good and abs(value) < 1e308 and all(holds(value, bound) for bound, _, holds in self._bounds)
             value = self.kind(value) if good else value
         if not good:
             raise InputError(f"{self.key}: expected {self.expected}, got {value!r}")

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputError
+from ..runs.recipe import Values
 from ..runs.settings import Setting
 
 _NORMAL = statistics.NormalDist()
@@ -99,6 +100,16 @@ class Drawn(Setting):
         if low > high:
             raise InputError(f"{self.key}: expected from {low:g} to no less, got {high:g}")
         return value
+
+
+@dataclass(frozen=True)
+class DrawnValues(Values):
+    """Values of settings, some of which may be draws."""
+
+    def drawn(self, key: str, dice: Dice, before: str = "") -> Any:
+        """What is drawn of a setting, checked; `before` stands before its key in the name of its random numbers."""
+        row = self.rows[key]
+        return row.checked(dice.draw(self[key], before + key, row.kind is int))
 
 
 def check_odds(odds: Any, count: int, name: str) -> None:

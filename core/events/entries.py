@@ -13,9 +13,8 @@ from ..errors import InputError, naming
 from ..phantoms.kinds import KINDS, Kind
 from ..phantoms.settings import setting_names
 from ..phantoms.torso import CardiacTorso
-from ..runs.recipe import Values
 from ..runs.settings import SETTINGS, Setting, own_settings
-from .draws import Drawn, options
+from .draws import Drawn, DrawnValues, options
 
 
 def like(key: str, known: str, row: type[Setting] = Setting, **changes: Any) -> Setting:
@@ -88,7 +87,7 @@ def plain_name(name: Any, what: str) -> str:
 
 
 @dataclass(frozen=True)
-class PhantomEntry(Values):
+class PhantomEntry(DrawnValues):
     """One of the phantoms that an event may have: its values and draws, by the keys of their settings."""
 
     settings: Mapping[str, Any] = field(default_factory=dict)  # of its kind, as the recipe says them

@@ -62,7 +62,7 @@ class EventMaker:
 
     @cached_property
     def views(self) -> Views:
-        """Of the scanner's images."""
+        """The views of the scanner's images."""
         return recipe_views(self.recipe.system, self.system)
 
     @property

@@ -1,4 +1,4 @@
-"""Recipes of event sets: TOML that says which phantoms, volumes, models and projections the events have."""
+"""Recipes of event sets: which phantoms, volumes, models and projections the events have, in TOML."""
 
 import copy
 import hashlib
@@ -15,10 +15,10 @@ import numpy as np
 
 from ..errors import InputError, naming
 from ..geometry.grid import Grid
-from ..runs.recipe import Recipe, Values
+from ..runs.recipe import Recipe
 from ..runs.settings import Setting
 from ..toml import parse_toml, toml_text
-from .draws import Dice, Drawn, check_odds
+from .draws import Drawn, DrawnValues, check_odds
 from .entries import PhantomEntry, by_key, flat, is_text, like, phantom_entry, plain_name, required, table
 from .inputs import Input, original_input
 
@@ -64,8 +64,8 @@ _KNOWN = ("version", "seed", "system", "detector", "phantoms", "models", "splits
 
 
 @dataclass(frozen=True)
-class _Settings(Values):
-    """What an event recipe says besides scanner, phantoms, models and splits."""
+class _Settings(DrawnValues):
+    """The values of an event recipe's `_TABLES`."""
 
     rows = _ROWS  # type: ignore[assignment]
 
@@ -91,9 +91,9 @@ class EventRecipe:
     name
         What messages call it, such as its path.
     folder
-        To which the paths in it are relative.
+        The paths in the recipe are relative to it.
     inputs
-        Instead of the files that it names: copies of them, by the names in the recipe, as a set keeps them.
+        Copies of the files that the recipe names, by these names, which a set keeps and reads instead.
     """
 
     text: str
@@ -111,11 +111,11 @@ class EventRecipe:
             for key in values:
                 if key not in _KNOWN:
                     raise InputError(f"{key}: no such entry; expected {', '.join(_KNOWN)}")
-            _ = self.seed, self._settings, self.system, self.grid, self.phantoms, self.models, self.radon, self.splits
+            _ = self.seed, self.settings, self.system, self.grid, self.phantoms, self.models, self.radon, self.splits
 
     def __getitem__(self, key: str) -> Any:
         """The value of a setting, such as "truth.store", or its default."""
-        return self._settings[key]
+        return self.settings[key]
 
     @cached_property
     def values(self) -> dict[str, Any]:
@@ -123,12 +123,9 @@ class EventRecipe:
         return parse_toml(self.text, self.name)
 
     @cached_property
-    def _settings(self) -> Values:
+    def settings(self) -> DrawnValues:
+        """The values of the tables `_TABLES`."""
         return _Settings(flat({name: table(self.values, name) for name in _TABLES}, _ROWS, *_TABLES))
-
-    def drawn(self, key: str, dice: Dice) -> Any:
-        """What is drawn of a setting, within its limits."""
-        return self._settings.rows[key].checked(dice.draw(self[key], key))
 
     @cached_property
     def seed(self) -> int:
@@ -137,7 +134,7 @@ class EventRecipe:
 
     @cached_property
     def system(self) -> Recipe:
-        """What [system], [detector] and nothing else say, as a recipe of projections."""
+        """The tables [system] and [detector], as a recipe of projections."""
         given = {name: table(self.values, name) for name in ("system", "detector")}
         recipe = Recipe(flat(given, {}, *given))
         required(recipe["system.file"], "system.file", "name the geometry workbook")

@@ -184,7 +184,7 @@ def _with_hole(values: Mapping[str, Any], kept: Collection[str]) -> dict[str, An
     given = {key for key in SAMPLING if values.get(key, SETTINGS[key].default) != SETTINGS[key].default}
     numbers = given if "model.hole" not in values else given.intersection(kept)
     is_free = values.get("model.kind") == "emission" and values.get("model.hole", "auto") == "auto"
-    return {**values, "model.hole": "rays"} if is_free and numbers else values
+    return {**values, "model.hole": "rays"} if is_free and numbers else dict(values)
 
 
 def is_met(values: Mapping[str, Any], need: str, rows: Mapping[str, Setting] = SETTINGS) -> bool:

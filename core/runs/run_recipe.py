@@ -136,16 +136,16 @@ def projector_of_run(
     threads: int | None = None,
     stages: Stages = lambda stage: None,
 ) -> Projector:
-    """The projector from volumes on `grid` to the images of a run, with the model that the run's recipe says.
+    """The projector from volumes on `grid` to the images of a run, with the model of the run's recipe.
 
     Parameters
     ----------
     run
         Simulated or measured.
     grid
-        Of the volumes.
+        The voxels of the volumes.
     mu
-        What attenuates (1/mm), on any grid, instead of what the recipe says: a file, which is read again, or the phantom,
+        What attenuates (1/mm), on any grid, instead of the recipe's: a file, which is read again, or the phantom,
         which is voxelized on `grid`.
     recipe
         Instead of the run's own, such as ``run.recipe.updated({"model.aperture_points": 19})``.

@@ -135,10 +135,9 @@ def own_settings(kind: Kind, row: type[Setting] = OwnSetting, **common: Any) -> 
     fields = {field.name: field for field in dataclasses.fields(kind.phantom)}
     found = []
     for key, name in setting_names(kind.phantom).items():
-        default, about = kind.usual.get(name, fields[name].default), fields[name].metadata
-        is_tuple = isinstance(default, tuple)
-        of_one = type(default[0] if is_tuple else default)
-        found.append(row(key, of_one, default, about.get("text", ""), sizes=() if is_tuple else None, **common))
+        default: Any = kind.usual.get(name, fields[name].default)
+        one, sizes = (default[0], ()) if isinstance(default, tuple) else (default, None)
+        found.append(row(key, type(one), default, fields[name].metadata.get("text", ""), sizes=sizes, **common))
     return found
 
 
@@ -367,7 +366,7 @@ SETTINGS: Mapping[str, Setting] = MappingProxyType({setting.key: setting for set
 def settings_with(kind: str) -> Mapping[str, Setting]:
     """Every setting by its key, with those of a kind of phantoms."""
     own = [row for known in KINDS if known.name == kind for row in own_settings(known, needs=_PHANTOM_NUMBER)]
-    return MappingProxyType(SETTINGS | {f"phantom.{row.key}": row for row in own})
+    return MappingProxyType({**SETTINGS, **{f"phantom.{row.key}": row for row in own}})
 
 
 TABLES = tuple(dict.fromkeys(key.partition(".")[0] for key in SETTINGS))

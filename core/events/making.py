@@ -17,6 +17,7 @@ from ..geometry.views import Views
 from ..memory import readable_size, require
 from ..progress import Progress, tell
 from ..projector import Emission, Model, Projector
+from ..projector.backends import choose
 from ..recording import Remembered, recorded_warnings, remembered
 from ..runs.projecting import Imaging, warn_of_energy
 from ..runs.recipe import Recipe
@@ -95,18 +96,18 @@ class EventMaker:
             tell(progress, done, steps)
 
         tell(progress, 0, steps)
-        system = self.system  # whose warnings are about the set
+        _ = self.system, choose("auto")  # before the event, whose file does not hold warnings of scanner and machine
         with naming(f"event {number}"), recorded_warnings() as warnings:
             truth = self.truth(planned)
             step()
-            gains = planned.gains(len(system))
+            gains = planned.gains(len(self.system))
             images, units = {}, {}
             for name in recipe.models:
                 with naming(name):
                     images[name], units[name] = self._images(name, planned, truth, gains)
                 step()
             radon = {}
-            for count, projector in self._radon.items():
+            for count, projector in self._radon.again().items():
                 radon[count] = projector(truth)
                 step()
         return EventArrays(planned, truth, images, units, radon, gains, tuple(dict.fromkeys(warnings)))
@@ -183,11 +184,11 @@ class EventMaker:
         return recipe_imaging(recipe, self.system, self.views, grid, mu, threads=self.threads)
 
     @cached_property
-    def _radon(self) -> dict[int, Projector]:
-        radon = self.recipe.radon
-        if radon is None:
-            return {}
-        return {n: Projector(self.recipe.grid, radon_views(self.recipe, n), threads=self.threads) for n in radon.counts}
+    def _radon(self) -> Remembered[dict[int, Projector]]:
+        recipe, counts = self.recipe, () if self.recipe.radon is None else self.recipe.radon.counts
+        return remembered(
+            lambda: {n: Projector(recipe.grid, radon_views(recipe, n), threads=self.threads) for n in counts}
+        )
 
 
 def radon_views(recipe: EventRecipe, count: int) -> Views:

@@ -137,6 +137,13 @@ def test_an_event_gives_the_warnings_of_a_run_of_the_same_settings(folder, scann
     np.testing.assert_allclose(first.images["images"], run.projections, rtol=1e-6, atol=1e-6)
 
 
+def test_events_of_one_maker_have_the_same_warnings_whichever_is_first(folder):
+    text = event_text(BASE | {"phantom.spacing": (0.01,)}) + "\n[radon]\nangles = 2\n"
+    recipe = EventRecipe(text, folder=folder)
+    one, other = EventMaker(recipe), EventMaker(recipe)
+    assert [one.make(number).warnings for number in (0, 1)] == [other.make(number).warnings for number in (1, 0)]
+
+
 def test_the_mu_of_an_events_volume_is_compared_with_the_model(folder):
     text = event_text(BASE | TC | {"volume.file": str(folder / "below.npz")})
     text = text.replace("[[phantoms]]", f"[[phantoms]]\nmu_file = {toml_value(str(folder / 'ct.npz'))}\nenergy = 80")

@@ -16,7 +16,7 @@ import numpy as np
 from ..errors import InputError, naming
 from ..geometry.grid import Grid
 from ..runs.recipe import Recipe
-from ..runs.settings import Setting
+from ..runs.settings import Setting, named
 from ..toml import parse_toml, toml_text
 from .draws import Drawn, DrawnValues, check_odds
 from .entries import PhantomEntry, by_key, flat, is_text, like, phantom_entry, plain_name, required, table
@@ -31,17 +31,13 @@ _TAKEN = (
 """What else exports and batches of an event hold, besides the images of models."""
 
 
-def _words(**words: str) -> dict[str, tuple[str, str]]:
-    return {word: (word, text) for word, text in words.items()}
-
-
 _ROWS = by_key((
     like("truth.voxels", "phantom.voxels"),
     like("truth.spacing", "phantom.spacing"),
     like("truth.center", "phantom.position", text="Middle of the truth, x y z"),
-    Setting("truth.quantity", str, "activity", "What the truth is of", words=_words(activity="kBq/mL", mu="1/mm")),
-    Setting("truth.store", str, "float32", "How the truth is stored", words=_words(
-        float32="As it is computed", float16="In half precision", sparse="The voxels that are not 0, and their places")),
+    Setting("truth.quantity", str, "activity", "What the truth is of", words=named(("activity", "mu"))),
+    Setting("truth.store", str, "float32", "How the truth is stored, sparse without voxels that are 0",
+            words=named(("float32", "float16", "sparse"))),
     Setting("truth.below", float, 0.0, "Share of the truth's maximum below which values are taken for 0", least=0, most=1,
             needs=("truth.store=sparse",)),
     Setting("radon.angles", int, None, "Numbers of angles, one for each set of parallel projections", least=1, sizes=()),
@@ -53,10 +49,9 @@ _ROWS = by_key((
     Drawn("augmentation.size", float, 1.0, "Factor of the phantom's lengths", above=0),
     Drawn("augmentation.activity", float, 1.0, "Factor of all values", above=0, needs=("truth.quantity=activity",)),
     Setting("augmentation.module_gain", float, 0.0, "Relative standard deviation of the modules' sensitivities", least=0,
-            below=1),
+            most=math.nextafter(1, 0)),
     Setting("noise.levels", float, (1.0,), "Shares of the acquisition time at which noise is drawn", above=0, sizes=()),
-    Setting("storage.images", str, "float32", "How images are stored", words=_words(
-        float32="As they are computed", float16="In half precision")),
+    Setting("storage.images", str, "float32", "How images are stored", words=named(("float32", "float16"))),
 ))  # fmt: skip
 _SEED = like("seed", "noise.seed", default=0, text="Seed of everything that is random")
 _TABLES = ("truth", "radon", "augmentation", "noise", "storage")

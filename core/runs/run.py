@@ -50,9 +50,7 @@ class ProjectionRun:
     workbook: str = ""  # name of the geometry workbook, and its SHA-256; empty where there is none
     workbook_sha256: str = ""
     versions: Mapping[str, str] = field(default_factory=versions)  # of mphDRR and what it ran on
-    background: float | NDArray[np.float64] = (
-        0.0  # expected besides the volume's: a number, (M,) or images, as in `Emission`
-    )
+    background: float | NDArray[np.float64] = 0.0  # besides the volume, as in `Emission`: (), (M,) or images
 
     def __post_init__(self) -> None:
         self.views.require_pinholes("run")

@@ -8,7 +8,7 @@ same name in the model's class.
 import dataclasses
 import functools
 import operator
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from numbers import Integral, Real
 from types import MappingProxyType
@@ -30,14 +30,6 @@ Words = Mapping[str, tuple[str, str]]
 """The words that a setting may be, each with its label and description."""
 
 
-_LIMITS = (
-    ("least", "of {:g} or more", operator.ge),
-    ("above", "above {:g}", operator.gt),
-    ("most", "and at most {:g}", operator.le),
-    ("below", "and below {:g}", operator.lt),
-)
-
-
 @dataclass(frozen=True)
 class Setting:
     """One setting of a run.
@@ -56,7 +48,6 @@ class Setting:
     least: float | None = None
     above: float | None = None  # it must exceed this
     most: float | None = None
-    below: float | None = None  # it must be less than this
     slider: float | None = None  # the largest value that a slider reaches
     sizes: tuple[int, ...] | None = None  # how many values it may have, () for any number; None: one value alone
     is_path: bool = False  # whether it names a file
@@ -77,19 +68,14 @@ class Setting:
         return text + (f"; without it, {self.absent}" if self.absent else "")
 
     @property
-    def _bounds(self) -> list[tuple[float, str, Callable[[Any, Any], bool]]]:
-        """The limits that there are, with words and what holds of values within them."""
-        known = [(getattr(self, name), text, holds) for name, text, holds in _LIMITS]
-        return [limit for limit in known if limit[0] is not None]
-
-    @property
     def expected(self) -> str:
         """What one value must be, for messages."""
         words = f"one of {', '.join(self.words)}" if self.words else ""
         if self.kind in (bool, str):
             return words or {bool: "true or false", str: "a text"}[self.kind]
         number = "a whole number" if self.kind is int else "a number"
-        number += "".join(f" {text.format(bound)}" for bound, text, _ in self._bounds)
+        bounds = {"of {:g} or more": self.least, "above {:g}": self.above, "and at most {:g}": self.most}
+        number += "".join(" " + text.format(bound) for text, bound in bounds.items() if bound is not None)
         return " or ".join(filter(None, (words, number + (f" ({self.unit})" if self.unit else ""))))
 
     def checked(self, value: Any) -> Any:
@@ -112,8 +98,9 @@ class Setting:
         elif self.kind in (bool, str):
             good = isinstance(value, self.kind)
         else:
+            bounds = ((self.least, operator.ge), (self.above, operator.gt), (self.most, operator.le))
             good = isinstance(value, Integral if self.kind is int else Real) and not isinstance(value, bool)
-            good = good and abs(value) < 1e308 and all(holds(value, bound) for bound, _, holds in self._bounds)
+            good = good and abs(value) < 1e308 and all(b is None or holds(value, b) for b, holds in bounds)
             value = self.kind(value) if good else value
         if not good:
             raise InputError(f"{self.key}: expected {self.expected}, got {value!r}")
@@ -141,7 +128,8 @@ def own_settings(kind: Kind, row: type[Setting] = OwnSetting, **common: Any) -> 
     return found
 
 
-def _named(names: Iterable[str], text: str) -> Words:
+def named(names: Iterable[str], text: str = "") -> Words:
+    """Words that label themselves, described alike."""
     return {name: (name[0].upper() + name[1:], text) for name in names}
 
 
@@ -156,7 +144,7 @@ _PHANTOM_NUMBER = (*_PHANTOM, "no phantom.file", "no phantom.text")
 _NO_PHANTOM = ("no phantom.kind", "no phantom.file", "no phantom.text")
 _SERIES = "The DICOM series with this number, description or UID, where the folder holds several"
 _AT_ENERGY = "Convert CT numbers to attenuation (1/mm) at this energy, or at an isotope's strongest line"
-_ISOTOPES = _named(ISOTOPES, "Energy window 10 % around its strongest line")
+_ISOTOPES = named(ISOTOPES, "Energy window 10 % around its strongest line")
 _BY_NAME = "As it attenuates the isotope's photons"
 
 
@@ -183,7 +171,7 @@ _DECLARED = (
     Setting("volume.state", str, None, "State of the object's sequence", needs=("volume.object",)),
     Setting("volume.series", str, None, _SERIES, needs=("volume.file",)),
     Setting("volume.quantity", str, None, "What the values of the volume are", "what the file says; a file that says "
-            "nothing holds activity for counts, mu for photons, else CT numbers", words=_named(LINE_INTEGRALS, ""),
+            "nothing holds activity for counts, mu for photons, else CT numbers", words=named(LINE_INTEGRALS, ""),
             needs=(_FILE, "no volume.energy")),
     Setting("volume.energy", float, None, _AT_ENERGY, unit="keV", words=_ISOTOPES, above=0,
             needs=(_FILE, "no model.kind=emission")),
@@ -232,7 +220,7 @@ _DECLARED = (
             needs=("counts.files",)),
     Setting("counts.raw_shape", int, None, "Frames, rows and columns of a raw file", least=1, sizes=(3,),
             needs=("counts.files",)),
-    Setting("counts.raw_type", str, None, "Type of a raw file's numbers", words=_named(RAW_TYPES, ""),
+    Setting("counts.raw_type", str, None, "Type of a raw file's numbers", words=named(RAW_TYPES, ""),
             needs=("counts.files",)),
     Setting("counts.raw_big_endian", bool, False, "The most significant byte of a raw file's numbers comes first",
             needs=("counts.files",)),
@@ -264,7 +252,7 @@ _DECLARED = (
             "this close to that of the whole hole", "0.1, where rays are used", above=0, slider=1,
             needs=(_COUNTS, "model.hole=rays"), label="Hole Tolerance"),
     Setting("model.aperture_mu", float, None, "Material of the aperture's edge, or its attenuation coefficient at the "
-            "photons' energy", "nothing penetrates it", unit="1/mm", words=_named(APERTURES, _BY_NAME), above=0,
+            "photons' energy", "nothing penetrates it", unit="1/mm", words=named(APERTURES, _BY_NAME), above=0,
             slider=10, needs=(_COUNTS,), label="Aperture"),
     Setting("model.opening_angle_degrees", float, 90.0, "Full angle of the knife edge's cone", unit="degrees", above=0,
             most=179.9, needs=(_COUNTS, "model.aperture_mu or model.within_cone")),
@@ -273,7 +261,7 @@ _DECLARED = (
         "path": ("Path Length", "Each by its path through the edge: more rays"),
     }, needs=(*_BY_RAYS, "model.aperture_mu")),
     Setting("model.crystal_mu", float, None, "Material of the crystal that stops the photons, or its attenuation "
-            "coefficient at their energy", "all photons are counted", unit="1/mm", words=_named(CRYSTALS, _BY_NAME),
+            "coefficient at their energy", "all photons are counted", unit="1/mm", words=named(CRYSTALS, _BY_NAME),
             above=0, slider=5, needs=(_COUNTS,), label="Crystal"),
     Setting("model.depth_layers", int, 1, "Depths in the crystal at which photons are recorded (parallax); 1: where they "
             "enter", least=1, slider=8, needs=(*_BY_RAYS, "model.crystal_mu")),

@@ -32,7 +32,7 @@ _ROWS = (
     Drawn("mu_file", str, None, "What attenuates a volume, which is placed with it", needs=_OF_FILE),
     like("center", "volume.center", needs=_OF_FILE),
     like("energy", "attenuation.energy", needs=_OF_FILE),
-    Setting("gates", int, 1, "Phases of the beating torso, whose mean the event is", least=1),
+    Setting("gates", int, 1, "Phases of the beating torso, whose mean the event is", least=1, needs=("kind",)),
     like("pose.position", "phantom.position", Drawn),
     like("pose.euler_degrees", "phantom.euler_degrees", Drawn),
     Setting("pose.turn", str, None, "How it is turned", words={"uniform": ("Uniform", "Every rotation is as likely")},
@@ -72,6 +72,8 @@ def _as_earlier(row: Setting, value: Any) -> Any:
     """A value, other where earlier versions took true for 1.0, "60" for an energy of 60.0, and 8.0 for 8."""
     if isinstance(value, list):
         return [_as_earlier(row, each) for each in value]
+    if isinstance(value, dict):
+        return {key: _as_earlier(row, each) if key == "one_of" else each for key, each in value.items()}
     is_number = isinstance(value, str) and row.words and value not in row.words
     if row.kind is float and (is_number or isinstance(value, bool)):
         with suppress(ValueError):

@@ -363,6 +363,23 @@ def test_what_is_not_understood_is_refused_by_name(tmp_path, old, new, said):
     assert not list((tmp_path / "set").glob("events/*"))
 
 
+def test_numbers_as_earlier_versions_took_them(tmp_path):
+    """Recipes of before open, whatever they wrote for a number, and the events are those of the number itself."""
+    before = ("counts = [{ from = 1, to = 3 }, 2, 1]", "angles = [6, 8]")
+    plain = ("counts = { one_of = [[2, 2, 1], [3, 2, 1]] }", "angles = [6, 8]", "mirror = 1", "size = { one_of = [1] }")
+    other = (
+        *("counts = { one_of = [[2.0, 2, 1], [3.0, 2.0, 1]] }", "angles = [6.0, 8]", "mirror = true"),
+        "size = { one_of = [true] }",
+    )
+    rows = []
+    for counts, angles, *augmentation in (plain, other):
+        text = TEXT.replace(before[0], counts).replace(before[1], angles)
+        recipe = small_recipe(tmp_path, "\n".join([text, "[augmentation]", *augmentation]))
+        assert recipe.radon is not None and recipe.radon.counts == (6, 8)
+        rows.append([events.plan(recipe, number).row() for number in range(8)])
+    assert rows[0] == rows[1] and any(row["phantom"] == "points" for row in rows[0])
+
+
 def test_shares_may_be_rounded(tmp_path):
     text = TEXT.replace("train = 0.8", "train = 0.3333333\nb = 0.3333333").replace("test = 0.2", "test = 0.3333333")
     assert sum(small_recipe(tmp_path, text).splits.values()) == pytest.approx(1, abs=1e-15)

@@ -25,7 +25,6 @@ from .run import ProjectionRun
 class Imaging:
     """Makes images of volumes: the one route of runs, reconstructions and events, with the same warnings for all."""
 
-    system: PinholeSystem  # whose images are the projector's views
     projector: Projector
     photons: float | None = None  # as for `project_run`
 
@@ -47,7 +46,7 @@ class Imaging:
         if self.photons is not None and not (isinstance(self.model, Transmission) and volume.quantity == "mu"):
             what = f"{self.model.name} of {volume.quantity}"
             raise InputError(f"photons: expected the transmission of a volume of mu, got {what}")
-        warn_of_images(volume, self.system, A.views, self.model)
+        warn_of_images(volume, A.views, self.model)
         if mu is not None and isinstance(self.model, Emission):
             for doubt in doubts_of_mu(mu, self.model):
                 warn(doubt)
@@ -111,7 +110,7 @@ def project_run(
     n_v, n_u = views.shape
     each = 4.0 if noise_seed is None else 20.0  # bytes; counts are drawn from float64, as int64
     require(each * len(views) * n_v * n_u, f"a set of {len(views)} projections of {n_v} x {n_u} pixels")
-    imaging = Imaging(system, Projector(volume.grid, views, model, backend, threads), photons)
+    imaging = Imaging(Projector(volume.grid, views, model, backend, threads), photons)
     model = imaging.model
     images = imaging.images(volume, progress=progress)
     if noise_seed is not None:
@@ -141,13 +140,13 @@ def warn_of_energy(model: Model, energy: float | str | None, source: str) -> Non
         warn(f"the mu of {source} holds at {energy:g} keV, {counted}")
 
 
-def warn_of_images(volume: Volume, system: PinholeSystem, views: Views, model: Model) -> None:
+def warn_of_images(volume: Volume, views: Views, model: Model) -> None:
     """Warn where images of a volume hardly are what is wanted: activity below 0, pixels beside crystals, unseen parts."""
     lowest, highest = float(volume.array.min()), float(volume.array.max())
     if isinstance(model, Emission) and lowest < -0.1 * abs(highest):  # interpolation leaves less
         warn(f"the activity is {lowest:g} to {highest:g} kBq/mL: what is below 0 makes counts below 0")
     if isinstance(model, Emission) and not model.within_crystal:
-        _warn_of_no_crystal(system, views)
+        _warn_of_no_crystal(model.system, views)
     _warn_of_unseen(volume, views, ends_at_plane=not isinstance(model, Emission))
 
 

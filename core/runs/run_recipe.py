@@ -179,7 +179,7 @@ def recipe_imaging(
 ) -> Imaging:  # fmt: skip
     """What makes a recipe's images of volumes on a grid; `mu` is what attenuates."""
     projector = Projector(grid, views, recipe_model(recipe, system, mu), backend, threads)
-    return Imaging(system, projector, recipe["model.photons"])
+    return Imaging(projector, recipe["model.photons"])
 
 
 def _volume_name(record: Recipe) -> str:

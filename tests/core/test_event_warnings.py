@@ -119,7 +119,7 @@ def event_text(given: dict[str, Any]) -> str:
 
 @pytest.mark.parametrize("case", CASES)
 def test_an_event_gives_the_warnings_of_a_run_of_the_same_settings(folder, scanner, case):
-    changes, said = CASES[case]
+    changes, expected = CASES[case]
     given = BASE | {key: str(folder / value) if key.endswith(".file") else value for key, value in changes.items()}
     recipe = {
         key: value for key, value in given.items() if "volume.file" not in given or not key.startswith("phantom.")
@@ -131,7 +131,7 @@ def test_an_event_gives_the_warnings_of_a_run_of_the_same_settings(folder, scann
         vars(maker)["system"] = scanner[:2]  # the same, read once
         first = maker.make(0)
         again = maker.make(1)
-    assert any(said in text for text in of_run) if said else not of_run, of_run
+    assert any(expected in text for text in of_run) if expected else not of_run, of_run
     assert {*of_set, *first.warnings} == set(of_run)
     assert again.warnings == first.warnings  # each event says all of its own
     np.testing.assert_allclose(first.images["images"], run.projections, rtol=1e-6, atol=1e-6)

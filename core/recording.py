@@ -9,9 +9,12 @@ import threading
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, Generic, TypeVar
 
-from .errors import InputWarning
+from .errors import InputWarning, warn
+
+T = TypeVar("T")
 
 _lock = threading.Lock()
 _recorders: list[tuple[int, list[str]]] = []  # thread and record, oldest first
@@ -39,6 +42,26 @@ def recorded_warnings() -> Iterator[list[str]]:
             _recorders[:] = [other for other in _recorders if other is not mine]
             if not _recorders:
                 _restore()
+
+
+@dataclass(frozen=True, eq=False)
+class Remembered(Generic[T]):
+    """What was made once for several uses, and the warnings that were given when it was made."""
+
+    value: T
+    warnings: list[str]
+
+    def again(self) -> T:
+        """The value, with the warnings of its making."""
+        for text in self.warnings:
+            warn(text)
+        return self.value
+
+
+def remembered(make: Callable[[], T]) -> Remembered[T]:
+    """What `make` makes, and its warnings, which nobody sees before they are asked for."""
+    with recorded_warnings() as warnings:
+        return Remembered(make(), warnings)
 
 
 class _Route:

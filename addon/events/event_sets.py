@@ -231,8 +231,8 @@ def _phantom_of(planned: events.PlannedEvent, target: _Target, files: Path, prog
         if field.metadata:
             is_activity = field.metadata.get("unit", "").startswith("kBq")
             values[field.name] = _times(getattr(phantom, field.name), planned.activity_factor if is_activity else 1.0)
-    if entry.gates > 1:
-        values["frames"] = entry.gates
+    if entry["gates"] > 1:
+        values["frames"] = entry["gates"]
     voxels = target.voxels or min(_VOXELS, *recipe.grid.shape)
     settings = plain_settings(entry.kind.name, **values, quantity=recipe.quantity, voxels=voxels)
     quantities = [recipe.quantity, *target.others]

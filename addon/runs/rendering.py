@@ -61,8 +61,7 @@ def render_job(context: bpy.types.Context, recipe: Recipe, volume: str = "", mu:
 
     def work(progress: Progress) -> tuple[ProjectionRun, images.Pictures]:
         stages = stages_of(progress)
-        if energy is not None:
-            warn_of_energy(model, energy, f"the mu of {recipe['attenuation.object']!r}")
+        warn_of_energy(model, energy, repr(recipe["attenuation.object"]))
         stages("reading")
         (run,) = run_recipe(recipe, system, read_volume(), read_mu and read_mu(), stages)
         return run, kept(run, path, display, stages)

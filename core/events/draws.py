@@ -9,13 +9,14 @@ import math
 import statistics
 import zlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from ..errors import InputError
-from ..validation import real_array
+from ..runs.recipe import Values
+from ..runs.settings import Setting
 
 _NORMAL = statistics.NormalDist()
 
@@ -50,7 +51,7 @@ class Dice:
         return max(i for i, share in enumerate(odds) if share > 0)
 
     def draw(self, value: Any, name: str, whole: bool = False) -> Any:
-        """The value of a setting of this name; `value` is checked (`check_draw`)."""
+        """The value of a setting of this name; `value` is checked (`Drawn`)."""
         if isinstance(value, Mapping):
             if "one_of" in value:
                 options = value["one_of"]
@@ -65,52 +66,50 @@ class Dice:
         return value
 
 
-def check_draw(value: Any, name: str, whole: bool = False) -> None:
-    """Raise `InputError` where a table in `value` is no draw, or draws what is no number; `name` says whose value it is."""
-    if isinstance(value, list | tuple):
-        for item in value:
-            check_draw(item, name, whole)
-    if not isinstance(value, Mapping):
-        return
-    if "one_of" in value:
-        _check_choice(value, name, whole)
-        return
-    if set(value) != {"from", "to"}:
-        found = ", ".join(value) or "nothing"
-        raise InputError(f"{name}: expected {{ from = …, to = … }} or {{ one_of = […] }}, got a table of {found}")
-    low, high = value["from"], value["to"]
-    kind = "whole numbers" if whole else "numbers"
-    for number in (low, high):
-        if (
-            isinstance(number, bool)
-            or not isinstance(number, int if whole else int | float)
-            or not math.isfinite(number)
-        ):
-            raise InputError(f"{name}: expected {kind} after from and to, got {number!r}")
-    if low > high:
-        raise InputError(f"{name}: expected from {low:g} to no less, got {high:g}")
+@dataclass(frozen=True)
+class Drawn(Setting):
+    """A setting whose value, or each of several, may be a draw. Its limits hold for what is drawn, not for a range."""
+
+    def checked(self, value: Any) -> Any:
+        """`value` as a recipe keeps it, with draws; `InputError` where it is not what is expected, or no draw."""
+        if not isinstance(value, Mapping) or (self.sizes is not None and "one_of" not in value):
+            return super().checked(value)
+        return self._choice(value) if "one_of" in value else self._range(value)
+
+    def _one(self, value: Any) -> Any:
+        return replace(self, sizes=None).checked(value) if isinstance(value, Mapping) else super()._one(value)
+
+    def _choice(self, value: Mapping[str, Any]) -> Mapping[str, Any]:
+        if unknown := set(value) - {"one_of", "odds"}:
+            raise InputError(f"{self.key}: beside one_of expected odds, got {', '.join(sorted(unknown))}")
+        options = value["one_of"]
+        if not isinstance(options, list) or not options:
+            raise InputError(f"{self.key}: expected a list of one or more after one_of, got {options!r}")
+        if "odds" in value:
+            check_odds(value["odds"], len(options), self.key)
+        return {**value, "one_of": list(map(self.checked, options))}
+
+    def _range(self, value: Mapping[str, Any]) -> Mapping[str, Any]:
+        if set(value) != {"from", "to"} or self.kind is str:
+            found = ", ".join(value) or "nothing"
+            raise InputError(
+                f"{self.key}: expected {{ from = …, to = … }} or {{ one_of = […] }}, got a table of {found}"
+            )
+        number = Setting(f"{self.key}: from and to", int if self.kind is int else float, None, self.text)
+        low, high = map(number.checked, (value["from"], value["to"]))
+        if low > high:
+            raise InputError(f"{self.key}: expected from {low:g} to no less, got {high:g}")
+        return value
 
 
-def check_number(value: Any, name: str) -> None:
-    """Raise `InputError` unless `value` is a number or a draw of numbers."""
-    check_draw(value, name)
-    if isinstance(value, Mapping):
-        for option in value.get("one_of", ()):
-            check_number(option, name)
-    else:
-        real_array(value, name, ())
+@dataclass(frozen=True)
+class DrawnValues(Values):
+    """Values of settings, some of which may be draws."""
 
-
-def _check_choice(value: Mapping[str, Any], name: str, whole: bool) -> None:
-    if unknown := set(value) - {"one_of", "odds"}:
-        raise InputError(f"{name}: beside one_of expected odds, got {', '.join(sorted(unknown))}")
-    options = value["one_of"]
-    if not isinstance(options, list) or not options:
-        raise InputError(f"{name}: expected a list of one or more after one_of, got {options!r}")
-    for option in options:
-        check_draw(option, name, whole)
-    if "odds" in value:
-        check_odds(value["odds"], len(options), name)
+    def drawn(self, key: str, dice: Dice, before: str = "") -> Any:
+        """What is drawn of a setting, checked; `before` stands before its key in the name of its random numbers."""
+        row = self.rows[key]
+        return row.checked(dice.draw(self[key], before + key, row.kind is int))
 
 
 def check_odds(odds: Any, count: int, name: str) -> None:

@@ -1,7 +1,10 @@
-"""The parts of an event recipe and their checks: tables, and the phantoms with their ranges."""
+"""The phantoms of an event recipe: their settings, values and draws."""
 
-from collections.abc import Collection, Mapping
+import functools
+from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -10,28 +13,72 @@ from ..errors import InputError, naming
 from ..phantoms.kinds import KINDS, Kind
 from ..phantoms.settings import setting_names
 from ..phantoms.torso import CardiacTorso
-from ..physics.isotopes import photon_energy
-from ..validation import one_of, real_array, whole_number
-from .draws import check_draw, check_number, options
-
-_OWN = ("name", "odds", "split", "pose")
-_OF_FILE = ("file", "mu_file", "center", "energy")
+from ..runs.settings import SETTINGS, Setting, own_settings
+from .draws import Drawn, DrawnValues, options
 
 
-def table(values: Mapping[str, Any], name: str, *known: str) -> dict[str, Any]:
-    """A table of the recipe, empty where it is not there; `InputError` for a key that is not one of those `known`."""
+def like(key: str, known: str, row: type[Setting] = Setting, **changes: Any) -> Setting:
+    """The row of a setting that is another's of projection runs under another key."""
+    return row(**{**vars(SETTINGS[known]), "key": key, "needs": (), **changes})
+
+
+_OF_FILE = ("file",)
+_ROWS = (
+    Setting("name", str, None, "What the phantom is called", "its kind"),
+    Setting("odds", float, 1.0, "How often it comes, beside the others", least=0),
+    Setting("split", str, None, "The split of all its events", "one by the shares of the splits"),
+    like("kind", "phantom.kind", default=None, needs=("no file",)),
+    Drawn("file", str, None, "A phantom's shapes (.toml) or a volume", needs=("no kind",)),
+    Drawn("mu_file", str, None, "What attenuates a volume, which is placed with it", needs=_OF_FILE),
+    like("center", "volume.center", needs=_OF_FILE),
+    like("energy", "attenuation.energy", needs=_OF_FILE),
+    Setting("gates", int, 1, "Phases of the beating torso, whose mean the event is", least=1, needs=("kind",)),
+    like("pose.position", "phantom.position", Drawn),
+    like("pose.euler_degrees", "phantom.euler_degrees", Drawn),
+    Setting("pose.turn", str, None, "How it is turned", words={"uniform": ("Uniform", "Every rotation is as likely")},
+            needs=("no pose.euler_degrees",)),
+)  # fmt: skip
+
+
+def by_key(rows: Iterable[Setting]) -> dict[str, Setting]:
+    """Settings by their keys."""
+    return {row.key: row for row in rows}
+
+
+def table(values: Mapping[str, Any], name: str) -> dict[str, Any]:
+    """A table of a recipe, empty where it is not there; `InputError` where it is none."""
     found = values.get(name, {})
     if not isinstance(found, dict):
         raise InputError(f"{name}: expected a table [{name}]")
-    unknown(found, known or found, f"{name}.")
     return found
 
 
-def unknown(values: Mapping[str, Any], known: Collection[str], before: str) -> None:
-    """Raise `InputError` for a key that is not one of those `known`."""
-    for key in values:
-        if key not in known:
-            raise InputError(f"{before}{key}: no such entry; expected {', '.join(known)}")
+def flat(values: Mapping[str, Any], rows: Mapping[str, Setting], *tables: str) -> dict[str, Any]:
+    """The values of a recipe by the keys of their rows: those in its tables as "table.name"."""
+    found = {key: value for key, value in values.items() if key not in tables}
+    for name in tables:
+        found |= {f"{name}.{key}": value for key, value in table(values, name).items()}
+    return {key: _as_earlier(rows[key], value) if key in rows else value for key, value in found.items()}
+
+
+def required(value: Any, key: str, what: str) -> Any:
+    """A value that has no default; `InputError`, which says what to give, where it is missing."""
+    if value is None:
+        raise InputError(f"{key}: missing; {what}")
+    return value
+
+
+def _as_earlier(row: Setting, value: Any) -> Any:
+    """A value, other where earlier versions took true for 1.0, "60" for an energy of 60.0, and 8.0 for 8."""
+    if isinstance(value, list):
+        return [_as_earlier(row, each) for each in value]
+    if isinstance(value, dict):
+        return {key: _as_earlier(row, each) if key == "one_of" else each for key, each in value.items()}
+    is_number = isinstance(value, str) and row.words and value not in row.words
+    if row.kind is float and (is_number or isinstance(value, bool)):
+        with suppress(ValueError):
+            return float(value)
+    return int(value) if row.kind is int and isinstance(value, float) and value.is_integer() else value
 
 
 def plain_name(name: Any, what: str) -> str:
@@ -41,146 +88,81 @@ def plain_name(name: Any, what: str) -> str:
     return name
 
 
-def share(value: Any, name: str) -> float:
-    """A number from 0 to 1."""
-    number = float(real_array(value, name, ()))
-    if not 0 <= number <= 1:
-        raise InputError(f"{name}: expected from 0 to 1, got {number:g}")
-    return number
-
-
 @dataclass(frozen=True)
-class PhantomEntry:
-    """One of the phantoms that an event may have."""
+class PhantomEntry(DrawnValues):
+    """One of the phantoms that an event may have: its values and draws, by the keys of their settings."""
 
-    name: str
-    kind: Kind | None  # None where it is a file
-    file: Any = None  # draw of the names of volumes or of phantoms (.toml)
-    mu_file: Any = None  # of a volume: what attenuates, which is placed with it
-    center: bool = False  # whether a volume's middle is moved to the origin first
-    energy: float | str | None = None  # at which a volume of CT numbers becomes mu
-    settings: dict[str, Any] = field(default_factory=dict)  # of the kind: values and draws
-    position: Any = (0.0, 0.0, 0.0)  # mm
-    euler_degrees: Any = (0.0, 0.0, 0.0)  # phi, theta, psi
-    turn_uniform: bool = False  # every rotation is as likely as any other
-    gates: int = 1  # of the beating torso: the event is the mean of so many phases
-    odds: float = 1.0
-    split: str | None = None  # to which all such events belong
+    settings: Mapping[str, Any] = field(default_factory=dict)  # of its kind, as the recipe says them
+
+    @cached_property
+    def rows(self) -> Mapping[str, Setting]:
+        """The settings that it may have."""
+        return _rows(str(self.given.get("kind")))
+
+    @cached_property
+    def kind(self) -> Kind | None:
+        """None where the phantom is a file."""
+        return next((kind for kind in KINDS if kind.name == self.given.get("kind")), None)
+
+    @property
+    def name(self) -> str:
+        """What the recipe calls it."""
+        return str(self["name"])
 
     @property
     def is_volume(self) -> bool:
         """Whether the files are volumes."""
-        return self.file is not None and not str(options(self.file)[0]).lower().endswith(".toml")
-
-    def is_whole(self, setting: str) -> bool:
-        """Whether a setting of the kind is a whole number, or several."""
-        default = _defaults(self.kind)[setting] if self.kind else 0.0
-        first = default[0] if isinstance(default, tuple) else default
-        return isinstance(first, int) and not isinstance(first, bool)
-
-    def what(self, quantity: str) -> str:
-        """What a volume is read as: its quantity, and the energy at which CT numbers become mu."""
-        return quantity if self.energy is None or quantity != "mu" else f"mu at {self.energy}"
+        return self["file"] is not None and not is_text(self["file"])
 
 
 def phantom_entry(values: dict[str, Any], number: int, quantity: str) -> PhantomEntry:
     """One table of [[phantoms]]; `InputError` names phantom and entry."""
-    called = values.get("name", values.get("kind", f"phantom {number}"))
-    with naming(f"phantoms: {called}"):
+    kind = values.get("kind")
+    with naming(f"phantoms: {values.get('name', f'phantom {number}' if kind is None else kind)}"):
         if ("kind" in values) == ("file" in values):
             raise InputError('expected either kind = "…" or file = "…"')
-        kind = None
-        if "kind" in values:
-            one_of(values["kind"], [known.name for known in KINDS], "kind")
-            (kind,) = (known for known in KINDS if known.name == values["kind"])
-        found = _placed(values) | _of_file(values, kind, quantity)
-        name = values.get("name", kind.name if kind else f"file-{number}")
-        if not isinstance(name, str) or not name:
-            raise InputError(f"name: expected a text, got {name!r}")
-        split = values.get("split")
-        if split is not None:
-            plain_name(split, "split")
-        odds = float(real_array(values.get("odds", 1.0), "odds", ()))
-        gates = whole_number(values.get("gates", 1), "gates")
-        if gates > 1 and (kind is None or kind.phantom is not CardiacTorso or "phase" in values):
+        if kind is not None:
+            _rows("")["kind"].checked(kind)
+        named = {"name": f"file-{number}" if kind is None else str(kind), **values}
+        own = {key: value for key, value in values.items() if key not in _rows("") and key != "pose"}
+        entry = PhantomEntry(flat(named, _rows(str(kind)), "pose"), own)
+        if not entry.name:
+            raise InputError("name: expected a text, got ''")
+        if entry["split"] is not None:
+            plain_name(entry["split"], "split")
+        if entry["gates"] > 1 and (entry.kind is None or entry.kind.phantom is not CardiacTorso or "phase" in own):
             raise InputError('gates: they are of kind = "torso" without a phase of its own')
-        entry = PhantomEntry(name, kind, gates=gates, odds=odds, split=split, **found)
-        _check_settings(entry)
+        if kind is None:
+            _check_files(entry, quantity)
         return entry
 
 
-def _of_file(values: dict[str, Any], kind: Kind | None, quantity: str) -> dict[str, Any]:
-    """The entries of a phantom that is a file, or the settings of one of a kind."""
-    if kind is not None:
-        settings = {key: value for key, value in values.items() if key not in (*_OWN, "kind", "gates")}
-        return {"settings": settings}
-    unknown(values, (*_OWN, *_OF_FILE), "")
-    found: dict[str, Any] = {}
-    for key in ("file", "mu_file"):
-        if key not in values:
-            continue
-        check_draw(values[key], key)
-        names = options(values[key])
-        if not names or not all(isinstance(name, str) and name for name in names):
-            raise InputError(f"{key}: expected a file's name, or {{ one_of = [names] }}, got {values[key]!r}")
-        if len({name.lower().endswith(".toml") for name in names}) > 1:
-            raise InputError(f"{key}: volumes and phantoms (.toml) do not go together: make two [[phantoms]] of them")
-        found[key] = values[key]
-    is_volume = not str(options(values["file"])[0]).lower().endswith(".toml")
+@functools.cache
+def _rows(kind: str) -> Mapping[str, Setting]:
+    """The settings of a phantom of a kind, or of a file."""
+    return by_key([*(row for known in KINDS if known.name == kind for row in own_settings(known, Drawn)), *_ROWS])
+
+
+def _check_files(entry: PhantomEntry, quantity: str) -> None:
+    """Raise `InputError` where the files of a phantom do not go together."""
+    files, others = options(entry["file"]), options(entry["mu_file"])
+    if "" in (*files, *others):
+        raise InputError("file: expected a file's name, got ''")
+    if any(len(set(map(is_text, names))) > 1 for names in (files, others)):
+        raise InputError("file: volumes and phantoms (.toml) do not go together: make two [[phantoms]] of them")
     for key in ("mu_file", "center", "energy"):
-        if key in values and not is_volume:
+        if key in entry.given and not entry.is_volume:
             raise InputError(f"{key}: it goes with volumes, not with phantoms (.toml)")
-    if not isinstance(values.get("center", False), bool):
-        raise InputError(f"center: expected true or false, got {values['center']!r}")
-    if "mu_file" in values and isinstance(values["mu_file"], dict) != isinstance(values["file"], dict):
-        raise InputError("mu_file: expected one for each file")
-    if "mu_file" in values and len(options(values["mu_file"])) != len(options(values["file"])):
+    is_one = [isinstance(entry[key], str) for key in ("file", "mu_file")]
+    if "mu_file" in entry.given and (len(others) != len(files) or is_one[0] != is_one[1]):
         raise InputError("mu_file: expected one for each file, in the same order")
-    if "energy" in values:
-        photon_energy(values["energy"])
-        if quantity != "mu" and "mu_file" not in values:
-            raise InputError("energy: it converts CT numbers to mu, but the truth is activity and there is no mu_file")
-    return found | {key: values[key] for key in ("center", "energy") if key in values}
+    if "energy" in entry.given and quantity != "mu" and "mu_file" not in entry.given:
+        raise InputError("energy: it converts CT numbers to mu, but the truth is activity and there is no mu_file")
 
 
-def _placed(values: dict[str, Any]) -> dict[str, Any]:
-    """The entries of [phantoms.pose]."""
-    pose = table(values, "pose", "position", "euler_degrees", "turn")
-    found: dict[str, Any] = {}
-    for key in ("position", "euler_degrees"):
-        if key not in pose:
-            continue
-        check_draw(pose[key], f"pose.{key}")
-        for option in options(pose[key]):
-            if not isinstance(option, list) or len(option) != 3:
-                raise InputError(f"pose.{key}: expected three numbers or draws, got {option!r}")
-            for value in option:
-                check_number(value, f"pose.{key}")
-        found[key] = pose[key]
-    if "turn" in pose:
-        one_of(pose["turn"], ("uniform",), "pose.turn")
-        if "euler_degrees" in pose:
-            raise InputError("pose.turn: it does not go with euler_degrees")
-        found["turn_uniform"] = True
-    return found
-
-
-def _check_settings(entry: PhantomEntry) -> None:
-    """Raise `InputError` for a setting that the kind does not have, or a wrong draw; the values are checked when drawn."""
-    if entry.kind is None:
-        return
-    known = setting_names(entry.kind.phantom)
-    for key, value in entry.settings.items():
-        if key not in known:
-            expected = ", ".join((*known, *_OWN, *(["gates"] if entry.kind.phantom is CardiacTorso else [])))
-            raise InputError(f"{key}: no such setting of {entry.kind.name}; expected {expected}")
-        check_draw(value, key, entry.is_whole(key))
-
-
-def _defaults(kind: Kind) -> dict[str, Any]:
-    """The settings of a kind by their names in recipes, with the values that they have unless told otherwise."""
-    defaults = {field.name: field.default for field in kind.phantom.__dataclass_fields__.values() if field.init}
-    return {key: kind.usual.get(name, defaults[name]) for key, name in setting_names(kind.phantom).items()}
+def is_text(file: Any) -> bool:
+    """Whether a file, or the first that may be drawn, is a phantom's description."""
+    return str(options(file)[0]).lower().endswith(".toml")
 
 
 def as_settings(phantom: Any, kind: Kind) -> dict[str, Any]:

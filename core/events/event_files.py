@@ -133,14 +133,14 @@ def packed(event: EventArrays, recipe: EventRecipe, geometry: dict[str, Any], th
 
 def _write_truth(file: Any, truth: Volume, recipe: EventRecipe, pool: ThreadPoolExecutor) -> None:
     """The truth: whole, in half precision, or the values that are not 0 and their places."""
-    array, store = truth.array, recipe.truth_store
+    array, store = truth.array, recipe["truth.store"]
     attributes = {"unit": truth.unit, "quantity": truth.quantity}
     if store != "sparse":
         brick = tuple(min(n, _BRICK) for n in array.shape)
         _write(file, "truth", array, store, brick, pool, attributes)
         return
     flat = array.reshape(-1)
-    least = recipe.truth_below * float(np.abs(flat).max(initial=0.0))
+    least = recipe["truth.below"] * float(np.abs(flat).max(initial=0.0))
     kept = np.flatnonzero(np.abs(flat) > least) if least > 0 else np.flatnonzero(flat)
     left = float(np.abs(np.delete(flat, kept)).max(initial=0.0)) if least > 0 else 0.0
     index = kept.astype(np.uint32 if flat.size <= 1 << 32 else np.uint64)
@@ -153,7 +153,7 @@ def _write_images(
     file: Any, name: str, images: NDArray[np.float32], unit: str, recipe: EventRecipe, pool: ThreadPoolExecutor
 ) -> None:
     """Images, each a chunk of its own, so that one reads alone."""
-    _write(file, name, images, recipe.image_store, (1, *images.shape[1:]), pool, {"unit": unit})
+    _write(file, name, images, recipe["storage.images"], (1, *images.shape[1:]), pool, {"unit": unit})
 
 
 def _write(

@@ -287,7 +287,7 @@ class Event:
         if "attenuation.file" in changes:
             changes |= {"attenuation.energy": None}  # the set's copy holds mu
         record = recorded_recipe(model.updated(changes))
-        if planned.phantom is not None and planned.entry.gates == 1 and planned.activity_factor == 1:
+        if planned.phantom is not None and planned.entry["gates"] == 1 and planned.activity_factor == 1:
             own: dict[str, Any] = {"phantom.voxels": recipe.grid.shape, "phantom.spacing": recipe.grid.spacing.tolist()}
             if planned.file is not None:
                 own["phantom.file"] = str(recipe.input(planned.file).path)

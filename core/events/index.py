@@ -33,7 +33,7 @@ class Index:
     def columns(self) -> list[str]:
         """The same for all events of the recipe."""
         entries = self._recipe.phantoms
-        files = ["file"] if any(entry.file is not None for entry in entries) else []
+        files = ["file"] if any(entry["file"] is not None for entry in entries) else []
         return [*FIXED_COLUMNS, *files, *dict.fromkeys(f"phantom.{key}" for entry in entries for key in entry.settings)]
 
     def read(self) -> dict[int, str]:

@@ -9,8 +9,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..files import write_bytes
-from ..physics.ct_numbers import hu_to_mu
-from ..physics.isotopes import photon_energy
+from ..runs.run_recipe import read_mu
 from ..volumes.volume import Volume
 from ..volumes.volume_files import read_volume, read_volume_of, write_volume
 
@@ -72,18 +71,7 @@ def _hash(path: Path, what: str, is_copy: bool) -> str:
 def _volume(path: Path, what: str) -> Volume:
     """The volume in a user's file."""
     quantity, _, energy = what.partition(" at ")
-    if not energy:
-        return read_volume_of(
-            path, quantity, "; of CT numbers, give the energy to convert them at" * (quantity == "mu")
-        )
-    volume = read_volume(path)
-    if volume.quantity != "hu":
-        raise InputError(f"{path}: it holds {volume.quantity}; an energy is for CT numbers (hu)")
-    try:
-        kev: float | str = float(energy)
-    except ValueError:
-        kev = energy
-    return hu_to_mu(volume, photon_energy(kev))
+    return read_mu(path, energy or None) if quantity == "mu" else read_volume_of(path, quantity)
 
 
 def _stem(path: Path) -> str:

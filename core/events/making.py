@@ -2,7 +2,8 @@
 
 import math
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,21 +12,20 @@ from numpy.typing import NDArray
 from ..errors import InputError, naming
 from ..geometry.grid import Grid
 from ..geometry.parallel_views import parallel_views
-from ..geometry.system import PinholeSystem, chosen_modules
+from ..geometry.system import PinholeSystem
 from ..geometry.views import Views
 from ..memory import readable_size, require
-from ..physics.isotopes import photon_energy
 from ..progress import Progress, tell
-from ..projector import Emission, Projector, intensity
-from ..recording import recorded_warnings
-from ..runs.projecting import warn_of_energy, warn_of_images
+from ..projector import Emission, Model, Projector
+from ..projector.backends import choose
+from ..recording import Remembered, recorded_warnings, remembered
+from ..runs.projecting import Imaging, warn_of_energy
 from ..runs.recipe import Recipe
-from ..runs.run_recipe import recipe_model, recipe_views, require_mu
+from ..runs.run_recipe import recipe_imaging, recipe_system, recipe_views, require_mu
 from ..validation import freeze
 from ..volumes.rearranging import centered
 from ..volumes.resampling import resample
 from ..volumes.volume import Volume
-from ..workbook import read_system
 from .planning import PlannedEvent, plan
 from .recipe import EventRecipe
 
@@ -43,7 +43,7 @@ class EventArrays:
     units: dict[str, str]  # by model
     radon: dict[int, NDArray[np.float32]]  # by number of angles, (n, n_v, n_u), value x mm
     gains: NDArray[np.float64]  # (M,)
-    warnings: tuple[str, ...] = ()  # of the truth, such as a phantom that lies outside its grid in part
+    warnings: tuple[str, ...] = ()  # those of a run of the same settings
 
 
 class EventMaker:
@@ -54,16 +54,16 @@ class EventMaker:
 
     def __init__(self, recipe: EventRecipe, threads: int | None = None) -> None:
         self.recipe, self.threads = recipe, threads
-        self._volumes: dict[str, Volume] = {}
+        self._volumes: dict[str, Remembered[Volume]] = {}
 
     @cached_property
     def system(self) -> PinholeSystem:
         """The scanner."""
-        return recipe_system(self.recipe)
+        return recipe_system(self.recipe.system, lambda name: self.recipe.input(name).path)
 
     @cached_property
     def views(self) -> Views:
-        """Of the scanner's images."""
+        """The views of the scanner's images."""
         return recipe_views(self.recipe.system, self.system)
 
     @property
@@ -96,9 +96,9 @@ class EventMaker:
             tell(progress, done, steps)
 
         tell(progress, 0, steps)
-        with naming(f"event {number}"):
-            with recorded_warnings() as warnings:
-                truth = self.truth(planned)
+        _ = self.system, choose("auto")  # before the event, whose file does not hold warnings of scanner and machine
+        with naming(f"event {number}"), recorded_warnings() as warnings:
+            truth = self.truth(planned)
             step()
             gains = planned.gains(len(self.system))
             images, units = {}, {}
@@ -107,13 +107,14 @@ class EventMaker:
                     images[name], units[name] = self._images(name, planned, truth, gains)
                 step()
             radon = {}
-            for count, projector in self._radon.items():
+            for count, projector in self._radon.again().items():
                 radon[count] = projector(truth)
                 step()
-        return EventArrays(planned, truth, images, units, radon, gains, tuple(warnings))
+        return EventArrays(planned, truth, images, units, radon, gains, tuple(dict.fromkeys(warnings)))
 
     def truth(self, planned: PlannedEvent) -> Volume:
         """The event's volume."""
+        planned.made_phantom.again()
         factor = planned.activity_factor
         volume = self._voxels(planned, self.recipe.quantity)
         if factor == 1.0:
@@ -127,7 +128,7 @@ class EventMaker:
             file = planned.file if quantity == self.recipe.quantity else planned.mu_file
             assert file is not None  # the recipe refuses attenuation by a volume without a mu_file
             volume = self._read(file)
-            if planned.entry.center and planned.file is not None:  # what attenuates moves as far as the activity
+            if planned.entry["center"] and planned.file is not None:  # what attenuates moves as far as the activity
                 volume = centered(volume, volume.grid.center - self._read(planned.file).grid.center)
             return _placed(volume, placement, grid)
         volumes = [phantom.voxelize(grid, placement, quantity=quantity) for phantom in planned.phantoms]
@@ -141,62 +142,53 @@ class EventMaker:
         if file not in self._volumes:
             while len(self._volumes) >= _KEPT_VOLUMES:
                 del self._volumes[next(iter(self._volumes))]
-            self._volumes[file] = self.recipe.input(file).volume()
-        return self._volumes[file]
+            self._volumes[file] = remembered(self.recipe.input(file).volume)
+        return self._volumes[file].again()
 
     def _images(
         self, name: str, planned: PlannedEvent, truth: Volume, gains: NDArray[np.float64]
     ) -> tuple[NDArray[np.float32], str]:
         """A model's images, and their unit."""
-        recipe = self.recipe.models[name]
-        own_mu = recipe["attenuation.of_phantom"]
-        if own_mu and planned.phantom is not None:
-            require_mu(planned.phantom, recipe_model(recipe, self.system))
-        projector = self._projectors[name]
-        images = projector(truth, mu=self._voxels(planned, "mu").array) if own_mu else projector(truth)
-        warn_of_images(truth, self.system, self.views, recipe["detector.magnification"], projector.model)
-        photons, unit = recipe["model.photons"], projector.model.unit(truth)
-        if photons is not None:
-            images, unit = intensity(images, photons), "photons"
-        images = np.asarray(images, np.float32) + projector.background.astype(np.float32)
-        if isinstance(projector.model, Emission) and self.recipe.augmentation.module_gain:
+        recipe, imaging, mu = self.recipe.models[name], self._imaging[name].again(), None
+        if recipe["attenuation.of_phantom"]:
+            self._check_mu(planned, imaging.model)
+            mu = self._voxels(planned, "mu").array
+        images = imaging.images(truth, mu)
+        if isinstance(imaging.model, Emission) and self.recipe["augmentation.module_gain"]:
             images *= gains.astype(np.float32)[:, None, None]
-        return images, unit
+        return images, imaging.unit(truth)
+
+    def _check_mu(self, planned: PlannedEvent, model: Model) -> None:
+        """Raise `InputError` where nothing attenuates; warn where it holds at another energy than the model's."""
+        if planned.phantom is not None:
+            require_mu(planned.phantom, model)
+        elif planned.mu_file is not None:
+            warn_of_energy(model, planned.entry["energy"], Path(planned.mu_file).name)
 
     @cached_property
-    def _projectors(self) -> dict[str, Projector]:
+    def _imaging(self) -> dict[str, Remembered[Imaging]]:
+        """What makes each model's images."""
         found = {}
         for name, recipe in self.recipe.models.items():
             with naming(f"models.{name}"):
-                found[name] = self._projector(recipe)
+                found[name] = remembered(partial(self._imaging_of, recipe))
         return found
 
-    def _projector(self, recipe: Recipe) -> Projector:
-        mu, grid = None, self.recipe.grid
+    def _imaging_of(self, recipe: Recipe) -> Imaging:
+        grid, file = self.recipe.grid, recipe["attenuation.file"]
+        mu = None if file is None else self.recipe.input(file).volume()
         if recipe["attenuation.of_phantom"]:  # each event has its own: here, to say on which grid
             mu = Volume(freeze(np.zeros(grid.shape, np.float32)), grid, "mu")
-        elif recipe["attenuation.file"] is not None:
-            mu = self.recipe.input(recipe["attenuation.file"]).volume()
-        model = recipe_model(recipe, self.system, mu)
-        if (energy := recipe["attenuation.energy"]) is not None:
-            warn_of_energy(model, photon_energy(energy), f"the mu of {recipe['attenuation.file']}")
-        return Projector(grid, self.views, model, threads=self.threads)
+        imaging = recipe_imaging(recipe, self.system, self.views, grid, mu, threads=self.threads)
+        warn_of_energy(imaging.model, recipe["attenuation.energy"], Path(file or "").name)
+        return imaging
 
     @cached_property
-    def _radon(self) -> dict[int, Projector]:
-        radon = self.recipe.radon
-        if radon is None:
-            return {}
-        return {n: Projector(self.recipe.grid, radon_views(self.recipe, n), threads=self.threads) for n in radon.counts}
-
-
-def recipe_system(recipe: EventRecipe) -> PinholeSystem:
-    """The scanner that a recipe names."""
-    given = recipe.system
-    columns = given["system.columns"]
-    path = recipe.input(given["system.file"]).path
-    system = read_system(path, columns=None if columns is None else recipe.input(columns).path)
-    return chosen_modules(system, given["system.modules"], "system.modules")
+    def _radon(self) -> Remembered[dict[int, Projector]]:
+        recipe, counts = self.recipe, () if self.recipe.radon is None else self.recipe.radon.counts
+        return remembered(
+            lambda: {n: Projector(recipe.grid, radon_views(recipe, n), threads=self.threads) for n in counts}
+        )
 
 
 def radon_views(recipe: EventRecipe, count: int) -> Views:

@@ -1,7 +1,6 @@
 """What event i is: drawn from recipe, seed and number alone, before anything is computed."""
 
 import math
-from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -14,46 +13,69 @@ from ..phantoms.language import read_phantom
 from ..phantoms.phantom import Phantom
 from ..phantoms.settings import setting_names
 from ..phantoms.torso import CardiacTorso
-from ..recording import recorded_warnings
+from ..recording import Remembered, remembered
 from .draws import Dice, options
-from .entries import PhantomEntry, as_settings
+from .entries import as_settings
 from .recipe import EventRecipe
 
 FIXED_COLUMNS = (
     *("event", "phantom", "split", "x_mm", "y_mm", "z_mm", "phi_degrees", "theta_degrees", "psi_degrees", "mirror"),
     *("size", "activity_factor", "noise_seed"),
 )
-"""Of the index, those that all recipes have."""
+"""The columns of the index that all recipes have."""
 _GOLDEN = (math.sqrt(5) - 1) / 2
 
 
-@dataclass(frozen=True, eq=False)
 class PlannedEvent:
-    """What event `number` of a recipe is; nothing of it is computed yet."""
+    """What event `number`, from 0, of a recipe is: drawn, with nothing of it computed yet.
 
-    number: int
-    entry: PhantomEntry
-    split: str | None
-    settings: dict[str, Any]  # of the phantom, drawn: those that the recipe names
-    file: str | None  # of the phantom, as the recipe names it
-    mu_file: str | None
-    position: tuple[float, float, float]  # mm
-    euler_degrees: tuple[float, float, float]  # phi, theta, psi
-    mirror: bool
-    size: float
-    activity_factor: float
-    noise_seed: int
-    recipe: EventRecipe
+    Attributes
+    ----------
+    entry : PhantomEntry
+        The recipe's phantom, and its `split`, None where there are none.
+    settings : dict
+        Those of the phantom that the recipe names, drawn.
+    file, mu_file : str or None
+        The phantom's files, as the recipe names them.
+    position, euler_degrees : tuple of three floats
+        The phantom's middle, mm, and phi, theta, psi.
+    mirror, size, activity_factor
+        What is changed besides: whether the phantom is mirrored, factors of its lengths and of all values.
+    noise_seed : int
+        The event's own seed of noise.
+    """
+
+    def __init__(self, recipe: EventRecipe, number: int) -> None:
+        self.recipe, self.number = recipe, number
+        dice = Dice(recipe.seed, number)
+        entry = recipe.phantoms[dice.choice("phantom", [entry["odds"] for entry in recipe.phantoms])]
+        own, kinds = f"{entry.name}: ", {key: row.kind for key, row in entry.rows.items()}
+        self.entry, self.split = entry, entry["split"] or _split(recipe, number)
+        self.settings = {key: dice.draw(value, own + key, kinds[key] is int) for key, value in entry.settings.items()}
+        self.file, self.mu_file = dice.draw(entry["file"], f"{own}file"), None
+        if entry["mu_file"] is not None:
+            self.mu_file = options(entry["mu_file"])[options(entry["file"]).index(self.file)]
+        self.position = entry.drawn("pose.position", dice, own)
+        if entry["pose.turn"] is None:
+            self.euler_degrees = entry.drawn("pose.euler_degrees", dice, own)
+        else:
+            u, v, w = (dice.unit(f"{own}pose.turn {axis}") for axis in range(3))
+            self.euler_degrees = 360 * u, math.degrees(math.acos(1 - 2 * v)), 360 * w
+        self.mirror = dice.unit("augmentation.mirror") < recipe["augmentation.mirror"]
+        with naming(f"event {number}"):
+            self.size = recipe.settings.drawn("augmentation.size", dice)
+            self.activity_factor = recipe.settings.drawn("augmentation.activity", dice)
+        self.noise_seed = dice.bits("noise") >> 32
 
     @property
     def name(self) -> str:
-        """Of the recipe's phantom."""
+        """What the recipe calls the phantom."""
         return self.entry.name
 
     @property
     def pose(self) -> NDArray[np.float64]:
         """World-from-phantom pose (4, 4), mm: rotation and translation."""
-        phi, theta, psi = (math.radians(angle) for angle in self.euler_degrees)
+        phi, theta, psi = map(math.radians, self.euler_degrees)
         return euler_pose(phi, theta, psi, self.position)
 
     @property
@@ -63,25 +85,33 @@ class PlannedEvent:
         placement: NDArray[np.float64] = self.pose @ scale
         return placement
 
-    @cached_property
+    @property
     def phantom(self) -> Phantom | None:
         """The phantom; None where it is a volume's file. `InputError` where the drawn settings do not go together."""
-        entry = self.entry
-        with naming(f"event {self.number}"), recorded_warnings():
-            if entry.kind is not None:
-                names = setting_names(entry.kind.phantom)
-                given = {names[key]: _tuples(value) for key, value in self.settings.items()}
-                phantom: Phantom = entry.kind.phantom(**{**entry.kind.usual, **given})
-                return phantom
-            return None if entry.is_volume or self.file is None else read_phantom(self.recipe.input(self.file).path)
+        return self.made_phantom.value
+
+    @cached_property
+    def made_phantom(self) -> Remembered[Phantom | None]:
+        """The phantom, and what was warned of when it was made."""
+        with naming(f"event {self.number}"):
+            return remembered(self._make_phantom)
+
+    def _make_phantom(self) -> Phantom | None:
+        kind = self.entry.kind
+        if kind is not None:
+            names = setting_names(kind.phantom)
+            given = {names[key]: _tuples(value) for key, value in self.settings.items()}
+            phantom: Phantom = kind.phantom(**{**kind.usual, **given})
+            return phantom
+        return None if self.entry.is_volume else read_phantom(self.recipe.input(str(self.file)).path)
 
     @property
     def phantoms(self) -> list[Phantom]:
         """The phantoms whose mean the event is: one, or the gates of a beating torso; none of a volume's file."""
         if self.phantom is None:
             return []
-        if isinstance(self.phantom, CardiacTorso) and self.entry.gates > 1:
-            return list(self.phantom.beating(self.entry.gates))
+        if isinstance(self.phantom, CardiacTorso) and self.entry["gates"] > 1:
+            return list(self.phantom.beating(self.entry["gates"]))
         return [self.phantom]
 
     @property
@@ -93,7 +123,7 @@ class PlannedEvent:
 
     def gains(self, count: int) -> NDArray[np.float64]:
         """Factors (count,) of the modules' sensitivities."""
-        deviation, dice = self.recipe.augmentation.module_gain, Dice(self.recipe.seed, self.number)
+        deviation, dice = self.recipe["augmentation.module_gain"], Dice(self.recipe.seed, self.number)
         return np.array([math.exp(deviation * dice.normal(f"module gain {m}")) for m in range(count)])
 
     def row(self) -> dict[str, Any]:
@@ -113,47 +143,11 @@ def plan(recipe: EventRecipe, number: int) -> PlannedEvent:
     """What event `number`, from 0, of a recipe is: the same on every machine, whatever is made before or beside it."""
     if isinstance(number, bool) or not isinstance(number, int | np.integer) or number < 0:
         raise InputError(f"event: expected a whole number of at least 0, got {number!r}")
-    number = int(number)
-    dice = Dice(recipe.seed, number)
-    entry = recipe.phantoms[dice.choice("phantom", [entry.odds for entry in recipe.phantoms])]
-    own = f"{entry.name}: "
-    settings = {key: dice.draw(value, f"{own}{key}", entry.is_whole(key)) for key, value in entry.settings.items()}
-    file = mu_file = None
-    if entry.file is not None:
-        file = dice.draw(entry.file, f"{own}file")
-        if entry.mu_file is not None:
-            mu_file = options(entry.mu_file)[options(entry.file).index(file)]
-    position = dice.draw(entry.position, f"{own}pose.position")
-    if entry.turn_uniform:
-        u, v, w = (dice.unit(f"{own}pose.turn {axis}") for axis in range(3))
-        angles = [360 * u, math.degrees(math.acos(1 - 2 * v)), 360 * w]
-    else:
-        angles = dice.draw(entry.euler_degrees, f"{own}pose.euler_degrees")
-    change = recipe.augmentation
-    size = float(dice.draw(change.size, "augmentation.size"))
-    factor = float(dice.draw(change.activity, "augmentation.activity"))
-    for value, name in ((size, "size"), (factor, "activity")):
-        if not 0 < value < math.inf:
-            raise InputError(f"augmentation.{name}: expected factors above 0, got {value:g} for event {number}")
-    return PlannedEvent(
-        number=number,
-        entry=entry,
-        split=entry.split or _split(recipe, number),
-        settings=settings,
-        file=file,
-        mu_file=mu_file,
-        position=_three(position),
-        euler_degrees=_three(angles),
-        mirror=dice.unit("augmentation.mirror") < change.mirror,
-        size=size,
-        activity_factor=factor,
-        noise_seed=dice.bits("noise") >> 32,
-        recipe=recipe,
-    )
+    return PlannedEvent(recipe, int(number))
 
 
 def _split(recipe: EventRecipe, number: int) -> str | None:
-    """The split of an event that no phantom's entry says.
+    """The split of an event whose phantom has none of its own.
 
     A low-discrepancy sequence, so that any stretch of events has about the shares of the recipe.
     """
@@ -163,11 +157,6 @@ def _split(recipe: EventRecipe, number: int) -> str | None:
         if place < total:
             return name
     return next(reversed(recipe.splits), None)
-
-
-def _three(values: Any) -> tuple[float, float, float]:
-    x, y, z = (float(value) for value in values)
-    return x, y, z
 
 
 def _tuples(value: Any) -> Any:

@@ -1,4 +1,4 @@
-"""Recipes of event sets: TOML that says which phantoms, volumes, models and projections the events have."""
+"""Recipes of event sets: which phantoms, volumes, models and projections the events have, in TOML."""
 
 import copy
 import hashlib
@@ -16,28 +16,53 @@ import numpy as np
 from ..errors import InputError, naming
 from ..geometry.grid import Grid
 from ..runs.recipe import Recipe
+from ..runs.settings import Setting, named
 from ..toml import parse_toml, toml_text
-from ..validation import lengths, one_of, real_array, seed_number, whole_number, whole_shape
-from .draws import check_number, check_odds, options
-from .entries import PhantomEntry, phantom_entry, plain_name, share, table, unknown
+from .draws import Drawn, DrawnValues, check_odds
+from .entries import PhantomEntry, by_key, flat, is_text, like, phantom_entry, plain_name, required, table
 from .inputs import Input, original_input
 
 VERSION = 1
-"""Of the recipes' language."""
-TRUTH_STORES = ("float32", "float16", "sparse")
-IMAGE_STORES = ("float32", "float16")
-QUANTITIES = ("activity", "mu")
+"""The version of the recipes' language."""
 _TAKEN = (
     *("truth", "truth_affine", "affine", "pose", "placement", "position", "euler_degrees", "module_gain", "number"),
     *("level", "record", "json"),
 )
 """What else exports and batches of an event hold, besides the images of models."""
 
-_TABLES = (
-    *("version", "seed", "system", "detector", "truth", "phantoms", "models", "radon", "augmentation", "noise"),
-    "storage",
-)
-_KNOWN = (*_TABLES, "splits")
+
+_ROWS = by_key((
+    like("truth.voxels", "phantom.voxels"),
+    like("truth.spacing", "phantom.spacing"),
+    like("truth.center", "phantom.position", text="Middle of the truth, x y z"),
+    Setting("truth.quantity", str, "activity", "What the truth is of", words=named(("activity", "mu"))),
+    Setting("truth.store", str, "float32", "How the truth is stored, sparse without voxels that are 0",
+            words=named(("float32", "float16", "sparse"))),
+    Setting("truth.below", float, 0.0, "Share of the truth's maximum below which values are taken for 0", least=0, most=1,
+            needs=("truth.store=sparse",)),
+    Setting("radon.angles", int, None, "Numbers of angles, one for each set of parallel projections", least=1, sizes=()),
+    Setting("radon.over_degrees", float, 180.0, "Angle that they cover", unit="degrees", above=0, most=360),
+    Setting("radon.rows", int, None, "Pixel rows", "one for each of the truth's voxels along z", least=1),
+    Setting("radon.columns", int, None, "Pixel columns", "one for each of the truth's voxels along x or y", least=1),
+    like("radon.pitch", "phantom.spacing", text="Pixel size, one or along u and v", absent="the voxels'", sizes=(1, 2)),
+    Setting("augmentation.mirror", float, 0.0, "Chance that the phantom is mirrored (its x axis reversed)", least=0, most=1),
+    Drawn("augmentation.size", float, 1.0, "Factor of the phantom's lengths", above=0),
+    Drawn("augmentation.activity", float, 1.0, "Factor of all values", above=0, needs=("truth.quantity=activity",)),
+    Setting("augmentation.module_gain", float, 0.0, "Relative standard deviation of the modules' sensitivities", least=0,
+            most=math.nextafter(1, 0)),
+    Setting("noise.levels", float, (1.0,), "Shares of the acquisition time at which noise is drawn", above=0, sizes=()),
+    Setting("storage.images", str, "float32", "How images are stored", words=named(("float32", "float16"))),
+))  # fmt: skip
+_SEED = like("seed", "noise.seed", default=0, text="Seed of everything that is random")
+_TABLES = ("truth", "radon", "augmentation", "noise", "storage")
+_KNOWN = ("version", "seed", "system", "detector", "phantoms", "models", "splits", *_TABLES)
+
+
+@dataclass(frozen=True)
+class _Settings(DrawnValues):
+    """The values of an event recipe's `_TABLES`."""
+
+    rows = _ROWS  # type: ignore[assignment]
 
 
 @dataclass(frozen=True)
@@ -51,16 +76,6 @@ class Radon:
 
 
 @dataclass(frozen=True)
-class Augmentation:
-    """What is changed besides the phantom's settings and pose."""
-
-    mirror: float = 0.0  # chance that the phantom is mirrored (its x axis reversed)
-    size: Any = 1.0  # draw of a factor of the phantom's lengths
-    activity: Any = 1.0  # draw of a factor of all values
-    module_gain: float = 0.0  # relative standard deviation of the modules' sensitivities
-
-
-@dataclass(frozen=True)
 class EventRecipe:
     """What the events of a set are made from; `InputError` names the entry that cannot be understood.
 
@@ -71,9 +86,9 @@ class EventRecipe:
     name
         What messages call it, such as its path.
     folder
-        To which the paths in it are relative.
+        The paths in the recipe are relative to it.
     inputs
-        Instead of the files that it names: copies of them, by the names in the recipe, as a set keeps them.
+        Copies of the files that the recipe names, by these names, which a set keeps and reads instead.
     """
 
     text: str
@@ -88,9 +103,14 @@ class EventRecipe:
                 raise InputError(f"version: missing; this mphDRR reads version = {VERSION}")
             if values["version"] != VERSION or isinstance(values["version"], bool):
                 raise InputError(f"version: expected {VERSION}, got {values['version']!r}; a newer mphDRR may read it")
-            unknown(values, _KNOWN, "")
-            _ = self.seed, self.system, self.grid, self.quantity, self.phantoms, self.models, self.radon
-            _ = self.augmentation, self.levels, self.splits, self.truth_store, self.image_store
+            for key in values:
+                if key not in _KNOWN:
+                    raise InputError(f"{key}: no such entry; expected {', '.join(_KNOWN)}")
+            _ = self.seed, self.settings, self.system, self.grid, self.phantoms, self.models, self.radon, self.splits
+
+    def __getitem__(self, key: str) -> Any:
+        """The value of a setting, such as "truth.store", or its default."""
+        return self.settings[key]
 
     @cached_property
     def values(self) -> dict[str, Any]:
@@ -98,60 +118,34 @@ class EventRecipe:
         return parse_toml(self.text, self.name)
 
     @cached_property
+    def settings(self) -> DrawnValues:
+        """The values of the tables `_TABLES`."""
+        return _Settings(flat({name: table(self.values, name) for name in _TABLES}, _ROWS, *_TABLES))
+
+    @cached_property
     def seed(self) -> int:
-        """Of all random numbers."""
-        return seed_number(self.values.get("seed", 0))
+        """The seed of all random numbers."""
+        return int(_SEED.checked(self.values.get("seed", _SEED.default)))
 
     @cached_property
     def system(self) -> Recipe:
-        """What [system], [detector] and nothing else say, as a recipe of projections."""
-        given: dict[str, Any] = {}
-        for name in ("system", "detector"):
-            given |= {f"{name}.{key}": value for key, value in table(self.values, name).items()}
-        if "system.file" not in given:
-            raise InputError("system.file: missing; name the geometry workbook")
-        return Recipe(given)
+        """The tables [system] and [detector], as a recipe of projections."""
+        given = {name: table(self.values, name) for name in ("system", "detector")}
+        recipe = Recipe(flat(given, {}, *given))
+        required(recipe["system.file"], "system.file", "name the geometry workbook")
+        return recipe
 
-    @cached_property
+    @property
     def quantity(self) -> str:
-        """Of the truth: "activity" or "mu"."""
-        quantity: str = self._truth.get("quantity", "activity")
-        one_of(quantity, QUANTITIES, "truth.quantity")
-        return quantity
+        """What the truth is of: "activity" or "mu"."""
+        return str(self["truth.quantity"])
 
     @cached_property
     def grid(self) -> Grid:
-        """Of the truth."""
-        if "spacing" not in self._truth:
-            raise InputError("truth.spacing: missing; give the voxel size in mm")
-        voxels = self._truth.get("voxels", 256)
-        if isinstance(voxels, bool):
-            raise InputError(f"truth.voxels: expected 3 whole numbers of at least 1, got {voxels}")
-        shape = whole_shape([voxels] * 3 if isinstance(voxels, int) else voxels, "truth.voxels", 3)
-        spacing = lengths(self._truth["spacing"], "truth.spacing", 3)
-        return Grid.centered(shape, spacing, real_array(self._truth.get("center", [0.0] * 3), "truth.center", (3,)))
-
-    @cached_property
-    def truth_store(self) -> str:
-        """How the truth is stored: one of `TRUTH_STORES`."""
-        store: str = self._truth.get("store", "float32")
-        one_of(store, TRUTH_STORES, "truth.store")
-        if "below" in self._truth and store != "sparse":
-            raise InputError('truth.below: it goes with store = "sparse" only')
-        return store
-
-    @cached_property
-    def truth_below(self) -> float:
-        """Of a sparse truth: the share of its maximum below which values are taken for 0."""
-        return share(self._truth.get("below", 0.0), "truth.below")
-
-    @cached_property
-    def image_store(self) -> str:
-        """How images are stored: one of `IMAGE_STORES`."""
-        storage = table(self.values, "storage", "images")
-        store: str = storage.get("images", "float32")
-        one_of(store, IMAGE_STORES, "storage.images")
-        return store
+        """The voxels of the truth."""
+        spacing = required(self["truth.spacing"], "truth.spacing", "give the voxel size in mm")
+        n_x, n_y, n_z = np.broadcast_to(self["truth.voxels"], 3).tolist()
+        return Grid.centered((n_x, n_y, n_z), np.broadcast_to(spacing, 3), self["truth.center"])
 
     @cached_property
     def phantoms(self) -> tuple[PhantomEntry, ...]:
@@ -164,9 +158,9 @@ class EventRecipe:
         for name in names:
             if names.count(name) > 1:
                 raise InputError(f"phantoms: {names.count(name)} are called {name!r}: give each a name of its own")
-        check_odds([entry.odds for entry in found], len(found), "phantoms: odds")
+        check_odds([entry["odds"] for entry in found], len(found), "phantoms: odds")
         for entry in found:
-            if entry.split is not None and self.splits and entry.split not in self.splits:
+            if entry["split"] is not None and self.splits and entry["split"] not in self.splits:
                 raise InputError(f"phantoms: {entry.name}: split: expected one of {', '.join(self.splits)}")
         return found
 
@@ -184,7 +178,7 @@ class EventRecipe:
                     raise InputError(f"other arrays are called so: expected a name but {', '.join(_TAKEN)} and radon…")
                 found[name] = self._model(dict(entries))
         for entry in self.phantoms if any(model["attenuation.of_phantom"] for model in found.values()) else ():
-            if entry.is_volume and entry.mu_file is None:
+            if entry.is_volume and entry["mu_file"] is None:
                 raise InputError(f'phantoms: {entry.name}: mu_file: missing, but a model has attenuation = "phantom"')
         if not found and self.radon is None:
             raise InputError("models: expected one [models.NAME] or more, or [radon]")
@@ -195,44 +189,18 @@ class EventRecipe:
         """The parallel projections; None for none."""
         if "radon" not in self.values:
             return None
-        radon = table(self.values, "radon", "angles", "over_degrees", "rows", "columns", "pitch")
-        counts = radon.get("angles")
-        counts = counts if isinstance(counts, list) else [counts]
-        counts = tuple(whole_number(count, "radon.angles") for count in counts)
-        if not counts or len(set(counts)) < len(counts):
+        counts = required(self["radon.angles"], "radon.angles", "give numbers of angles, such as [96, 256]")
+        if len(set(counts)) < len(counts):
             raise InputError(f"radon.angles: expected different numbers of angles, such as [96, 256], got {counts}")
-        degrees = float(real_array(radon.get("over_degrees", 180.0), "radon.over_degrees", ()))
-        if not 0 < degrees <= 360:
-            raise InputError(f"radon.over_degrees: expected above 0 and at most 360, got {degrees:g}")
-        n_x, n_y, n_z = self.grid.shape
-        rows = whole_number(radon.get("rows", n_z), "radon.rows")
-        columns = whole_number(radon.get("columns", max(n_x, n_y)), "radon.columns")
-        d_x, d_y, d_z = self.grid.spacing.tolist()
-        pitch_u, pitch_v = lengths(radon.get("pitch", [max(d_x, d_y), d_z]), "radon.pitch", 2).tolist()
-        return Radon(counts, degrees, (rows, columns), (pitch_u, pitch_v))
+        (n_x, n_y, n_z), (d_x, d_y, d_z) = self.grid.shape, self.grid.spacing.tolist()
+        shape = self["radon.rows"] or n_z, self["radon.columns"] or max(n_x, n_y)
+        pitch_u, pitch_v = np.broadcast_to(self["radon.pitch"] or (max(d_x, d_y), d_z), 2).tolist()
+        return Radon(counts, self["radon.over_degrees"], shape, (pitch_u, pitch_v))
 
-    @cached_property
-    def augmentation(self) -> Augmentation:
-        """What is changed besides the phantom's settings and pose."""
-        values = table(self.values, "augmentation", "mirror", "size", "activity", "module_gain")
-        for name in ("size", "activity"):
-            check_number(values.get(name, 1.0), f"augmentation.{name}")
-        if "activity" in values and self.quantity != "activity":
-            raise InputError(f"augmentation.activity: the truth is {self.quantity}")
-        gain = float(real_array(values.get("module_gain", 0.0), "augmentation.module_gain", ()))
-        if not 0 <= gain < 1:
-            raise InputError(f"augmentation.module_gain: expected 0 or more and below 1, got {gain:g}")
-        mirror = share(values.get("mirror", 0.0), "augmentation.mirror")
-        return Augmentation(mirror, values.get("size", 1.0), values.get("activity", 1.0), gain)
-
-    @cached_property
+    @property
     def levels(self) -> tuple[float, ...]:
         """Shares of the acquisition time at which noise is to be drawn."""
-        noise = table(self.values, "noise", "levels")
-        levels = real_array(noise.get("levels", [1.0]), "noise.levels", (None,))
-        if not len(levels) or np.any(levels <= 0):
-            raise InputError("noise.levels: expected shares of the acquisition time above 0, such as [1.0, 0.25]")
-        return tuple(levels.tolist())
+        return tuple(self["noise.levels"])
 
     @cached_property
     def splits(self) -> dict[str, float]:
@@ -272,10 +240,6 @@ class EventRecipe:
     def _read_inputs(self) -> dict[str, Input]:
         return {}
 
-    @cached_property
-    def _truth(self) -> dict[str, Any]:
-        return table(self.values, "truth", "voxels", "spacing", "center", "quantity", "store", "below")
-
     def _model(self, entries: dict[str, Any]) -> Recipe:
         attenuation, energy = entries.pop("attenuation", None), entries.pop("attenuation_energy", None)
         given = dict(self.system.given) | {f"model.{key}": value for key, value in entries.items()}
@@ -307,21 +271,25 @@ class EventRecipe:
         for entry, checked in zip(values["phantoms"], self.phantoms, strict=True):
             for key in ("file", "mu_file"):
                 if key in entry:
-                    is_text = all(str(name).lower().endswith(".toml") for name in options(entry[key]))
                     quantity = "mu" if key == "mu_file" else self.quantity
-                    entry[key] = changed(entry[key], "copy" if is_text else checked.what(quantity))
+                    entry[key] = changed(
+                        entry[key], "copy" if is_text(entry[key]) else _what(quantity, checked["energy"])
+                    )
         for name, model in self.models.items():
-            if model["attenuation.file"] is not None:
-                energy = model["attenuation.energy"]
-                what = "mu" if energy is None else f"mu at {energy}"
-                values["models"][name]["attenuation"] = change(model["attenuation.file"], what)
+            if (file := model["attenuation.file"]) is not None:
+                values["models"][name]["attenuation"] = change(file, _what("mu", model["attenuation.energy"]))
         return values
+
+
+def _what(quantity: str, energy: Any) -> str:
+    """What a volume's file is read as: its quantity, and the energy at which CT numbers become mu."""
+    return quantity if energy is None or quantity != "mu" else f"mu at {energy}"
 
 
 def read_recipe(path: str | os.PathLike[str], inputs: Mapping[str, Input] | None = None) -> EventRecipe:
     """The recipe of an event set in a TOML file; paths in it are relative to its folder. `InputError` names the entry.
 
-    `inputs` as of `EventRecipe`.
+    `inputs` as for `EventRecipe`.
     """
     path = Path(path)
     return EventRecipe(toml_text(path), str(path), path.absolute().parent, inputs or {})

@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..geometry.grid import Grid
 from ..geometry.views import Views
@@ -28,12 +29,23 @@ def doubts(grid: Grid, views: Views, model: Model) -> Iterator[str]:
         yield f"the grid is {wide:.3g} mm wide, {near:.3g} mm from the sources: lengths are in mm; is it in metres?"
     if not isinstance(model, Emission):
         return
-    lines = model.isotope.lines_within(*model.window) if model.isotope else ()  # type: ignore[union-attr, misc]
-    bone, *metals = (max(attenuation(x, energy) for energy, _ in lines or _UNNAMED) for x in ("bone", *APERTURES))
+    most = max(_largest(model, metal) for metal in APERTURES)
     for name in ("aperture_mu", "crystal_mu"):
         value = np.max(0.0 if getattr(model, name) is None else getattr(model, name))
-        if value > _ABOVE_METALS * max(metals):
-            yield f"{name} is {value:g} 1/mm, more than any material's at its energy ({max(metals):.3g}): is it in 1/cm?"
-    mu = np.zeros(1, np.float32) if model.mu is None else model.mu.array
+        if value > _ABOVE_METALS * most:
+            yield f"{name} is {value:g} 1/mm, more than any material's at its energy ({most:.3g}): is it in 1/cm?"
+    if model.mu is not None:
+        yield from doubts_of_mu(model.mu.array, model)
+
+
+def doubts_of_mu(mu: NDArray[np.float32], model: Emission) -> Iterator[str]:
+    """Of what attenuates, 1/mm."""
+    bone = _largest(model, "bone")
     if (high := mu[mu > _ABOVE_BONE * bone]).sum(dtype=float) > 0.5 * mu.sum(dtype=float):
         yield f"mu is {high.mean():.3g} 1/mm where most photons are lost, bone's is {bone:.3g}: is it in 1/cm?"
+
+
+def _largest(model: Emission, material: str) -> float:
+    """A material's largest coefficient at the energies that are counted, 1/mm."""
+    lines = model.isotope.lines_within(*model.window) if model.isotope else ()  # type: ignore[union-attr, misc]
+    return max(attenuation(material, energy) for energy, _ in lines or _UNNAMED)

@@ -1,22 +1,65 @@
-"""From a system and a volume to a projection run: the main job, as one call."""
+"""From a system and a volume to images and to a projection run: the main job, as one call."""
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InputError, warn
 from ..geometry.scanner import Detector, Scanner
 from ..geometry.system import PinholeSystem
 from ..geometry.views import Views
 from ..memory import require
+from ..physics.isotopes import photon_energy
 from ..physics.noise import sample_counts
-from ..progress import Progress, tell
+from ..progress import Progress
 from ..projector import Emission, Model, Projector, Transmission, intensity
+from ..projector.doubts import doubts_of_mu
 from ..validation import positive, seed_number
 from ..volumes.volume import Volume
 from .run import ProjectionRun
+
+
+@dataclass(frozen=True, eq=False)
+class Imaging:
+    """Makes images of volumes: the one route of runs, reconstructions and events, with the same warnings for all."""
+
+    projector: Projector
+    photons: float | None = None  # as for `project_run`
+
+    @property
+    def model(self) -> Model:
+        """What a pixel measures."""
+        return self.projector.model
+
+    def images(
+        self, volume: Volume, mu: NDArray[np.float32] | None = None, progress: Progress | None = None
+    ) -> NDArray[np.float32]:
+        """The expected images (M, n_v, n_u) of a volume, the background included.
+
+        `mu`, 1/mm, attenuates in place of the model's, on whose grid it is. `progress` is called after every view.
+        `InputError` where the model has no meaning for the volume. Warnings say where images hardly are what is wanted.
+        """
+        A = self.projector
+        self.model.check_volume(volume)
+        if self.photons is not None and not (isinstance(self.model, Transmission) and volume.quantity == "mu"):
+            what = f"{self.model.name} of {volume.quantity}"
+            raise InputError(f"photons: expected the transmission of a volume of mu, got {what}")
+        warn_of_images(volume, A.views, self.model)
+        if mu is not None and isinstance(self.model, Emission):
+            for doubt in doubts_of_mu(mu, self.model):
+                warn(doubt)
+        images = np.asarray(A(volume, progress, mu))
+        for image, background in zip(images, A.background, strict=True):
+            passed = image if self.photons is None else intensity(image, self.photons)
+            image[...] = passed + background.astype(image.dtype)
+        return images.astype(np.float32, copy=False)
+
+    def unit(self, volume: Volume) -> str:
+        """The unit of a volume's images."""
+        return self.model.unit(volume) if self.photons is None else "photons"
 
 
 def project_run(
@@ -39,15 +82,16 @@ def project_run(
     Parameters
     ----------
     shape, detector, magnification, pitch
-        The images, as of `PinholeSystem.views`.
+        The images, as for `PinholeSystem.views`.
     backend, threads
-        As of `Projector`.
+        As for `Projector`.
     settings
         More to record in the run.
     model
         `Transmission` (the default), an `Emission` or an `InverseSquareSum` of the same system.
     photons
-        Of an X-ray source, per pixel: the run of a volume of mu holds those that pass (`intensity`), not line integrals.
+        Photons of an X-ray source, per pixel: the run of a volume of mu holds those that pass (`intensity`), not line
+        integrals.
     noise_seed
         With an `Emission` or `photons`: the run holds counts drawn with this seed (`sample_counts`), not their means.
     progress
@@ -58,59 +102,58 @@ def project_run(
     InputError
         A setting is out of range, the volume holds what the model has no meaning for, or the images do not fit into memory.
     """
-    model = Transmission() if model is None else model
-    model.check_volume(volume)
-    if photons is not None:
-        if not isinstance(model, Transmission) or volume.quantity != "mu":
-            what = f"{model.name} of {volume.quantity}"
-            raise InputError(f"photons: expected the transmission of a volume of mu, got {what}")
-        photons = positive(photons, "photons")
-    elif noise_seed is not None and not isinstance(model, Emission):
-        raise InputError("noise_seed: only the counts of an Emission, or photons that pass, have noise")
-    noise_seed = None if noise_seed is None else seed_number(noise_seed)
+    photons = None if photons is None else positive(photons, "photons")
+    if noise_seed is not None:
+        if photons is None and not isinstance(model, Emission):
+            raise InputError("noise_seed: only the counts of an Emission, or photons that pass, have noise")
+        noise_seed = seed_number(noise_seed)
     views = system.views(shape=shape, detector=detector, magnification=magnification, pitch=pitch)
-    warn_of_images(volume, system, views, magnification, model)
     n_v, n_u = views.shape
     each = 4.0 if noise_seed is None else 20.0  # bytes; counts are drawn from float64, as int64
     require(each * len(views) * n_v * n_u, f"a set of {len(views)} projections of {n_v} x {n_u} pixels")
-    projector = Projector(volume.grid, views, model=model, backend=backend, threads=threads)
-    images = np.empty((len(views), n_v, n_u), np.float32)
-    for m, image in enumerate(projector.iter_views(volume)):
-        images[m] = image + projector.background[m] if photons is None else intensity(image, photons)
-        tell(progress, m + 1, len(views))
+    imaging = Imaging(Projector(volume.grid, views, model, backend, threads), photons)
+    model = imaging.model
+    images = imaging.images(volume, progress=progress)
     if noise_seed is not None:
         images = sample_counts(images, noise_seed).astype(np.float32)
     record = {
         "detector": detector, "magnification": float(magnification),
-        "pitch_mm": None if pitch is None else np.broadcast_to(pitch, 2).tolist(), "model": model.name,
-        **model.record(), **({} if photons is None else {"photons": photons}), "backend": projector.backend,
-        **(settings or {}),
+        "pitch_mm": None if pitch is None else np.broadcast_to(pitch, 2).tolist(), "model": model.name, **model.record(),
+        **({} if photons is None else {"photons": photons}), "backend": imaging.projector.backend, **(settings or {}),
     }  # fmt: skip
-    unit = model.unit(volume) if photons is None else "photons"
     return ProjectionRun(
-        images, system, views, volume, unit=unit, settings=record, seed=noise_seed, background=model.background
-    )
+        images, system, views, volume, unit=imaging.unit(volume), settings=record, seed=noise_seed,
+        background=model.background,
+    )  # fmt: skip
 
 
-def warn_of_images(volume: Volume, system: Scanner, views: Views, magnification: float, model: Model) -> None:
+def warn_of_energy(model: Model, energy: float | str | None, source: str) -> None:
+    """Warn where mu holds at an energy (keV, or an isotope's) whose photons the model does not count.
+
+    `source` names what the mu is of.
+    """
+    window = model.window if isinstance(model, Emission) else None
+    if window is None or energy is None:
+        return
+    energy = photon_energy(energy)
+    if not window[0] <= energy <= window[1]:
+        counted = f"photons of {window[0]:g} to {window[1]:g} keV are counted"
+        warn(f"the mu of {source} holds at {energy:g} keV, {counted}")
+
+
+def warn_of_images(volume: Volume, views: Views, model: Model) -> None:
     """Warn where images of a volume hardly are what is wanted: activity below 0, pixels beside crystals, unseen parts."""
     lowest, highest = float(volume.array.min()), float(volume.array.max())
     if isinstance(model, Emission) and lowest < -0.1 * abs(highest):  # interpolation leaves less
         warn(f"the activity is {lowest:g} to {highest:g} kBq/mL: what is below 0 makes counts below 0")
     if isinstance(model, Emission) and not model.within_crystal:
-        _warn_of_no_crystal(model.system, views, magnification)
+        _warn_of_no_crystal(model.system, views)
     _warn_of_unseen(volume, views, ends_at_plane=not isinstance(model, Emission))
 
 
-def warn_of_energy(model: Model, energy: float, what: str) -> None:
-    """Warn where mu holds at an energy (keV) whose photons the model does not count; `what` names the mu."""
-    window = model.window if isinstance(model, Emission) else None
-    if window is not None and not window[0] <= energy <= window[1]:
-        warn(f"{what} holds at {energy:g} keV, photons of {window[0]:g} to {window[1]:g} keV are counted")
-
-
-def _warn_of_no_crystal(system: PinholeSystem, views: Views, magnification: float) -> None:
+def _warn_of_no_crystal(system: PinholeSystem, views: Views) -> None:
     """Warn where images of counts reach beyond the crystal."""
+    magnification = np.linalg.norm(views.detector_centers - views.sources, axis=1) / system.collimator_length
     steps = np.stack([views.u_steps, views.v_steps])
     sides = np.linalg.norm(steps, axis=2) * np.array(views.shape[::-1])[:, None] / magnification  # on the crystal, mm
     beyond = int(np.any(sides > 1.001 * system.detector_side, axis=0).sum())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,39 +12,68 @@ from typing import Any
 
 from ..errors import InputError, naming
 from ..files import write_bytes
-from ..phantoms.kinds import KINDS
 from ..phantoms.settings import setting_names
 from ..toml import read_toml, toml_value
-from .settings import SAMPLING, SETTINGS, TABLES
+from .settings import SAMPLING, SETTINGS, TABLES, Setting, settings_with
 
 _PLACED = ("phantom.position", "phantom.euler_degrees")
 
 
 @dataclass(frozen=True)
-class Recipe:
-    """Values of settings by their keys (`settings.SETTINGS`); those that are not given have their defaults.
+class Values(ABC):
+    """Values of settings by their keys; those that are not given have their defaults.
 
-    The settings of a phantom's class are there as ``"phantom.<name>"``. `InputError` for an unknown setting, a wrong value,
-    and a setting without an effect beside the others.
+    `InputError` for an unknown setting, a wrong value, and a setting without an effect beside the others.
+    """
+
+    given: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+
+    @property
+    @abstractmethod
+    def rows(self) -> Mapping[str, Setting]:
+        """The settings that there are, by their keys."""
+
+    def __post_init__(self) -> None:
+        rows = self.rows
+        for key in self.given:
+            if key not in rows:
+                siblings = [other for other in rows if other.rpartition(".")[0] == key.rpartition(".")[0]]
+                if not siblings:
+                    tables = dict.fromkeys(other.partition(".")[0] for other in rows)
+                    raise InputError(f"{key}: expected TABLE.NAME with a table of {', '.join(tables)}")
+                known = ", ".join(other.rpartition(".")[2] for other in siblings)
+                raise InputError(f"{key}: no such setting; expected {known}")
+        checked = {key: rows[key].checked(value) for key, value in self.given.items()}
+        object.__setattr__(self, "given", checked)
+        for key in checked:
+            for need in _unmet(checked, key, rows):
+                names = map(_named, need.removeprefix("no ").split(" or "))
+                problem = "does not go with" if need.startswith("no ") else "needs"
+                raise InputError(f"{_named(key)} {problem} {' or '.join(names)}")
+
+    def __getitem__(self, key: str) -> Any:
+        return self.given[key] if key in self.given else self.rows[key].default
+
+
+@dataclass(frozen=True)
+class Recipe(Values):
+    """What a projection run is made from: values of `settings.SETTINGS`, by their keys.
+
+    The settings of a phantom's class are there as ``"phantom.<name>"``.
 
     >>> recipe = Recipe({"system.file": "scanner.xlsx", "model.kind": "emission", "model.isotope": "Tc-99m"})
     >>> recipe["model.time"]
     1.0
     """
 
-    given: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-
     def __post_init__(self) -> None:
-        checked = _with_hole({key: _checked(self.given, key) for key in self.given}, self.given)
-        object.__setattr__(self, "given", checked)
-        for key in checked:
-            for need in _unmet(checked, key):
-                names = map(_said, need.removeprefix("no ").split(" or "))
-                problem = "does not go with" if need.startswith("no ") else "needs"
-                raise InputError(f"{_said(key)} {problem} {' or '.join(names)}")
+        object.__setattr__(self, "given", _with_hole(self.given, self.given))
+        super().__post_init__()
 
-    def __getitem__(self, key: str) -> Any:
-        return self.given[key] if key in self.given else SETTINGS[key].default
+    @property
+    def rows(self) -> Mapping[str, Setting]:
+        """All settings, with those of the phantom's kind."""
+        return _rows(self.given)
 
     def updated(self, changes: Mapping[str, Any]) -> Recipe:
         """This recipe with other values, None to take one away; entries without an effect beside the new ones are dropped.
@@ -78,15 +108,13 @@ class Recipe:
 def fitting_recipe(values: Mapping[str, Any], kept: Collection[str] = ()) -> Recipe:
     """The recipe of those values, None aside, that have an effect; `InputError` where one of `kept` has none."""
     values = _with_hole({key: value for key, value in values.items() if value is not None}, kept)
-
-    def is_stale(key: str) -> bool:
-        is_known = key in SETTINGS or key.partition(".")[2] in _phantom_fields(values)
-        return not is_known or bool(_unmet(values, key))
-
-    while stale := [key for key in values if key not in kept and is_stale(key)]:
+    while True:
+        rows = _rows(values)
+        stale = [key for key in values if key not in kept and (key not in rows or _unmet(values, key, rows))]
+        if not stale:
+            return Recipe(values)
         for key in stale:
             del values[key]
-    return Recipe(values)
 
 
 def recorded_recipe(recipe: Recipe) -> Recipe:
@@ -100,7 +128,7 @@ def recipe_of_tables(tables: Mapping[str, Any], recorded: bool = False) -> Recip
     """The recipe of values by table and name, as `Recipe.tables` gives them, without defaults that have no effect.
 
     With `recorded` it is one of a run: earlier versions wrote numbers of rays that had no effect, and these go, too.
-    `InputError` as of `Recipe`.
+    `InputError` as for `Recipe`.
     """
     values: dict[str, Any] = {}
     for table, entries in tables.items():
@@ -151,33 +179,32 @@ def write_recipe(recipe: Recipe, path: str | os.PathLike[str]) -> None:
     write_bytes(path, "\n".join([*lines, ""]).encode())
 
 
-def _with_hole(values: dict[str, Any], kept: Collection[str]) -> dict[str, Any]:
+def _with_hole(values: Mapping[str, Any], kept: Collection[str]) -> dict[str, Any]:
     """The values, with hole "rays" for numbers of rays beside hole "auto", if they are `kept`, or beside none."""
     given = {key for key in SAMPLING if values.get(key, SETTINGS[key].default) != SETTINGS[key].default}
     numbers = given if "model.hole" not in values else given.intersection(kept)
     is_free = values.get("model.kind") == "emission" and values.get("model.hole", "auto") == "auto"
-    return {**values, "model.hole": "rays"} if is_free and numbers else values
+    return {**values, "model.hole": "rays"} if is_free and numbers else dict(values)
 
 
-def is_met(values: Mapping[str, Any], need: str) -> bool:
+def is_met(values: Mapping[str, Any], need: str, rows: Mapping[str, Setting] = SETTINGS) -> bool:
     """Whether given values meet a condition of `Setting.needs`."""
 
     def holds(term: str) -> bool:
         key, _, word = term.partition("=")
-        if word and SETTINGS[key].names_file(values.get(key)):  # what its contents take is known when it is read
+        if word and rows[key].names_file(values.get(key)):  # what its contents take is known when it is read
             return True
-        return values.get(key, SETTINGS[key].default) == word if word else values.get(key) not in (None, False)
+        return values.get(key, rows[key].default) == word if word else values.get(key) not in (None, False)
 
     return any(map(holds, need.removeprefix("no ").split(" or "))) != need.startswith("no ")
 
 
-def _unmet(values: Mapping[str, Any], key: str) -> list[str]:
+def _unmet(values: Mapping[str, Any], key: str, rows: Mapping[str, Setting]) -> list[str]:
     """The conditions that keep a setting from having an effect beside the others."""
-    own = ("no phantom.file", "no phantom.text", *SETTINGS["phantom.position"].needs)
-    return [need for need in (SETTINGS[key].needs if key in SETTINGS else own) if not is_met(values, need)]
+    return [need for need in rows[key].needs if not is_met(values, need, rows)]
 
 
-def _said(term: str) -> str:
+def _named(term: str) -> str:
     """A setting, or one with a value, for messages: with its option."""
     key, _, word = term.partition("=")
     if word:
@@ -185,27 +212,9 @@ def _said(term: str) -> str:
     return f"{key} ({SETTINGS[key].option})" if key in SETTINGS else key
 
 
-def _checked(values: Mapping[str, Any], key: str) -> Any:
-    """The value of a key, as a recipe keeps it."""
-    if key in SETTINGS:
-        return SETTINGS[key].checked(values[key])
-    table, _, name = key.partition(".")
-    known = [other.partition(".")[2] for other in SETTINGS if other.startswith(f"{table}.")]
-    if table == "phantom":
-        own = _phantom_fields(values)
-        if name in own:  # the phantom's class checks it
-            value = values[key].tolist() if hasattr(values[key], "tolist") else values[key]
-            return tuple(value) if isinstance(value, list) else value
-        known += own
-    if not known:
-        raise InputError(f"{key}: expected TABLE.NAME with a table of {', '.join(TABLES)}")
-    raise InputError(f"{key}: no such setting; expected {', '.join(known)}")
-
-
-def _phantom_fields(values: Mapping[str, Any]) -> list[str]:
-    """The numbers of the phantom's kind."""
-    name = values.get("phantom.kind", SETTINGS["phantom.kind"].default)
-    return [key for kind in KINDS if kind.name == name for key in setting_names(kind.phantom)]
+def _rows(values: Mapping[str, Any]) -> Mapping[str, Setting]:
+    """All settings, with those of the phantom's kind."""
+    return settings_with(str(values.get("phantom.kind", SETTINGS["phantom.kind"].default)))
 
 
 def _with_paths(recipe: Recipe, change: Callable[[str], str]) -> Recipe:

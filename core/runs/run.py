@@ -50,7 +50,7 @@ class ProjectionRun:
     workbook: str = ""  # name of the geometry workbook, and its SHA-256; empty where there is none
     workbook_sha256: str = ""
     versions: Mapping[str, str] = field(default_factory=versions)  # of mphDRR and what it ran on
-    background: float | NDArray[np.float64] = 0.0  # expected besides the volume's, as of `Emission`: (), (M,) or images
+    background: float | NDArray[np.float64] = 0.0  # besides the volume, as in `Emission`: (), (M,) or images
 
     def __post_init__(self) -> None:
         self.views.require_pinholes("run")
@@ -78,7 +78,7 @@ class ProjectionRun:
 
     @property
     def recipe(self) -> Recipe:
-        """What was asked for; `InputError` where the run does not say it, as those of version 0.1.0 do not."""
+        """What was asked for; `InputError` where the run holds no recipe, as those of version 0.1.0."""
         if "recipe" not in self.settings:
             raise InputError("the run holds no recipe: give its model, as by --set model.kind=emission or --recipe")
         return recipe_of_tables(self.settings["recipe"], recorded=True)

@@ -1,7 +1,7 @@
 """From a recipe to projection runs: the main job, for the command line, the demo, scripts and Blender."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -27,11 +27,12 @@ from ..volumes.volume import Volume
 from ..volumes.volume_files import read_volume, read_volume_of
 from ..workbook import read_system
 from .measured import recipe_counts
-from .projecting import project_run, warn_of_energy
+from .projecting import Imaging, project_run, warn_of_energy
 from .recipe import Recipe, recorded_recipe
 from .run import ProjectionRun
 
 _MODELS: dict[str, Any] = {"transmission": Transmission, "emission": Emission, "inverse-square": InverseSquareSum}
+_MODULES = "system.modules"
 _MOST_MU = 500.0
 """1/mm: more than any material of the tables attenuates photons of 10 keV or more."""
 
@@ -60,13 +61,9 @@ def run_recipe(
     Raises
     ------
     InputError
-        A file cannot be read, the recipe names no system, or as `project_run`; all but the volumes is checked first.
+        A file cannot be read, the recipe names no system, or see `project_run`; all but the volumes is checked first.
     """
-    if system is None:
-        if recipe["system.file"] is None:
-            raise InputError("system.file: missing; name the geometry workbook")
-        system = read_system(recipe["system.file"], columns=recipe["system.columns"])
-    system = chosen_modules(system, recipe["system.modules"], "system.modules")
+    system = recipe_system(recipe) if system is None else chosen_modules(system, recipe["system.modules"], _MODULES)
     model = recipe_model(recipe, system)
     if mu is None:
         mu = _attenuation(recipe, model, stages)
@@ -90,20 +87,32 @@ def run_recipe(
         if seed is not None:  # noise of its own for each state
             record = record.updated({"noise.seed": seed + number})
         yield project_run(
-            system, source, (recipe["detector.rows"], recipe["detector.columns"]), detector=recipe["detector.plane"],
-            magnification=recipe["detector.magnification"], pitch=recipe["detector.pitch"],
-            backend=recipe["compute.backend"], threads=recipe["compute.threads"],
+            system, source, **_detector(recipe), backend=recipe["compute.backend"], threads=recipe["compute.threads"],
             settings={"volume": _volume_name(record), **converted, "recipe": record.tables()},
             model=recipe_model(recipe, system, mu_of_it), photons=recipe["model.photons"],
             noise_seed=record["noise.seed"], progress=stages("projecting"),
         )  # fmt: skip
 
 
+def recipe_system(recipe: Recipe, path: Callable[[str], str | Path] = Path) -> Scanner:
+    """The scanner that a recipe names; `path` says where its files are."""
+    file, columns = recipe["system.file"], recipe["system.columns"]
+    if file is None:
+        raise InputError("system.file: missing; name the geometry workbook")
+    system = read_system(path(file), columns=None if columns is None else path(columns))
+    return chosen_modules(system, recipe["system.modules"], _MODULES)
+
+
 def recipe_views(recipe: Recipe, system: Scanner) -> Views:
     """The views of a recipe's detector."""
+    return system.views(**_detector(recipe))
+
+
+def _detector(recipe: Recipe) -> dict[str, Any]:
+    """The arguments of `PinholeSystem.views`."""
+    given = {name: recipe[f"detector.{name}"] for name in ("magnification", "pitch")}
     shape = recipe["detector.rows"], recipe["detector.columns"]
-    plane, magnification, pitch = (recipe[f"detector.{name}"] for name in ("plane", "magnification", "pitch"))
-    return system.views(shape, plane, magnification, pitch)
+    return {"shape": shape, "detector": recipe["detector.plane"], **given}
 
 
 def recipe_model(recipe: Recipe, system: Scanner, mu: Volume | None = None) -> Model:
@@ -128,21 +137,21 @@ def projector_of_run(
     threads: int | None = None,
     stages: Stages = lambda stage: None,
 ) -> Projector:
-    """The projector from volumes on `grid` to the images of a run, with the model that the run's recipe says.
+    """The projector from volumes on `grid` to the images of a run, with the model of the run's recipe.
 
     Parameters
     ----------
     run
         Simulated or measured.
     grid
-        Of the volumes.
+        The voxels of the volumes.
     mu
-        What attenuates (1/mm), on any grid, instead of what the recipe says: a file, which is read again, or the phantom,
+        What attenuates (1/mm), on any grid, instead of the recipe's: a file, which is read again, or the phantom,
         which is voxelized on `grid`.
     recipe
         Instead of the run's own, such as ``run.recipe.updated({"model.aperture_points": 19})``.
     backend, threads
-        As of `Projector`.
+        As for `Projector`.
     stages
         Begins each stage: reading, voxelizing.
 
@@ -162,7 +171,16 @@ def projector_of_run(
             )
         else:
             mu = _attenuation(recipe, model, stages)
-    return Projector(grid, run.views, recipe_model(recipe, run.system, mu), backend, threads)
+    return recipe_imaging(recipe, run.system, run.views, grid, mu, backend, threads).projector
+
+
+def recipe_imaging(
+    recipe: Recipe, system: Scanner, views: Views, grid: Grid, mu: Volume | None = None, backend: str = "auto",
+    threads: int | None = None,
+) -> Imaging:  # fmt: skip
+    """What makes a recipe's images of volumes on a grid; `mu` is what attenuates."""
+    projector = Projector(grid, views, recipe_model(recipe, system, mu), backend, threads)
+    return Imaging(projector, recipe["model.photons"])
 
 
 def _volume_name(record: Recipe) -> str:
@@ -180,10 +198,8 @@ def _attenuation(recipe: Recipe, model: Model, stages: Stages) -> Volume | None:
         raise InputError(f"attenuation.object: {name!r} is in a Blender scene; give --mu FILE instead")
     if path is None:
         return None
-    mu = _read_mu(path, energy, recipe["attenuation.series"], stages("reading"))
-    if energy is not None:
-        warn_of_energy(model, photon_energy(energy), f"the mu of {Path(path).name}")
-    return mu
+    warn_of_energy(model, energy, Path(path).name)
+    return read_mu(path, energy, recipe["attenuation.series"], stages("reading"))
 
 
 def _from_files(recipe: Recipe, record: Recipe, mu: Volume | None, stages: Stages) -> Iterator[_Source]:
@@ -213,7 +229,7 @@ def _read(path: str, recipe: Recipe, progress: Progress | None) -> Volume:
             raise InputError(f"{path}: {values}; --quantity activity takes them as such")
         return volume
     if recipe["model.photons"] is not None or recipe["volume.energy"] is not None:
-        return _read_mu(path, recipe["volume.energy"], series, progress)
+        return read_mu(path, recipe["volume.energy"], series, progress)
     volume = read_volume(path, series=series, progress=progress)
     if volume.quantity == "hu":
         raise InputError(
@@ -223,20 +239,22 @@ def _read(path: str, recipe: Recipe, progress: Progress | None) -> Volume:
     return volume
 
 
-def _read_mu(path: str, energy: float | str | None, series: str | None, progress: Progress | None) -> Volume:
-    """The volume of mu in a file: as it is, or from CT numbers at `energy`."""
+def read_mu(
+    path: str | Path, energy: float | str | None, series: str | None = None, progress: Progress | None = None
+) -> Volume:
+    """The volume of mu in a file: as it is, or from CT numbers at `energy` (keV, or an isotope's)."""
     if energy is not None:
         volume = read_volume(path, series=series, progress=progress)
         if volume.quantity != "hu":
-            raise InputError(f"{path}: it holds {volume.quantity}; --energy is for CT numbers (hu)")
+            raise InputError(f"{path}: it holds {volume.quantity}; an energy (--energy) is for CT numbers (hu)")
         return hu_to_mu(volume, photon_energy(energy))
-    advice = "; of CT numbers, give --energy to convert them"
+    advice = "; of CT numbers, give the energy (--energy) to convert them"
     volume = read_volume_of(path, "mu", advice, series=series, progress=progress)
     lowest, highest = float(volume.array.min()), float(volume.array.max())
     if lowest < -1 or highest > _MOST_MU:  # interpolation may leave values a little below 0
         raise InputError(
             f"{path}: {lowest if lowest < -1 else highest:g} is no attenuation in 1/mm; if it holds CT numbers, give "
-            "--energy to convert them"
+            "the energy (--energy) to convert them"
         )
     return volume
 
@@ -296,7 +314,7 @@ def require_mu(phantom: Phantom, model: Model) -> None:
     """Raise `InputError` where a phantom attenuates nothing; warn where the model counts photons of another energy."""
     if all(shape.mu is None for shape in phantom.shapes):
         raise InputError(f"attenuation.of_phantom (--phantom-mu): no shape of the {phantom.title} has a mu")
-    warn_of_energy(model, phantom.mu_energy, f"the mu of the {phantom.title}")
+    warn_of_energy(model, phantom.mu_energy, f"the {phantom.title}")
 
 
 def phantom_pose(recipe: Recipe) -> NDArray[np.float64]:

@@ -5,6 +5,8 @@ and operator, and the record in a run file follow from it. A new setting of a mo
 same name in the model's class.
 """
 
+import dataclasses
+import functools
 import operator
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
@@ -15,7 +17,8 @@ from types import MappingProxyType
 from typing import Any
 
 from ..errors import InputError
-from ..phantoms.kinds import KINDS
+from ..phantoms.kinds import KINDS, Kind
+from ..phantoms.settings import setting_names
 from ..physics.isotopes import ISOTOPES
 from ..physics.materials import APERTURES, CRYSTALS
 from ..projector.backends import BACKENDS, OLD_NAMES
@@ -57,7 +60,7 @@ class Setting:
     label: str = ""  # in Blender
 
     def __post_init__(self) -> None:
-        name = self.key.partition(".")[2].removesuffix("_degrees")
+        name = self.key.rpartition(".")[2].removesuffix("_degrees")
         object.__setattr__(self, "option", self.option or "--" + name.replace("_", "-"))
         object.__setattr__(self, "label", self.label or name.replace("_", " ").title())
 
@@ -69,8 +72,8 @@ class Setting:
     def help(self) -> str:
         """The text with unit, words and what leaving it out means."""
         words = f"one of {', '.join(self.words)}" if self.words else ""
-        said = ", ".join(filter(None, (self.text, self.unit, words)))
-        return said + (f"; without it, {self.absent}" if self.absent else "")
+        text = ", ".join(filter(None, (self.text, self.unit, words)))
+        return text + (f"; without it, {self.absent}" if self.absent else "")
 
     @property
     def expected(self) -> str:
@@ -82,7 +85,7 @@ class Setting:
             return words or {bool: "true or false", str: "a text"}[self.kind]
         number = "a whole number" if self.kind is int else "a number"
         bounds = {"of {:g} or more": self.least, "above {:g}": self.above, "and at most {:g}": self.most}
-        number += "".join(" " + said.format(bound) for said, bound in bounds.items() if bound is not None)
+        number += "".join(" " + text.format(bound) for text, bound in bounds.items() if bound is not None)
         return " or ".join(filter(None, (words, number + (f" ({self.unit})" if self.unit else ""))))
 
     def checked(self, value: Any) -> Any:
@@ -114,7 +117,29 @@ class Setting:
         return value
 
 
-def _named(names: Iterable[str], text: str) -> Words:
+@dataclass(frozen=True)
+class OwnSetting(Setting):
+    """A setting of one kind of phantoms, whose class checks its values."""
+
+    def checked(self, value: Any) -> Any:
+        """`value` as a recipe keeps it, lists as tuples."""
+        value = value.tolist() if hasattr(value, "tolist") else value
+        return tuple(value) if isinstance(value, list) else value
+
+
+def own_settings(kind: Kind, row: type[Setting] = OwnSetting, **common: Any) -> list[Setting]:
+    """The settings of a kind of phantoms, as rows of a class; `common` is what all of them have."""
+    fields = {field.name: field for field in dataclasses.fields(kind.phantom)}
+    found = []
+    for key, name in setting_names(kind.phantom).items():
+        default: Any = kind.usual.get(name, fields[name].default)
+        one, sizes = (default[0], ()) if isinstance(default, tuple) else (default, None)
+        found.append(row(key, type(one), default, fields[name].metadata.get("text", ""), sizes=sizes, **common))
+    return found
+
+
+def named(names: Iterable[str], text: str = "") -> Words:
+    """Words that label themselves, described alike."""
     return {name: (name[0].upper() + name[1:], text) for name in names}
 
 
@@ -130,10 +155,11 @@ _RAYS = "model.kind=transmission or model.hole=rays or model.hole=point"
 _FILE = "volume.file or volume.states"
 _MADE = "no counts.files"
 _PHANTOM = ("no volume.file", "no volume.states", _MADE)
+_PHANTOM_NUMBER = (*_PHANTOM, "no phantom.file", "no phantom.text")
 _NO_PHANTOM = ("no phantom.kind", "no phantom.file", "no phantom.text")
 _SERIES = "The DICOM series with this number, description or UID, where the folder holds several"
 _AT_ENERGY = "Convert CT numbers to attenuation (1/mm) at this energy, or at an isotope's strongest line"
-_ISOTOPES = _named(ISOTOPES, "Energy window 10 % around its strongest line")
+_ISOTOPES = named(ISOTOPES, "Energy window 10 % around its strongest line")
 _BY_NAME = "As it attenuates the isotope's photons"
 
 
@@ -168,7 +194,7 @@ _DECLARED = (
     Setting("volume.state", str, None, "State of the object's sequence", needs=("volume.object",)),
     Setting("volume.series", str, None, _SERIES, needs=("volume.file",)),
     Setting("volume.quantity", str, None, "What the values of the volume are", "what the file says; a file that says "
-            "nothing holds activity for counts, mu for photons, else CT numbers", words=_named(LINE_INTEGRALS, ""),
+            "nothing holds activity for counts, mu for photons, else CT numbers", words=named(LINE_INTEGRALS, ""),
             needs=(_FILE, "no volume.energy")),
     Setting("volume.energy", float, None, _AT_ENERGY, unit="keV", words=_ISOTOPES, above=0,
             needs=(_FILE, "no model.kind=emission")),
@@ -217,7 +243,7 @@ _DECLARED = (
             needs=("counts.files",)),
     Setting("counts.raw_shape", int, None, "Frames, rows and columns of a raw file", least=1, sizes=(3,),
             needs=("counts.files",)),
-    Setting("counts.raw_type", str, None, "Type of a raw file's numbers", words=_named(RAW_TYPES, ""),
+    Setting("counts.raw_type", str, None, "Type of a raw file's numbers", words=named(RAW_TYPES, ""),
             needs=("counts.files",)),
     Setting("counts.raw_big_endian", bool, False, "The most significant byte of a raw file's numbers comes first",
             needs=("counts.files",)),
@@ -249,7 +275,7 @@ _DECLARED = (
             "this close to that of the whole hole", "0.1, where rays are used", above=0, slider=1,
             needs=(_COUNTS, "model.hole=rays"), label="Hole Tolerance"),
     Setting("model.aperture_mu", float, None, "Material of the aperture's edge, or its attenuation coefficient at the "
-            "photons' energy", "nothing penetrates it", unit="1/mm", words=_named(APERTURES, _BY_NAME), above=0,
+            "photons' energy", "nothing penetrates it", unit="1/mm", words=named(APERTURES, _BY_NAME), above=0,
             slider=10, needs=(_COUNTS,), label="Aperture"),
     Setting("model.opening_angle_degrees", float, 90.0, "Full angle of the knife edge's cone", unit="degrees", above=0,
             most=179.9, needs=(_COUNTS, "model.aperture_mu or model.within_cone")),
@@ -258,7 +284,7 @@ _DECLARED = (
         "path": ("Path Length", "Each by its path through the edge: more rays"),
     }, needs=(*_BY_RAYS, "model.aperture_mu")),
     Setting("model.crystal_mu", float, None, "Material of the crystal that stops the photons, or its attenuation "
-            "coefficient at their energy", "all photons are counted", unit="1/mm", words=_named(CRYSTALS, _BY_NAME),
+            "coefficient at their energy", "all photons are counted", unit="1/mm", words=named(CRYSTALS, _BY_NAME),
             above=0, slider=5, needs=(_COUNTS,), label="Crystal"),
     Setting("model.depth_layers", int, 1, "Depths in the crystal at which photons are recorded (parallax); 1: where they "
             "enter", least=1, slider=8, needs=(*_BY_RAYS, "model.crystal_mu")),
@@ -342,7 +368,15 @@ _DECLARED = (
 )  # fmt: skip
 
 SETTINGS: Mapping[str, Setting] = MappingProxyType({setting.key: setting for setting in _DECLARED})
-"""Every setting by its key, table by table. A phantom's own numbers come beside them, from the class of its kind."""
+"""Every setting by its key, table by table; `settings_with` has those of a kind of phantoms, too."""
+
+
+@functools.cache
+def settings_with(kind: str) -> Mapping[str, Setting]:
+    """Every setting by its key, with those of a kind of phantoms."""
+    own = [row for known in KINDS if known.name == kind for row in own_settings(known, needs=_PHANTOM_NUMBER)]
+    return MappingProxyType({**SETTINGS, **{f"phantom.{row.key}": row for row in own}})
+
 
 TABLES = tuple(dict.fromkeys(key.partition(".")[0] for key in SETTINGS))
 

@@ -225,7 +225,7 @@ def test_what_a_worker_refuses_is_one_line(tmp_path, capsys):
         ["events", "make", str(folder / "set"), "--recipe", str(folder / "small.toml"), "-n", "3", "--workers", "2"]
     )
     said = capsys.readouterr().err
-    assert status == 1 and "points: spheres: no such setting of points" in said and "Traceback" not in said
+    assert status == 1 and "points: spheres: no such setting; expected counts" in said and "Traceback" not in said
 
 
 @pytest.fixture

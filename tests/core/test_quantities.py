@@ -178,8 +178,8 @@ def test_a_file_that_says_nothing_holds_what_the_user_says(quantity, options, un
     [
         (["--volume", "ct.nii", "--emission"], "as of a CT, are no activity; --quantity activity takes them"),
         (["--volume", "mu.nii", "--quantity", "mu", "--emission"], "emission: expected a volume of activity, got mu"),
-        (["--volume", "raw.nii", "--photons", "1000"], "4000 is no attenuation in 1/mm; .* give --energy"),
-        (["--emission", "--mu", "raw.nii"], "4000 is no attenuation in 1/mm; .* give --energy"),
+        (["--volume", "raw.nii", "--photons", "1000"], "4000 is no attenuation in 1/mm; .* give the energy"),
+        (["--emission", "--mu", "raw.nii"], "4000 is no attenuation in 1/mm; .* give the energy"),
         (["--volume", "map.npz"], "expected a volume of activity or mu, got sensitivity"),
         (["--volume", "map.npz", "--emission"], "holds sensitivity, expected activity"),
         (

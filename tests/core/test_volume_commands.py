@@ -116,8 +116,14 @@ def test_project_converts_and_centers_a_ct(tmp_path, ct, workbook, scanner, caps
     assert np.allclose(counts, expected, rtol=1e-5)
 
     for arguments, message in (
-        (("--volume", tmp_path / "a.nrrd", "--emission", "--mu", ct_file), "give --energy to convert them"),
-        (("--volume", tmp_path / "a.nrrd", "--energy", "80"), "it holds activity; --energy is for CT numbers"),
+        (
+            ("--volume", tmp_path / "a.nrrd", "--emission", "--mu", ct_file),
+            "give the energy (--energy) to convert them",
+        ),
+        (
+            ("--volume", tmp_path / "a.nrrd", "--energy", "80"),
+            "it holds activity; an energy (--energy) is for CT numbers",
+        ),
         (("--volume", ct_file, "--emission"), "ct.nrrd: it holds hu, expected activity in kBq/mL"),
         (("--volume", tmp_path / "a.nrrd", "--photons", "100"), "a.nrrd: it holds activity, expected mu in 1/mm"),
         (

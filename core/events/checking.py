@@ -4,7 +4,6 @@ import os
 from collections import Counter
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -49,12 +48,8 @@ def status(folder: str | os.PathLike[str]) -> Status:
     """
     target = SetFolder(folder)
     fingerprint, lines = target.recipe.fingerprint, target.index.read()
-    made = {}
-    for number, place in target.store.places().items():
-        with suppress(InputError):
-            found = header(place)
-            if found.event == number and found.recipe == fingerprint:
-                made[number] = found
+    headers = {number: target.header(number, place) for number, place in target.store.places().items()}
+    made = {number: found for number, found in headers.items() if found is not None and found.recipe == fingerprint}
     asked = target.planned() or list(made)
     made = {number: made[number] for number in asked if number in made}
     rows = [lines.get(number) or target.index.line(number) for number in made]

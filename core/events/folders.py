@@ -4,12 +4,13 @@ import json
 import os
 import re
 from collections.abc import Sequence
+from contextlib import suppress
 from functools import cached_property
 
 from ..errors import InputError, warn
 from ..files import ensure_folder, folder_path, is_leftover, write_bytes
 from ..version import build
-from .event_files import Place, header
+from .event_files import Header, Place, header
 from .index import Index
 from .inputs import Input
 from .recipe import EventRecipe, read_recipe
@@ -33,13 +34,17 @@ class SetFolder:
         """Its table of events."""
         return Index(self.path / INDEX, self.recipe)
 
+    def header(self, number: int, place: Place | None) -> Header | None:
+        """The header of an event's file; None where it is not there, not as long as it should be, or another event."""
+        with suppress(InputError):
+            found = None if place is None else header(place)
+            return found if found is not None and found.event == number else None
+        return None
+
     def is_made(self, number: int, place: Place) -> bool:
         """Whether an event is as long as it should be and of this recipe."""
-        try:
-            found = header(place)
-        except InputError:
-            return False
-        return found.event == number and found.recipe == self.recipe.fingerprint
+        found = self.header(number, place)
+        return found is not None and found.recipe == self.recipe.fingerprint
 
     @cached_property
     def recipe(self) -> EventRecipe:
@@ -103,12 +108,8 @@ class SetFolder:
         """Which of some events are not there as they should be; `InputError` for one of another recipe."""
         missing, said = [], False
         for number in mine:
-            place = places.get(number)
-            try:
-                found = None if place is None else header(place)
-            except InputError:
-                found = None
-            if found is None or found.event != number:
+            found = self.header(number, places.get(number))
+            if found is None:
                 missing.append(number)
                 continue
             if found.recipe != self.recipe.fingerprint:

@@ -6,6 +6,7 @@ import re
 from collections.abc import Sequence
 from contextlib import suppress
 from functools import cached_property
+from typing import Any
 
 from ..errors import InputError, warn
 from ..files import ensure_folder, folder_path, is_leftover, write_bytes
@@ -13,6 +14,7 @@ from ..version import build
 from .event_files import Header, Place, header
 from .index import Index
 from .inputs import Input
+from .making import EventMaker
 from .recipe import EventRecipe, read_recipe
 from .store import Store
 
@@ -29,10 +31,32 @@ class SetFolder:
         self.recipe_path, self.inputs, self.asked_path = self.path / RECIPE, self.path / INPUTS, self.path / ASKED
         self.store = Store(self.path)
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        return SetFolder, (self.path,)
+
+    @cached_property
+    def maker(self) -> EventMaker:
+        """What makes its events: it has scanner and views."""
+        return EventMaker(self.recipe)
+
     @cached_property
     def index(self) -> Index:
         """Its table of events."""
         return Index(self.path / INDEX, self.recipe)
+
+    @cached_property
+    def lines(self) -> dict[int, str]:
+        """The rows of the index by event, as they were when this was first asked for."""
+        return self.index.read()
+
+    def line(self, number: int) -> str:
+        """A row of the index, drawn where the index has none."""
+        return self.lines.get(number) or self.index.line(number)
+
+    @cached_property
+    def places(self) -> dict[int, Place]:
+        """The events' files, as they were when this was first asked for: a set may be packed while it is read."""
+        return self.store.places()
 
     def header(self, number: int, place: Place | None) -> Header | None:
         """The header of an event's file; None where it is not there, not as long as it should be, or another event."""

@@ -15,7 +15,6 @@ from pathlib import Path
 from ..errors import InputError
 from ..memory import cores
 from .folders import SetFolder
-from .making import EventMaker
 from .writing import EventWriter, Written
 
 _MOST_BREAKS = 3
@@ -39,7 +38,7 @@ def in_processes(target: SetFolder, numbers: Sequence[int], workers: int) -> Ite
             f"workers: expected 1 within Blender, which takes all cores, got {workers}; mphdrr as a Python package takes "
             "more, and several commands share a set by --shard"
         )
-    EventMaker(target.recipe).require_memory(workers)
+    target.maker.require_memory(workers)
     waiting, breaks = deque(numbers), 0
     while waiting:
         under_way: dict[Future[Written], int] = {}

@@ -9,7 +9,6 @@ from pathlib import Path
 
 from ...errors import InputError
 from ...events.folders import SetFolder
-from ...events.making import EventMaker
 from ...events.recipe import EventRecipe, read_recipe
 from ...events.store import size_of
 from ...events.work import Made, Making, making
@@ -100,7 +99,7 @@ class _Report:
             return
         missing = len(work.missing)
         sizes = [size_of(place) for place in islice(self.folder.store.places().values(), 100)]
-        raw = EventMaker(self.folder.recipe).raw_bytes
+        raw = self.folder.maker.raw_bytes
         if sizes:
             each = sum(sizes) / len(sizes)
             size = f"about {readable_size(each)} each, {readable_size(each * missing)} in all"

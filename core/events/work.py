@@ -42,10 +42,25 @@ class Made:
 
 
 class Making(Iterator[Made]):
-    """Work on a set: gives each event once it is made. `missing` says which are to be made, `folder` where."""
+    """Work on a set: makes the events `missing` in `folder`, and gives each once it is made; the rest as in `making`."""
 
-    def __init__(self, folder: SetFolder, missing: Sequence[int], written: Iterator[Written]) -> None:
+    def __init__(
+        self,
+        folder: SetFolder,
+        missing: Sequence[int],
+        workers: int = 1,
+        progress: Progress | None = None,
+        dask: str | None = None,
+    ) -> None:
         self.folder, self.missing = folder, missing
+        if (workers := whole_number(workers, "workers")) > 1:
+            workers = min(workers, max(1, len(missing)))
+        if dask is not None and missing:
+            written = in_cluster(folder, missing, dask, workers)
+        elif workers > 1:
+            written = in_processes(folder, missing, workers)
+        else:
+            written = _in_turn(folder, missing, progress)
         self._made = self._follow(written)
 
     def __next__(self) -> Made:
@@ -65,7 +80,7 @@ class Making(Iterator[Made]):
                 path = store.event_path(event.number)
                 yield Made(event.number, path, event.size, event.seconds, done, len(self.missing))
                 unpacked += event.size
-                if unpacked >= SHARD_BYTES and store.shards.is_dir():
+                if unpacked >= SHARD_BYTES:
                     _pack(store)
                     unpacked = 0
         except BaseException:
@@ -74,14 +89,14 @@ class Making(Iterator[Made]):
             raise
         self.folder.complete_index()
         store.remove_leftovers()  # of workers that died
-        if store.shards.is_dir():
-            _pack(store)
+        _pack(store)
 
 
 def _pack(store: Store) -> None:
-    """Put what was made into shards, unless another work is doing it."""
-    with suppress(Locked):
-        store.pack()
+    """Put what was made into shards where the set has some, unless another work is doing it."""
+    if store.shards.is_dir():
+        with suppress(Locked):
+            store.pack()
 
 
 def making(
@@ -124,21 +139,7 @@ def making(
     target, missing = prepare(recipe, folder, count, first, shard)
     if pack:
         ensure_folder(target.store.shards)
-    if dask is not None and missing:
-        return Making(target, missing, in_cluster(target, missing, dask, whole_number(workers, "workers")))
-    return _making(target, missing, workers, progress)
-
-
-def making_again(folder: str | os.PathLike[str], numbers: Sequence[int], workers: int = 1) -> Making:
-    """Make some events of a set, as `making` does, which are not there or have been removed."""
-    return _making(SetFolder(folder), numbers, workers)
-
-
-def _making(target: SetFolder, missing: Sequence[int], workers: int, progress: Progress | None = None) -> Making:
-    workers = whole_number(workers, "workers")
-    if workers > 1 and len(missing) > 1:
-        return Making(target, missing, in_processes(target, missing, min(workers, len(missing))))
-    return Making(target, missing, _in_turn(target, missing, progress))
+    return Making(target, missing, workers, progress, dask)
 
 
 def prepare(

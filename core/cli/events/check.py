@@ -1,15 +1,14 @@
 """``mphdrr events check SET``."""
 
 import argparse
-import sys
 import time
 from dataclasses import asdict
 
 from ...errors import InputError
 from ...events.checking import check, index_faults, repair
 from ...events.folders import SetFolder
-from ...events.work import making_again
-from ..options import add_command, print_answer, progress_bar
+from ...events.work import Making
+from ..options import add_command, print_answer, progress_bar, say
 from .make import watched
 
 _TIMES, _SECONDS = 10, 0.5
@@ -48,9 +47,9 @@ def _run(arguments: argparse.Namespace) -> None:
             )
         return
     for line in lines:
-        sys.stderr.write(f"mphdrr: {line}\n")
+        say(line)
     again = repair(folder, faults)
-    done = watched(making_again(folder, again, arguments.workers), quiet=True)
+    done = watched(Making(SetFolder(folder), again, arguments.workers), quiet=True)
     left = check(folder, progress_bar("checking again"))
     for _ in range(_TIMES):  # another work that ends now may be writing it
         if {fault.kind for fault in left} != {"index"}:

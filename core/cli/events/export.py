@@ -1,12 +1,11 @@
 """``mphdrr events export SET --to PROGRAM -o FOLDER``."""
 
 import argparse
-import sys
 
 from ...events.event_set import EventSet
 from ...events.exports import PROGRAMS, planned_export
 from ...events.exports.unet3d import RAW
-from ..options import add_command, print_answer, progress_bar
+from ..options import add_command, print_answer, progress_bar, say
 
 
 def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
@@ -48,8 +47,7 @@ def _run(arguments: argparse.Namespace) -> None:
         for name in ("noise", "level", "slots", "raw", "events_per_shard", "uncompressed")
     }
     plan = planned_export(events, arguments.output, arguments.to, models=arguments.model, **options)
-    sys.stderr.write(f"mphdrr: {plan.says()}\n")
-    sys.stderr.flush()
+    say(plan.says())
     plan.write(progress_bar("exporting"))
     record = {"folder": arguments.output, "program": arguments.to, "events": len(plan.rows)}
     print_answer(arguments, record, [f"{arguments.output}: {len(plan.rows)} events, {PROGRAMS[arguments.to].title}"])

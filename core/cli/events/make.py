@@ -2,7 +2,6 @@
 
 import argparse
 import shutil
-import sys
 import time
 from itertools import islice
 from pathlib import Path
@@ -11,9 +10,9 @@ from ...errors import InputError
 from ...events.folders import SetFolder
 from ...events.recipe import EventRecipe, read_recipe
 from ...events.store import size_of
-from ...events.work import Made, Making, making
+from ...events.work import Making, making
 from ...memory import readable_size
-from ..options import add_command, print_answer
+from ..options import add_command, print_answer, progress_bar, say
 
 
 def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
@@ -78,67 +77,39 @@ def _run(arguments: argparse.Namespace) -> None:
 
 
 def watched(work: Making, quiet: bool) -> int:
-    """Do the work and say how far it is; the number of events that it made."""
-    report, done = _Report(work, quiet), 0
-    try:
-        for made in work:
-            done = made.done
-            report(made)
-    finally:
-        report.end()
+    """Do the work, and say how large the set becomes and what is left; the number of events that it made."""
+    started, done, size, left = time.monotonic(), 0, 0, ""
+    bar = progress_bar("making", lambda: f"{left} left")
+    if not quiet:
+        say(f"events missing: {len(work.missing)}, {_expected(work)}; {readable_size(_free(work))} are free")
+    for made in work:
+        done, size = made.done, size + made.size
+        share = (made.total - done) / done  # what is left is so many times what was done
+        left = f"{readable_size(size * share)}, {_time((time.monotonic() - started) * share)}"
+        if done == 1 and not quiet:
+            what = f"{readable_size(size)} in {made.seconds:.1f} s; {made.total - 1} more: {left}"
+            say(f"event {made.number}: {what}")
+        if done in (1, 10, 100, 1000) and size * share > _free(work):
+            say(f"warning: only {readable_size(_free(work))} are free on the disk of {work.folder.path}")
+        if not quiet:
+            bar(done, made.total)
     return done
 
 
-class _Report:
-    """Says how large the set becomes, and what is left, on standard error."""
+def _expected(work: Making) -> str:
+    """How large the missing events become, by the first ones that are there."""
+    missing = len(work.missing)
+    sizes = [size_of(place) for place in islice(work.folder.store.places().values(), 100)]
+    if sizes:
+        each = sum(sizes) / len(sizes)
+        return f"about {readable_size(each)} each, {readable_size(each * missing)} in all"
+    raw = work.folder.maker.raw_bytes
+    return f"up to {readable_size(raw)} each, {readable_size(raw * missing)} in all, before they are compressed"
 
-    def __init__(self, work: Making, quiet: bool) -> None:
-        self.folder, self.quiet, self.shows = work.folder, quiet, sys.stderr.isatty() and not quiet
-        self.started, self.bytes, self.open_line = time.monotonic(), 0, False
-        if quiet:
-            return
-        missing = len(work.missing)
-        sizes = [size_of(place) for place in islice(self.folder.store.places().values(), 100)]
-        raw = self.folder.maker.raw_bytes
-        if sizes:
-            each = sum(sizes) / len(sizes)
-            size = f"about {readable_size(each)} each, {readable_size(each * missing)} in all"
-        else:
-            size = f"up to {readable_size(raw)} each, {readable_size(raw * missing)} in all, before they are compressed"
-        self._say(f"events missing: {missing}, {size}; {readable_size(self._free())} are free")
 
-    def __call__(self, made: Made) -> None:
-        self.bytes += made.size
-        left = made.total - made.done
-        each, seconds = self.bytes / made.done, (time.monotonic() - self.started) / made.done
-        if made.done == 1 and not self.quiet:
-            said = f"{readable_size(made.size)} in {made.seconds:.1f} s"
-            self._say(
-                f"event {made.number}: {said}; {left} more: {readable_size(each * left)}, {_time(seconds * left)}"
-            )
-        if made.done in (1, 10, 100, 1000) and each * left > self._free():
-            self._say(f"warning: only {readable_size(self._free())} are free on the disk of {self.folder.path}")
-        if self.shows:
-            filled = 30 * made.done // made.total
-            bar = f"[{'#' * filled}{'.' * (30 - filled)}] {made.done}/{made.total}"
-            more = f"{readable_size(each * left)} and {_time(seconds * left)} left"
-            sys.stderr.write(f"\r{bar}  {more}\x1b[K")
-            sys.stderr.flush()
-            self.open_line = True
-
-    def end(self) -> None:
-        """The line with the bar is done."""
-        if self.open_line:
-            sys.stderr.write("\n")
-            self.open_line = False
-
-    def _say(self, text: str) -> None:
-        self.end()
-        sys.stderr.write(f"mphdrr: {text}\n")
-        sys.stderr.flush()
-
-    def _free(self) -> int:
-        return shutil.disk_usage(self.folder.path).free
+def _free(work: Making) -> int:
+    """Bytes on the disk of a set."""
+    return shutil.disk_usage(work.folder.path).free
 
 
 def _shard(text: str) -> tuple[int, int]:

@@ -41,6 +41,14 @@ class Chosen:
         """A model's images (M, n_v, n_u): with the noise, where they are counts."""
         return noisy_images(event, model, self.seed(event), self.level)
 
+    def arrays(self, event: Event) -> Iterator[tuple[str, Images]]:
+        """The event's arrays by their names in `shapes`: truth, images of the models, Radon images."""
+        yield "truth", event.truth_part()
+        for model in self.models:
+            yield model, self.images(event, model)
+        for n in self.radon_counts:
+            yield f"radon{n}", event.radon(n)
+
     @cached_property
     def shapes(self) -> Shapes:
         """Of the arrays of an event."""

@@ -21,10 +21,8 @@ class Npz(Layout):
     def contents(self, row: Row, event: Event) -> Iterator[tuple[str, bytes]]:
         """All that there is of the event; `record` is text, as JSON."""
         arrays = {
-            "truth": event.truth.array,
+            **dict(self.chosen.arrays(event)),
             "truth_affine": event.recipe.grid.affine,
-            **{model: self.chosen.images(event, model) for model in self.chosen.models},
-            **{f"radon{n}": event.radon(n) for n in self.chosen.radon_counts},
             "pose": event.pose,
             "record": json.dumps(record(self.chosen, event)),
         }

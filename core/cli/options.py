@@ -131,6 +131,11 @@ def number_or_name(text: str) -> float | str:
         return text
 
 
+def counted(number: int, word: str) -> str:
+    """A number of things, such as "1 fault" or "2 faults"."""
+    return f"{number} {word}{'s' * (number != 1)}"
+
+
 def say(text: str) -> None:
     """Write a line on standard error; on a terminal in the place of a bar that is not at its end."""
     over = "\r\x1b[K" if sys.stderr.isatty() else ""

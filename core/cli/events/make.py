@@ -12,37 +12,33 @@ from ...events.recipe import EventRecipe, read_recipe
 from ...events.store import size_of
 from ...events.work import Making, making
 from ...memory import readable_size
-from ..options import add_command, print_answer, progress_bar, say
+from ..options import print_answer, progress_bar, say
+from .action import add_action
 
 
 def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     """Add the action."""
-    parser = add_command(
+    parser = add_action(
         actions,
         "make",
+        _run,
         "make the events of a set that are missing",
-        "mphdrr events make set --recipe derenzo.toml -n 1000 --workers 2\n"
-        "example: mphdrr events make set\n"
-        "example: mphdrr events make set -n 100000 --shard 3/50",
+        "mphdrr events make set --recipe derenzo.toml -n 1000 --workers 2",
+        "mphdrr events make set",
+        "mphdrr events make set -n 100000 --shard 3/50",
     )
-    parser.add_argument("folder", metavar="SET", help="folder of the set, with recipe.toml in it, or a new one")
-    parser.add_argument("--recipe", metavar="FILE", help="recipe (.toml) of a new set; the folder keeps a copy")
-    parser.add_argument(
-        "-n", "--count", type=int, metavar="N", help="events; default: as many as were asked for before"
-    )
-    parser.add_argument("--first", type=int, default=0, metavar="I", help="number of the first event")
-    parser.add_argument(
-        "--workers", type=int, default=1, metavar="N", help="processes, which share the processor's cores"
-    )
+    add = parser.add_argument
+    add("--recipe", metavar="FILE", help="recipe (.toml) of a new set, whose folder keeps a copy")
+    add("-n", "--count", type=int, metavar="N", help="events; default: as many as were asked for before")
+    add("--first", type=int, default=0, metavar="I", help="number of the first event")
+    add("--workers", type=int, default=1, metavar="N", help="processes, which share the processor's cores")
     text = "only part I of N, for several machines that work on one folder"
-    parser.add_argument("--shard", type=_shard, default=(1, 1), metavar="I/N", help=text)
+    add("--shard", type=_shard, default="1/1", metavar="I/N", help=text)
     text = "let the workers of a Dask cluster make them, which see SET under the same path; local: --workers of this machine"
-    parser.add_argument("--dask", metavar="ADDRESS|local", help=text)
+    add("--dask", metavar="ADDRESS|local", help=text)
     text = "put events into shards, files of many, as they become enough; a set that has shards goes on so"
-    parser.add_argument("--pack", action="store_true", help=text)
-    parser.add_argument("--json", action="store_true", help="say what there is at the end as JSON")
-    parser.add_argument("--quiet", action="store_true", help="say nothing on standard error but warnings")
-    parser.set_defaults(run=_run)
+    add("--pack", action="store_true", help=text)
+    add("--quiet", action="store_true", help="say nothing on standard error but warnings")
 
 
 def chosen_recipe(folder: str, recipe: str | None) -> EventRecipe:

@@ -130,6 +130,12 @@ def is_leftover(path: Path) -> bool:
     return False
 
 
+def remove_leftovers(folder: Path) -> None:
+    """Remove the files of a folder that were being written by what has ended."""
+    for path in filter(is_leftover, folder.glob(".*")):
+        path.unlink(missing_ok=True)
+
+
 def require_file(path: str | os.PathLike[str], expected: str = "a file") -> Path:
     """A path, if it is that of a file that can be read; `InputError` of what is missing, a folder, device or pipe."""
     path = Path(path)

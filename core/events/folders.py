@@ -9,7 +9,7 @@ from functools import cached_property
 from typing import Any
 
 from ..errors import InputError, warn
-from ..files import ensure_folder, folder_path, is_leftover, write_bytes
+from ..files import ensure_folder, folder_path, remove_leftovers, write_bytes
 from ..version import build
 from .event_files import Header, Place, header
 from .index import Index
@@ -98,9 +98,8 @@ class SetFolder:
         another one, or files that are no event set.
         """
         ensure_folder(self.path)
-        for path in (path for folder in (self.path, self.inputs) for path in folder.glob(".*")):
-            if is_leftover(path):
-                path.unlink(missing_ok=True)
+        for folder in (self.path, self.inputs, self.store.events):
+            remove_leftovers(folder)
         if not self.recipe_path.exists():
             # Names with a dot are of files that other works have begun.
             if others := [name for name in os.listdir(self.path) if not name.startswith(".")]:
@@ -113,7 +112,6 @@ class SetFolder:
             no_events = "" if places else f", or remove {self.path}, which holds no events yet"
             raise InputError(f"{self.recipe_path}: another recipe: choose another folder for {recipe.name}{no_events}")
         ensure_folder(self.store.events)
-        self.store.remove_leftovers()
         copies = self.copies()
         if set(copies) != set(recipe.files) or not places:
             copies = self._copy(recipe, copies)

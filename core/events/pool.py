@@ -13,6 +13,7 @@ from multiprocessing import get_context, parent_process
 from pathlib import Path
 
 from ..errors import InputError
+from ..files import remove_leftovers
 from ..memory import cores
 from .folders import SetFolder
 from .writing import EventWriter, Written
@@ -69,7 +70,7 @@ def in_processes(target: SetFolder, numbers: Sequence[int], workers: int) -> Ite
             for worker in list(pool._processes.values()):
                 worker.kill()
             pool.shutdown(cancel_futures=True)
-            target.store.remove_leftovers()
+            remove_leftovers(target.store.events)
             raise
         finally:
             pool.shutdown(cancel_futures=True)  # what is under way is finished: it counts

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from ..errors import InputError, refusing
-from ..files import is_leftover, locked, write_bytes
+from ..files import locked, write_bytes
 from ..progress import Progress, tell
 from .event_files import Place, verify
 
@@ -52,12 +52,6 @@ class Store:
         """The shards, in order."""
         names = filter(_SHARD.fullmatch, _names(self.shards))
         return [self.shards / name for name in sorted(names, key=lambda name: (len(name), name))]
-
-    def remove_leftovers(self) -> None:
-        """Remove what works have left that were killed."""
-        for name in _names(self.events):
-            if name.startswith(".") and is_leftover(path := self.events / name):
-                path.unlink(missing_ok=True)
 
     def alone(self) -> list[int]:
         """The events that have a file of their own."""

@@ -9,10 +9,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..errors import InputError, warn
-from ..files import Locked, ensure_folder
+from ..files import Locked, ensure_folder, remove_leftovers
 from ..memory import readable_size
 from ..progress import Progress, tell
-from ..validation import whole_number
+from ..validation import seed_number, whole_number
 from .dask_work import in_cluster
 from .event_set import EventSet
 from .folders import SetFolder
@@ -88,7 +88,7 @@ class Making(Iterator[Made]):
                 self.folder.complete_index()
             raise
         self.folder.complete_index()
-        store.remove_leftovers()  # of workers that died
+        remove_leftovers(store.events)  # of workers that died
         _pack(store)
 
 
@@ -136,25 +136,7 @@ def making(
     InputError
         As of `make`.
     """
-    target, missing = prepare(recipe, folder, count, first, shard)
-    if pack:
-        ensure_folder(target.store.shards)
-    return Making(target, missing, workers, progress, dask)
-
-
-def prepare(
-    recipe: EventRecipe,
-    folder: str | os.PathLike[str],
-    count: int | None = None,
-    first: int = 0,
-    shard: tuple[int, int] = (1, 1),
-) -> tuple[SetFolder, list[int]]:
-    """Put recipe, copies and index into a set's folder; and the numbers of the shard's events that are still missing."""
-    if isinstance(first, bool) or not isinstance(first, int) or first < 0:
-        raise InputError(f"first: expected a whole number of at least 0, got {first!r}")
-    place, parts = shard
-    if not (isinstance(place, int) and isinstance(parts, int) and 1 <= place <= parts):
-        raise InputError(f"shard: expected i/n with i from 1 to n, got {place}/{parts}")
+    seed_number(first, "first")
     target = SetFolder(folder)
     asked = target.asked if count is None else [range(first, first + whole_number(count, "count"))]
     if not asked:
@@ -164,13 +146,23 @@ def prepare(
         size = readable_size(maker.raw_bytes * most)
         raise InputError(f"count: at most {_MOST:,} events in a set, got {most:,}, of up to {size} uncompressed")
     maker.require_memory()
-    mine = [n for part in asked for n in range(part.start + (place - 1 - part.start) % parts, part.stop, parts)]
+    mine = _part(asked, *shard)
     end = time.monotonic() + _CHECK_SECONDS
     # What does not fit together shows before anything is computed.
     for number in mine[:: max(1, len(mine) // _CHECKED)]:
         if time.monotonic() < end and not target.store.event_path(number).exists():
             _ = plan(recipe, number).phantom
-    return target, target.prepare(recipe, asked, mine)
+    missing = target.prepare(recipe, asked, mine)
+    if pack:
+        ensure_folder(target.store.shards)
+    return Making(target, missing, workers, progress, dask)
+
+
+def _part(asked: Sequence[range], place: int, parts: int) -> list[int]:
+    """The events of a shard: those whose numbers leave the same rest."""
+    if not (isinstance(place, int) and isinstance(parts, int) and 1 <= place <= parts):
+        raise InputError(f"shard: expected i/n with i from 1 to n, got {place}/{parts}")
+    return [n for part in asked for n in range(part.start + (place - 1 - part.start) % parts, part.stop, parts)]
 
 
 def _in_turn(target: SetFolder, missing: Sequence[int], progress: Progress | None) -> Iterator[Written]:

@@ -111,7 +111,7 @@ def new_folder(path: Path) -> Iterator[Path]:
 
 
 def written_name(name: str) -> str | None:
-    """Of the temporary file of `replacing`, the name of the file that it was to be; None of others."""
+    """The name that a temporary file of `replacing` was to get; None for other files."""
     found = _TEMPORARY.fullmatch(name)
     return None if found is None else found[3]
 

@@ -74,7 +74,7 @@ def check(folder: str | os.PathLike[str], progress: Progress | None = None) -> l
     Parameters
     ----------
     folder
-        Of the set.
+        The set's.
     progress
         Called as ``progress(events read, events)``; may raise `Cancelled`.
 
@@ -158,8 +158,8 @@ def _planned(target: SetFolder) -> list[int]:
         asked = []
     if target.asked_path.is_dir() and asked:
         return asked
-    beside = {n: place for n, place in target.store.places().items() if n not in asked}  # of an index that was cut
-    return sorted({*asked, *(n for n, place in beside.items() if not asked or target.is_made(n, place))})
+    places = target.store.places()  # of which the index may have been cut
+    return sorted({*asked, *(n for n, place in places.items() if not asked or target.is_made(n, place))})
 
 
 def index_faults(folder: str | os.PathLike[str]) -> list[Fault]:

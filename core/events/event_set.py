@@ -80,7 +80,7 @@ class Event:
 
     @property
     def recipe(self) -> EventRecipe:
-        """Of its set."""
+        """The recipe of its set."""
         return self._folder.recipe
 
     @property
@@ -95,14 +95,14 @@ class Event:
 
     @cached_property
     def attributes(self) -> dict[str, Any]:
-        """Of its file."""
+        """The attributes of its file."""
         with self.opened() as file:
             items = file.attrs.items()
             return {name: value.item() if isinstance(value, np.generic) else value for name, value in items}
 
     @property
     def name(self) -> str:
-        """Of the phantom in the recipe."""
+        """The phantom's name in the recipe."""
         return str(self.attributes["phantom"])
 
     @property
@@ -128,7 +128,7 @@ class Event:
 
     pose: Floats = _numbers("pose", "World-from-phantom pose (4, 4), mm: rotation and translation.")
     placement: Floats = _numbers("placement", "The pose with mirroring and the factor of size, (4, 4), mm.")
-    position: Floats = _numbers("position", "Of the phantom, (3,), mm.")
+    position: Floats = _numbers("position", "Position of the phantom, (3,), mm.")
     euler_degrees: Floats = _numbers("euler_degrees", "phi, theta, psi of the phantom, (3,), degrees.")
     module_gain: Floats = _numbers(
         "module_gain", "Factors (M,) of the modules' sensitivities, in the images of counts."
@@ -149,7 +149,7 @@ class Event:
 
     @property
     def views(self) -> Views:
-        """Of the images."""
+        """The views of its images."""
         return self._folder.maker.views
 
     @property
@@ -164,7 +164,7 @@ class Event:
             return list(file.get("images", ()))
 
     def unit(self, model: str) -> str:
-        """Of a model's images, such as "counts"."""
+        """The unit of a model's images, such as "counts"."""
         with self.opened() as file:
             return str(self._images(file, model).attrs["unit"])
 
@@ -224,7 +224,7 @@ class Event:
             return Images.of(read_array(file, self._dataset(file, f"radon/{count}", shape).name), self.recipe.quantity)
 
     def radon_views(self, count: int) -> Views:
-        """Of the parallel projections."""
+        """The views of the parallel projections."""
         return radon_views(self._folder.recipe, count)
 
     def run(self, model: str, noise_seed: int | None = None) -> ProjectionRun:
@@ -288,7 +288,7 @@ class EventSet:
     Parameters
     ----------
     folder
-        Of the set.
+        The set's.
 
     Raises
     ------
@@ -340,7 +340,7 @@ class EventSet:
 
     @property
     def numbers(self) -> list[int]:
-        """Of the events, in order."""
+        """The numbers of the events, in order."""
         return [event.number for event in self._events]
 
     @property
@@ -350,7 +350,7 @@ class EventSet:
 
     @property
     def recipe(self) -> EventRecipe:
-        """Of the first event's set."""
+        """The recipe of the first event's set."""
         return self._first.recipe
 
     @property

@@ -128,7 +128,7 @@ class SetFolder:
 
     def _missing(self, mine: Sequence[int], places: dict[int, Place]) -> list[int]:
         """Which of some events are not there as they should be; `InputError` for one of another recipe."""
-        missing, said = [], False
+        missing, has_warned = [], False
         for number in mine:
             found = self.header(number, places.get(number))
             if found is None:
@@ -139,8 +139,8 @@ class SetFolder:
                     f"{self.store.event_path(number)}: an event of another recipe: choose another folder, or "
                     f"`mphdrr events check {self.path} --repair` makes such events anew"
                 )
-            if found.build != build() and not said:
-                said = True
+            if found.build != build() and not has_warned:
+                has_warned = True
                 warn(
                     f"{self.path}: event {number} was made by another build of mphDRR ({found.build or 'of version 0.1'}, "
                     f"this is {build()}): events of the two may differ in their last digits, or by what was mended between"

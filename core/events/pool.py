@@ -77,7 +77,7 @@ def in_processes(target: SetFolder, numbers: Sequence[int], workers: int) -> Ite
 
 
 def threads_each(workers: int) -> int:
-    """Of each worker: together they use all cores of the job."""
+    """Threads for each worker: together they use all cores of the job."""
     return max(1, cores() // workers)
 
 

@@ -19,7 +19,7 @@ from .noise_choice import chosen_seed, mixed_seed, noisy_images
 _New = Callable[[str, Sequence[int]], torch.Tensor]
 """Gives zeros of a shape for a field."""
 _PLACE, _LEVEL, _NOISE = range(3)
-"""Of random numbers, what for: so that one does not depend on whether there are others."""
+"""What random numbers are drawn for: so that one does not depend on whether there are others."""
 
 
 @dataclass(eq=False)

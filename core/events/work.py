@@ -26,7 +26,7 @@ from .writing import EventWriter, Written
 _MOST = 10**7
 """Events in a set."""
 _CHECKED, _CHECK_SECONDS = 1000, 1.0
-"""Of how many events the settings are checked before the work begins, and how long at most."""
+"""The settings of so many events are checked before the work begins, for so many seconds at most."""
 
 
 @dataclass(frozen=True)
@@ -67,15 +67,15 @@ class Making(Iterator[Made]):
         return next(self._made)
 
     def _follow(self, written: Iterator[Written]) -> Iterator[Made]:
-        """What is said of events as they are written; each warning is given once, for the first event that it is of."""
-        said: set[str] = set()
+        """The events as they are written; each warning is given once, for the first event that it is about."""
+        given: set[str] = set()
         store, unpacked = self.folder.store, 0
         try:
             for done, event in enumerate(written, 1):
                 for text in event.warnings:
                     words = re.sub(r"[\d.]+", "", text)  # the same with other numbers says nothing new
-                    if words not in said:
-                        said.add(words)
+                    if words not in given:
+                        given.add(words)
                         warn(f"event {event.number}: {text}", 3)
                 path = store.event_path(event.number)
                 yield Made(event.number, path, event.size, event.seconds, done, len(self.missing))
@@ -115,7 +115,7 @@ def making(
     Parameters
     ----------
     recipe, folder, count, first, workers
-        As of `make`. Without a count: the events that were asked for before.
+        The same as in `make`. Without a count: the events that were asked for before.
     shard
         ``(i, n)``: only part i, from 1, of n equal ones; several machines may work on one folder so.
     progress
@@ -134,7 +134,7 @@ def making(
     Raises
     ------
     InputError
-        As of `make`.
+        In the same cases as `make`.
     """
     seed_number(first, "first")
     target = SetFolder(folder)
@@ -187,14 +187,14 @@ def make(
     Parameters
     ----------
     recipe : EventRecipe
-        As of `read_recipe`. The folder keeps its text and copies of the files that it names.
+        From `read_recipe`. The folder keeps its text and copies of the files that it names.
     folder
         New, or that of an event set of the same recipe.
     count, first
         How many events, from which number.
     workers
         Processes; they share the processor's cores. With more than one, a script calls this under
-        ``if __name__ == "__main__":``, as of all of Python's processes.
+        ``if __name__ == "__main__":``, as always with Python's processes.
     progress
         Called as ``progress(events done, events)``; may raise `Cancelled`.
 

@@ -56,7 +56,7 @@ def _run(arguments: argparse.Namespace) -> None:
         repair(folder, left)
         left = index_faults(folder)
     record = [{**asdict(fault), "path": str(fault.path)} for fault in left]
-    said = f"{folder}: {counted(len(faults), 'fault')} mended, {done} events made anew"
-    print_answer(arguments, record, [fault.text for fault in left] or [said])
+    mended = f"{folder}: {counted(len(faults), 'fault')} mended, {done} events made anew"
+    print_answer(arguments, record, [fault.text for fault in left] or [mended])
     if left:
         raise InputError(f"{folder}: {len(left)} of its faults are left")

@@ -13,7 +13,7 @@ from ..options import output_path, print_answer
 from .action import add_action
 
 _ON_SHEET = 4
-"""Events on a sheet, unless told otherwise."""
+"""Events on a sheet by default."""
 _COLUMNS = ("x_mm", "y_mm", "z_mm", "phi_degrees", "theta_degrees", "psi_degrees")
 
 

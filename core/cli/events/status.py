@@ -39,5 +39,5 @@ def numbers_text(numbers: list[int]) -> str:
             parts[-1][1:] = [number]
         else:
             parts.append([number])
-    said = ["-".join(map(str, part)) for part in parts]
-    return ", ".join(said if len(said) <= 10 else [*said[:10], f"… ({len(numbers)} in all)"])
+    texts = ["-".join(map(str, part)) for part in parts]
+    return ", ".join(texts if len(texts) <= 10 else [*texts[:10], f"… ({len(numbers)} in all)"])

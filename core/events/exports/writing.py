@@ -32,7 +32,7 @@ class Plan:
     folder: Path
     rows: list[Row]
     parts: list[Part]
-    """Of the whole export."""
+    """All parts of the export."""
     missing: list[Part]
     """What is not there yet."""
     changed: list[Path]

@@ -68,7 +68,8 @@ def header(place: Place) -> Header:
     try:
         with open(path, "rb", buffering=0) as file:
             size = os.fstat(file.fileno()).st_size if size is None else size
-            file.seek(offset)
+            if offset:
+                file.seek(offset)
             seal = hdf5.parse_seal(file.read(hdf5.HEADER))
     except (OSError, InputError) as error:  # by hand, since sets have a hundred thousand
         raise InputError(f"{path}: {getattr(error, 'strerror', None) or error}") from None

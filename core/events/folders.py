@@ -4,7 +4,6 @@ import json
 import os
 import re
 from collections.abc import Sequence
-from contextlib import suppress
 from functools import cached_property
 from typing import Any
 
@@ -60,10 +59,11 @@ class SetFolder:
 
     def header(self, number: int, place: Place | None) -> Header | None:
         """The header of an event's file; None where it is not there, not as long as it should be, or another event."""
-        with suppress(InputError):
+        try:
             found = None if place is None else header(place)
-            return found if found is not None and found.event == number else None
-        return None
+        except InputError:
+            return None
+        return found if found is not None and found.event == number else None
 
     def is_made(self, number: int, place: Place) -> bool:
         """Whether an event is as long as it should be and of this recipe."""

@@ -350,10 +350,11 @@ def test_an_event_that_is_not_as_it_should_be_is_refused_by_name(whole, change, 
         _ = event.pose, event.images("lines")
 
 
-def test_no_flipped_bit_of_an_event_reads_as_another_event(whole, made):
+@pytest.mark.parametrize("count", [60, pytest.param(200, marks=pytest.mark.long)])
+def test_no_flipped_bit_of_an_event_reads_as_another_event(whole, made, count):
     path = whole / "events" / "000001.h5"
     data, random = path.read_bytes(), np.random.default_rng(7)
-    for bit in random.integers(8 * len(data), size=60):
+    for bit in random.integers(8 * len(data), size=count):
         changed = bytearray(data)
         changed[bit // 8] ^= 1 << bit % 8
         path.write_bytes(changed)

@@ -9,7 +9,8 @@ truth, 80 views of 256 x 256 with noise), each in a file of its own and in shard
 from __future__ import annotations
 
 import argparse
-import resource
+import subprocess
+import sys
 import tempfile
 import time
 import warnings
@@ -50,6 +51,16 @@ def many(folder: Path, count: int) -> mph.events.EventRecipe:
     return recipe
 
 
+def memory(folder: Path, count: int) -> float:
+    """MB of a process that begins a shard of a set, on Linux."""
+    code = (
+        "import re, sys, mphdrr.core as mph; recipe = mph.events.read_recipe(sys.argv[1] + '/recipe.toml')\n"
+        f"mph.events.making(recipe, sys.argv[1], {count}, shard=(7, {SHARDS}))\n"
+        "print(int(re.search(r'VmHWM:\\s*(\\d+)', open('/proc/self/status').read())[1]) / 1e3)"  # not that of its parent
+    )
+    return float(subprocess.run([sys.executable, "-c", code, str(folder)], capture_output=True, check=True).stdout)
+
+
 def folder_work(count: int, place: str) -> None:
     """Seconds of what looks at a whole set."""
     with tempfile.TemporaryDirectory(dir=place) as name:
@@ -64,15 +75,16 @@ def folder_work(count: int, place: str) -> None:
         split, _ = timed(lambda: there.split("train"))
         print(
             f"| {count:,} | {start:.2f} | {1e3 * more:.2f} | {checked:.2f} | {opened + split:.2f} | "
-            f"{resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3:.0f} | {len(made)} made, {each:.2f} s",
+            f"{memory(folder, count):.0f} | {len(made)} made, {each:.2f} s",
             flush=True,
         )
 
 
 def reading(count: int, place: str) -> None:
-    """Events a second through a loader, from files and from shards."""
+    """Events a second through a loader of two workers, and processor time in one process, from files and from shards."""
     import torch
 
+    torch.set_num_threads(1)  # as in a loader's workers
     with tempfile.TemporaryDirectory(dir=place) as name, warnings.catch_warnings():
         warnings.simplefilter("ignore", mph.InputWarning)
         folder = Path(name) / "set"
@@ -88,8 +100,15 @@ def reading(count: int, place: str) -> None:
                 loader = torch.utils.data.DataLoader(dataset, batch_size=4, num_workers=2, persistent_workers=True)
                 list(loader)
                 seconds, _ = timed(lambda loader=loader: list(map(len, loader)))
+                worked = time.process_time()
+                for place in range(count):
+                    dataset[place]
+                each = (time.process_time() - worked) / count
                 what = "truth and noisy counts" if crop is None else "parts of 64^3 of the truth"
-                print(f"{form}, {what}: {2 * count / seconds:.1f} events/s", flush=True)
+                print(
+                    f"{form}, {what}: {2 * count / seconds:.1f} events/s, {1e3 * each:.0f} ms of a core each",
+                    flush=True,
+                )
 
 
 def main() -> None:

@@ -111,7 +111,7 @@ def new_folder(path: Path) -> Iterator[Path]:
 
 
 def written_name(name: str) -> str | None:
-    """Of the temporary file of `replacing`, the name of the file that it was to be; None of others."""
+    """The name that a temporary file of `replacing` was to get; None for other files."""
     found = _TEMPORARY.fullmatch(name)
     return None if found is None else found[3]
 
@@ -128,6 +128,12 @@ def is_leftover(path: Path) -> bool:
     with suppress(OSError):
         return time.time() - path.stat().st_mtime > _LEFT_AFTER
     return False
+
+
+def remove_leftovers(folder: Path) -> None:
+    """Remove the files of a folder that were being written by what has ended."""
+    for path in filter(is_leftover, folder.glob(".*")):
+        path.unlink(missing_ok=True)
 
 
 def require_file(path: str | os.PathLike[str], expected: str = "a file") -> Path:

@@ -26,6 +26,8 @@ from .memory import require
 HEADER = 512
 """Bytes of text before the HDF5 data."""
 _BLOCK, _DIGEST = 1 << 16, 32
+_KEPT = 8
+"""Blocks that are kept of an open file: HDF5 reads the same ones again and again."""
 _VERSION = 2
 _TEXT = re.compile(rb"(mphDRR [a-zA-Z0-9 ]+) (\d+)\n((?:\w+ \w+\n)*)bytes (\d+)\nsha256 (\w{64})\n\0*")
 _PROBE_SECONDS = 30
@@ -125,15 +127,14 @@ def opened(path: str | os.PathLike[str], offset: int = 0, *, whole: bool = False
     path = require_file(path)
     with reading(path, "HDF5"), open(path, "rb") as file:
         sealed = _sealed(file, offset)
-        if sealed is None and offset:
-            raise InputError(f"damaged: nothing of mphDRR begins at its byte {offset}")
-        if sealed is not None and whole:
-            sealed.check()
         if sealed is None:
+            if offset:
+                raise InputError(f"damaged: nothing of mphDRR begins at its byte {offset}")
             _probe(path)
-        is_checked = sealed is None or (whole and not offset)
+        elif whole:
+            sealed.check()
         try:
-            with h5py.File(path if is_checked else sealed, "r") as content:
+            with h5py.File(path if sealed is None or (whole and not offset) else sealed, "r") as content:
                 _refuse_foreign(content)
                 yield content
         except Exception:  # dropped here: its traceback keeps what crashes Python when it ends
@@ -151,72 +152,67 @@ def numbers(dataset: Any) -> NDArray[Any]:
 
 
 class _Sealed(io.RawIOBase):
-    """The text and the HDF5 of a sealed file, whose blocks are compared with the table before they are read."""
+    """The text and the HDF5 of a sealed file, whose blocks are compared with the table when they are read."""
 
     def __init__(self, file: BinaryIO, seal: Seal, offset: int) -> None:
-        self._file, self._seal, self._start = file, seal, offset + HEADER
+        self._file, self._seal, self._start, self._at = file, seal, offset + HEADER, 0
         size = file.seek(0, os.SEEK_END) - offset
         if size < seal.file_size:
             raise InputError(f"cut: {size} of {seal.file_size} bytes")
-        file.seek(self._start + seal.size)
-        self._table = file.read(seal.file_size - HEADER - seal.size) if seal.version > 1 else self._table_of_old()
-        if seal.version > 1 and seal.signed(self._table) != seal:
+        file.seek(self._start)
+        if seal.version == 1:  # it has no table: one is made of the content, which is read at once
+            content = file.read(seal.size)
+            self._table, is_good = digests(content), hashlib.sha256(content).hexdigest() == seal.sha256
+        else:
+            file.seek(seal.size, os.SEEK_CUR)
+            self._table = file.read(seal.file_size - HEADER - seal.size)
+            is_good = seal.signed(self._table) == seal
+        if not is_good:
             raise InputError("changed: its first or last bytes are not those that were written")
-        self._at, self._read, self._from, self._kept = 0, set[int](), 0, b""
+        self._kept: dict[int, bytes] = {}
         self.wrong: Exception | None = None  # found while HDF5 was reading, which then reads zeros
-
-    def _table_of_old(self) -> bytes:
-        """Of version 1, which has none: made of the content, which is read at once."""
-        self._file.seek(self._start)
-        content = self._file.read(self._seal.size)
-        if hashlib.sha256(content).hexdigest() != self._seal.sha256:
-            raise InputError("changed: its bytes are not those that were written")
-        return digests(content)
 
     def check(self) -> None:
         """Raise `InputError` unless every block is as it was written."""
-        for start in range(0, self._seal.size, _BLOCK):
-            self.body(start, min(start + _BLOCK, self._seal.size))
+        for block in range(len(self._table) // _DIGEST):
+            self._block(block)
 
-    def body(self, start: int, stop: int) -> bytes:
-        """The HDF5's bytes from `start` to `stop`."""
-        if not self._from <= start <= stop <= self._from + len(self._kept):
-            first, last = start // _BLOCK, -(-stop // _BLOCK)
-            self._file.seek(self._start + first * _BLOCK)
-            self._kept, self._from = (
-                self._file.read(min(last * _BLOCK, self._seal.size) - first * _BLOCK),
-                first * _BLOCK,
-            )
-            for block in set(range(first, last)) - self._read:
-                part = self._kept[(block - first) * _BLOCK : (block - first + 1) * _BLOCK]
-                if hashlib.sha256(part).digest() != self._table[block * _DIGEST : (block + 1) * _DIGEST]:
-                    raise InputError("changed: its bytes are not those that were written")
-                self._read.add(block)
-        return self._kept[start - self._from : stop - self._from]
+    def _block(self, block: int) -> bytes:
+        """A block of the HDF5; the last few are kept."""
+        if block not in self._kept:
+            self._file.seek(self._start + block * _BLOCK)
+            part = self._file.read(min(_BLOCK, self._seal.size - block * _BLOCK))
+            if hashlib.sha256(part).digest() != self._table[block * _DIGEST : (block + 1) * _DIGEST]:
+                raise InputError("changed: its bytes are not those that were written")
+            if len(self._kept) == _KEPT:
+                del self._kept[next(iter(self._kept))]
+            self._kept[block] = part
+        return self._kept[block]
 
     def readable(self) -> bool:
-        """Of a raw file."""
+        """A raw file can be read …"""
         return True
 
     def seekable(self) -> bool:
-        """Of a raw file."""
+        """… at any place."""
         return True
 
     def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
-        """Of a raw file; it ends where the HDF5 does."""
+        """Go to a place; the file ends where the HDF5 does."""
         self._at = offset + (0, self._at, HEADER + self._seal.size)[whence]
         return self._at
 
     def readinto(self, memory: Any) -> int:
-        """Of a raw file."""
+        """Read on, into memory; how many bytes."""
         stop = max(self._at, min(self._at + len(memory), HEADER + self._seal.size))
         text = self._seal.text()[self._at : stop]
-        if stop > max(self._at, HEADER):
-            try:
-                text += self.body(max(0, self._at - HEADER), stop - HEADER)
-            except Exception as error:  # raised here, h5py would lose it; its traceback crashes Python when it ends
-                self.wrong = self.wrong or error.with_traceback(None)
-                text += bytes(stop - self._at - len(text))
+        start, end = max(0, self._at - HEADER), stop - HEADER  # of the HDF5
+        try:
+            blocks = b"".join(map(self._block, range(start // _BLOCK, -(-end // _BLOCK))))
+            text += blocks[start % _BLOCK :][: max(0, end - start)]
+        except Exception as error:  # raised here, h5py would lose it; its traceback crashes Python when it ends
+            self.wrong = self.wrong or error.with_traceback(None)
+            text = text.ljust(stop - self._at, b"\0")
         memory[: len(text)] = text
         self._at += len(text)
         return len(text)

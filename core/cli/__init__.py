@@ -15,7 +15,7 @@ from typing import Any, NoReturn
 from ..errors import InputError, InputWarning
 from ..progress import Cancelled
 from ..version import VERSION
-from .options import NotingStore
+from .options import NotingStore, say
 
 AddParser = Callable[[Any], None]
 
@@ -94,10 +94,10 @@ def _status(argv: Sequence[str] | None, more_commands: Sequence[AddParser]) -> i
 
 
 def _fail(message: str, status: int) -> int:
-    sys.stderr.write(f"mphdrr: {message}\n")
+    say(message)
     return status
 
 
 def _show_warning(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
     if issubclass(category, InputWarning):
-        sys.stderr.write(f"mphdrr: warning: {message}\n")
+        say(f"warning: {message}")

@@ -107,7 +107,7 @@ def print_answer(arguments: argparse.Namespace, record: Any, lines: Iterable[str
         print(json.dumps(record, indent=1))
         return
     for note in notes:
-        sys.stderr.write(f"mphdrr: {note}\n")
+        say(note)
     print("\n".join(lines))
 
 
@@ -146,17 +146,33 @@ def number_or_name(text: str) -> float | str:
         return text
 
 
-def progress_bar(label: str) -> Progress:
-    """A progress callback that draws a bar on standard error when that is a terminal, and says nothing otherwise."""
+def counted(number: int, word: str) -> str:
+    """A number of things, such as "1 fault" or "2 faults"."""
+    return f"{number} {word}{'s' * (number != 1)}"
+
+
+def say(text: str) -> None:
+    """Write a line on standard error; on a terminal in the place of a bar that is not at its end."""
+    over = "\r\x1b[K" if sys.stderr.isatty() else ""
+    sys.stderr.write(f"{over}mphdrr: {text}\n")
+    sys.stderr.flush()
+
+
+def progress_bar(label: str, more: Callable[[], str] | None = None) -> Progress:
+    """A progress callback that draws a bar on standard error when that is a terminal, and says nothing otherwise.
+
+    The bar ends in the seconds that went by, or in what `more` says.
+    """
     started, width = time.monotonic(), 30
 
     def show(done: int, total: int) -> None:
         if not sys.stderr.isatty():
             return
         filled = width * done // max(total, 1)
-        seconds = time.monotonic() - started
+        words = f"{time.monotonic() - started:.1f} s" if more is None else more()
         end = "\n" if done >= total else ""
-        sys.stderr.write(f"\r{label} [{'#' * filled}{'.' * (width - filled)}] {done}/{total}  {seconds:.1f} s{end}")
+        bar = f"[{'#' * filled}{'.' * (width - filled)}]"
+        sys.stderr.write(f"\r{label} {bar} {done}/{total}  {words}\x1b[K{end}")
         sys.stderr.flush()
 
     return show

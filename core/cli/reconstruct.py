@@ -21,7 +21,7 @@ from ..runs.run import ProjectionRun
 from ..runs.settings import SETTINGS
 from ..volumes.volume import Volume
 from ..volumes.volume_files import VOLUME_FORMATS, read_volume, write_volume
-from .options import add_command, output_path, progress_bar
+from .options import add_command, output_path, progress_bar, say
 from .recipe_options import add_entries, add_setting, typed_entries
 
 _OTHERS = ("attenuation.file", "attenuation.energy", "compute.backend", "compute.threads")
@@ -101,7 +101,7 @@ def _run(arguments: argparse.Namespace) -> None:
         if state is not None and cancelled.reconstruction is not None:
             write_reconstruction(cancelled.reconstruction, state)
             done = cancelled.reconstruction.iterations
-            sys.stderr.write(f"mphdrr: {state}: iterations done: {done}; --resume goes on\n")
+            say(f"{state}: iterations done: {done}; --resume goes on")
         raise
     finally:
         if usual is not None:

@@ -4,7 +4,6 @@ import os
 from collections import Counter
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -48,16 +47,12 @@ def status(folder: str | os.PathLike[str]) -> Status:
     `InputError` where the folder is no event set.
     """
     target = SetFolder(folder)
-    fingerprint, lines = target.recipe.fingerprint, target.index.read()
-    made = {}
-    for number, place in target.store.places().items():
-        with suppress(InputError):
-            found = header(place)
-            if found.event == number and found.recipe == fingerprint:
-                made[number] = found
+    fingerprint = target.recipe.fingerprint
+    headers = {number: target.header(number, place) for number, place in target.places.items()}
+    made = {number: found for number, found in headers.items() if found is not None and found.recipe == fingerprint}
     asked = target.planned() or list(made)
     made = {number: made[number] for number in asked if number in made}
-    rows = [lines.get(number) or target.index.line(number) for number in made]
+    rows = [target.line(number) for number in made]
     return Status(
         asked=len(asked),
         made=len(made),
@@ -79,7 +74,7 @@ def check(folder: str | os.PathLike[str], progress: Progress | None = None) -> l
     Parameters
     ----------
     folder
-        Of the set.
+        The set's.
     progress
         Called as ``progress(events read, events)``; may raise `Cancelled`.
 
@@ -144,20 +139,15 @@ def repair(folder: str | os.PathLike[str], faults: list[Fault]) -> list[int]:
 def _inputs(target: SetFolder) -> Iterator[Fault]:
     """Copies of what the recipe names that are missing or not as they were."""
     copies = target.copies()
-    recipe = target.recipe
-    for name in recipe.files:
-        path = target.inputs / INPUT_LIST
-        if name not in copies:
-            yield Fault("input", path, f"{path}: it has no copy of {name}")
-            continue
-        copy = copies[name]
+    for name in target.recipe.files:
+        path = copies[name].path if name in copies else target.inputs / INPUT_LIST
         try:
-            same = copy.current_sha256() == copy.sha256
+            if name not in copies:
+                raise InputError(f"{path}: it has no copy of {name}")
+            if copies[name].current_sha256() != copies[name].sha256:
+                raise InputError(f"{path}: changed: it is not the {name} that the set was begun with")
         except InputError as error:
-            yield Fault("input", copy.path, str(error))
-            continue
-        if not same:
-            yield Fault("input", copy.path, f"{copy.path}: changed: it is not the {name} that the set was begun with")
+            yield Fault("input", path, str(error))
 
 
 def _planned(target: SetFolder) -> list[int]:
@@ -168,8 +158,8 @@ def _planned(target: SetFolder) -> list[int]:
         asked = []
     if target.asked_path.is_dir() and asked:
         return asked
-    beside = {n: place for n, place in target.store.places().items() if n not in asked}  # of an index that was cut
-    return sorted({*asked, *(n for n, place in beside.items() if not asked or target.is_made(n, place))})
+    places = target.store.places()  # of which the index may have been cut
+    return sorted({*asked, *(n for n, place in places.items() if not asked or target.is_made(n, place))})
 
 
 def index_faults(folder: str | os.PathLike[str]) -> list[Fault]:

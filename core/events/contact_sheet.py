@@ -275,8 +275,8 @@ def _bright(values: NDArray[np.float32]) -> float:
 
 def _range(window: tuple[float, float], unit: str) -> str:
     largest = f"{window[1]:.0f}" if window[1] >= 1000 else number(window[1], 3)
-    said = unit.replace("1/mm mm", "").replace(" mm", " · mm")  # line integrals of mu are numbers
-    return f"0 to {largest} {said}".rstrip()
+    shown = unit.replace("1/mm mm", "").replace(" mm", " · mm")  # line integrals of mu are numbers
+    return f"0 to {largest} {shown}".rstrip()
 
 
 def _listed(values: NDArray[np.float64]) -> str:

@@ -66,20 +66,13 @@ def header(place: Place) -> Header:
     """The header of an event's file; `InputError` where the file is none, or is not as long as it says."""
     path, offset, size = place
     try:
-        descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_BINARY", 0))
-        try:
-            size = os.fstat(descriptor).st_size if size is None else size
+        with open(path, "rb", buffering=0) as file:
+            size = os.fstat(file.fileno()).st_size if size is None else size
             if offset:
-                os.lseek(descriptor, offset, os.SEEK_SET)
-            start = os.read(descriptor, hdf5.HEADER)
-        finally:
-            os.close(descriptor)
-    except OSError as error:
-        raise InputError(f"{path}: {error.strerror or error}") from None
-    try:
-        seal = hdf5.parse_seal(start)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
+                file.seek(offset)
+            seal = hdf5.parse_seal(file.read(hdf5.HEADER))
+    except (OSError, InputError) as error:  # by hand, since sets have a hundred thousand
+        raise InputError(f"{path}: {getattr(error, 'strerror', None) or error}") from None
     if seal is None or seal.kind != _KIND or "recipe" not in seal.fields:
         raise InputError(f"{path}: not an event of mphDRR")
     if size != seal.file_size:

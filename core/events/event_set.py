@@ -27,7 +27,7 @@ from ..volumes.volume import Volume
 from .event_files import Place, read_array, read_truth
 from .folders import SetFolder
 from .index import column
-from .making import EventMaker, radon_views
+from .making import radon_views
 from .planning import PlannedEvent, plan
 from .recipe import EventRecipe
 
@@ -35,39 +35,6 @@ Floats = NDArray[np.float64]
 
 COUNTED = ("counts", "photons")
 """Units of images that have Poisson noise."""
-
-
-class _Source:
-    """What the events of one folder share."""
-
-    def __init__(self, folder: str | os.PathLike[str]) -> None:
-        self.folder = SetFolder(folder)
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return _Source, (self.folder.path,)
-
-    @property
-    def recipe(self) -> EventRecipe:
-        return self.folder.recipe
-
-    @cached_property
-    def maker(self) -> EventMaker:
-        """It has scanner and views."""
-        return EventMaker(self.recipe)
-
-    @cached_property
-    def places(self) -> dict[int, Place]:
-        """The events' files; found anew where one is not there any more, since sets may be packed while they are read."""
-        return self.folder.store.places()
-
-    @cached_property
-    def lines(self) -> dict[int, str]:
-        """The rows of the index, by event."""
-        return self.folder.index.read()
-
-    def line(self, number: int) -> str:
-        """A row of the index, drawn where the index has none."""
-        return self.lines.get(number) or self.folder.index.line(number)
 
 
 def _numbers(name: str, text: str) -> Any:
@@ -83,8 +50,8 @@ def _numbers(name: str, text: str) -> Any:
 class Event:
     """One event of a set. Each access opens its file, reads what is asked for, and closes it."""
 
-    def __init__(self, source: _Source, number: int) -> None:
-        self._source, self.number = source, number
+    def __init__(self, folder: SetFolder, number: int) -> None:
+        self._folder, self.number = folder, number
         self._file: Any = None
 
     @contextmanager
@@ -94,7 +61,7 @@ class Event:
             yield self._file
             return
         if not self.path.exists():
-            vars(self._source).pop("places", None)
+            vars(self._folder).pop("places", None)
         with hdf5.opened(self.path, self._place.offset) as file:
             if file.attrs["event"] != self.number or file.attrs["recipe_sha256"] != self.recipe.fingerprint:
                 raise InputError("an event of another number or recipe")
@@ -103,18 +70,18 @@ class Event:
     @contextmanager
     def held(self) -> Iterator[Event]:
         """The same event with its file open, for several readings in one thread."""
-        held = Event(self._source, self.number)
+        held = Event(self._folder, self.number)
         with self.opened() as held._file:
             yield held
 
     @property
     def _place(self) -> Place:
-        return self._source.places.get(self.number) or Place(str(self._source.folder.store.event_path(self.number)))
+        return self._folder.places.get(self.number) or Place(str(self._folder.store.event_path(self.number)))
 
     @property
     def recipe(self) -> EventRecipe:
-        """Of its set."""
-        return self._source.recipe
+        """The recipe of its set."""
+        return self._folder.recipe
 
     @property
     def path(self) -> Path:
@@ -124,18 +91,18 @@ class Event:
     @property
     def row(self) -> dict[str, Any]:
         """Its row of the index, by column."""
-        return self._source.folder.index.values(self._source.line(self.number))
+        return self._folder.index.values(self._folder.line(self.number))
 
     @cached_property
     def attributes(self) -> dict[str, Any]:
-        """Of its file."""
+        """The attributes of its file."""
         with self.opened() as file:
             items = file.attrs.items()
             return {name: value.item() if isinstance(value, np.generic) else value for name, value in items}
 
     @property
     def name(self) -> str:
-        """Of the phantom in the recipe."""
+        """The phantom's name in the recipe."""
         return str(self.attributes["phantom"])
 
     @property
@@ -157,11 +124,11 @@ class Event:
     @property
     def planned(self) -> PlannedEvent:
         """How it was drawn, with its phantom."""
-        return plan(self._source.recipe, self.number)
+        return plan(self._folder.recipe, self.number)
 
     pose: Floats = _numbers("pose", "World-from-phantom pose (4, 4), mm: rotation and translation.")
     placement: Floats = _numbers("placement", "The pose with mirroring and the factor of size, (4, 4), mm.")
-    position: Floats = _numbers("position", "Of the phantom, (3,), mm.")
+    position: Floats = _numbers("position", "Position of the phantom, (3,), mm.")
     euler_degrees: Floats = _numbers("euler_degrees", "phi, theta, psi of the phantom, (3,), degrees.")
     module_gain: Floats = _numbers(
         "module_gain", "Factors (M,) of the modules' sensitivities, in the images of counts."
@@ -182,13 +149,13 @@ class Event:
 
     @property
     def views(self) -> Views:
-        """Of the images."""
-        return self._source.maker.views
+        """The views of its images."""
+        return self._folder.maker.views
 
     @property
     def system(self) -> PinholeSystem:
         """The scanner."""
-        return self._source.maker.system
+        return self._folder.maker.system
 
     @property
     def models(self) -> list[str]:
@@ -197,7 +164,7 @@ class Event:
             return list(file.get("images", ()))
 
     def unit(self, model: str) -> str:
-        """Of a model's images, such as "counts"."""
+        """The unit of a model's images, such as "counts"."""
         with self.opened() as file:
             return str(self._images(file, model).attrs["unit"])
 
@@ -257,8 +224,8 @@ class Event:
             return Images.of(read_array(file, self._dataset(file, f"radon/{count}", shape).name), self.recipe.quantity)
 
     def radon_views(self, count: int) -> Views:
-        """Of the parallel projections."""
-        return radon_views(self._source.recipe, count)
+        """The views of the parallel projections."""
+        return radon_views(self._folder.recipe, count)
 
     def run(self, model: str, noise_seed: int | None = None) -> ProjectionRun:
         """The images of a model as a projection run, with truth, scanner and recipe: to show, write or reconstruct.
@@ -266,7 +233,7 @@ class Event:
         The recipe is left out where what attenuates is a phantom that no recipe of projections describes: with a factor of
         its activity, the mean of several gates, or a volume.
         """
-        models = self._source.recipe.models
+        models = self._folder.recipe.models
         if model not in models:
             raise InputError(f"{model!r}: no such model; there are {', '.join(models) or 'none'}")
         settings: dict[str, Any] = {"model": model, "event": self.number, "volume": self.name}
@@ -281,7 +248,7 @@ class Event:
 
     def _record(self, model: Recipe) -> Recipe | None:
         """The recipe of a run of a model's images; None where none can say what attenuates."""
-        planned, recipe = self.planned, self._source.recipe
+        planned, recipe = self.planned, self._folder.recipe
         files = {key: model[key] for key in ("system.file", "system.columns", "attenuation.file")}
         changes: dict[str, Any] = {key: str(recipe.input(name).path) for key, name in files.items() if name is not None}
         if "attenuation.file" in changes:
@@ -321,7 +288,7 @@ class EventSet:
     Parameters
     ----------
     folder
-        Of the set.
+        The set's.
 
     Raises
     ------
@@ -338,9 +305,9 @@ class EventSet:
     """
 
     def __init__(self, folder: str | os.PathLike[str]) -> None:
-        source = _Source(folder)
-        _ = source.recipe  # which every set has
-        self._events = [Event(source, number) for number in source.places]
+        found = SetFolder(folder)
+        _ = found.recipe  # which every set has
+        self._events = [Event(found, number) for number in found.places]
 
     @classmethod
     def _of(cls, events: list[Event]) -> EventSet:
@@ -373,7 +340,7 @@ class EventSet:
 
     @property
     def numbers(self) -> list[int]:
-        """Of the events, in order."""
+        """The numbers of the events, in order."""
         return [event.number for event in self._events]
 
     @property
@@ -383,7 +350,7 @@ class EventSet:
 
     @property
     def recipe(self) -> EventRecipe:
-        """Of the first event's set."""
+        """The recipe of the first event's set."""
         return self._first.recipe
 
     @property
@@ -397,7 +364,7 @@ class EventSet:
 
     def split(self, name: str) -> EventSet:
         """The events of a split, such as "train"; `InputError` where the recipe has no such split."""
-        splits = [column(event._source.line(event.number), 2) for event in self._events]
+        splits = [column(event._folder.line(event.number), 2) for event in self._events]
         known = set(splits) - {""} | (set(self.recipe.splits) if self._events else set())
         if name not in known:
             raise InputError(f"split {name!r}: there are {', '.join(sorted(known)) or 'none'}")
@@ -407,7 +374,7 @@ class EventSet:
         return f"EventSet({len(self)} events)"
 
     @property
-    def _first(self) -> _Source:
+    def _first(self) -> SetFolder:
         if not self._events:
             raise InputError("the event set holds no events")
-        return self._events[0]._source
+        return self._events[0]._folder

@@ -5,13 +5,15 @@ import os
 import re
 from collections.abc import Sequence
 from functools import cached_property
+from typing import Any
 
 from ..errors import InputError, warn
-from ..files import ensure_folder, folder_path, is_leftover, write_bytes
+from ..files import ensure_folder, folder_path, remove_leftovers, write_bytes
 from ..version import build
-from .event_files import Place, header
+from .event_files import Header, Place, header
 from .index import Index
 from .inputs import Input
+from .making import EventMaker
 from .recipe import EventRecipe, read_recipe
 from .store import Store
 
@@ -28,18 +30,45 @@ class SetFolder:
         self.recipe_path, self.inputs, self.asked_path = self.path / RECIPE, self.path / INPUTS, self.path / ASKED
         self.store = Store(self.path)
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        return SetFolder, (self.path,)
+
+    @cached_property
+    def maker(self) -> EventMaker:
+        """What makes its events: it has scanner and views."""
+        return EventMaker(self.recipe)
+
     @cached_property
     def index(self) -> Index:
         """Its table of events."""
         return Index(self.path / INDEX, self.recipe)
 
+    @cached_property
+    def lines(self) -> dict[int, str]:
+        """The rows of the index by event, as they were when this was first asked for."""
+        return self.index.read()
+
+    def line(self, number: int) -> str:
+        """A row of the index, drawn where the index has none."""
+        return self.lines.get(number) or self.index.line(number)
+
+    @cached_property
+    def places(self) -> dict[int, Place]:
+        """The events' files, as they were when this was first asked for: a set may be packed while it is read."""
+        return self.store.places()
+
+    def header(self, number: int, place: Place | None) -> Header | None:
+        """The header of an event's file; None where it is not there, not as long as it should be, or another event."""
+        try:
+            found = None if place is None else header(place)
+        except InputError:
+            return None
+        return found if found is not None and found.event == number else None
+
     def is_made(self, number: int, place: Place) -> bool:
         """Whether an event is as long as it should be and of this recipe."""
-        try:
-            found = header(place)
-        except InputError:
-            return False
-        return found.event == number and found.recipe == self.recipe.fingerprint
+        found = self.header(number, place)
+        return found is not None and found.recipe == self.recipe.fingerprint
 
     @cached_property
     def recipe(self) -> EventRecipe:
@@ -69,9 +98,8 @@ class SetFolder:
         another one, or files that are no event set.
         """
         ensure_folder(self.path)
-        for path in (path for folder in (self.path, self.inputs) for path in folder.glob(".*")):
-            if is_leftover(path):
-                path.unlink(missing_ok=True)
+        for folder in (self.path, self.inputs, self.store.events):
+            remove_leftovers(folder)
         if not self.recipe_path.exists():
             # Names with a dot are of files that other works have begun.
             if others := [name for name in os.listdir(self.path) if not name.startswith(".")]:
@@ -84,7 +112,6 @@ class SetFolder:
             no_events = "" if places else f", or remove {self.path}, which holds no events yet"
             raise InputError(f"{self.recipe_path}: another recipe: choose another folder for {recipe.name}{no_events}")
         ensure_folder(self.store.events)
-        self.store.remove_leftovers()
         copies = self.copies()
         if set(copies) != set(recipe.files) or not places:
             copies = self._copy(recipe, copies)
@@ -101,14 +128,10 @@ class SetFolder:
 
     def _missing(self, mine: Sequence[int], places: dict[int, Place]) -> list[int]:
         """Which of some events are not there as they should be; `InputError` for one of another recipe."""
-        missing, said = [], False
+        missing, has_warned = [], False
         for number in mine:
-            place = places.get(number)
-            try:
-                found = None if place is None else header(place)
-            except InputError:
-                found = None
-            if found is None or found.event != number:
+            found = self.header(number, places.get(number))
+            if found is None:
                 missing.append(number)
                 continue
             if found.recipe != self.recipe.fingerprint:
@@ -116,8 +139,8 @@ class SetFolder:
                     f"{self.store.event_path(number)}: an event of another recipe: choose another folder, or "
                     f"`mphdrr events check {self.path} --repair` makes such events anew"
                 )
-            if found.build != build() and not said:
-                said = True
+            if found.build != build() and not has_warned:
+                has_warned = True
                 warn(
                     f"{self.path}: event {number} was made by another build of mphDRR ({found.build or 'of version 0.1'}, "
                     f"this is {build()}): events of the two may differ in their last digits, or by what was mended between"

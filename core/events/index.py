@@ -39,7 +39,8 @@ class Index:
     def read(self) -> dict[int, str]:
         """The rows that are there, each a line as it is in the file; what is no row is left out."""
         try:
-            heading, *lines = _lines(self.path.read_bytes().decode())[:-1]  # what no line end follows was cut
+            # What no line end follows was cut; of a table that another work begins just now nothing may be there.
+            heading, *lines = _lines(self.path.read_bytes().decode())[:-1] or [""]
         except FileNotFoundError:
             return {}
         except (OSError, UnicodeError) as error:
@@ -47,6 +48,8 @@ class Index:
             raise InputError(
                 f"{self.path}: cannot be read ({error}): mphdrr events check {folder} --repair writes it anew"
             ) from None
+        if _CUT in heading:
+            return {}
         names = _cells(heading)
         found = {int(first): line for line in lines if (first := line.partition(",")[0]).isdigit() and _CUT not in line}
         if names != self.columns:  # of an earlier version: the columns of what was drawn

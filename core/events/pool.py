@@ -13,9 +13,9 @@ from multiprocessing import get_context, parent_process
 from pathlib import Path
 
 from ..errors import InputError
+from ..files import remove_leftovers
 from ..memory import cores
 from .folders import SetFolder
-from .making import EventMaker
 from .writing import EventWriter, Written
 
 _MOST_BREAKS = 3
@@ -39,7 +39,7 @@ def in_processes(target: SetFolder, numbers: Sequence[int], workers: int) -> Ite
             f"workers: expected 1 within Blender, which takes all cores, got {workers}; mphdrr as a Python package takes "
             "more, and several commands share a set by --shard"
         )
-    EventMaker(target.recipe).require_memory(workers)
+    target.maker.require_memory(workers)
     waiting, breaks = deque(numbers), 0
     while waiting:
         under_way: dict[Future[Written], int] = {}
@@ -70,14 +70,14 @@ def in_processes(target: SetFolder, numbers: Sequence[int], workers: int) -> Ite
             for worker in list(pool._processes.values()):
                 worker.kill()
             pool.shutdown(cancel_futures=True)
-            target.store.remove_leftovers()
+            remove_leftovers(target.store.events)
             raise
         finally:
             pool.shutdown(cancel_futures=True)  # what is under way is finished: it counts
 
 
 def threads_each(workers: int) -> int:
-    """Of each worker: together they use all cores of the job."""
+    """Threads for each worker: together they use all cores of the job."""
     return max(1, cores() // workers)
 
 

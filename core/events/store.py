@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from ..errors import InputError, refusing
-from ..files import is_leftover, locked, write_bytes
+from ..files import locked, write_bytes
 from ..progress import Progress, tell
 from .event_files import Place, verify
 
@@ -21,8 +21,8 @@ SHARD_BYTES = 10**9
 """About how large a shard becomes."""
 _BATCH = 1 << 26  # bytes that are put into a shard before the files that they come from are removed
 _TAR = tarfile.BLOCKSIZE
-_EVENT = re.compile(r"(\d{6,})\.h5")
-_SHARD = re.compile(r"(\d{6,})\.tar")
+_EVENT = re.compile(r"([0-9]{6}|[1-9][0-9]{6,})\.h5")
+_SHARD = re.compile(r"[0-9]{6,}\.tar")
 
 
 class Store:
@@ -44,26 +44,14 @@ class Store:
         for shard in self.shard_paths():
             found |= dict(_members(shard))
         folder = f"{self.events}{os.sep}"
-        for name in _names(self.events):
-            stem, _, ending = name.partition(".")
-            if (
-                ending == "h5"
-                and stem.isdecimal()
-                and stem.isascii()
-                and (len(stem) == 6 or (len(stem) > 6 and stem[0] != "0"))
-            ):
-                found[int(stem)] = Place(folder + name)
+        for name in filter(None, map(_EVENT.fullmatch, _names(self.events))):
+            found[int(name[1])] = Place(folder + name[0])
         return dict(sorted(found.items()))
 
     def shard_paths(self) -> list[Path]:
         """The shards, in order."""
-        return [self.shards / name for name in sorted(_names(self.shards), key=_by_number) if _SHARD.fullmatch(name)]
-
-    def remove_leftovers(self) -> None:
-        """Remove what works have left that were killed."""
-        for name in _names(self.events):
-            if name.startswith(".") and is_leftover(path := self.events / name):
-                path.unlink(missing_ok=True)
+        names = filter(_SHARD.fullmatch, _names(self.shards))
+        return [self.shards / name for name in sorted(names, key=lambda name: (len(name), name))]
 
     def alone(self) -> list[int]:
         """The events that have a file of their own."""
@@ -80,7 +68,7 @@ class Store:
         with locked(self.shards / LOCK, f"{self.shards}: another work is packing this set; wait for its end"):
             numbers, there = self.alone(), self.shard_paths()
             packed = dict(member for shard in there for member in _members(shard))
-            last, done = _by_number(there[-1].name) if there else 0, 0
+            last, done = int(there[-1].stem) if there else 0, 0
             while done < len(numbers):
                 done += self._append(self.shards / f"{last:06d}.tar", numbers[done:], packed, shard_bytes)
                 last += 1
@@ -200,8 +188,3 @@ def _names(folder: Path) -> list[str]:
             return os.listdir(folder)
         except FileNotFoundError:
             return []
-
-
-def _by_number(name: str) -> int:
-    match = _SHARD.fullmatch(name)
-    return int(match[1]) if match else -1

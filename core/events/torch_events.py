@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -13,33 +14,29 @@ from torch.utils.data._utils.collate import default_collate_fn_map
 from ..errors import InputError, warn
 from .event_set import Event, EventSet
 from .exports.slots import Slots
-from .noise_choice import mixed_seed, noisy_images
+from .noise_choice import chosen_seed, mixed_seed, noisy_images
 
 _New = Callable[[str, Sequence[int]], torch.Tensor]
 """Gives zeros of a shape for a field."""
 _PLACE, _LEVEL, _NOISE = range(3)
-"""Of random numbers, what for: so that one does not depend on whether there are others."""
+"""What random numbers are drawn for: so that one does not depend on whether there are others."""
 
 
+@dataclass(eq=False)
 class TorchEvents(Dataset):
     """The events of a set as dicts of tensors; made by `torch_dataset`."""
 
-    def __init__(
-        self,
-        events: EventSet,
-        fields: Mapping[str, tuple[int, ...]],
-        crops: Mapping[tuple[str, ...], tuple[int | None, ...]],
-        random_crops: bool,
-        noise: Literal["own", "epoch"] | None,
-        levels: Sequence[float],
-        seed: int,
-        slots: Slots | None,
-        skip_damaged: bool,
-    ) -> None:
-        self.events, self.fields, self.crops, self.random_crops = events, dict(fields), dict(crops), random_crops
-        self.noise, self.levels, self.seed, self.slots, self.skip_damaged = (
-            noise, tuple(levels), seed, slots, skip_damaged
-        )  # fmt: skip
+    events: EventSet
+    fields: Mapping[str, tuple[int, ...]]  # shapes
+    crops: Mapping[tuple[str, ...], tuple[int | None, ...]]
+    random_crops: bool
+    noise: Literal["own", "epoch"] | None
+    levels: Sequence[float]
+    seed: int
+    slots: Slots | None
+    skip_damaged: bool
+
+    def __post_init__(self) -> None:
         # In shared memory, so that the workers that a DataLoader keeps from epoch to epoch see its change.
         self._epoch = torch.zeros((), dtype=torch.int64).share_memory_()
 
@@ -135,9 +132,9 @@ class TorchEvents(Dataset):
                 out[...] = (self.slots.arranged(images) if arranged and self.slots is not None else images)[part]
 
     def _noise_seed(self, event: Event, epoch: int) -> int | None:
-        if self.noise is None or self.noise == "own":
-            return None if self.noise is None else event.noise_seed
-        return mixed_seed(event.noise_seed, self.seed, epoch, _NOISE)
+        if self.noise == "epoch":
+            return mixed_seed(event.noise_seed, self.seed, epoch, _NOISE)
+        return chosen_seed(event.noise_seed, self.noise)
 
     def _start(
         self, event: Event, epoch: int, count: int, shape: tuple[int, ...], size: tuple[int | None, ...]

@@ -9,10 +9,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..errors import InputError, warn
-from ..files import Locked, ensure_folder
+from ..files import Locked, ensure_folder, remove_leftovers
 from ..memory import readable_size
 from ..progress import Progress, tell
-from ..validation import whole_number
+from ..validation import seed_number, whole_number
 from .dask_work import in_cluster
 from .event_set import EventSet
 from .folders import SetFolder
@@ -26,7 +26,7 @@ from .writing import EventWriter, Written
 _MOST = 10**7
 """Events in a set."""
 _CHECKED, _CHECK_SECONDS = 1000, 1.0
-"""Of how many events the settings are checked before the work begins, and how long at most."""
+"""The settings of so many events are checked before the work begins, for so many seconds at most."""
 
 
 @dataclass(frozen=True)
@@ -42,30 +42,45 @@ class Made:
 
 
 class Making(Iterator[Made]):
-    """Work on a set: gives each event once it is made. `missing` says which are to be made, `folder` where."""
+    """Work on a set: makes the events `missing` in `folder`, and gives each once it is made; the rest as in `making`."""
 
-    def __init__(self, folder: SetFolder, missing: Sequence[int], written: Iterator[Written]) -> None:
+    def __init__(
+        self,
+        folder: SetFolder,
+        missing: Sequence[int],
+        workers: int = 1,
+        progress: Progress | None = None,
+        dask: str | None = None,
+    ) -> None:
         self.folder, self.missing = folder, missing
+        if (workers := whole_number(workers, "workers")) > 1:
+            workers = min(workers, max(1, len(missing)))
+        if dask is not None and missing:
+            written = in_cluster(folder, missing, dask, workers)
+        elif workers > 1:
+            written = in_processes(folder, missing, workers)
+        else:
+            written = _in_turn(folder, missing, progress)
         self._made = self._follow(written)
 
     def __next__(self) -> Made:
         return next(self._made)
 
     def _follow(self, written: Iterator[Written]) -> Iterator[Made]:
-        """What is said of events as they are written; each warning is given once, for the first event that it is of."""
-        said: set[str] = set()
+        """The events as they are written; each warning is given once, for the first event that it is about."""
+        given: set[str] = set()
         store, unpacked = self.folder.store, 0
         try:
             for done, event in enumerate(written, 1):
                 for text in event.warnings:
                     words = re.sub(r"[\d.]+", "", text)  # the same with other numbers says nothing new
-                    if words not in said:
-                        said.add(words)
+                    if words not in given:
+                        given.add(words)
                         warn(f"event {event.number}: {text}", 3)
                 path = store.event_path(event.number)
                 yield Made(event.number, path, event.size, event.seconds, done, len(self.missing))
                 unpacked += event.size
-                if unpacked >= SHARD_BYTES and store.shards.is_dir():
+                if unpacked >= SHARD_BYTES:
                     _pack(store)
                     unpacked = 0
         except BaseException:
@@ -73,15 +88,15 @@ class Making(Iterator[Made]):
                 self.folder.complete_index()
             raise
         self.folder.complete_index()
-        store.remove_leftovers()  # of workers that died
-        if store.shards.is_dir():
-            _pack(store)
+        remove_leftovers(store.events)  # of workers that died
+        _pack(store)
 
 
 def _pack(store: Store) -> None:
-    """Put what was made into shards, unless another work is doing it."""
-    with suppress(Locked):
-        store.pack()
+    """Put what was made into shards where the set has some, unless another work is doing it."""
+    if store.shards.is_dir():
+        with suppress(Locked):
+            store.pack()
 
 
 def making(
@@ -100,7 +115,7 @@ def making(
     Parameters
     ----------
     recipe, folder, count, first, workers
-        As of `make`. Without a count: the events that were asked for before.
+        The same as in `make`. Without a count: the events that were asked for before.
     shard
         ``(i, n)``: only part i, from 1, of n equal ones; several machines may work on one folder so.
     progress
@@ -119,41 +134,9 @@ def making(
     Raises
     ------
     InputError
-        As of `make`.
+        In the same cases as `make`.
     """
-    target, missing = prepare(recipe, folder, count, first, shard)
-    if pack:
-        ensure_folder(target.store.shards)
-    if dask is not None and missing:
-        return Making(target, missing, in_cluster(target, missing, dask, whole_number(workers, "workers")))
-    return _making(target, missing, workers, progress)
-
-
-def making_again(folder: str | os.PathLike[str], numbers: Sequence[int], workers: int = 1) -> Making:
-    """Make some events of a set, as `making` does, which are not there or have been removed."""
-    return _making(SetFolder(folder), numbers, workers)
-
-
-def _making(target: SetFolder, missing: Sequence[int], workers: int, progress: Progress | None = None) -> Making:
-    workers = whole_number(workers, "workers")
-    if workers > 1 and len(missing) > 1:
-        return Making(target, missing, in_processes(target, missing, min(workers, len(missing))))
-    return Making(target, missing, _in_turn(target, missing, progress))
-
-
-def prepare(
-    recipe: EventRecipe,
-    folder: str | os.PathLike[str],
-    count: int | None = None,
-    first: int = 0,
-    shard: tuple[int, int] = (1, 1),
-) -> tuple[SetFolder, list[int]]:
-    """Put recipe, copies and index into a set's folder; and the numbers of the shard's events that are still missing."""
-    if isinstance(first, bool) or not isinstance(first, int) or first < 0:
-        raise InputError(f"first: expected a whole number of at least 0, got {first!r}")
-    place, parts = shard
-    if not (isinstance(place, int) and isinstance(parts, int) and 1 <= place <= parts):
-        raise InputError(f"shard: expected i/n with i from 1 to n, got {place}/{parts}")
+    seed_number(first, "first")
     target = SetFolder(folder)
     asked = target.asked if count is None else [range(first, first + whole_number(count, "count"))]
     if not asked:
@@ -163,13 +146,23 @@ def prepare(
         size = readable_size(maker.raw_bytes * most)
         raise InputError(f"count: at most {_MOST:,} events in a set, got {most:,}, of up to {size} uncompressed")
     maker.require_memory()
-    mine = [n for part in asked for n in range(part.start + (place - 1 - part.start) % parts, part.stop, parts)]
+    mine = _part(asked, *shard)
     end = time.monotonic() + _CHECK_SECONDS
     # What does not fit together shows before anything is computed.
     for number in mine[:: max(1, len(mine) // _CHECKED)]:
         if time.monotonic() < end and not target.store.event_path(number).exists():
             _ = plan(recipe, number).phantom
-    return target, target.prepare(recipe, asked, mine)
+    missing = target.prepare(recipe, asked, mine)
+    if pack:
+        ensure_folder(target.store.shards)
+    return Making(target, missing, workers, progress, dask)
+
+
+def _part(asked: Sequence[range], place: int, parts: int) -> list[int]:
+    """The events of a shard: those whose numbers leave the same rest."""
+    if not (isinstance(place, int) and isinstance(parts, int) and 1 <= place <= parts):
+        raise InputError(f"shard: expected i/n with i from 1 to n, got {place}/{parts}")
+    return [n for part in asked for n in range(part.start + (place - 1 - part.start) % parts, part.stop, parts)]
 
 
 def _in_turn(target: SetFolder, missing: Sequence[int], progress: Progress | None) -> Iterator[Written]:
@@ -194,14 +187,14 @@ def make(
     Parameters
     ----------
     recipe : EventRecipe
-        As of `read_recipe`. The folder keeps its text and copies of the files that it names.
+        From `read_recipe`. The folder keeps its text and copies of the files that it names.
     folder
         New, or that of an event set of the same recipe.
     count, first
         How many events, from which number.
     workers
         Processes; they share the processor's cores. With more than one, a script calls this under
-        ``if __name__ == "__main__":``, as of all of Python's processes.
+        ``if __name__ == "__main__":``, as always with Python's processes.
     progress
         Called as ``progress(events done, events)``; may raise `Cancelled`.
 

@@ -33,18 +33,18 @@ class EventWriter:
         self._indexed = set(self.folder.index.read())
 
     def write(self, number: int, progress: Progress | None = None) -> Written:
-        """Make an event and write its file, unless another work has; `progress` as of `EventMaker.make`."""
+        """Make an event and write its file, unless another work has; `progress` as in `EventMaker.make`."""
         started, folder = time.monotonic(), self.folder
-        place, said, size = Place(str(folder.store.event_path(number))), list[str](), 0
+        place, warnings, size = Place(str(folder.store.event_path(number))), list[str](), 0
         if not folder.is_made(number, place):
-            with recorded_warnings() as said:
+            with recorded_warnings() as given:
                 event = self.maker.make(number, progress)
             data = packed(event, folder.recipe, self._geometry(), self.maker.threads)
             write_bytes(place.path, data)
-            said, size = [*event.warnings, *said], len(data)
+            warnings, size = [*event.warnings, *given], len(data)
         if number not in self._indexed:
             folder.index.add(number)
-        return Written(number, size or os.stat(place.path).st_size, time.monotonic() - started, tuple(said))
+        return Written(number, size or os.stat(place.path).st_size, time.monotonic() - started, tuple(warnings))
 
     def _geometry(self) -> dict[str, Any]:
         maker = self.maker

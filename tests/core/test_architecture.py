@@ -175,3 +175,16 @@ def test_only_one_file_writes_files():
     for path in set(SOURCES) - {ROOT / "core" / name for name in ("files.py", "events/index.py", "events/store.py")}:
         calls = [node for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))) if isinstance(node, ast.Call)]
         assert [call.lineno for call in calls if writes(call)] == [], path
+
+
+def test_the_tests_that_the_pages_name_are_there():
+    files: dict[str, str] = {}
+    for path in sorted((ROOT / "tests").rglob("test_*.py")):
+        files[path.name] = files.get(path.name, "") + path.read_text(encoding="utf-8")
+    for page in sorted((ROOT / "docs").glob("*.md")):
+        for line in page.read_text(encoding="utf-8").splitlines():
+            named = {Path(name).name for name in re.findall(r"`([\w/]*test_\w+\.py)`", line)}
+            assert named <= files.keys(), page.name
+            text = "".join(files[name] for name in (named if line.startswith("|") and named else files))
+            missing = [name for name in re.findall(r"`(test_\w+)`", line) if f"def {name}(" not in text]
+            assert not missing, page.name

@@ -19,7 +19,7 @@ from mphdrr.core.errors import InputError
 from mphdrr.core.events.exports import PROGRAMS, export_events
 from mphdrr.core.events.exports.slots import read_slots, row_slots
 
-from .small_events import small_recipe
+from .small_events import TEXT, small_recipe
 
 
 def rows_of(folder: Path, name: str) -> list[dict[str, str]]:
@@ -205,6 +205,17 @@ def test_compressed_shards_take_little_more_than_the_set_and_uncompressed_ones_h
         for ending, value in sample.items():
             same = plain[name][ending.removesuffix(".gz")]
             assert np.array_equal(value, same) if ending != "json" else value == same
+
+
+def test_compressed_exports_are_at_most_a_fifth_larger_than_the_set(tmp_path):
+    text = TEXT.replace("voxels = 16", "voxels = 96").replace("spacing = 6.0", "spacing = 1.0")
+    text = text.replace("rows = 14", "rows = 96").replace("columns = 16", "columns = 96")
+    there = mph.events.make(small_recipe(tmp_path, text), tmp_path / "set", 2)
+    size = sum(event.path.stat().st_size for event in there)
+    for program in ("webdataset", "npz"):
+        export_events(there, tmp_path / program, program)
+        written = sum(path.stat().st_size for path in (tmp_path / program).iterdir())
+        assert written <= 1.2 * size, (program, written / size)
 
 
 def test_npz_holds_all_that_is_known(event_set, tmp_path):

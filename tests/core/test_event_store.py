@@ -257,6 +257,19 @@ def test_works_that_grow_a_set_at_once_lose_no_rows(tmp_path):
     assert SetFolder(tmp_path / "set").asked == [range(12)] and events.check(tmp_path / "set") == []
 
 
+@pytest.mark.parametrize("kept", [0, 5, 14])
+@pytest.mark.parametrize("more", [(), (2, 4)])
+def test_an_index_whose_heading_was_cut_or_is_just_begun_is_read_and_completed(whole, made, kept, more):
+    path = whole / "index.csv"
+    path.write_bytes((made / "index.csv").read_bytes()[:kept])
+    for number in more:
+        SetFolder(whole).index.add(number)
+    assert events.status(whole).made == COUNT
+    assert events.EventSet(whole).split("train").numbers == events.EventSet(made).split("train").numbers
+    events.make(events.EventSet(whole).recipe, whole, COUNT)
+    assert tree(whole) == tree(made)
+
+
 @pytest.mark.parametrize("kept", [1, 9, 14, 30, -40, -3, -1])
 def test_a_row_of_the_index_that_was_cut_is_drawn_anew(whole, made, kept):
     """Alone at the end of the file, and with other rows written on behind it."""
@@ -337,10 +350,11 @@ def test_an_event_that_is_not_as_it_should_be_is_refused_by_name(whole, change, 
         _ = event.pose, event.images("lines")
 
 
-def test_no_flipped_bit_of_an_event_reads_as_another_event(whole, made):
+@pytest.mark.parametrize("count", [60, pytest.param(200, marks=pytest.mark.long)])
+def test_no_flipped_bit_of_an_event_reads_as_another_event(whole, made, count):
     path = whole / "events" / "000001.h5"
     data, random = path.read_bytes(), np.random.default_rng(7)
-    for bit in random.integers(8 * len(data), size=60):
+    for bit in random.integers(8 * len(data), size=count):
         changed = bytearray(data)
         changed[bit // 8] ^= 1 << bit % 8
         path.write_bytes(changed)

@@ -1,15 +1,15 @@
 """``mphdrr events check SET``."""
 
 import argparse
-import sys
 import time
 from dataclasses import asdict
 
 from ...errors import InputError
 from ...events.checking import check, index_faults, repair
 from ...events.folders import SetFolder
-from ...events.work import making_again
-from ..options import add_command, print_answer, progress_bar
+from ...events.work import Making
+from ..options import counted, print_answer, progress_bar, say
+from .action import add_action
 from .make import watched
 
 _TIMES, _SECONDS = 10, 0.5
@@ -18,19 +18,18 @@ _TIMES, _SECONDS = 10, 0.5
 
 def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     """Add the action."""
-    parser = add_command(
+    parser = add_action(
         actions,
         "check",
+        _run,
         "read every byte of a set and say what is wrong: events that are missing, cut, changed or of another recipe, and "
         "foreign files",
-        "mphdrr events check set\nexample: mphdrr events check set --repair --workers 2",
+        "mphdrr events check set",
+        "mphdrr events check set --repair --workers 2",
     )
-    parser.add_argument("folder", metavar="SET", help="folder of the set")
     text = "make missing and damaged events anew; foreign files move to the folder SET-foreign; the rest is not touched"
     parser.add_argument("--repair", action="store_true", help=text)
     parser.add_argument("--workers", type=int, default=1, metavar="N", help="processes that make events anew")
-    parser.add_argument("--json", action="store_true", help="as JSON")
-    parser.set_defaults(run=_run)
 
 
 def _run(arguments: argparse.Namespace) -> None:
@@ -43,14 +42,12 @@ def _run(arguments: argparse.Namespace) -> None:
             lines = [f"{folder}: {sum(map(len, SetFolder(folder).asked))} events, every byte as it was written"]
         print_answer(arguments, record, lines)
         if faults:
-            raise InputError(
-                f"{folder}: {len(faults)} fault{'s' * (len(faults) > 1)}; --repair mends what can be mended"
-            )
+            raise InputError(f"{folder}: {counted(len(faults), 'fault')}; --repair mends what can be mended")
         return
     for line in lines:
-        sys.stderr.write(f"mphdrr: {line}\n")
+        say(line)
     again = repair(folder, faults)
-    done = watched(making_again(folder, again, arguments.workers), quiet=True)
+    done = watched(Making(SetFolder(folder), again, arguments.workers), quiet=True)
     left = check(folder, progress_bar("checking again"))
     for _ in range(_TIMES):  # another work that ends now may be writing it
         if {fault.kind for fault in left} != {"index"}:
@@ -59,7 +56,7 @@ def _run(arguments: argparse.Namespace) -> None:
         repair(folder, left)
         left = index_faults(folder)
     record = [{**asdict(fault), "path": str(fault.path)} for fault in left]
-    said = f"{folder}: {len(faults)} fault{'s' * (len(faults) > 1)} mended, {done} events made anew"
-    print_answer(arguments, record, [fault.text for fault in left] or [said])
+    mended = f"{folder}: {counted(len(faults), 'fault')} mended, {done} events made anew"
+    print_answer(arguments, record, [fault.text for fault in left] or [mended])
     if left:
         raise InputError(f"{folder}: {len(left)} of its faults are left")

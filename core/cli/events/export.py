@@ -1,25 +1,25 @@
 """``mphdrr events export SET --to PROGRAM -o FOLDER``."""
 
 import argparse
-import sys
 
 from ...events.event_set import EventSet
 from ...events.exports import PROGRAMS, planned_export
 from ...events.exports.unet3d import RAW
-from ..options import add_command, print_answer, progress_bar
+from ..options import print_answer, progress_bar, say
+from .action import add_action
 
 
 def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     """Add the action."""
-    parser = add_command(
+    parser = add_action(
         actions,
         "export",
+        _run,
         "write a set's events for another program",
-        "mphdrr events export set --to 3dunet --model counts --noise own -o unet\n"
-        "example: mphdrr events export set --to webdataset --split train -o shards",
+        "mphdrr events export set --to 3dunet --model counts --noise own -o unet",
+        "mphdrr events export set --to webdataset --split train -o shards",
     )
     add = parser.add_argument
-    add("folder", metavar="SET", help="folder of the set")
     add("--to", required=True, choices=PROGRAMS, metavar="PROGRAM", help="see the list below")
     folder = "a new one, or one that holds the beginning of the same export, which is gone on with"
     add("-o", "--output", required=True, metavar="FOLDER", help=folder)
@@ -33,10 +33,8 @@ def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     add("--raw", choices=RAW, help=text)
     add("--events-per-shard", type=int, metavar="N", help="webdataset; default: as many as make about a gigabyte")
     add("--uncompressed", action="store_true", default=None, help="webdataset: .npy members instead of .npy.gz")
-    add("--json", action="store_true", help="say what was written as JSON")
     programs = "\n".join(f"  {program.name:<13}{program.title}" for program in PROGRAMS.values())
     parser.epilog = f"programs:\n{programs}\n{parser.epilog}"
-    parser.set_defaults(run=_run)
 
 
 def _run(arguments: argparse.Namespace) -> None:
@@ -48,8 +46,7 @@ def _run(arguments: argparse.Namespace) -> None:
         for name in ("noise", "level", "slots", "raw", "events_per_shard", "uncompressed")
     }
     plan = planned_export(events, arguments.output, arguments.to, models=arguments.model, **options)
-    sys.stderr.write(f"mphdrr: {plan.says()}\n")
-    sys.stderr.flush()
+    say(plan.says())
     plan.write(progress_bar("exporting"))
     record = {"folder": arguments.output, "program": arguments.to, "events": len(plan.rows)}
     print_answer(arguments, record, [f"{arguments.output}: {len(plan.rows)} events, {PROGRAMS[arguments.to].title}"])

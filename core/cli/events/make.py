@@ -2,49 +2,43 @@
 
 import argparse
 import shutil
-import sys
 import time
 from itertools import islice
 from pathlib import Path
 
 from ...errors import InputError
 from ...events.folders import SetFolder
-from ...events.making import EventMaker
 from ...events.recipe import EventRecipe, read_recipe
 from ...events.store import size_of
-from ...events.work import Made, Making, making
+from ...events.work import Making, making
 from ...memory import readable_size
-from ..options import add_command, print_answer
+from ..options import print_answer, progress_bar, say
+from .action import add_action
 
 
 def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     """Add the action."""
-    parser = add_command(
+    parser = add_action(
         actions,
         "make",
+        _run,
         "make the events of a set that are missing",
-        "mphdrr events make set --recipe derenzo.toml -n 1000 --workers 2\n"
-        "example: mphdrr events make set\n"
-        "example: mphdrr events make set -n 100000 --shard 3/50",
+        "mphdrr events make set --recipe derenzo.toml -n 1000 --workers 2",
+        "mphdrr events make set",
+        "mphdrr events make set -n 100000 --shard 3/50",
     )
-    parser.add_argument("folder", metavar="SET", help="folder of the set, with recipe.toml in it, or a new one")
-    parser.add_argument("--recipe", metavar="FILE", help="recipe (.toml) of a new set; the folder keeps a copy")
-    parser.add_argument(
-        "-n", "--count", type=int, metavar="N", help="events; default: as many as were asked for before"
-    )
-    parser.add_argument("--first", type=int, default=0, metavar="I", help="number of the first event")
-    parser.add_argument(
-        "--workers", type=int, default=1, metavar="N", help="processes, which share the processor's cores"
-    )
+    add = parser.add_argument
+    add("--recipe", metavar="FILE", help="recipe (.toml) of a new set, whose folder keeps a copy")
+    add("-n", "--count", type=int, metavar="N", help="events; default: as many as were asked for before")
+    add("--first", type=int, default=0, metavar="I", help="number of the first event")
+    add("--workers", type=int, default=1, metavar="N", help="processes, which share the processor's cores")
     text = "only part I of N, for several machines that work on one folder"
-    parser.add_argument("--shard", type=_shard, default=(1, 1), metavar="I/N", help=text)
+    add("--shard", type=_shard, default="1/1", metavar="I/N", help=text)
     text = "let the workers of a Dask cluster make them, which see SET under the same path; local: --workers of this machine"
-    parser.add_argument("--dask", metavar="ADDRESS|local", help=text)
+    add("--dask", metavar="ADDRESS|local", help=text)
     text = "put events into shards, files of many, as they become enough; a set that has shards goes on so"
-    parser.add_argument("--pack", action="store_true", help=text)
-    parser.add_argument("--json", action="store_true", help="say what there is at the end as JSON")
-    parser.add_argument("--quiet", action="store_true", help="say nothing on standard error but warnings")
-    parser.set_defaults(run=_run)
+    add("--pack", action="store_true", help=text)
+    add("--quiet", action="store_true", help="say nothing on standard error but warnings")
 
 
 def chosen_recipe(folder: str, recipe: str | None) -> EventRecipe:
@@ -79,67 +73,39 @@ def _run(arguments: argparse.Namespace) -> None:
 
 
 def watched(work: Making, quiet: bool) -> int:
-    """Do the work and say how far it is; the number of events that it made."""
-    report, done = _Report(work, quiet), 0
-    try:
-        for made in work:
-            done = made.done
-            report(made)
-    finally:
-        report.end()
+    """Do the work, and say how large the set becomes and what is left; the number of events that it made."""
+    started, done, size, left = time.monotonic(), 0, 0, ""
+    bar = progress_bar("making", lambda: f"{left} left")
+    if not quiet:
+        say(f"events missing: {len(work.missing)}, {_expected(work)}; {readable_size(_free(work))} are free")
+    for made in work:
+        done, size = made.done, size + made.size
+        share = (made.total - done) / done  # what is left is so many times what was done
+        left = f"{readable_size(size * share)}, {_time((time.monotonic() - started) * share)}"
+        if done == 1 and not quiet:
+            what = f"{readable_size(size)} in {made.seconds:.1f} s; {made.total - 1} more: {left}"
+            say(f"event {made.number}: {what}")
+        if done in (1, 10, 100, 1000) and size * share > _free(work):
+            say(f"warning: only {readable_size(_free(work))} are free on the disk of {work.folder.path}")
+        if not quiet:
+            bar(done, made.total)
     return done
 
 
-class _Report:
-    """Says how large the set becomes, and what is left, on standard error."""
+def _expected(work: Making) -> str:
+    """How large the missing events become, by the first ones that are there."""
+    missing = len(work.missing)
+    sizes = [size_of(place) for place in islice(work.folder.store.places().values(), 100)]
+    if sizes:
+        each = sum(sizes) / len(sizes)
+        return f"about {readable_size(each)} each, {readable_size(each * missing)} in all"
+    raw = work.folder.maker.raw_bytes
+    return f"up to {readable_size(raw)} each, {readable_size(raw * missing)} in all, before they are compressed"
 
-    def __init__(self, work: Making, quiet: bool) -> None:
-        self.folder, self.quiet, self.shows = work.folder, quiet, sys.stderr.isatty() and not quiet
-        self.started, self.bytes, self.open_line = time.monotonic(), 0, False
-        if quiet:
-            return
-        missing = len(work.missing)
-        sizes = [size_of(place) for place in islice(self.folder.store.places().values(), 100)]
-        raw = EventMaker(self.folder.recipe).raw_bytes
-        if sizes:
-            each = sum(sizes) / len(sizes)
-            size = f"about {readable_size(each)} each, {readable_size(each * missing)} in all"
-        else:
-            size = f"up to {readable_size(raw)} each, {readable_size(raw * missing)} in all, before they are compressed"
-        self._say(f"events missing: {missing}, {size}; {readable_size(self._free())} are free")
 
-    def __call__(self, made: Made) -> None:
-        self.bytes += made.size
-        left = made.total - made.done
-        each, seconds = self.bytes / made.done, (time.monotonic() - self.started) / made.done
-        if made.done == 1 and not self.quiet:
-            said = f"{readable_size(made.size)} in {made.seconds:.1f} s"
-            self._say(
-                f"event {made.number}: {said}; {left} more: {readable_size(each * left)}, {_time(seconds * left)}"
-            )
-        if made.done in (1, 10, 100, 1000) and each * left > self._free():
-            self._say(f"warning: only {readable_size(self._free())} are free on the disk of {self.folder.path}")
-        if self.shows:
-            filled = 30 * made.done // made.total
-            bar = f"[{'#' * filled}{'.' * (30 - filled)}] {made.done}/{made.total}"
-            more = f"{readable_size(each * left)} and {_time(seconds * left)} left"
-            sys.stderr.write(f"\r{bar}  {more}\x1b[K")
-            sys.stderr.flush()
-            self.open_line = True
-
-    def end(self) -> None:
-        """The line with the bar is done."""
-        if self.open_line:
-            sys.stderr.write("\n")
-            self.open_line = False
-
-    def _say(self, text: str) -> None:
-        self.end()
-        sys.stderr.write(f"mphdrr: {text}\n")
-        sys.stderr.flush()
-
-    def _free(self) -> int:
-        return shutil.disk_usage(self.folder.path).free
+def _free(work: Making) -> int:
+    """Bytes on the disk of a set."""
+    return shutil.disk_usage(work.folder.path).free
 
 
 def _shard(text: str) -> tuple[int, int]:

@@ -43,8 +43,8 @@ def _run(arguments: argparse.Namespace) -> None:
     with replacing(path) as temporary:
         text = template_text(arguments.like, _seen_from(path.parent, workbook))
         temporary.write_text(text, encoding="utf-8")
-    said = f"{path}: edit it, then: mphdrr events make SET --recipe {path} -n 1000"
-    print_answer(arguments, {"file": str(path), "recipe": text}, [said])
+    advice = f"{path}: edit it, then: mphdrr events make SET --recipe {path} -n 1000"
+    print_answer(arguments, {"file": str(path), "recipe": text}, [advice])
 
 
 def _seen_from(folder: Path, workbook: Path) -> str:

@@ -9,29 +9,29 @@ from ...errors import InputError
 from ...events.contact_sheet import contact_sheet
 from ...events.event_set import EventSet
 from ...figures.page import SUFFIXES
-from ..options import add_command, output_path, print_answer
+from ..options import output_path, print_answer
+from .action import add_action
 
 _ON_SHEET = 4
-"""Events on a sheet, unless told otherwise."""
+"""Events on a sheet by default."""
 _COLUMNS = ("x_mm", "y_mm", "z_mm", "phi_degrees", "theta_degrees", "psi_degrees")
 
 
 def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     """Add the action."""
-    parser = add_command(
+    parser = add_action(
         actions,
         "show",
+        _run,
         "draw events of a set: slices of the truth, all images, a Radon view and a sinogram; or list them",
-        "mphdrr events show set -o sheet.png\nexample: mphdrr events show set --events 0 7 12 --model emission -o some.svg",
+        "mphdrr events show set -o sheet.png",
+        "mphdrr events show set --events 0 7 12 --model emission -o some.svg",
     )
     add = parser.add_argument
-    add("folder", metavar="SET", help="folder of the set")
     text = f"numbers of the events; default: the first {_ON_SHEET} for a sheet, all for a list"
     add("--events", type=int, nargs="+", metavar="I", help=text)
     add("--model", metavar="NAME", help="whose images are drawn; default: the recipe's first")
     add("-o", "--output", metavar="FILE", help=f"the sheet: {', '.join(SUFFIXES)}; default: a list as text")
-    add("--json", action="store_true", help="print the events' rows of the index as JSON")
-    parser.set_defaults(run=_run)
 
 
 def _run(arguments: argparse.Namespace) -> None:

@@ -5,17 +5,14 @@ from dataclasses import asdict
 
 from ...events.checking import status
 from ...memory import readable_size
-from ..options import add_command, print_answer
+from ..options import counted, print_answer
+from .action import add_action
 
 
 def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     """Add the action."""
-    parser = add_command(
-        actions, "status", "say how many events a set has, and which are missing", "mphdrr events status set"
-    )
-    parser.add_argument("folder", metavar="SET", help="folder of the set")
-    parser.add_argument("--json", action="store_true", help="as JSON")
-    parser.set_defaults(run=_run)
+    summary = "say how many events a set has, and which are missing"
+    add_action(actions, "status", _run, summary, "mphdrr events status set")
 
 
 def _run(arguments: argparse.Namespace) -> None:
@@ -25,7 +22,7 @@ def _run(arguments: argparse.Namespace) -> None:
         if counts:
             lines.append(f"{name}: " + ", ".join(f"{key} {count}" for key, count in counts.items()))
     if found.shards:
-        lines.append(f"in {found.shards} shard{'s' * (found.shards > 1)}")
+        lines.append(f"in {counted(found.shards, 'shard')}")
     if len(found.builds) > 1:
         builds = ", ".join(f"{build or 'of version 0.1'} {count}" for build, count in found.builds.items())
         lines.append(f"builds of mphDRR: {builds}; events of two may differ in their last digits")
@@ -42,5 +39,5 @@ def numbers_text(numbers: list[int]) -> str:
             parts[-1][1:] = [number]
         else:
             parts.append([number])
-    said = ["-".join(map(str, part)) for part in parts]
-    return ", ".join(said if len(said) <= 10 else [*said[:10], f"… ({len(numbers)} in all)"])
+    texts = ["-".join(map(str, part)) for part in parts]
+    return ", ".join(texts if len(texts) <= 10 else [*texts[:10], f"… ({len(numbers)} in all)"])

@@ -17,13 +17,6 @@ def npy(array: NDArray[Any]) -> bytes:
     return buffer.getvalue()
 
 
-def npz(arrays: Mapping[str, Any]) -> bytes:
-    """Arrays as an .npz file, compressed."""
-    buffer = io.BytesIO()
-    np.savez_compressed(buffer, **arrays)
-    return buffer.getvalue()
-
-
 def pt(array: NDArray[Any]) -> bytes:
     """An array as a .pt file: one tensor, which ``torch.load(path, weights_only=True)`` gives."""
     try:

@@ -17,8 +17,8 @@ from ..noise_choice import NoiseChoice, chosen_seed, noisy_images
 
 Images = NDArray[np.float32]
 Row = dict[str, Any]
-"""Of events.csv: i, the export's running number from 0; the event's number, split and name, and what besides its pose places
-its phantom; the noise's seed, or ""."""
+"""A row of events.csv: i, the export's running number from 0; the event's number, split and name, what places its phantom
+besides the pose; the noise's seed, or ""."""
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class Chosen:
 
     events: EventSet
     models: tuple[str, ...]
-    """Of the images."""
+    """The models whose images are exported."""
     noise: NoiseChoice = None
     """None: the mean images; "own": with the noise of each event's own seed; a number: another noise of that seed."""
     level: float = 1.0
@@ -41,9 +41,17 @@ class Chosen:
         """A model's images (M, n_v, n_u): with the noise, where they are counts."""
         return noisy_images(event, model, self.seed(event), self.level)
 
+    def arrays(self, event: Event) -> Iterator[tuple[str, Images]]:
+        """The event's arrays by their names in `shapes`: truth, images of the models, Radon images."""
+        yield "truth", event.truth_part()
+        for model in self.models:
+            yield model, self.images(event, model)
+        for n in self.radon_counts:
+            yield f"radon{n}", event.radon(n)
+
     @cached_property
     def shapes(self) -> Shapes:
-        """Of the arrays of an event."""
+        """The shapes of an event's arrays."""
         return field_shapes(self.events)
 
     @property
@@ -83,14 +91,14 @@ class Layout:
         return ("truth", *self.chosen.models, *(f"radon{n}" for n in self.chosen.radon_counts))
 
     def contained(self) -> dict[str, Any]:
-        """Instead of the options that name files, what is in these: whether two exports are the same is told by it."""
+        """The contents of the files that options name, which are compared to tell whether two exports are the same."""
         return {}
 
     def files(self, row: Row) -> tuple[str, ...]:
         """Paths of an event's files."""
         raise NotImplementedError
 
-    def contents(self, row: Row, event: Event) -> Iterator[tuple[str, bytes]]:
+    def contents(self, row: Row, event: Event) -> Iterator[tuple[str, bytes | memoryview]]:
         """Each of an event's files, and what is in it."""
         raise NotImplementedError
 

@@ -53,11 +53,8 @@ class Legacy(Layout):
 
     def contents(self, row: Row, event: Event) -> Iterator[tuple[str, bytes]]:
         """Their tensors."""
-        truth, projections, *radon = self.files(row)
-        yield truth, pt(event.truth.array[None])
-        yield projections, pt(self.slots.arranged(self.chosen.images(event, self.model))[None])
-        for name, n in zip(radon, self.chosen.radon_counts, strict=True):
-            yield name, pt(event.radon(n)[None])
+        for file, (name, array) in zip(self.files(row), self.chosen.arrays(event), strict=True):
+            yield file, pt((self.slots.arranged(array) if name == self.model else array)[None])
 
     def tables(self, rows: list[Row]) -> dict[str, bytes]:
         """The poses, and what the slots show."""

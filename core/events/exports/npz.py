@@ -3,8 +3,8 @@
 import json
 from collections.abc import Iterator
 
+from ...volumes.formats.numpy_files import packed
 from ..event_set import Event
-from .arrays import npz
 from .layout import Layout, Row
 from .record import record
 
@@ -18,14 +18,12 @@ class Npz(Layout):
         """One."""
         return (f"{row['i']:06d}.npz",)
 
-    def contents(self, row: Row, event: Event) -> Iterator[tuple[str, bytes]]:
+    def contents(self, row: Row, event: Event) -> Iterator[tuple[str, bytes | memoryview]]:
         """All that there is of the event; `record` is text, as JSON."""
         arrays = {
-            "truth": event.truth.array,
+            **dict(self.chosen.arrays(event)),
             "truth_affine": event.recipe.grid.affine,
-            **{model: self.chosen.images(event, model) for model in self.chosen.models},
-            **{f"radon{n}": event.radon(n) for n in self.chosen.radon_counts},
             "pose": event.pose,
             "record": json.dumps(record(self.chosen, event)),
         }
-        yield self.files(row)[0], npz(arrays)
+        yield self.files(row)[0], packed(arrays)

@@ -68,7 +68,7 @@ class Unet3d(Layout):
         return (self.label, self.label)
 
     def contained(self) -> dict[str, Any]:
-        """The table of slots, and what raw is where it was not said."""
+        """The table of slots, and what raw is by default."""
         return {"raw": self.raw} | (
             {"slots": self.slots.table(self.chosen.events.system)} if self.raw == "slots" else {}
         )

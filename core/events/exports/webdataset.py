@@ -10,11 +10,7 @@ import io
 import json
 import tarfile
 from collections.abc import Callable, Iterator
-from functools import partial
 from pathlib import Path
-
-import numpy as np
-from numpy.typing import NDArray
 
 from ...files import replacing
 from ...validation import strict_whole
@@ -63,15 +59,9 @@ class WebDataset(Layout):
     def contents(self, row: Row, event: Event) -> Iterator[tuple[str, bytes]]:
         """The members of an event."""
         key = f"{row['i']:06d}"
-        arrays: dict[str, Callable[[], NDArray[np.float32]]] = {"truth": event.truth_part}
-        arrays |= {model: partial(self.chosen.images, event, model) for model in self.chosen.models}
-        arrays |= {f"radon{n}": partial(event.radon, n) for n in self.chosen.radon_counts}
-        for name, array in arrays.items():
-            content = npy(array())
-            # of no time, so that the same set makes the same bytes
-            yield (
-                (f"{key}.{name}.npy.gz", gzip.compress(content, 4, mtime=0))
-                if self.packed
-                else (f"{key}.{name}.npy", content)
-            )
+        for name, array in self.chosen.arrays(event):
+            if self.packed:  # of no time, so that the same set makes the same bytes
+                yield f"{key}.{name}.npy.gz", gzip.compress(npy(array), 4, mtime=0)
+            else:
+                yield f"{key}.{name}.npy", npy(array)
         yield f"{key}.json", json.dumps(record(self.chosen, event)).encode()

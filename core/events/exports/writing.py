@@ -31,10 +31,13 @@ class Plan:
     layout: Layout
     folder: Path
     rows: list[Row]
+    parts: list[Part]
+    """All parts of the export."""
     missing: list[Part]
     """What is not there yet."""
+    changed: list[Path]
+    """Files of an earlier export of fewer events that will have more in them."""
     request: dict[str, Any]
-    event_bytes: int
 
     @property
     def events(self) -> int:
@@ -44,16 +47,15 @@ class Plan:
     @property
     def size(self) -> int:
         """Bytes of all that is to be written; of compressed files the most that it can be."""
-        return self.events * self.event_bytes
+        return self.events * self.layout.event_bytes
 
     def says(self) -> str:
         """How much there is to do, in a line."""
         there = len(self.rows) - self.events
         most = "at most " if self.layout.packed else ""
         kept = f", {there} are there already" if there else ""
-        return (
-            f"{self.events} events of {most}{readable_size(self.event_bytes)}, {readable_size(self.size)} in all{kept}"
-        )
+        each, size = readable_size(self.layout.event_bytes), readable_size(self.size)
+        return f"{self.events} events of {most}{each}, {size} in all{kept}"
 
     def write(self, progress: Progress | None = None) -> None:
         """Write what is missing, and the tables; `progress` counts events."""
@@ -61,11 +63,11 @@ class Plan:
         for name in {str(Path(file).parent) for part in self.missing for file in part.files}:
             ensure_folder(self.folder / name)
         self._remove_leftovers()
-        self._remove_changed()
+        for path in self.changed:
+            path.unlink(missing_ok=True)
         # First, so that whatever there is of an unfinished export is known to be of it.
         write_bytes(self.folder / REQUEST, json.dumps(self.request, indent=1).encode() + b"\n")
-        tables = {TABLE: table(self.rows), **self.layout.tables(self.rows)}
-        for name, content in tables.items():
+        for name, content in {TABLE: table(self.rows), **self.layout.tables(self.rows)}.items():
             write_bytes(self.folder / name, content)
         done = len(self.rows) - self.events
 
@@ -79,19 +81,11 @@ class Plan:
 
     def _remove_leftovers(self) -> None:
         """Remove what a killed export was writing: readers of whole folders would find it."""
-        known = {self.folder / file for part in self.layout.parts(self.rows) for file in part.files}
+        known = {self.folder / file for part in self.parts for file in part.files}
         for path in (*self.folder.glob(".*"), *self.folder.glob("*/.*")):
             name = written_name(path.name)
             if name and is_leftover(path) and (path.with_name(name) in known or path.parent == self.folder):
                 path.unlink(missing_ok=True)
-
-    def _remove_changed(self) -> None:
-        """Of an earlier export of fewer events, remove the files that will have more in them."""
-        before = _rows_of(self.folder)
-        if before is not None and len(before) < len(self.rows):
-            for part in set(self.layout.parts(self.rows[: len(before)])) - set(self.layout.parts(self.rows)):
-                for file in part.files:
-                    (self.folder / file).unlink(missing_ok=True)
 
     def _require_room(self) -> None:
         free = shutil.disk_usage(self.folder).free
@@ -128,13 +122,10 @@ def plan_export(layout: Layout, chosen: Chosen, folder: Path, program: str, opti
     }
     folder = ensure_folder(folder)
     before = _require_same(folder, request, rows)
-    kept = set(layout.parts(rows[:before]))
-    missing = [
-        part
-        for part in layout.parts(rows)
-        if part not in kept or not all((folder / file).is_file() for file in part.files)
-    ]
-    return Plan(layout, folder, rows, missing, request, layout.event_bytes)
+    parts, kept = layout.parts(rows), set(layout.parts(rows[:before]))
+    missing = [part for part in parts if part not in kept or not all((folder / file).is_file() for file in part.files)]
+    changed = [folder / file for part in kept.difference(parts) for file in part.files]
+    return Plan(layout, folder, rows, parts, missing, changed, request)
 
 
 def _require_same(folder: Path, request: dict[str, Any], rows: list[Row]) -> int:
@@ -150,11 +141,10 @@ def _require_same(folder: Path, request: dict[str, Any], rows: list[Row]) -> int
     changed = [name for name in request if asked.get(name) != request[name]]
     if changed:
         raise InputError(f"{folder}: holds an export of another {', '.join(changed)}; choose another folder")
-    before = _rows_of(folder)
-    if before is None:
-        return 0
+    path = folder / TABLE
+    before = _cells(path.read_text(encoding="utf-8")) if path.is_file() else []
     if _cells(table(rows).decode())[: len(before)] != before:
-        raise InputError(f"{folder}: holds an export of other events (see {TABLE}); choose another folder")
+        raise InputError(f"{folder}: holds an export of other events (see {path.name}); choose another folder")
     return len(before)
 
 
@@ -165,14 +155,6 @@ def table(rows: list[Row]) -> bytes:
     lines.writeheader()
     lines.writerows({key: escaped(value) for key, value in row.items()} for row in rows)
     return text.getvalue().encode()
-
-
-def _rows_of(folder: Path) -> list[list[str]] | None:
-    """The fields of the lines of events.csv without its heading; None where there is none."""
-    try:
-        return _cells((folder / TABLE).read_text(encoding="utf-8"))
-    except OSError:
-        return None
 
 
 def _cells(text: str) -> list[list[str]]:

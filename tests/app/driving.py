@@ -140,7 +140,8 @@ def module(number: int, within=None):
 
 def is_idle() -> bool:
     """Whether no job is running."""
-    return not len(bpy.context.window_manager.windows[0].modal_operators)
+    has_modal = len(bpy.context.window_manager.windows[0].modal_operators) > 0
+    return not has_modal and not ours("addon.blender.jobs").is_running()
 
 
 def idle() -> Iterator[float]:

@@ -1,7 +1,8 @@
 """The tutorial (docs/tutorial.md) in the window, step by step, as a user does it, with a picture of each step.
 
-A step is a generator: it yields what to wait for, and returns what it found, in words that its text must contain. Its name is
-its picture's. To add one, write it here, and its section with that picture in the page; `make tutorial` takes all pictures anew.
+A step is a generator: it yields what to wait for, and returns what it found, in words that its text must contain. Its name
+is its picture's. To add one, write it here, and its section with that picture in the page; `make tutorial` takes all
+pictures anew.
 """
 
 from collections.abc import Callable

@@ -68,7 +68,7 @@ docs:
 
 tutorial: env-dev
 	$(BIN)/python tools/build_extension.py --platform linux-x64
-	$(BIN)/python -m pytest tests/app/test_window_tutorial.py
+	$(BIN)/python -m pytest tests/app/test_windows.py -k tutorial
 	$(BIN)/python tools/tutorial_pictures.py
 
 dist: env-dev

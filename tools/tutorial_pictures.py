@@ -1,4 +1,4 @@
-"""Write the pictures that tests/app/test_window_tutorial.py has taken as docs/images/tutorial: `make tutorial`."""
+"""Write the pictures that the tutorial's test in tests/app has taken as docs/images/tutorial: `make tutorial`."""
 
 from pathlib import Path
 

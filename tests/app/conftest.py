@@ -7,6 +7,7 @@ from it go to `work_folder`.
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import subprocess
@@ -14,6 +15,7 @@ import tomllib
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -121,22 +123,24 @@ def blender_script(blender: Run, work_folder: Path) -> Run:
 
 
 @pytest.fixture
-def blender_window(home: Path, work_folder: Path) -> Callable[..., Path]:
-    """`blender_window(text, *arguments)`: run Python in a Blender with its window; return a PNG of the screen.
+def window(home: Path, work_folder: Path) -> Callable[..., dict[str, Any]]:
+    """`window(name, *arguments)`: take the steps of window_NAME.py in a Blender with its window; return what it has seen.
 
-    The script writes its findings to a JSON file in `work_folder`; the window is closed when that has "error" or a
-    true "ok", and at the latest after some minutes.
+    The window is closed when the script says that it has ended, and at the latest after some minutes; "screen" is then a
+    PNG of the whole screen, and nothing may have gone wrong, in the script or in what Blender printed.
     """
 
-    def run(text: str, *arguments: str | Path) -> Path:
-        script, picture = work_folder / "window.py", work_folder / "window.png"
-        script.write_text(text, encoding="utf-8")
-        driver = Path(__file__).with_name("in_window.py")
-        done = real_blender(
-            "python", driver, picture, script, str(PATIENCE), work_folder, *arguments, home=home, timeout=PATIENCE + 60
-        )
-        if not picture.is_file():
-            pytest.fail(f"no screenshot\n{done.stdout[-4000:]}\n{done.stderr[-4000:]}")
-        return picture
+    def run(name: str, *arguments: str | Path) -> dict[str, Any]:
+        here, screen, said = Path(__file__).parent, work_folder / "window.png", work_folder / "seen.json"
+        script = here / f"window_{name}.py"
+        given = (str(PATIENCE), work_folder, work_folder, *arguments)
+        done = real_blender("python", here / "in_window.py", screen, script, *given, home=home, timeout=PATIENCE + 60)
+        if not screen.is_file() or not said.is_file():
+            pytest.fail(f"no screenshot, or nothing seen\n{done.stdout[-4000:]}\n{done.stderr[-4000:]}")
+        seen = json.loads(said.read_text())
+        assert seen["ok"], seen.get("error", seen)
+        log = (work_folder / "log.txt").read_text()
+        assert "Traceback" not in log, log
+        return {**seen, "screen": screen}
 
     return run

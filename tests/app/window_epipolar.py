@@ -1,99 +1,35 @@
-"""A point source in the example: its pixel clicked on in the mosaic, the marker dragged to it, a pixel picked on a plane.
+"""A point source in the example: its pixel clicked on in the mosaic, the marker dragged to it, a pixel picked on a plane."""
 
-Argument after ``--``: the file for what was seen.
-"""
-
-import importlib
-import json
-import subprocess
-import sys
 import time
-import traceback
-from pathlib import Path
 
 import bpy
 import numpy as np
 from bpy_extras.view3d_utils import location_3d_to_region_2d, region_2d_to_origin_3d, region_2d_to_vector_3d
+from driving import WORKBOOK, editor, idle, on_screen, open_tab, opened, ours, picture, press, run, seen, xdotool
 
-MODULE = "bl_ext.user_default.mphdrr"
-core, epipolar, epipolar_drawing, images, planes, tiles = (
-    importlib.import_module(f"{MODULE}.{name}")
-    for name in (
-        "core",
-        "addon.perspective.epipolar",
-        "addon.perspective.epipolar_drawing",
-        "addon.pictures.images",
-        "addon.pictures.planes",
-        "addon.pictures.tiles",
-    )
+core, epipolar, epipolar_drawing = map(
+    ours, ("core", "addon.perspective.epipolar", "addon.perspective.epipolar_drawing")
 )
-
-result_file = Path(sys.argv[sys.argv.index("--") + 1])
-bpy.context.preferences.view.show_splash = False
+images, planes, tiles = (ours(f"addon.pictures.{name}") for name in ("images", "planes", "tiles"))
 bpy.context.preferences.inputs.use_mouse_continuous = False  # or the mouse is put elsewhere while a slider is dragged
-seen: dict[str, object] = {"ok": False}
 NUMBER, PIXEL, SHARE = 30, (37, 26), 0.94  # the module, its pixel, and the point's depth in it over the isocentre's
 BLUE = np.array([0x47, 0x72, 0xB3])  # of Blender's sliders
-
-
-def editor(kind: str):
-    window = bpy.context.window_manager.windows[0]
-    area = max((a for a in window.screen.areas if a.type == kind), key=lambda a: a.width * a.height)
-    return window, area, next(r for r in area.regions if r.type == "WINDOW")
-
-
-def press(kind: str, operator: str, how: str = "INVOKE_DEFAULT", **settings: object) -> None:
-    window, area, region = editor(kind)
-    group, name = operator.split(".")
-    with bpy.context.temp_override(window=window, area=area, region=region):
-        getattr(getattr(bpy.ops, group), name)(how, True, **settings)
-
-
-def xdotool(*what: object) -> None:
-    subprocess.run(["xdotool", *map(str, what)], check=True)
-
-
-def screenshot(name: str) -> Path:
-    path = result_file.with_name(f"{name}.png")
-    subprocess.run(["import", "-window", "root", str(path)], check=True)
-    return path
-
-
-def on_screen(kind: str, x: float, y: float) -> tuple[int, int]:
-    window, _, region = editor(kind)
-    return round(region.x + x), round(window.height - 1 - region.y - y)
-
-
-def idle():
-    """Yields until no job is running."""
-    yield 1.0
-    while len(bpy.context.window_manager.windows[0].modal_operators):
-        yield 0.5
-
-
-def closed_but(name: str, *others: str) -> None:
-    """Have one panel open from the start, above others, which are closed: so it is in sight."""
-    for each in (name, *others):
-        panel = getattr(bpy.types, each)
-        bpy.utils.unregister_class(panel)
-        panel.bl_options = set() if each == name else {"DEFAULT_CLOSED"}
-        bpy.utils.register_class(panel)
 
 
 def place_of(number: int, pixel: tuple[float, float]) -> tuple[int, int]:
     """Where on the screen a module's tile has a pixel."""
     _, area, region = editor("IMAGE_EDITOR")
     image = area.spaces.active.image
-    (picture,) = (each for each in tiles.pictures(image) if each.number == number)
-    row, column = picture.places(pixel, epipolar.run_views(bpy.context.scene).views.shape)
-    return on_screen("IMAGE_EDITOR", *region.view2d.view_to_region(column / image.size[0], 1 - row / image.size[1]))
+    (tile,) = (each for each in tiles.pictures(image) if each.number == number)
+    row, column = tile.places(pixel, epipolar.run_views(bpy.context.scene).views.shape)
+    return on_screen(*region.view2d.view_to_region(column / image.size[0], 1 - row / image.size[1]), "IMAGE_EDITOR")
 
 
 def slider() -> tuple[int, int]:
     """A place in the filled part of the slider in the Image Editor's sidebar, which is the widest blue there."""
     window, area, _ = editor("IMAGE_EDITOR")
     sidebar = next(region for region in area.regions if region.type == "UI")
-    shot = bpy.data.images.load(str(screenshot("slider")))
+    shot = bpy.data.images.load(str(picture("slider")))
     width, height = shot.size
     screen = np.rint(np.array(shot.pixels).reshape(height, width, 4)[..., :3] * 255).astype(int)
     bpy.data.images.remove(shot)
@@ -108,21 +44,20 @@ def slider() -> tuple[int, int]:
 
 def steps():
     """Yields seconds to wait."""
-    closed_but("MPHDRR_PT_epipolar_of_images", "MPHDRR_PT_display_of_images", "MPHDRR_PT_runs_of_images")
-    press("VIEW_3D", "mphdrr.load_example")
+    opened("MPHDRR_PT_epipolar_of_images", but_closed=("MPHDRR_PT_display_of_images", "MPHDRR_PT_runs_of_images"))
+    press(bpy.ops.mphdrr.load_example)
     yield from idle()
     yield 4.0
     scene = bpy.context.scene
     bpy.data.objects["Derenzo"].hide_viewport = True
     # The point is where the pixel's ray is, at a depth of its own.
-    system = core.read_system(Path(sys.modules[MODULE].__file__).parent / "examples" / "dc-spect-80.xlsx")
+    system = core.read_system(WORKBOOK)
     views = system.views((64, 64))
     b = np.linalg.norm(system.centers[NUMBER - 1])
     point = core.points_at_depths(views, NUMBER - 1, PIXEL, SHARE * b)
     seen["point"] = point.tolist()
     press(
-        "VIEW_3D",
-        "mphdrr.add_points",
+        bpy.ops.mphdrr.add_points,
         "EXEC_DEFAULT",
         counts=(1, 1, 1),
         diameter=6.0,
@@ -133,21 +68,28 @@ def steps():
     settings = scene.mphdrr_projections
     settings.volume = bpy.context.object
     settings.width = settings.height = 64
-    press("VIEW_3D", "mphdrr.render_projections")
+    press(bpy.ops.mphdrr.render_projections)
     yield from idle()
     yield 6.0
     _, area, region = editor("IMAGE_EDITOR")
     area.spaces.active.show_region_ui = True
     yield 1.0
-    next(r for r in area.regions if r.type == "UI").active_panel_category = "mphDRR"
+    open_tab("IMAGE_EDITOR")
     yield 1.0
-    press("IMAGE_EDITOR", "image.view_zoom_ratio", "EXEC_DEFAULT", ratio=2.0)  # a pixel is some of the screen's then
+    press(
+        bpy.ops.image.view_zoom_ratio, "EXEC_DEFAULT", kind="IMAGE_EDITOR", ratio=2.0
+    )  # a pixel is some of the screen's then
     yield 1.0
     start = np.array(place_of(NUMBER, PIXEL))
-    middle = np.array(on_screen("IMAGE_EDITOR", region.width / 2, region.height / 2))
-    press("IMAGE_EDITOR", "image.view_pan", "EXEC_DEFAULT", offset=(np.array([1, -1]) * (start - middle) / 2).tolist())
+    middle = np.array(on_screen(region.width / 2, region.height / 2, "IMAGE_EDITOR"))
+    press(
+        bpy.ops.image.view_pan,
+        "EXEC_DEFAULT",
+        kind="IMAGE_EDITOR",
+        offset=(np.array([1, -1]) * (start - middle) / 2).tolist(),
+    )
     yield 1.0
-    press("IMAGE_EDITOR", "mphdrr.pick_pixel")
+    press(bpy.ops.mphdrr.pick_pixel, kind="IMAGE_EDITOR")
     yield 0.5
     at = place_of(NUMBER, PIXEL)
     seen["clicked at"] = at
@@ -157,8 +99,8 @@ def steps():
     yield 3.0
     found = epipolar.picked(scene)
     seen["picked"] = None if found is None else [found.run.numbers[found.index], *found.pixel.tolist(), found.seen_by]
-    screenshot("picked")
-    press("IMAGE_EDITOR", "image.view_all", "EXEC_DEFAULT", fit_view=True)
+    picture("picked")
+    press(bpy.ops.image.view_all, "EXEC_DEFAULT", kind="IMAGE_EDITOR", fit_view=True)
     yield 3.0
     before = found.places
     x, y = slider()
@@ -215,7 +157,7 @@ def steps():
                 times.append(1e3 * (time.perf_counter() - started))
             spent.append(float(np.median(times)))
     seen["ms to draw"] = spent
-    screenshot("marker")
+    picture("marker")
     # A pixel of a plane in the scene, of one that is seen.
     _, area, region = editor("VIEW_3D")
     space = area.spaces.active.region_3d
@@ -232,10 +174,10 @@ def steps():
                     bpy.context, found.run, np.array(region_2d_to_origin_3d(region, space, at)), way
                 )
             if hit is not None and hit[0] == plane.mphdrr_module.number:
-                target = hit, on_screen("VIEW_3D", *at)
+                target = hit, on_screen(*at)
                 break
     seen["target"] = target
-    press("VIEW_3D", "mphdrr.pick_pixel")
+    press(bpy.ops.mphdrr.pick_pixel)
     yield 0.5
     xdotool("mousemove", *target[1])
     yield 0.5
@@ -243,23 +185,7 @@ def steps():
     yield 3.0
     found = epipolar.picked(scene)
     seen["on plane"] = [found.run.numbers[found.index], *found.pixel.tolist()]
-    screenshot("plane")
-    seen["ok"] = True
+    picture("plane")
 
 
-STEPS = steps()
-
-
-def step():
-    wait = None
-    try:
-        wait = next(STEPS)
-    except StopIteration:
-        pass
-    except Exception:
-        seen["error"] = traceback.format_exc()
-    result_file.write_text(json.dumps(seen))
-    return wait
-
-
-bpy.app.timers.register(step, first_interval=1.5)
+run(steps())

@@ -1,57 +1,17 @@
-"""Jobs in a real Blender's window: how long it stands still in each, their words, the queue, cancelling in every stage.
+"""Jobs in a real Blender's window: how long it stands still in each, their words, the queue, cancelling in every stage."""
 
-Arguments after ``--``: the file for what was seen, the workbook.
-"""
-
-import itertools
-import json
-import sys
-import time
-import traceback
 from pathlib import Path
 
 import bpy
 import numpy as np
+from driving import WORKBOOK, beat, beats, editor, folder, open_tab, ours, pause_beyond_redraw, press, run, seen, within
 
-result_file, workbook = Path(sys.argv[-2]), sys.argv[-1]
-bpy.context.preferences.view.show_splash = False
-jobs = next(module for name, module in sys.modules.items() if name.endswith(".addon.blender.jobs"))
-seen: dict = {"ok": False, "gaps": {}, "words": [], "changed": []}
-beats: list[float] = []
-
-
-def own_time() -> float:
-    """Seconds, without those in which this thread could run but other work had the processor (Linux counts them)."""
-    try:
-        waited = int(Path("/proc/thread-self/schedstat").read_text().split()[1])
-    except OSError:
-        waited = 0
-    return time.perf_counter() - waited * 1e-9
-
-
-def beat() -> float:
-    """The timer whose pauses are measured."""
-    beats.append(own_time())
-    if jobs._current is not None and jobs._current.text not in seen["words"]:
-        seen["words"].append(jobs._current.text)
-    return 0.02
-
-
-def longest() -> float:
-    return round(max(b - a for a, b in itertools.pairwise(beats)), 3)
-
-
-def view():
-    """The largest area, which is the 3D view to begin with, as the context."""
-    window = bpy.context.window_manager.windows[0]
-    area = max(window.screen.areas, key=lambda area: area.width * area.height)
-    region = next(r for r in area.regions if r.type == "WINDOW")
-    return bpy.context.temp_override(window=window, area=area, region=region)
+jobs = ours("addon.blender.jobs")
+seen |= {"gaps": {}, "words": [], "changed": []}
 
 
 def start(operator, **settings) -> None:
-    with view():
-        outcome = operator("INVOKE_DEFAULT", confirmed=True, **settings)
+    outcome = press(operator, kind="TEXT_EDITOR", confirmed=True, **settings)
     assert outcome == {"RUNNING_MODAL"}, outcome
 
 
@@ -66,16 +26,9 @@ def measured(name: str, operator, **settings):
         while jobs.is_running():
             yield 0.02
         yield 0.3
-        during = longest()
-        beats.clear()
-        for _ in range(3):
-            for area in bpy.context.window_manager.windows[0].screen.areas:
-                area.tag_redraw()
-            yield 0.1
-        seen["gaps"].setdefault(name, []).append(round(during - longest(), 3))
+        seen["gaps"].setdefault(name, []).append((yield from pause_beyond_redraw()))
         if seen["gaps"][name][-1] < 0.1:
             break
-    note()
 
 
 def state() -> dict[str, object]:
@@ -112,19 +65,17 @@ def cancelled(stage: str, operator, **settings):
 
 def steps():
     mph = bpy.ops.mphdrr
-    with view():
-        area = bpy.context.area
+    area = editor()[1]
     area.spaces.active.show_region_ui = True
     yield 1.0
-    next(r for r in area.regions if r.type == "UI").active_panel_category = "mphDRR"
+    open_tab()
     bpy.data.objects.remove(bpy.data.objects["Cube"])
-    mph.import_geometry(filepath=workbook)
+    mph.import_geometry(filepath=str(WORKBOOK))
     yield 2.0
     # Without the 3D view, which takes seconds to draw in software: what is measured is not the drawing.
     area.type = "TEXT_EDITOR"
     yield 1.0
     render = {"width": 256, "height": 256, "volume": "Derenzo"}
-    folder = result_file.parent
     yield from measured("phantom", mph.add_derenzo, voxels=128)
     yield from measured("projecting", mph.render_projections, **render)
     yield from measured("dataset", mph.export_dataset, filepath=str(folder / "a.h5"))
@@ -132,10 +83,9 @@ def steps():
     yield from measured("solids", mph.export_for_program, format="stl", filepath=str(folder / "a.stl"))
     for stage in ("projecting", "packing", "storing"):
         yield from cancelled(stage, mph.render_projections, **render)
-    note()
     # The scene is usable: undo works, and it can be rendered again.
     bpy.data.objects["Derenzo"].location.x = 12.0
-    with view():
+    with within("TEXT_EDITOR"):
         bpy.ops.ed.undo_push(message="moved")
         bpy.ops.ed.undo()
     yield 0.5
@@ -154,26 +104,7 @@ def steps():
     while jobs.is_running():
         yield 0.05
     seen["added"] = sorted(name for name in ("A", "B", "C") if name in bpy.data.objects)
-    seen["ok"] = True
-
-
-def note() -> None:
-    result_file.write_text(json.dumps(seen, indent=1))
-
-
-running = steps()
-
-
-def drive() -> float | None:
-    try:
-        return next(running)
-    except StopIteration:
-        pass
-    except Exception:
-        seen["error"] = traceback.format_exc()
-    note()
-    return None
 
 
 bpy.app.timers.register(beat)
-bpy.app.timers.register(drive, first_interval=1.5)
+run(steps())

@@ -1,27 +1,13 @@
-"""The example with a live preview: fifty moves of module and phantom, numbers edited; then the eyedropper.
+"""The example with a live preview: fifty moves of module and phantom, numbers edited; then the eyedropper."""
 
-Argument after ``--``: the file for what was seen.
-"""
-
-import importlib
-import json
-import subprocess
-import sys
 import time
-import traceback
-from pathlib import Path
 
 import bpy
 import numpy as np
+from driving import editor, idle, on_screen, open_tab, ours, press, run, seen, xdotool
 
-MODULE = "bl_ext.user_default.mphdrr"
-preview = importlib.import_module(f"{MODULE}.addon.runs.preview")
-volumes = importlib.import_module(f"{MODULE}.addon.volumes.volumes")
-core = importlib.import_module(f"{MODULE}.core")
-
-result_file = Path(sys.argv[sys.argv.index("--") + 1])
-bpy.context.preferences.view.show_splash = False
-seen: dict[str, object] = {"ok": False}
+core, preview, volumes = (ours(name) for name in ("core", "addon.runs.preview", "addon.volumes.volumes"))
+images = ours("addon.pictures.images")
 spent = {"move": 0.0}
 MOVES = 50
 
@@ -47,39 +33,19 @@ preview.preview_drawing._draw_corner = timed(preview.preview_drawing._draw_corne
 preview.preview_drawing._draw_plane = timed(preview.preview_drawing._draw_plane)
 
 
-def view():
-    window = bpy.context.window_manager.windows[0]
-    area = max((a for a in window.screen.areas if a.type == "VIEW_3D"), key=lambda a: a.width)
-    return window, area
-
-
-def load():
-    window, area = view()
-    area.spaces.active.show_region_ui = True
-    region = next(r for r in area.regions if r.type == "WINDOW")
-    with bpy.context.temp_override(window=window, area=area, region=region):
-        bpy.ops.mphdrr.load_example("INVOKE_DEFAULT")
-
-
 def pick_high(number):
     """Click with the eyedropper on the brightest pixel of a module's tile in the mosaic."""
-    window = bpy.context.window_manager.windows[0]
-    area = next(a for a in window.screen.areas if a.type == "IMAGE_EDITOR")
-    region = next(r for r in area.regions if r.type == "WINDOW")
+    area, region = editor("IMAGE_EDITOR")[1:]
     image = area.spaces.active.image
     tiles = image["mphdrr_tiles"].to_dict()
-    exact = importlib.import_module(f"{MODULE}.addon.pictures.images").projection_array(
-        bpy.data.images[f"mphDRR {number}"]
-    )
+    exact = images.projection_array(bpy.data.images[f"mphDRR {number}"])
     picture = exact[::-1, ::-1]
     place = np.array(np.unravel_index(picture.argmax(), picture.shape)) + 0.5
     row, column = np.reshape(tiles["corners"], (-1, 2))[tiles["numbers"].index(number)] + place
     x, y = region.view2d.view_to_region(column / image.size[0], 1 - row / image.size[1], clip=False)
-    with bpy.context.temp_override(window=window, area=area, region=region):
-        bpy.ops.mphdrr.pick_window("INVOKE_DEFAULT", end="HIGH")
-    on_screen = str(round(region.x + x)), str(round(window.height - region.y - y))
-    subprocess.run(["xdotool", "mousemove", *on_screen], check=True)
-    subprocess.run(["xdotool", "click", "1"], check=True)
+    press(bpy.ops.mphdrr.pick_window, kind="IMAGE_EDITOR", end="HIGH")
+    xdotool("mousemove", *on_screen(x, y, "IMAGE_EDITOR"))
+    xdotool("click", 1)
 
 
 def figures(name, times):
@@ -87,12 +53,11 @@ def figures(name, times):
 
 
 def steps():
-    window, area = view()
-    load()
-    while len(window.modal_operators):
-        yield 0.5
+    editor()[1].spaces.active.show_region_ui = True
+    press(bpy.ops.mphdrr.load_example)
+    yield from idle()
     yield 6.0  # drawn in software, slowly
-    next(r for r in area.regions if r.type == "UI").active_panel_category = "mphDRR"
+    open_tab()
     scene = bpy.context.scene
     camera, phantom = bpy.data.objects["Module 55"], bpy.data.objects["Derenzo"]
     for item in list(bpy.context.selected_objects):
@@ -100,10 +65,7 @@ def steps():
     camera.select_set(True)
     bpy.context.view_layer.objects.active = camera
     scene.mphdrr_projections.width = scene.mphdrr_projections.height = 256
-    scanner = scene.mphdrr_geometry.scanner
-    importlib.import_module(f"{MODULE}.addon.scanner.scanner").show_modules(
-        scanner, 50, 60
-    )  # drawn in software, slowly
+    bpy.ops.mphdrr.show_modules(first=50, last=60, mode="ONLY")  # drawn in software, slowly
     phantom.display_type = "BOUNDS"
     yield 4.0
     off = []
@@ -150,25 +112,9 @@ def steps():
     seen["unit"] = session.shown.run.unit
     pick_high(30)
     yield 4.0
-    exact = importlib.import_module(f"{MODULE}.addon.pictures.images").projection_array(bpy.data.images["mphDRR 30"])
+    exact = images.projection_array(bpy.data.images["mphDRR 30"])
     settings = scene.mphdrr_display
     seen["picked"] = [settings.automatic, settings.low, bool(settings.high > 0 and np.isin(settings.high, exact))]
-    seen["ok"] = True
 
 
-STEPS = steps()
-
-
-def step():
-    wait = None
-    try:
-        wait = next(STEPS)
-    except StopIteration:
-        pass
-    except Exception:
-        seen["error"] = traceback.format_exc()
-    result_file.write_text(json.dumps(seen))
-    return wait
-
-
-bpy.app.timers.register(step, first_interval=1.5)
+run(steps())

@@ -1,0 +1,220 @@
+"""What the scripts in the window share: its editors, keys and mouse, pictures, and the steps that they take.
+
+A script's arguments stand after ``--``: the folder for its files, then its own, `ARGUMENTS`. `seen` is what its test gets.
+"""
+
+import itertools
+import json
+import subprocess
+import sys
+import time
+import traceback
+from collections.abc import Callable, Iterator
+from importlib import import_module
+from pathlib import Path
+from types import ModuleType
+
+import bpy
+from bpy_extras.view3d_utils import location_3d_to_region_2d
+from mathutils import Euler
+
+folder, *ARGUMENTS = map(Path, sys.argv[sys.argv.index("--") + 1 :])
+WORKBOOK = Path(bpy.utils.user_resource("EXTENSIONS")) / "user_default/mphdrr/examples/dc-spect-80.xlsx"
+seen: dict = {"ok": False}
+bpy.context.preferences.view.show_splash = False
+
+
+def ours(name: str) -> ModuleType:
+    """A module of the extension, such as ``"addon.runs.runs"``."""
+    return import_module(f"bl_ext.user_default.mphdrr.{name}")
+
+
+def editor(kind: str = "VIEW_3D"):
+    """Window, area and region of the largest editor of a kind."""
+    window = bpy.context.window_manager.windows[0]
+    area = max((a for a in window.screen.areas if a.type == kind), key=lambda a: a.width * a.height)
+    return window, area, next(r for r in area.regions if r.type == "WINDOW")
+
+
+def within(kind: str = "VIEW_3D"):
+    """The context of that editor."""
+    window, area, region = editor(kind)
+    return bpy.context.temp_override(window=window, area=area, region=region)
+
+
+def press(operator: Callable, how: str = "INVOKE_DEFAULT", kind: str = "VIEW_3D", **settings: object) -> set[str]:
+    """Call an operator as a button of that editor's sidebar does; INVOKE_DEFAULT starts a job."""
+    with within(kind):
+        return operator(how, True, **settings)
+
+
+def sidebar(kind: str = "VIEW_3D"):
+    """The sidebar's region."""
+    return next(region for region in editor(kind)[1].regions if region.type == "UI")
+
+
+def open_tab(kind: str = "VIEW_3D") -> None:
+    """Show our tab, of a sidebar that has been drawn."""
+    sidebar(kind).active_panel_category = "mphDRR"
+
+
+def only(*names: str) -> None:
+    """Only these panels are there, open, so that all of them is on the screen."""
+    panels = [getattr(bpy.types, name) for name in dir(bpy.types) if name.startswith("MPHDRR_PT_")]
+    others = [cls for cls in panels if cls.__name__ not in names]
+    for cls in sorted(others, key=lambda cls: not hasattr(cls, "bl_parent_id")):  # a panel after those in it
+        bpy.utils.unregister_class(cls)
+    opened(*names)
+
+
+def opened(*names: str, but_closed: tuple[str, ...] = ()) -> None:
+    """Have panels open from the start, and others closed."""
+    for name in (*names, *but_closed):
+        panel = getattr(bpy.types, name)
+        bpy.utils.unregister_class(panel)
+        panel.bl_options = {"DEFAULT_CLOSED"} if name in but_closed else set()
+        bpy.utils.register_class(panel)
+
+
+def xdotool(*what: object) -> None:
+    """Mouse and keyboard."""
+    subprocess.run(["xdotool", *map(str, what)], check=True)
+
+
+def on_screen(x: float, y: float, kind: str = "VIEW_3D") -> tuple[int, int]:
+    """Where on the screen a place of an editor's region is."""
+    window, _, region = editor(kind)
+    return round(region.x + x), round(window.height - region.y - y)
+
+
+def frame(kind: str = "VIEW_3D") -> list[int]:
+    """Left, top, right and bottom of an editor's region on the screen."""
+    region = editor(kind)[2]
+    return [*on_screen(0, region.height, kind), *on_screen(region.width, 0, kind)]
+
+
+def place(point) -> tuple[int, int]:
+    """Where on the screen a place in the world is, in the 3D view."""
+    region = editor()[2]
+    return on_screen(*location_3d_to_region_2d(region, region.data, point))
+
+
+def look(distance: float, angles=(0.0, 0.0, 0.0), at=(0.0, 0.0, 0.0)) -> None:
+    """Look at a place from these angles, without perspective."""
+    view = editor()[2].data
+    view.view_perspective, view.view_rotation = "ORTHO", Euler(angles).to_quaternion()
+    view.view_location, view.view_distance = at, distance
+
+
+def keys(*names: str) -> None:
+    """Type keys with the mouse in the middle of the 3D view."""
+    _, _, region = editor()
+    xdotool("mousemove", *on_screen(region.width // 2, region.height // 2))
+    for name in names:
+        xdotool("key", "--delay", "60", name)
+
+
+def picture(name: str) -> Path:
+    """Capture the screen in the folder."""
+    path = folder / f"{name}.png"
+    subprocess.run(["import", "-window", "root", str(path)], check=True)
+    return path
+
+
+def empty_scene() -> None:
+    """Without the objects of the start-up file."""
+    for name in ("Cube", "Light", "Camera"):
+        bpy.data.objects.remove(bpy.data.objects[name])
+
+
+def scanner():
+    """The first scanner's collection."""
+    return next(c for c in bpy.data.collections if c.mphdrr_scanner.is_scanner)
+
+
+def module(number: int, within=None):
+    """The camera of a module, of the first scanner or the one given."""
+    items = (within or scanner()).all_objects
+    return next(o for o in items if o.mphdrr_module.is_module and o.mphdrr_module.number == number)
+
+
+def is_idle() -> bool:
+    """Whether no job is running."""
+    has_modal = len(bpy.context.window_manager.windows[0].modal_operators) > 0
+    return not has_modal and not ours("addon.blender.jobs").is_running()
+
+
+def idle() -> Iterator[float]:
+    """Wait until no job runs."""
+    yield 1.0
+    while not is_idle():
+        yield 0.3
+
+
+beats: list[float] = []
+
+
+def own_time() -> float:
+    """Seconds, without those in which this thread could run but other work had the processor (Linux counts them)."""
+    try:
+        waited = int(Path("/proc/thread-self/schedstat").read_text().split()[1])
+    except OSError:
+        waited = 0
+    return time.perf_counter() - waited * 1e-9
+
+
+def beat() -> float:
+    """A timer whose pauses are measured; it also notes the words of jobs."""
+    beats.append(own_time())
+    current = ours("addon.blender.jobs")._current
+    if current is not None and current.text not in seen["words"]:
+        seen["words"].append(current.text)
+    return 0.02
+
+
+def longest_pause() -> float:
+    """The longest pause between two beats, s."""
+    return max(b - a for a, b in itertools.pairwise(beats))
+
+
+def pause_beyond_redraw() -> Iterator[float]:
+    """Yields seconds to wait; returns the longest pause since the beats were cleared, without what a redraw takes."""
+    during = longest_pause()
+    beats.clear()
+    for _ in range(3):
+        for area in bpy.context.window_manager.windows[0].screen.areas:
+            area.tag_redraw()
+        yield 0.1
+    return round(during - longest_pause(), 3)
+
+
+def run(steps: Iterator[float | Callable[[], bool]], patience: float = 40.0, settle: float = 0.0) -> None:
+    """Take the steps: each yields what to wait for, seconds or a function that says when it has happened.
+
+    After such an event `settle` seconds more are waited, for what may still come; after `patience` seconds without it the
+    script has failed. What was seen is written after the last step.
+    """
+    wanted: float | Callable[[], bool] = 0.0
+    since = 0.0
+
+    def tick() -> float | None:
+        nonlocal wanted, since
+        try:
+            if callable(wanted):
+                if not wanted():
+                    if time.monotonic() - since > patience:
+                        raise TimeoutError(f"waited in vain at line {steps.gi_frame.f_lineno}")
+                    return 0.2
+                wanted = settle
+                if settle:
+                    return settle
+            wanted, since = next(steps), time.monotonic()
+            return 0.2 if callable(wanted) else wanted
+        except StopIteration:
+            seen["ok"] = True
+        except Exception:
+            seen["error"] = traceback.format_exc()
+        (folder / "seen.json").write_text(json.dumps(seen))
+        return None
+
+    bpy.app.timers.register(tick, first_interval=1.5)

@@ -153,7 +153,7 @@ class Event:
         return self._folder.maker.views
 
     @property
-    def system(self) -> PinholeSystem:
+    def system(self) -> Scanner:
         """The scanner."""
         return self._folder.maker.system
 
@@ -354,7 +354,7 @@ class EventSet:
         return self._first.recipe
 
     @property
-    def system(self) -> PinholeSystem:
+    def system(self) -> Scanner:
         """The scanner of the first event's set."""
         return self._first.maker.system
 

@@ -57,7 +57,7 @@ class EventMaker:
         self._volumes: dict[str, Remembered[Volume]] = {}
 
     @cached_property
-    def system(self) -> PinholeSystem:
+    def system(self) -> Scanner:
         """The scanner."""
         return recipe_system(self.recipe.system, lambda name: self.recipe.input(name).path)
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from .. import hdf5
 from ..errors import InputError
-from ..geometry.system import PinholeSystem
+from ..geometry.scanner import Scanner
 from ..geometry.views import Views
 from ..physics.noise import draw_counts
 from ..runs.recipe import Recipe, recorded_recipe

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ..errors import InputError, naming
 from ..geometry.grid import Grid
 from ..geometry.parallel_views import parallel_views
-from ..geometry.system import PinholeSystem
+from ..geometry.scanner import Scanner
 from ..geometry.views import Views
 from ..memory import readable_size, require
 from ..progress import Progress, tell

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import InputError
-from ...geometry.system import PinholeSystem
+from ...geometry.scanner import Scanner
 
 MIRRORED = 4
 """Columns of mirrored images at the end of a row."""
@@ -43,7 +43,7 @@ class Slots:
         taken[self.mirrored] = taken[self.mirrored][..., ::-1]
         return taken
 
-    def table(self, system: PinholeSystem) -> str:
+    def table(self, system: Scanner) -> str:
         """What each slot shows as CSV: slot, row, column, the module's number and ring (from 1), mirrored (1 or 0)."""
         rings = system.rings() + 1
         lines = ["slot,row,column,module,ring,mirrored"]
@@ -53,7 +53,7 @@ class Slots:
         return "\n".join(lines) + "\n"
 
 
-def row_slots(system: PinholeSystem) -> Slots:
+def row_slots(system: Scanner) -> Slots:
     """A ring in a row, in the order of its modules, and after each row its last `MIRRORED` images mirrored.
 
     `InputError` where the rings are not of one size, or too small to mirror.
@@ -76,7 +76,7 @@ def row_slots(system: PinholeSystem) -> Slots:
     return Slots(modules, np.arange(len(modules)) % columns >= sizes[0], columns)
 
 
-def read_slots(path: str | os.PathLike[str], system: PinholeSystem) -> Slots:
+def read_slots(path: str | os.PathLike[str], system: Scanner) -> Slots:
     """Slots from a table such as `Slots.table` writes: a CSV file with the columns slot, module and mirrored.
 
     Slots are counted from 0, modules are named by their numbers, and a column "column" says how many are in a row; others

@@ -10,6 +10,7 @@ from ..validation import radians, real_array
 
 # z and a principal ray are parallel if the sine of the angle between them is below this.
 _PARALLEL = 1e-9
+_ROUNDING = 1e-14  # rad
 
 
 def principal_rays(centers: ArrayLike) -> NDArray[np.float64]:
@@ -47,8 +48,9 @@ def tilted(frames: NDArray[np.float64], tilt: NDArray[np.float64]) -> NDArray[np
 
 
 def tilts(frames: NDArray[np.float64], turned: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Rotation vectors (M, 3), rad, about u, v and k of `frames` (M, 3, 3) that make them `turned`."""
-    return rotation_vectors((turned @ frames.transpose(0, 2, 1)).transpose(0, 2, 1))
+    """Rotation vectors (M, 3), rad, about u, v and k of `frames` (M, 3, 3) that make them `turned`; 0 within rounding."""
+    found = rotation_vectors((turned @ frames.transpose(0, 2, 1)).transpose(0, 2, 1))
+    return np.where(np.abs(found).max(axis=1, keepdims=True) > _ROUNDING, found, 0.0)
 
 
 def rotations(vectors: NDArray[np.float64]) -> NDArray[np.float64]:

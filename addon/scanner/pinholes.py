@@ -6,13 +6,14 @@ from dataclasses import asdict
 
 import bpy
 import numpy as np
+from numpy.typing import NDArray
 
 from ...core.errors import InputError
 from ...core.geometry import checks
 from ...core.geometry.collimator import Construction, EdgePlace
 from ...core.geometry.scanner import Scanner
 from ...core.geometry.system import PinholeSystem
-from ...core.physics.performance import isocentre_performance
+from ...core.physics.performance import isocentre_performance, resolution, sensitivity
 from ..blender.decimals import typed
 from . import collimators
 from .module_values import Kind
@@ -73,15 +74,23 @@ def write_readouts(
     """Write the readouts of the modules `which` of a system, 0 where there is none."""
     values = np.zeros((len(modules), len(_READOUTS)))
     if isinstance(found, PinholeSystem):
-        at = isocentre_performance(
-            found.pinhole_distance, found.pinhole_diameter, found.collimator_length, found.detector_side,
-            found.detector_thickness, intrinsic_fwhm=typed(scanner.intrinsic_fwhm),
-        )  # fmt: skip
-        seen = found.roi_radius_seen() if found.tilt.any() else at[3]
-        values = np.stack([1e6 * at[0], at[1], at[2], seen], axis=1)[which]
+        values = _readouts(found, typed(scanner.intrinsic_fwhm))[which]
     for module, row in zip(modules, values.tolist(), strict=True):
         for name, value in zip(_READOUTS, row, strict=True):
             setattr(module, name, value)
+
+
+def _readouts(system: PinholeSystem, intrinsic_fwhm: float) -> NDArray[np.float64]:
+    """The `_READOUTS` of the modules at the isocentre, (M, 4)."""
+    at = isocentre_performance(
+        system.pinhole_distance, system.pinhole_diameter, system.collimator_length, system.detector_side,
+        system.detector_thickness, intrinsic_fwhm=intrinsic_fwhm,
+    )  # fmt: skip
+    counts, fwhm, magnification, seen = at
+    if system.tilt.any():  # else the dimensions alone say it, which is faster
+        counts, seen = sensitivity(system, np.zeros((1, 3)))[0], system.roi_radius_seen()
+        fwhm = resolution(system, np.zeros((1, 3)), intrinsic_fwhm=intrinsic_fwhm)[0]
+    return np.stack([1e6 * counts, fwhm, magnification, seen], axis=1)
 
 
 def write_totals(scanner: bpy.types.PropertyGroup, modules: Sequence[bpy.types.PropertyGroup]) -> None:

@@ -200,8 +200,10 @@ def read_scanner(collection: bpy.types.Collection) -> Scanner:
 
     Values that have not changed come back exactly, in float64. A pinhole's camera that does not look at the isocentre, to
     1e-4 rad, is that of a tilted module. The system has its source (the workbook) only while everything is as it was
-    imported. Raises InputError for no modules, equal module numbers and impossible values.
+    imported. What a script has moved just now is followed first: Blender has not yet called for it. Raises InputError for no
+    modules, equal module numbers and impossible values.
     """
+    following.refresh(collection)
     found = modules(collection)
     if not found:
         raise InputError(f"collection '{collection.name}' has no modules: import a geometry first")

@@ -17,7 +17,7 @@ from ...core.recording import recorded_warnings
 from ...core.workbook import read_system, write_system
 from ..blender import jobs, storage
 from ..blender.decimals import typed
-from . import following, pinholes, scanner
+from . import pinholes, scanner
 from .module_values import kind_of
 
 WORKBOOK_SUFFIXES = (".xlsx", ".xlsm")
@@ -31,7 +31,6 @@ def exporting_scanner(collection: bpy.types.Collection, path: Path, use_template
     by; a new one is made where that workbook has gone (`InputWarning`). Raises InputError, and leaves the scanner as it was,
     where the file cannot be written.
     """
-    following.refresh(collection)
     system = scanner.read_pinholes(collection)
     template = _template(collection) if use_template else None
     source = scanner.source(collection) if template is not None else None
@@ -107,7 +106,7 @@ def _difference(one: PinholeSystem, other: PinholeSystem) -> str:
     """Where two systems differ, in words."""
     if not np.array_equal(one.numbers, other.numbers):
         return "the modules' numbers"
-    for name, column in one.columns.items():
+    for column in one.columns.values():
         a, b = column.of(one), column.of(other)
         wrong = a != b if column.is_text else np.abs(a - b) > _EQUAL * np.maximum(1.0, np.abs(a))
         if column.role != "derived" and wrong.any():

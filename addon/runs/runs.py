@@ -264,8 +264,8 @@ def _of_modules(collection: bpy.types.Collection | None, old: Mapping[str, Any])
         if pairs_of:
             first, *others = set(pairs_of.values())
             unit, factor = next(iter(column.units.items()))
-            values = first if column.is_text else (value / factor for value in first)
-            yield f"{_modules(sorted(pairs_of), count)}: {column.name} {'changed' if others else _now(*values, unit)}"
+            values = first if column.is_text else [value / factor for value in first]
+            yield f"{_modules(sorted(pairs_of), count)}: {column.name} {'changed' if others else _now(*values, unit=unit)}"
     gone = [int(number) for number in old["modules"] if number not in modes]
     if gone:
         yield f"{_modules(gone, count)} {'are' if len(gone) > 1 else 'is'} gone"

@@ -15,7 +15,7 @@ from ...core.errors import InputError
 from ...core.geometry.scanner import SCANNERS, Scanner
 from . import cameras, collimators, pinholes
 from .collimators import PARTS
-from .module_values import TYPED, Kind, are_aimed, designed, kind_of, readings
+from .module_values import TYPED, Kind, aim_of, designed, kind_of, readings
 
 _KEY = "mphdrr_solid"  # custom property of a mesh: the values that it was built from
 _writing = 0
@@ -109,31 +109,22 @@ def _refresh_modules(
 ) -> bool:
     """Make modules follow, all together, which is faster than one by one; returns whether a value has changed."""
     cameras_, matrices = list(parts), cameras.world_matrices(list(parts))
-    aimed = are_aimed(kind, matrices)
+    exact, aimed = aim_of(kind, matrices)
     to_aim = []
     for m, (camera, place) in enumerate(zip(cameras_, matrices[:, :3, 3], strict=True)):
         module = camera.mphdrr_module
         if np.any(np.array(module.placed, np.float32) != place.astype(np.float32)):
-            if aim and scanner.keep_aimed and not aimed[m] and module.built and is_free(camera) and place.any():
+            if aim and scanner.keep_aimed and not aimed[m] and module.built and is_free(camera):
                 to_aim.append(m)  # it is not new
             module.placed = place
-    if to_aim:
-        matrices[to_aim] = turn_to_isocentre(kind, [cameras_[m] for m in to_aim])
-        aimed = are_aimed(kind, matrices)
+    for m in to_aim:
+        cameras.set_world_matrix(cameras_[m], exact[m])
+        matrices[m], aimed[m] = cameras.world_matrix(cameras_[m]), True
     changed = [
         _follow(found, [cameras_[m] for m in which], aimed[which].tolist(), parts, scanner)
         for which, found in readings(kind, cameras_, matrices)
     ]
     return any(changed)
-
-
-def turn_to_isocentre(kind: Kind, cameras_: Sequence[bpy.types.Object]) -> Any:
-    """Turn cameras of a kind that is aimed to the isocentre, where they stand; returns their world matrices (M, 4, 4)."""
-    poses = kind.aimed(cameras.world_matrices(cameras_)[:, :3, 3])
-    if poses is not None:
-        for camera, matrix in zip(cameras_, cameras.matrices_of(poses), strict=True):
-            cameras.set_world_matrix(camera, matrix)
-    return cameras.world_matrices(cameras_)
 
 
 def _follow(
@@ -204,7 +195,7 @@ def _reshape(
     scanner: bpy.types.PropertyGroup,
 ) -> None:
     """Reshape the `old` parts of modules: index, values and objects of each."""
-    chosen = found[[m for m, _, _ in old]] if len(old) < len(found) else found
+    chosen = found[np.array([m for m, _, _ in old])] if len(old) < len(found) else found
     try:
         built = chosen.parts(pinholes.construction(scanner, type(found)))
     except InputError as error:  # e.g. while d is typed before Ld: the last shape stays

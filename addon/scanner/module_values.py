@@ -244,19 +244,23 @@ def changes(found: Sequence[bpy.types.Object]) -> tuple[list[bool], list[bool]]:
     return moved.tolist(), edited
 
 
+def aim_of(kind: Kind, matrices: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """The world matrices (M, 4, 4) with which cameras look at the isocentre from where they stand, and which do so, upright.
+
+    `matrices` (M, 4, 4) are those that they have. Of a kind that is not aimed, and at the isocentre itself, all are right.
+    """
+    poses, off_centre = cameras.poses_of(matrices), np.any(matrices[:, :3, 3], axis=1)
+    exact = kind.aimed(poses[off_centre, :3, 3])
+    if exact is None:
+        return matrices, np.ones(len(matrices), bool)
+    aimed, found = ~off_centre, matrices.copy()
+    found[off_centre] = cameras.matrices_of(exact)
+    aimed[off_centre] = np.abs(poses[off_centre] - exact)[:, :3, :3].max(axis=(1, 2)) <= _AIMED
+    return found, aimed
+
+
 def off_aim(collection: bpy.types.Collection, cameras_: Iterable[bpy.types.Object]) -> list[int]:
     """Numbers of a scanner's modules whose cameras do not look at the isocentre, or are rolled."""
     found = list(cameras_)
-    aimed = are_aimed(kind_of(collection), cameras.world_matrices(found))
+    _, aimed = aim_of(kind_of(collection), cameras.world_matrices(found))
     return [camera.mphdrr_module.number for camera, is_aimed in zip(found, aimed, strict=True) if not is_aimed]
-
-
-def are_aimed(kind: Kind, matrices: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Whether cameras of these world matrices (M, 4, 4) look at the isocentre, upright, if their kind does: (M,)."""
-    aimed = np.any(matrices[:, :3, 3], axis=1)  # at the isocentre there is no direction to it
-    poses = cameras.poses_of(matrices[aimed])
-    exact = kind.aimed(poses[:, :3, 3])
-    if exact is None:
-        return np.ones(len(matrices), bool)
-    aimed[aimed] = np.abs(poses - exact)[:, :3, :3].max(axis=(1, 2)) <= _AIMED
-    return aimed

@@ -21,7 +21,7 @@ from ...core.workbook import ColumnMap, QuantityCells, SystemSource
 from ..blender import ids
 from . import cameras, collimators, following, framing, pinholes
 from .following import modules
-from .module_values import changes, kind_of, off_aim, read_modules, remember
+from .module_values import aim_of, changes, kind_of, off_aim, read_modules, remember
 from .scanner_parts import NewScanner, clear, losses
 
 _DEFAULT = Construction()
@@ -249,12 +249,14 @@ def check_geometry(collection: bpy.types.Collection) -> tuple[list[str], list[bp
 
 def aim_modules(collection: bpy.types.Collection) -> list[int]:
     """Turn every camera that does not look at the isocentre; returns their modules' numbers."""
-    off = off_aim(collection, modules(collection))
-    turned = [camera for camera in modules(collection) if camera.mphdrr_module.number in off]
-    if turned:
-        following.turn_to_isocentre(kind_of(collection), turned)
+    found = modules(collection)
+    turned = []
+    for camera, matrix, aimed in zip(found, *aim_of(kind_of(collection), cameras.world_matrices(found)), strict=True):
+        if not aimed:
+            cameras.set_world_matrix(camera, matrix)
+            turned.append(camera.mphdrr_module.number)
     following.refresh(collection)
-    return sorted(off)
+    return sorted(turned)
 
 
 def set_visible(camera: bpy.types.Object, visible: bool) -> None:

@@ -198,5 +198,7 @@ class Scanner(ABC):
 
 def repeated(rows: NDArray[Any]) -> NDArray[np.bool_]:
     """Which rows (M,) of an array (M, ...) stand there before."""
+    if len(rows) == 1:
+        return np.zeros(1, bool)
     _, first, inverse = np.unique(rows, axis=0, return_index=True, return_inverse=True)
     return first[inverse.reshape(-1)] != np.arange(len(rows))

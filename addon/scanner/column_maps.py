@@ -229,10 +229,11 @@ def update(form: ColumnMapProperties) -> None:
 def _preview(workbook: Path, columns: ColumnMap) -> tuple[int, list[list[str]]]:
     """How many modules the workbook has; headings, then the numbers of the first modules and the last, mm."""
     system = read_system(workbook, columns)
-    names = [name for name in QUANTITIES if name in (*TYPED, "b")]
+    filled = system.filled()
+    names = [name for name, column in QUANTITIES.items() if name == "b" or (name in TYPED and column.field in filled)]
     numbers = zip(*(QUANTITIES[name].of(system).tolist() for name in names), strict=True)
     rows = [
-        [str(module), *(f"{value:.3f}" for value in values)]
+        [str(module), *(value if isinstance(value, str) else f"{value:.3f}" for value in values)]
         for module, values in zip(system.numbers.tolist(), numbers, strict=True)
     ]
     if len(rows) > _FIRST + 2:

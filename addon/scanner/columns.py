@@ -33,7 +33,7 @@ def declared(edited: Callable[[str], Any], suffix: str = "") -> dict[str, Any]:
 def _declared(column: Column, update: Any, suffix: str) -> Any:
     about = f"{column.help or column.title}{_UNITS.get(column.kind, '')}{suffix}"
     common = {"name": column.title.title().replace("Roi", "ROI"), "description": about, "update": update}
-    default = column.blank if column.has_constant_blank else None
+    default: Any = column.blank if column.has_constant_blank else None
     if column.kind == "text":
         return StringProperty(**common, default=default or "")
     if column.kind == "choice":

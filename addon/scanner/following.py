@@ -6,7 +6,6 @@ Blender has stored an undo step, and undo expects the datablocks that it stored.
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any
 
 import bpy
 import numpy as np

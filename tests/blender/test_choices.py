@@ -166,7 +166,7 @@ if sys.argv[2] == "more":
     materials.APERTURES = ("platinum", *materials.APERTURES)
     materials.CRYSTALS = ("LaBr3", *materials.CRYSTALS)
     volume.UNITS = inserted(volume.UNITS, "density", "g/cm^3", 0)
-    from mphdrr.addon import ids
+    from mphdrr.addon.blender import ids
     ids.PARTS = ("PLATE", *ids.PARTS)
 
     from dataclasses import dataclass

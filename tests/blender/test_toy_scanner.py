@@ -14,8 +14,10 @@ from mathutils import Vector
 
 import mphdrr.core as mph
 from mphdrr.addon import registration
+from mphdrr.addon.blender import storage
 from mphdrr.addon.runs import runs
 from mphdrr.addon.scanner import scanner
+from mphdrr.addon.volumes import volumes
 from mphdrr.core.errors import InputError
 from mphdrr.core.geometry import scanner as kinds
 from mphdrr.core.geometry.columns import Column, ColumnTable
@@ -23,6 +25,7 @@ from mphdrr.core.geometry.frames import affine_matrix
 from mphdrr.core.geometry.module_parts import BOX_FACES, ModulePart
 from mphdrr.core.geometry.scanner import Scanner
 from mphdrr.core.geometry.views import Views
+from mphdrr.core.runs.files import read_run
 
 
 def vector(name: str, attribute: str) -> list[Column]:
@@ -162,14 +165,10 @@ def test_it_is_projected_and_its_run_is_current_until_it_moves(scene, system):
     collection = scanner.build_scanner(scene, system)
     grid = mph.Grid.centered((20, 24, 16), 8.0)
     array = np.random.default_rng(1).uniform(0.0, 0.02, grid.shape).astype(np.float32)
-    from mphdrr.addon.volumes import volumes
-
     volumes.add_volume(mph.Volume(array, grid, "mu"), "Box")
-    scene.mphdrr_projections.model = "TRANSMISSION"
-    assert bpy.ops.mphdrr.render_projections(width=20, height=15) == {"FINISHED"}
-    from mphdrr.addon.blender import storage
-    from mphdrr.core.runs.files import read_run
-
+    panel = scene.mphdrr_projections
+    panel.model, panel.width, panel.height = "TRANSMISSION", 20, 15
+    assert bpy.ops.mphdrr.render_projections() == {"FINISHED"}
     run = read_run(storage.absolute(scene.mphdrr_projections.run_file))
     expected = mph.Projector(grid, system.views((15, 20)), model=mph.Transmission(), backend="numpy")(array)
     assert np.allclose(run.projections, expected, atol=1e-3 * expected.max()) and expected.min() < expected.max()

@@ -262,10 +262,12 @@ def _of_modules(collection: bpy.types.Collection | None, old: Mapping[str, Any])
     for column in kind.columns.scalars.values():
         pairs_of = changed.get(column.name, {})
         if pairs_of:
-            first, *others = set(pairs_of.values())
+            (old_value, new_value), *others = set(pairs_of.values())
             unit, factor = next(iter(column.units.items()))
-            values = first if column.is_text else [value / factor for value in first]
-            yield f"{_modules(sorted(pairs_of), count)}: {column.name} {'changed' if others else _now(*values, unit=unit)}"
+            if not column.is_text:
+                old_value, new_value = old_value / factor, new_value / factor
+            text = "changed" if others else _now(old_value, new_value, unit)
+            yield f"{_modules(sorted(pairs_of), count)}: {column.name} {text}"
     gone = [int(number) for number in old["modules"] if number not in modes]
     if gone:
         yield f"{_modules(gone, count)} {'are' if len(gone) > 1 else 'is'} gone"

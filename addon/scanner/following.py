@@ -68,7 +68,7 @@ def refresh(
     kind, found = kind_of(collection), modules(collection)
     with writing():
         parts = parts_of(collection, found if changed is None else changed)
-        rebuilt = _refresh_modules(kind, parts, scanner, aim)
+        rebuilt = bool(parts) and _refresh_modules(kind, parts, scanner, aim)
         if changed is None or rebuilt or scanner.count != len(found):
             _update_totals(kind, scanner, [camera.mphdrr_module for camera in found])
             pinholes.resize_roi(collection, found)
@@ -119,8 +119,9 @@ def _refresh_modules(
     for m in to_aim:
         cameras.set_world_matrix(cameras_[m], exact[m])
         matrices[m], aimed[m] = cameras.world_matrix(cameras_[m]), True
+    distances = np.linalg.norm(matrices[:, :3, 3], axis=1)
     changed = [
-        _follow(found, [cameras_[m] for m in which], aimed[which].tolist(), parts, scanner)
+        _follow(found, [cameras_[m] for m in which], aimed[which].tolist(), distances[which].tolist(), parts, scanner)
         for which, found in readings(kind, cameras_, matrices)
     ]
     return any(changed)
@@ -130,6 +131,7 @@ def _follow(
     found: Scanner | InputError,
     cameras_: Sequence[bpy.types.Object],
     aimed: Sequence[bool],
+    distances: Sequence[float],
     parts: dict[bpy.types.Object, list[bpy.types.Object]],
     scanner: bpy.types.PropertyGroup,
 ) -> bool:
@@ -144,7 +146,7 @@ def _follow(
     for m in changed:
         module = cameras_[m].mphdrr_module
         module.built, module.finding, module.aimed = texts[m], "", aimed[m]
-        module.pinhole_distance = float(np.linalg.norm(cameras.world_matrix(cameras_[m])[:3, 3]))
+        module.pinhole_distance = distances[m]
         module.problem = str(found) if isinstance(found, InputError) else ""
         if isinstance(found, Scanner):
             for column in designed(type(found)):

@@ -116,7 +116,7 @@ def read_modules(
         _carry(kind, rows, known, poses, np.flatnonzero(moved).tolist())
     for column in designed(kind):
         _design(kind, column, rows, cameras_, known)
-    return kind.of({**rows, "source": source})
+    return kind.of({name: np.array(row) for name, row in rows.items()} | {"source": source})
 
 
 def readings(
@@ -183,9 +183,9 @@ def _carry(
 ) -> None:
     """Write the attributes into `rows` that modules have at their poses; one by one where they cannot be together."""
     names = kind.columns.fields
-    now = {name: [rows[name][m] for m in which] for name in ("numbers", *kind.columns.scalars)}
+    now = {name: np.array([rows[name][m] for m in which]) for name in ("numbers", *kind.columns.scalars)}
     try:
-        imported = kind.of({name: [known[m].get(name, rows[name][m]) for m in which] for name in names})
+        imported = kind.of({name: np.array([known[m].get(name, rows[name][m]) for m in which]) for name in names})
         there = imported.at_poses(poses[which], **now)
     except InputError:
         if len(which) == 1:

@@ -137,7 +137,7 @@ class ScannerProperties(bpy.types.PropertyGroup):
     keep_aimed: BoolProperty(
         name="Keep Aimed",
         description="Turn a module that is moved so that it keeps looking at the isocentre. One that is only turned "
-        "stays turned, and is marked",
+        "stays turned: it is tilted",
         default=True, update=on_edit("scanner"),
     )  # fmt: skip
     # With the modules' properties: the first module's values. `mixed` names those that differ between modules.

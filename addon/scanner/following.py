@@ -17,6 +17,10 @@ from .collimators import PARTS
 from .module_values import TYPED, Kind, aim_of, designed, kind_of, readings
 
 _KEY = "mphdrr_solid"  # custom property of a mesh: the values that it was built from
+_Parts = dict[bpy.types.Object, list[bpy.types.Object]]
+"""Camera of each module -> what hangs on it."""
+_Old = tuple[int, str, list[bpy.types.Object]]
+"""Index of a module, its values, and its parts that were built from others."""
 _writing = 0
 
 
@@ -42,13 +46,11 @@ def modules(collection: bpy.types.Collection) -> list[bpy.types.Object]:
     return sorted(found, key=lambda o: (o.mphdrr_module.index, o.mphdrr_module.number, o.name))
 
 
-def parts_of(
-    collection: bpy.types.Collection, found: Sequence[bpy.types.Object]
-) -> dict[bpy.types.Object, list[bpy.types.Object]]:
+def parts_of(collection: bpy.types.Collection, found: Sequence[bpy.types.Object]) -> _Parts:
     """What hangs on each module's camera: its collimator and its crystal."""
     # `Object.children` searches all objects: once for one module, but not once for each of eighty.
     items = found[0].children if len(found) == 1 else collection.all_objects
-    parts: dict[bpy.types.Object, list[bpy.types.Object]] = {camera: [] for camera in found}
+    parts: _Parts = {camera: [] for camera in found}
     for item in items:
         if item.mphdrr_module.part in PARTS and item.parent in parts:
             parts[item.parent].append(item)
@@ -103,9 +105,7 @@ def set_for_all(collection: bpy.types.Collection, name: str) -> None:
     refresh(collection)
 
 
-def _refresh_modules(
-    kind: Kind, parts: dict[bpy.types.Object, list[bpy.types.Object]], scanner: bpy.types.PropertyGroup, aim: bool
-) -> bool:
+def _refresh_modules(kind: Kind, parts: _Parts, scanner: bpy.types.PropertyGroup, aim: bool) -> bool:
     """Make modules follow, all together, which is faster than one by one; returns whether a value has changed."""
     cameras_, matrices = list(parts), cameras.world_matrices(list(parts))
     exact, aimed = aim_of(kind, matrices)
@@ -128,13 +128,9 @@ def _refresh_modules(
 
 
 def _follow(
-    found: Scanner | InputError,
-    cameras_: Sequence[bpy.types.Object],
-    aimed: Sequence[bool],
-    distances: Sequence[float],
-    parts: dict[bpy.types.Object, list[bpy.types.Object]],
-    scanner: bpy.types.PropertyGroup,
-) -> bool:
+    found: Scanner | InputError, cameras_: Sequence[bpy.types.Object], aimed: Sequence[bool], distances: Sequence[float],
+    parts: _Parts, scanner: bpy.types.PropertyGroup,
+) -> bool:  # fmt: skip
     """Make cameras follow the modules that are `found`, or why there are none; returns whether a value has changed."""
     given = pinholes.settings(scanner)
     if isinstance(found, InputError):
@@ -167,10 +163,7 @@ def is_free(item: bpy.types.Object) -> bool:
 
 
 def _rebuild(
-    found: Scanner,
-    cameras_: Sequence[bpy.types.Object],
-    parts: dict[bpy.types.Object, list[bpy.types.Object]],
-    scanner: bpy.types.PropertyGroup,
+    found: Scanner, cameras_: Sequence[bpy.types.Object], parts: _Parts, scanner: bpy.types.PropertyGroup
 ) -> None:
     """Give the cameras' views and the parts' meshes the shapes of modules, or say at a module why it has none."""
     sizes = zip(*(getattr(found, name).tolist() for name in found.columns.scalars), strict=True)
@@ -190,12 +183,9 @@ def _rebuild(
 
 
 def _reshape(
-    found: Scanner,
-    cameras_: Sequence[bpy.types.Object],
-    old: Sequence[tuple[int, str, list[bpy.types.Object]]],
-    scanner: bpy.types.PropertyGroup,
+    found: Scanner, cameras_: Sequence[bpy.types.Object], old: Sequence[_Old], scanner: bpy.types.PropertyGroup
 ) -> None:
-    """Reshape the `old` parts of modules: index, values and objects of each."""
+    """Reshape the `old` parts of modules."""
     chosen = found[np.array([m for m, _, _ in old])] if len(old) < len(found) else found
     try:
         built = chosen.parts(pinholes.construction(scanner, type(found)))

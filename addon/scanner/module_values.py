@@ -6,6 +6,7 @@ valid as long as the visible one is its rounding. A number that the user has typ
 
 import json
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from functools import lru_cache
 from types import SimpleNamespace
 from typing import Any
@@ -43,16 +44,14 @@ def designed(kind: Kind) -> list[Column]:
 
 def write_modules(cameras_: Sequence[bpy.types.Object], system: Scanner) -> None:
     """Make objects the cameras of a system's modules; `l` follows the ROI where the design formula gives it."""
-    follow = np.logical_and.reduce([column.is_default(system) for column in designed(type(system))] or [[False]])
-    rows = _rows(system)
-    for m, (camera, ring, follows) in enumerate(
-        zip(cameras_, system.rings().tolist(), np.broadcast_to(follow, len(system)), strict=True)
-    ):
+    rows, rings = _rows(system), system.rings().tolist()
+    follow = [column.is_default(system) for column in designed(type(system))]
+    for m, camera in enumerate(cameras_):
         module = camera.mphdrr_module
         for name, column in system.columns.scalars.items():  # before is_module, which lets an edit rebuild the module
             setattr(module, name, columns.shown(column, rows[name][m]))
-        module.length_mode = FROM_ROI if follows else TYPED
-        module.ring = ring
+        module.length_mode = FROM_ROI if follow and all(defaults[m] for defaults in follow) else TYPED
+        module.ring = rings[m]
         module.part, module.is_module = "CAMERA", True
     remember(cameras_, system)
 
@@ -114,8 +113,7 @@ def read_modules(
     if moved.any():
         poses[moved] = _straightened(kind, poses[moved], turned[moved])
         _carry(kind, rows, known, poses, np.flatnonzero(moved).tolist())
-    for column in designed(kind):
-        _design(kind, column, rows, cameras_, known)
+    _design(kind, rows, cameras_, known)
     return kind.of({name: np.array(row) for name, row in rows.items()} | {"source": source})
 
 
@@ -198,32 +196,23 @@ def _carry(
             rows[name][m] = value
 
 
-def _design(
-    kind: Kind,
-    column: Column,
-    rows: _Rows,
-    cameras_: Sequence[bpy.types.Object],
-    known: Sequence[dict[str, Any]],
-) -> None:
-    """Write the values of a column that follows from the others into `rows`."""
+def _design(kind: Kind, rows: _Rows, cameras_: Sequence[bpy.types.Object], known: Sequence[dict[str, Any]]) -> None:
+    """Write the values that follow from the others into `rows`, as imported where these have not changed."""
     needed = {kind.columns[name].field for name in kind.columns.needed}
     changed = []
     for m, (camera, exact) in enumerate(zip(cameras_, known, strict=True)):
         if camera.mphdrr_module.length_mode != FROM_ROI:
             continue
         if exact.get("mode") == FROM_ROI and all(rows[name][m] == exact[name] for name in needed):
-            rows[column.field][m] = exact[column.field]
+            for column in designed(kind):
+                rows[column.field][m] = exact[column.field]
         else:
             changed.append(m)
-    if not changed:
-        return
     given = SimpleNamespace(**{name: np.array([rows[name][m] for m in changed]) for name in needed})
-    try:
-        found = column.default(kind.columns.needed_values(given)).tolist()
-    except InputError:  # the system itself is refused for the same reason
-        return
-    for m, value in zip(changed, found, strict=True):
-        rows[column.field][m] = value
+    for column in designed(kind) if changed else ():
+        with suppress(InputError):  # the system itself is refused for the same reason
+            for m, value in zip(changed, column.default(kind.columns.needed_values(given)).tolist(), strict=True):
+                rows[column.field][m] = value
 
 
 def changes(found: Sequence[bpy.types.Object]) -> tuple[list[bool], list[bool]]:

@@ -15,7 +15,7 @@ from mathutils import Quaternion
 
 from ...core.errors import InputError
 from ...core.geometry.collimator import Construction
-from ...core.geometry.scanner import Scanner
+from ...core.geometry.scanner import SCANNERS, Scanner
 from ...core.geometry.system import PinholeSystem
 from ...core.workbook import ColumnMap, QuantityCells, SystemSource
 from ..blender import ids
@@ -153,8 +153,9 @@ def is_set_up(scene: bpy.types.Scene) -> bool:
 
 
 def scanners(scene: bpy.types.Scene) -> list[bpy.types.Collection]:
-    """The scanners in the scene."""
-    return [c for c in scene.collection.children_recursive if c.mphdrr_scanner.is_scanner]
+    """The scanners in the scene, of the kinds that are known."""
+    found = [c for c in scene.collection.children_recursive if c.mphdrr_scanner.is_scanner]
+    return [c for c in found if c.mphdrr_scanner.kind in SCANNERS]
 
 
 def find_scanner(scene: bpy.types.Scene, name: str) -> bpy.types.Collection | None:

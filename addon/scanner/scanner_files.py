@@ -4,6 +4,7 @@ import hashlib
 import math
 from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 import bpy
 import numpy as np
@@ -75,7 +76,7 @@ def exporting_for_program(
     options = {} if built is None else asdict(built)
     if built is not None:
         options["opening_degrees"] = typed(math.degrees(options.pop("opening_angle")))
-    system = scanner.read_scanner(collection)
+    system: Any = scanner.read_scanner(collection)  # of a kind that the format refuses or takes
     views = system.views(shape, detector, magnification=magnification)
     known = {name: value for name, value in options.items() if name in FORMATS[format].options}
 

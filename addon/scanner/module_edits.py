@@ -73,7 +73,8 @@ def tidy(collection: bpy.types.Collection) -> tuple[list[int], int]:
     Returns the new modules' numbers, and how many parts were removed. Where a shape cannot be built nothing is changed.
     """
     copied, orphans, numbers = copied_cameras(collection), orphan_parts(collection), []
-    _require_solids(collection, [*copied, *bare_cameras(collection)])
+    for camera in (*copied, *bare_cameras(collection)):
+        _solids(collection, camera)  # refuses what cannot be, before anything is changed
     cameras.remove_objects(orphans)
     for camera in copied:
         adopt(collection, camera)
@@ -120,12 +121,6 @@ def _solids(collection: bpy.types.Collection, camera: bpy.types.Object) -> Seque
     return _read(collection, camera).parts(construction)
 
 
-def _require_solids(collection: bpy.types.Collection, modules: Sequence[bpy.types.Object]) -> None:
-    """Raise InputError where a module's parts cannot be built, before anything is changed."""
-    for camera in modules:
-        _solids(collection, camera)
-
-
 def _add_parts(collection: bpy.types.Collection, camera: bpy.types.Object) -> None:
     for built in _solids(collection, camera):
         part = built.kind.upper()
@@ -145,11 +140,11 @@ def duplicate(
     neighbours and constant beyond the arc's ends; it keeps its tilt. Raises InputError, and leaves the scene as it was,
     where a module already stands in a copy's place or its shapes cannot be built.
     """
-    _require_solids(collection, modules)
     taken = [_place(o) for o in scanner.modules(collection)]
     angles = np.linspace(angle, count * angle, count)
     copies: list[tuple[bpy.types.Object, Scanner]] = []
     for camera in modules:
+        _solids(collection, camera)
         module = scanner.read_module(collection, camera)
         poses = _along_ring(collection, camera, module, angles, follow_ring)
         for pose in poses:

@@ -180,7 +180,10 @@ class Scanner(ABC):
         return self.views((1, 1)).fields(self.poses())
 
     def parts(self, construction: Any = None) -> Sequence[ModulePart]:
-        """The modules' solids for the scene and for files, built as a kind's `construction` says; none by default."""
+        """The modules' solids for the scene and for files, built as a kind's `construction` says; none by default.
+
+        A module has at most one part of each kind.
+        """
         return ()
 
     def rings(self) -> NDArray[np.int64]:

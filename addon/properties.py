@@ -7,8 +7,6 @@ float64 numbers beside it (`module_values.py`). Names and enumeration numbers mu
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import Any
 
 import bpy
 from bpy.props import (
@@ -21,7 +19,7 @@ from bpy.props import (
     StringProperty,
 )
 
-from ..core.geometry.system import LENGTHS
+from ..core.geometry.system import PinholeSystem
 from .blender import choices, ids
 from .blender.updates import FUNCTIONS, on_edit
 from .events import event_properties
@@ -30,7 +28,8 @@ from .phantoms import phantom_properties
 from .pictures import display_properties
 from .reconstruction import reconstruction_properties
 from .runs import projection_properties
-from .scanner import column_maps
+from .scanner import column_maps, columns
+from .scanner.collimators import PARTS
 
 
 # Functions, not lambdas: Blender evaluates annotations where a lambda does not find this module's names.
@@ -46,40 +45,20 @@ _LENGTH_MODES = [
     ("FROM_ROI", "From ROI", "l follows b, d, Ld and R: the field of view is tangent to the ROI sphere", 0),
     ("TYPED", "Typed", "l stays as it was typed", 1),
 ]
-_MAY_BE_ZERO = ("pinhole_diameter", "detector_thickness")  # while they are typed; of the others a picture is drawn
-_SHORT = {"pinhole_diameter": "Hole", "detector_thickness": "Depth", "roi_radius": "ROI"}
-LABELS = {
-    name: f"{_SHORT.get(name, name.split('_')[-1].capitalize())} {text.partition(':')[0]}"
-    for name, text in LENGTHS.items()
-}
-"""The lengths' names, short enough for the sidebar: "Hole d"."""
 _SEES_ROI = 1 - 1e-6  # of R: an `l` from the ROI sees R up to rounding
 
 
-def _lengths(edited: Callable[[str], Any], suffix: str = "") -> dict[str, Any]:
-    """Properties for d, l, Ld, Td and R, with the callback that `edited` gives for each name."""
-    return {
-        name: FloatProperty(
-            name=name.replace("_", " ").title().replace("Roi", "ROI"),
-            description=f"{text}, in mm{suffix}",
-            min=0.0 if name in _MAY_BE_ZERO else 1e-3,
-            step=10,
-            precision=3,
-            unit="NONE",
-            update=edited(name),
-        )
-        for name, text in LENGTHS.items()
-    }
-
-
 class ModuleProperties(bpy.types.PropertyGroup):
-    """`Object.mphdrr_module`: one pinhole module, on its camera object; other parts carry `part` and `number` only."""
+    """`Object.mphdrr_module`: one module, on its camera object; other parts carry `part` and `number` only.
+
+    It also has a property for each typed column of any kind of scanner that is no coordinate (`add_columns`).
+    """
 
     is_module: BoolProperty(name="Is Module", options={"HIDDEN"})
     part: EnumProperty(
         name="Part", description="What the object is in a scanner", options={"HIDDEN"},
         default="NONE",
-        items=choices.items(choices.PARTS, ((part, part.capitalize(), "") for part in ids.PARTS)),
+        items=choices.items(choices.PARTS, ((part, part.capitalize(), "") for part in dict.fromkeys((*ids.PARTS, *PARTS)))),
     )  # fmt: skip
     visible: BoolProperty(
         name="Visible", description="Show the module, its collimator and its crystal, also in renders",
@@ -116,16 +95,14 @@ class ModuleProperties(bpy.types.PropertyGroup):
         return not self.problem and self.roi_seen >= _SEES_ROI * self.roi_radius
 
 
-ModuleProperties.__annotations__ |= _lengths(
-    lambda name: on_edit("length" if name == "collimator_length" else "module")
-)
-
-
 class ScannerProperties(bpy.types.PropertyGroup):
-    """One scanner; lives on its collection as `Collection.mphdrr_scanner`."""
+    """One scanner; lives on its collection as `Collection.mphdrr_scanner`. It has the modules' properties, too."""
 
     is_scanner: BoolProperty(name="Is Scanner", options={"HIDDEN"})
     is_ring: BoolProperty(name="Is Ring", description="The collection is a ring of a scanner", options={"HIDDEN"})
+    kind: StringProperty(
+        name="Kind", description="What kind of scanner it is", default=PinholeSystem.kind, options={"HIDDEN"}
+    )
     scanner_name: StringProperty(name="Scanner Name", description="Its name in the import: the same name replaces it")
     workbook: StringProperty(name="Workbook", description="File last read from or written to", subtype="FILE_PATH")
     sha256: StringProperty(name="SHA-256", description="Checksum of the workbook when it was read")
@@ -160,10 +137,10 @@ class ScannerProperties(bpy.types.PropertyGroup):
     keep_aimed: BoolProperty(
         name="Keep Aimed",
         description="Turn a module that is moved so that it keeps looking at the isocentre. One that is only turned "
-        "stays turned, and is marked",
+        "stays turned: it is tilted",
         default=True, update=on_edit("scanner"),
     )  # fmt: skip
-    # With the five lengths below: the first module's numbers. `mixed` names those that differ between modules.
+    # With the modules' properties: the first module's values. `mixed` names those that differ between modules.
     length_mode: EnumProperty(
         name="Length", description="Where the collimators' lengths come from. Changing it sets all modules",
         items=_LENGTH_MODES, default="TYPED", update=on_edit("all_modules", "length_mode"),
@@ -179,11 +156,6 @@ class ScannerProperties(bpy.types.PropertyGroup):
     )
     untidy: StringProperty(name="Untidy", description="Copied cameras and parts without a camera, in words")
     findings: StringProperty(name="Findings", description="What the last check of the geometry found, JSON")
-
-
-ScannerProperties.__annotations__ |= _lengths(
-    lambda name: on_edit("all_modules", name), ". Changing it sets all modules"
-)
 
 
 def _is_scanner(self: GeometryProperties, collection: bpy.types.Collection) -> bool:
@@ -225,6 +197,19 @@ _ROOMS = (
     phantom_properties, projection_properties, reconstruction_properties, display_properties,
     perspective_properties, event_properties, column_maps,
 )  # fmt: skip
+_OWN = {cls: dict(cls.__annotations__) for cls in (ModuleProperties, ScannerProperties)}
+
+
+def add_columns() -> None:
+    """Give modules and scanners the properties of the typed columns that there are now, before they are registered."""
+    known = columns.known_columns()
+    for cls, edited, suffix in (
+        (ModuleProperties, lambda name: on_edit("length" if callable(known[name].blank) else "module"), ""),
+        (ScannerProperties, lambda name: on_edit("all_modules", name), ". Changing it sets all modules"),
+    ):
+        cls.__annotations__ = columns.declared(edited, suffix) | _OWN[cls]
+
+
 # Every property group; a group comes after those that it points to.
 CLASSES = (ModuleProperties, ScannerProperties, GeometryProperties, *(cls for room in _ROOMS for cls in room.CLASSES))
 

@@ -166,6 +166,7 @@ _registered = ExitStack()  # takes back what was registered, in reverse order
 def register(command: Callable[..., int] | None = None) -> None:
     """Register everything, or nothing if something fails; `command` is what ``blender --command mphdrr`` calls."""
     updates.FUNCTIONS.update(UPDATES)
+    properties.add_columns()
     try:
         for cls in CLASSES:
             _complete(cls)

@@ -1,19 +1,21 @@
-"""Sidebar, Geometry > Design: numbers and readouts (`following.py`) of the active module, and of all modules."""
+"""Sidebar, Geometry > Design: values and readouts (`following.py`) of the active module, and of all modules."""
 
 import json
 from collections.abc import Sequence
 
 import bpy
+import numpy as np
 from bpy.app.translations import pgettext_iface as iface
 
 from ..addon.blender import ids, jobs
 from ..addon.blender.layouts import invoking, labelled
-from ..addon.properties import LABELS
-from ..addon.scanner import following, scanner, selection
+from ..addon.scanner import columns, following, pinholes, scanner, selection
+from ..addon.scanner.module_values import Column, Kind, designed, kind_of
 from .geometry import ScannerPanel
 from .sidebar import draw_facts, draw_text
 
 _MOST_FINDINGS = 8
+_ANYWHERE = np.ones((1, 3))  # mm
 
 
 class MPHDRR_PT_design(ScannerPanel, bpy.types.Panel):
@@ -39,13 +41,14 @@ class MPHDRR_PT_design(ScannerPanel, bpy.types.Panel):
         if camera is None:
             layout.label(text="Select a module's camera", icon="INFO")
         else:
-            _draw_module(layout, camera)
+            _draw_module(layout, camera, kind_of(collection))
         row = invoking(layout.row(align=True))
         row.operator(ids.DUPLICATE_MODULES, text="Duplicate", icon="DUPLICATE")
         row.operator(ids.REMOVE_MODULES, text="Remove", icon="TRASH")
-        row = layout.row(align=True)
-        row.prop(properties, "keep_aimed", toggle=True, icon="CON_TRACKTO")
-        row.operator(ids.AIM_MODULES)
+        if kind_of(collection).aimed(_ANYWHERE) is not None:
+            row = layout.row(align=True)
+            row.prop(properties, "keep_aimed", toggle=True, icon="CON_TRACKTO")
+            row.operator(ids.AIM_MODULES)
 
 
 class MPHDRR_PT_scanner_design(ScannerPanel, bpy.types.Panel):
@@ -56,21 +59,13 @@ class MPHDRR_PT_scanner_design(ScannerPanel, bpy.types.Panel):
     def draw_scanner(self, context: bpy.types.Context, collection: bpy.types.Collection) -> None:
         layout = self.layout
         properties = collection.mphdrr_scanner
-        column = _draw_numbers(layout, properties, properties.mixed.split())
-        column.separator()
-        column.prop(properties, "plate_thickness", text="Plate (mm)")
-        column.prop(properties, "wall_thickness", text="Wall (mm)")
-        column.prop(properties, "opening_angle")
-        column.prop(properties, "edge_at")
-        column.prop(properties, "intrinsic_fwhm", text="Crystal FWHM")
-        draw_facts(
-            layout.box().split(factor=0.42),
-            ("Sensitivity", f"{properties.sensitivity:.1f} cps/MBq"),
-            ("Mean FWHM", f"{properties.resolution:.2f} mm"),
-            ("See the ROI", iface("{some} of {all} modules").format(some=properties.n_covering, all=properties.count)),
-        )
+        kind = kind_of(collection)
+        column = _draw_values(layout, properties, kind, properties.mixed.split())
+        if pinholes.has_pinholes(kind):
+            _draw_pinholes(layout, column, properties)
         layout.operator_menu_enum(ids.RENUMBER_MODULES, "order", text="Renumber", icon="LINENUMBERS_ON")
-        layout.operator(ids.CHECK_GEOMETRY, icon="CHECKMARK")
+        if pinholes.has_pinholes(kind):
+            layout.operator(ids.CHECK_GEOMETRY, icon="CHECKMARK")
         if properties.findings:
             findings = json.loads(properties.findings)
             if not findings:
@@ -81,7 +76,8 @@ class MPHDRR_PT_scanner_design(ScannerPanel, bpy.types.Panel):
                 more = iface("... and {count} more").format(count=len(findings) - _MOST_FINDINGS)
                 layout.label(text=more, icon="BLANK1")
         column = invoking(layout.column(align=True))
-        column.operator_menu_enum(ids.ADD_MAP, "quantity", text="Add Map", icon="OUTLINER_DATA_VOLUME")
+        if pinholes.has_pinholes(kind):
+            column.operator_menu_enum(ids.ADD_MAP, "quantity", text="Add Map", icon="OUTLINER_DATA_VOLUME")
         jobs.draw_job(column)
         column = invoking(layout.column(align=True))
         column.operator(ids.EXPORT_GEOMETRY, text="Export Workbook", icon="EXPORT")
@@ -90,38 +86,62 @@ class MPHDRR_PT_scanner_design(ScannerPanel, bpy.types.Panel):
         column.operator(ids.REMOVE_SCANNER, icon="TRASH")
 
 
-def _draw_module(layout: bpy.types.UILayout, camera: bpy.types.Object) -> None:
-    module = camera.mphdrr_module
-    layout.label(text=camera.name, icon="OUTLINER_OB_CAMERA")
-    _draw_numbers(layout, module, mixed=())
-    for text in (module.problem, module.finding, "" if module.aimed else "Not aimed at the isocentre"):
-        if text:
-            draw_text(layout, text)
+def _draw_pinholes(layout: bpy.types.UILayout, column: bpy.types.UILayout, properties: bpy.types.PropertyGroup) -> None:
+    """Draw how collimators are built, and the readouts of all modules together."""
+    column.separator()
+    column.prop(properties, "plate_thickness", text="Plate (mm)")
+    column.prop(properties, "wall_thickness", text="Wall (mm)")
+    column.prop(properties, "opening_angle")
+    column.prop(properties, "edge_at")
+    column.prop(properties, "intrinsic_fwhm", text="Crystal FWHM")
     draw_facts(
         layout.box().split(factor=0.42),
-        ("Distance b", f"{module.pinhole_distance:.2f} mm"),
-        ("Sensitivity", f"{module.sensitivity:.2f} cps/MBq"),
-        ("Resolution", f"{module.resolution:.2f} mm FWHM"),
-        ("Magnif. l / b", f"{module.magnification:.3f}"),
-        ("Radius seen", f"{module.roi_seen:.2f} mm"),
-        ("ROI", "seen whole" if module.sees_roi else "not seen whole"),
+        ("Sensitivity", f"{properties.sensitivity:.1f} cps/MBq"),
+        ("Mean FWHM", f"{properties.resolution:.2f} mm"),
+        ("See the ROI", iface("{some} of {all} modules").format(some=properties.n_covering, all=properties.count)),
     )
 
 
-def _draw_numbers(
-    layout: bpy.types.UILayout, numbers: bpy.types.PropertyGroup, mixed: Sequence[str]
+def _draw_module(layout: bpy.types.UILayout, camera: bpy.types.Object, kind: Kind) -> None:
+    module = camera.mphdrr_module
+    layout.label(text=camera.name, icon="OUTLINER_OB_CAMERA")
+    _draw_values(layout, module, kind, mixed=())
+    for text in (module.problem, module.finding):
+        if text:
+            draw_text(layout, text)
+    if not module.aimed:
+        draw_text(layout, "Not aimed at the isocentre", icon="INFO")
+    facts = [("Distance b", f"{module.pinhole_distance:.2f} mm")]
+    if pinholes.has_pinholes(kind):
+        facts += [
+            ("Sensitivity", f"{module.sensitivity:.2f} cps/MBq"),
+            ("Resolution", f"{module.resolution:.2f} mm FWHM"),
+            ("Magnif. l / b", f"{module.magnification:.3f}"),
+            ("Radius seen", f"{module.roi_seen:.2f} mm"),
+            ("ROI", "seen whole" if module.sees_roi else "not seen whole"),
+        ]
+    draw_facts(layout.box().split(factor=0.42), *facts)
+
+
+def _draw_values(
+    layout: bpy.types.UILayout, values: bpy.types.PropertyGroup, kind: Kind, mixed: Sequence[str]
 ) -> bpy.types.UILayout:
-    """Draw d, Ld, Td, R and l; "mixed" stands beside those that differ between modules."""
-    column = labelled(layout.column(align=True))
-    for name, label in LABELS.items():
-        if name != "collimator_length":
-            column.prop(numbers, name, text=_label(label, name in mixed))
-    column.row(align=True).prop(numbers, "length_mode", expand=True)
-    row = column.row(align=True)
-    row.enabled = numbers.length_mode == "TYPED"  # otherwise it follows the others
-    row.prop(numbers, "collimator_length", text=_label(LABELS["collimator_length"], "collimator_length" in mixed))
+    """Draw the values of a module's columns, those by formula last; "mixed" stands beside those that differ."""
+    column, last = labelled(layout.column(align=True)), designed(kind)
+    for one in kind.columns.scalars.values():
+        if one not in last:
+            column.prop(values, one.field, text=_label(one, mixed))
+    if last:
+        column.row(align=True).prop(values, "length_mode", expand=True)
+    for one in last:
+        row = column.row(align=True)
+        row.enabled = values.length_mode == "TYPED"  # otherwise it follows the others
+        row.prop(values, one.field, text=_label(one, mixed))
     return column
 
 
-def _label(text: str, is_mixed: bool) -> str:
-    return iface("{name}, mixed" if is_mixed else "{name} (mm)").format(name=iface(text))
+def _label(column: Column, mixed: Sequence[str]) -> str:
+    name = iface(columns.short_label(column))
+    if column.field in mixed:
+        return iface("{name}, mixed").format(name=name)
+    return iface("{name} (mm)").format(name=name) if column.kind == "length" else name

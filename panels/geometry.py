@@ -8,7 +8,8 @@ from bpy.app.translations import pgettext_iface as iface
 
 from ..addon.blender import ids, jobs
 from ..addon.blender.layouts import invoking, shown_where
-from ..addon.scanner import following, scanner, selection
+from ..addon.scanner import following, pinholes, scanner, selection
+from ..addon.scanner.module_values import kind_of
 from .sidebar import Folded, Sidebar, draw_facts, draw_hint, draw_text
 
 
@@ -23,10 +24,9 @@ class MPHDRR_UL_modules(bpy.types.UIList):
         row = layout.row(align=True)
         row.active = module.visible
         columns = row.row(align=True)
-        columns.alert = bool(module.problem or module.finding or not module.aimed) or not following.shows_its_field(
-            item
-        )
-        _columns(columns, item.name, f"{module.pinhole_distance:.1f}", f"{module.collimator_length:.1f}")
+        columns.alert = bool(module.problem or module.finding) or not following.shows_its_field(item)
+        length = f"{module.collimator_length:.1f}" if pinholes.has_pinholes(kind_of(data)) else ""
+        _columns(columns, item.name, f"{module.pinhole_distance:.1f}", length)
         if columns.alert:
             columns.label(text="", icon="ERROR")
         row.prop(module, "visible", text="", icon="HIDE_OFF" if module.visible else "HIDE_ON", emboss=False)
@@ -118,7 +118,7 @@ class MPHDRR_PT_modules(ScannerPanel, bpy.types.Panel):
 
         head = layout.row(align=True)
         head.active = False
-        _columns(head, "  Module", "b (mm)", "l (mm)")
+        _columns(head, "  Module", "b (mm)", "l (mm)" if pinholes.has_pinholes(kind_of(collection)) else "")
         head.label(text="", icon="BLANK1")
         head.separator(factor=2.0)  # the list's scroll bar
         layout.template_list(

@@ -30,7 +30,8 @@ from ...core.runs.resizing import resized
 from ..blender import compat, ids, jobs, storage, timers
 from ..blender.choices import items
 from ..phantoms import phantoms
-from ..scanner import collimators, following, scanner, selection
+from ..scanner import collimators, pinholes, scanner, selection
+from ..scanner.module_values import kind_of
 from ..volumes import looks, volumes
 from . import studio
 
@@ -91,9 +92,9 @@ def figure_job(
     if kind.one_module and modules is None and active is not None:
         modules = str(active.mphdrr_module.number)
     known: dict[str, Any] = {"modules": modules, "display": scene.mphdrr_display.display()}
-    if collection is not None:
+    if collection is not None and kind_of(collection) is PinholeSystem:
         known["scanner"] = scanner.read_scanner(collection)
-        known["construction"] = following.construction(collection.mphdrr_scanner)
+        known["construction"] = pinholes.construction(collection.mphdrr_scanner)
     later: dict[str, Callable[[], Any]] = {}
     if item is not None:
         pose = volumes.pose_of_object(item)

@@ -27,8 +27,7 @@ from ..blender import ids, jobs, objects
 from ..phantoms import phantoms
 from ..pictures import images
 from ..runs import runs
-from ..scanner import selection
-from ..scanner.module_values import module_numbers, system_of
+from ..scanner import scanner, selection
 from ..volumes import slices, volume_materials, volumes
 from ..volumes.stored_volumes import StoredVolume
 
@@ -229,7 +228,10 @@ def _request(context: bpy.types.Context) -> _Request:
 
 def _views(scene: bpy.types.Scene, camera: bpy.types.Object) -> Views:
     """The view of one module, with the pixels that the Projections panel asks for."""
-    return recipe_views(runs.panel_recipe(scene), system_of([module_numbers(camera)]))
+    collection = scanner.scanner_of(scene, camera)
+    if collection is None:
+        raise InputError(f"{camera.name!r} is in no scanner of the scene")
+    return recipe_views(runs.panel_recipe(scene), scanner.read_module(collection, camera))
 
 
 def _state(scene: bpy.types.Scene, item: bpy.types.Object, camera: bpy.types.Object) -> dict[str, Any]:

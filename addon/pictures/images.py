@@ -13,7 +13,7 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core import ProjectionRun, Views
+from ...core import PinholeSystem, ProjectionRun, Views
 from ...core.memory import cores
 from ...core.progress import Progress, part_of, tell
 from ...core.runs.display import Display
@@ -82,7 +82,9 @@ def storing(run: ProjectionRun, made: Pictures) -> Generator[tuple[str, int, int
     _describe(mosaic, made.drawn, numbers, run.system.rings().tolist(), run.unit, made.display)
     mosaic[_LABELS] = "\n".join(labels(run))
     arrays = {name: getattr(run.views, name).ravel().tolist() for name in _ARRAYS}
-    mosaic[_VIEWS] = arrays | {"shape": run.views.shape, "roi_radius": run.system.roi_radius.tolist()}
+    system = run.system
+    radii = system.roi_radius if isinstance(system, PinholeSystem) else np.full(len(system), system.region_radius())
+    mosaic[_VIEWS] = arrays | {"shape": run.views.shape, "roi_radius": radii.tolist()}
     return mosaic
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from mathutils import Matrix
 from numpy.typing import NDArray
 
-from ...core import PinholeSystem, ProjectionRun, Views
+from ...core import ProjectionRun
 from ..blender import ids, objects
 from ..scanner import grabbing, scanner, selection
 from . import images
@@ -38,7 +38,7 @@ def make(scene: bpy.types.Scene, run: ProjectionRun, collection: bpy.types.Colle
     cameras = {camera.mphdrr_module.number: camera for camera in scanner.modules(collection)}
     made = []
     numbers = run.system.numbers.tolist()
-    for number, field in zip(numbers, _fields(run.system, run.views), strict=True):
+    for number, field in zip(numbers, run.views.fields(run.system.poses()), strict=True):
         if number not in cameras:
             continue
         camera = cameras[number]
@@ -159,19 +159,6 @@ def _wanted(scene: bpy.types.Scene) -> list[tuple[bpy.types.Object, bool]]:
         return mode == "ALL" or camera == active or (mode == "RING" and camera.mphdrr_module.ring == ring)
 
     return [(plane, shown(plane.parent)) for plane in planes(scene) if plane.data is not None]
-
-
-def _fields(system: PinholeSystem, views: Views) -> NDArray[np.float64]:
-    """For each view x, y and distance of the picture's middle in the camera's frame, and its width and height (M, 5), mm.
-
-    Width and height are negative where the picture is upside down, as on the real detector.
-    """
-    u, v, k = np.moveaxis(system.frames(), 1, 0)
-    to_middle = views.detector_centers - views.sources
-    n_v, n_u = views.shape
-    width, height = n_u * np.sum(views.u_steps * u, axis=1), n_v * np.sum(views.v_steps * v, axis=1)
-    places = [-np.sum(to_middle * u, axis=1), np.sum(to_middle * v, axis=1), np.sum(to_middle * k, axis=1)]
-    return np.stack([*places, width, height], axis=1)
 
 
 def _set_background(camera: bpy.types.Camera, field: NDArray[np.float64], picture: bpy.types.Image) -> None:

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core import InputError, PinholeSystem, ProjectionRun, Recipe, Views, Volume
+from ...core.geometry.scanner import Scanner
 from ...core.memory import readable_size
 from ...core.runs.display import Display
 from ...core.runs.mosaic import as_seen, sized, totals
@@ -25,7 +26,6 @@ from ..blender import jobs, timers, windows
 from ..phantoms import phantoms
 from ..pictures import planes
 from ..scanner import scanner, selection
-from ..scanner.module_values import module_numbers, off_aim, system_of
 from ..volumes import volumes
 from ..volumes.stored_volumes import moved
 from ..volumes.vdb import read_vdb
@@ -53,7 +53,7 @@ class Request:
     """What a preview is to be made from."""
 
     recipe: Recipe  # the panel's
-    system: PinholeSystem  # the active module alone
+    system: Scanner  # the active module alone
     volume: Source
     mu: Source | None  # what attenuates
     display: Display
@@ -81,12 +81,12 @@ class Preview:
 def request(context: bpy.types.Context) -> Request:
     """What the context's scene asks for; raises InputError where nothing can be previewed."""
     scene = context.scene
-    scanner.required_scanner(scene)
+    collection = scanner.required_scanner(scene)
     recipe = runs.panel_recipe(scene).updated({"system.modules": None})
     camera = selection.active_module(context)
     if camera is None:
         raise InputError("no module is active: select its camera, or choose it in the Modules panel")
-    system = system_of([module_numbers(camera)])
+    system = scanner.read_module(collection, camera)
     model = recipe_model(recipe, system)
     item, mu_item = rendering.sources(context, recipe, model)
     chosen = [item] if mu_item is None else [item, mu_item]
@@ -96,17 +96,16 @@ def request(context: bpy.types.Context) -> Request:
         most = readable_size(MOST_KEPT)
         raise InputError(f"{names}: {readable_size(kept)} of voxels; a live preview keeps at most {most} in memory")
     module = camera.mphdrr_module
-    lines = [
-        f"Preview: {item.name} in {camera.name}",
-        f"At the isocentre {module.sensitivity:.2f} cps/MBq, {module.resolution:.2f} mm FWHM",
-    ]
+    lines = [f"Preview: {item.name} in {camera.name}"]
+    if isinstance(system, PinholeSystem):
+        lines.append(f"At the isocentre {module.sensitivity:.2f} cps/MBq, {module.resolution:.2f} mm FWHM")
     for one in chosen:
         if (phantom := phantoms.outdated(one)) is not None:
             lines.append(f"{phantom.name} as it was last built: Update Phantom shows the new one")
-    if off_aim([camera]):
-        lines.append("Not aimed at the isocentre, but calculated as if aimed")
+    if not module.aimed:
+        lines.append("Not aimed at the isocentre")
     shown = scene.mphdrr_display
-    distance = recipe["detector.magnification"] * float(system.collimator_length[0])
+    distance = float(recipe_views(recipe, system).fields(system.poses())[0, 2])
     share = None if shown.planes == "NONE" else planes.share_of_way(shown, module, distance)
     mu = None if mu_item is None else volumes.source(mu_item)
     return Request(recipe, system, volumes.source(item), mu, shown.display(), share, tuple(lines))
@@ -171,7 +170,7 @@ def _corners(views: Views, shape: tuple[int, ...], share: float) -> NDArray[np.f
 
 def _words(asked: Request) -> tuple[str, ...]:
     """A request in words that two have in common exactly if they ask for the same."""
-    module = [getattr(asked.system, name).tolist() for name in _OF_MODULE]
+    module = [asked.system.numbers, *asked.system.values().values()]
     sources = [(str(path), pose.tolist()) for path, pose in filter(None, (asked.volume, asked.mu))]
     return tuple(map(repr, (dict(asked.recipe.given), module, sources, asked.display, asked.share, asked.lines)))
 

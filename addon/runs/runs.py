@@ -14,7 +14,7 @@ import bpy
 import numpy as np
 
 from ...core.errors import InputError, refusing
-from ...core.geometry.system import LENGTHS, PinholeSystem
+from ...core.geometry.scanner import Scanner
 from ...core.memory import readable_size
 from ...core.runs.recipe import Recipe, fitting_recipe
 from ...core.runs.run import ProjectionRun
@@ -23,12 +23,13 @@ from ..blender import ids, objects, storage, timers, windows
 from ..blender.decimals import typed
 from ..phantoms import phantoms
 from ..scanner import following, scanner
-from ..scanner.module_values import FROM_ROI, numbers_of
+from ..scanner.module_values import FROM_ROI, designed, kind_of, readings
 from ..scanner.scanner_parts import modules_text
 from ..volumes import volumes
 from .projection_properties import OPENING_ANGLE, settings_recipe
 
 UNKNOWN = "made without this scene, or by an earlier version: its state is not known"
+_KEPT = ("x1", "y1", "z1", "d", "l", "Ld", "Td", "R")  # of a module in a state of earlier versions
 _MOST = 3  # lines of differences
 _PRECISION = float(np.finfo(np.float32).eps)
 _REST = 0.3  # s after a change until the runs are compared with the scene
@@ -43,16 +44,14 @@ _looked: dict[str, list[str]] = {}  # by scene: the lines that its panels show
 
 
 def state_of(
-    system: PinholeSystem, recipe: Recipe, item: bpy.types.Object | None, mu: bpy.types.Object | None
+    system: Scanner, recipe: Recipe, item: bpy.types.Object | None, mu: bpy.types.Object | None
 ) -> dict[str, Any]:
     """What a run of `system` as `recipe` says is made from: the objects of its volume and attenuation.
 
     A measured run has no volume (None): only its scanner can differ from the scene's.
     """
-    lengths = [getattr(system, name).tolist() for name in LENGTHS]
-    numbers = [[*center, *own] for center, *own in zip(system.centers.tolist(), *lengths, strict=True)]
     return {
-        "modules": dict(zip(map(str, system.numbers.tolist()), numbers, strict=True)),
+        "modules": _values_of(system),
         "volume": item and _volume_state(item),
         "mu": mu and _volume_state(mu),
         "settings": _settings(recipe),
@@ -231,47 +230,61 @@ def _of_modules(collection: bpy.types.Collection | None, old: Mapping[str, Any])
     if collection is None:
         yield "the scanner is gone"
         return
-    found = scanner.modules(collection)
-    now_all = numbers_of(found, objects.world_matrices(found))
-    modules = {str(now.number): (camera, now) for camera, now in zip(found, now_all, strict=True)}
-    moved: list[int] = []
-    changed: dict[int, dict[str, tuple[float, float]]] = {}
-    for number, values in old["modules"].items():
-        if number not in modules:
-            continue
-        camera, now = modules[number]
-        is_moved = not all(map(_equal, values[:3], now.center.tolist()))
-        if is_moved:
-            moved.append(int(number))
-        other = {
-            name: (value, getattr(now, name))
-            for name, value in zip(LENGTHS, values[3:], strict=True)
-            if not _equal(value, getattr(now, name))
-        }
-        follows = camera.mphdrr_module.length_mode == FROM_ROI and (is_moved or len(other) > 1)
-        if follows:
-            other.pop("collimator_length", None)
-        if other:
-            changed[int(number)] = other
-    count = len(modules)
-    if moved:
-        yield f"{_modules(moved, count)} moved"
-    for name, text in LENGTHS.items():
-        pairs = {number: values[name] for number, values in changed.items() if name in values}
-        if pairs:
-            first, *others = set(pairs.values())
-            what = "changed" if others else _now(*first, "mm")
-            yield f"{_modules(list(pairs), count)}: {text.partition(':')[0]} {what}"
-    gone = [int(number) for number in old["modules"] if number not in modules]
+    kind, found = kind_of(collection), scanner.modules(collection)
+    count, modes = len(found), {str(o.mphdrr_module.number): o.mphdrr_module.length_mode for o in found}
+    now: dict[str, dict[str, Any]] = {}
+    for _, system in readings(kind, found, objects.world_matrices(found)):
+        if isinstance(system, InputError):
+            yield str(system)
+        else:
+            now |= _values_of(system)
+    changed: dict[str, dict[int, tuple[Any, Any]]] = {}  # by column, then by module
+    follow = {column.name for column in designed(kind)}
+    for number in old["modules"].keys() & now.keys():
+        pairs = _changed(old["modules"][number], now[number])
+        if modes[number] == FROM_ROI and len(pairs) > 1:
+            pairs = {name: pair for name, pair in pairs.items() if name not in follow}
+        for name, pair in pairs.items():
+            changed.setdefault(name, {})[int(number)] = pair
+    for verb, what in (("moved", "length"), ("turned", "angle")):
+        axes = [name for name in changed if kind.columns[name].axis is not None and kind.columns[name].kind == what]
+        numbers = sorted({number for name in axes for number in changed[name]})
+        if numbers:
+            yield f"{_modules(numbers, count)} {verb}"
+    for column in kind.columns.scalars.values():
+        pairs_of = changed.get(column.name, {})
+        if pairs_of:
+            (old_value, new_value), *others = set(pairs_of.values())
+            unit, factor = next(iter(column.units.items()))
+            if not column.is_text:
+                old_value, new_value = old_value / factor, new_value / factor
+            text = "changed" if others else _now(old_value, new_value, unit)
+            yield f"{_modules(sorted(pairs_of), count)}: {column.name} {text}"
+    gone = [int(number) for number in old["modules"] if number not in modes]
     if gone:
         yield f"{_modules(gone, count)} {'are' if len(gone) > 1 else 'is'} gone"
-    new = [] if "system.modules" in old["settings"] else [int(n) for n in modules if n not in old["modules"]]
+    new = [] if "system.modules" in old["settings"] else [int(n) for n in modes if n not in old["modules"]]
     if new:
         yield f"{_modules(new, count)} added"
 
 
-def _equal(old: float, new: float) -> bool:
-    """Whether two numbers are one in float64, up to the rounding of other machines and of several numbers at once."""
+def _values_of(system: Scanner) -> dict[str, dict[str, Any]]:
+    """Number of each module -> its values by column, as JSON holds them."""
+    values = {name: column.tolist() for name, column in system.values().items()}
+    rows = (dict(zip(values, row, strict=True)) for row in zip(*values.values(), strict=True))
+    return dict(zip(map(str, system.numbers.tolist()), rows, strict=True))
+
+
+def _changed(old: Any, now: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
+    """The values of a module that are not as they were, by column; earlier versions kept a list of `_KEPT`."""
+    known = old if isinstance(old, dict) else dict(zip(_KEPT, old, strict=True))
+    return {name: (known[name], now[name]) for name in known if name in now and not _equal(known[name], now[name])}
+
+
+def _equal(old: Any, new: Any) -> bool:
+    """Whether two values are one: numbers in float64, up to the rounding of other machines and of several at once."""
+    if isinstance(old, str) or isinstance(new, str):
+        return bool(old == new)
     return math.isclose(old, new, rel_tol=1e-12, abs_tol=1e-12)
 
 

@@ -1,48 +1,91 @@
-"""Camera datablocks that see what a module's virtual detector sees.
+"""Camera datablocks that see what a module's view shows.
 
 A Blender camera is right-handed with X right, Y up and looks along -Z; seen from the pinhole, +v is up and +u is
 to the LEFT. So a module's camera has X = -u, Y = v, Z = -k.
 """
 
+from ast import literal_eval
+from functools import lru_cache
+from typing import Any
+
 import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core.geometry.frames import module_poses
-from ...core.geometry.system import PinholeSystem
-
+_KEY = "mphdrr_solid"  # custom property of a camera: the field that it was set to, as `_text`
 _CAMERA_FROM_MODULE = np.diag([-1.0, 1.0, -1.0, 1.0])
 _ROUNDING = 1e-5  # of a field of view
 _SMALLEST = 1.0  # Blender silently clamps Camera.lens and Camera.sensor_width below this
 
-
-def camera_matrices(centers: NDArray[np.float64]) -> NDArray[np.float64]:
-    """World matrices (M, 4, 4) of cameras at pinhole `centers` (M, 3), mm, aimed at the isocentre."""
-    return module_poses(centers) @ _CAMERA_FROM_MODULE
+Field = tuple[float, ...]
+"""x, y and distance of the middle of what a camera sees, its width and height, in any unit: only their ratios count."""
 
 
-def set_field_of_view(camera: bpy.types.Camera, width: float, distance: float) -> None:
-    """Make the picture `width` wide at `distance` from the pinhole (any unit: only their ratio counts)."""
-    scale = max(1.0, _SMALLEST / width, _SMALLEST / distance)
+def matrices_of(poses: NDArray[np.float64]) -> NDArray[np.float64]:
+    """World matrices (M, 4, 4) of the cameras of modules at `poses` (M, 4, 4)."""
+    return poses @ _CAMERA_FROM_MODULE
+
+
+def poses_of(matrices: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The modules' poses (M, 4, 4) whose cameras have these world matrices (M, 4, 4), but for their scale."""
+    poses = matrices @ _CAMERA_FROM_MODULE
+    poses[:, :3, :3] /= np.linalg.norm(poses[:, :3, :3], axis=1, keepdims=True)
+    return poses
+
+
+def set_field_of_view(camera: bpy.types.Camera, field: Field) -> None:
+    """Make a camera see just that field."""
+    x, y, distance, width, height = field
+    width, height = abs(width), abs(height)  # an image may be upside down
+    scale = max(1.0, *(_SMALLEST / size for size in (width, height, distance)))
     camera.type = "PERSP"
     camera.sensor_fit = "HORIZONTAL"
-    camera.sensor_width = width * scale
+    camera.sensor_width, camera.sensor_height = width * scale, height * scale
     camera.lens_unit = "MILLIMETERS"
     camera.lens = distance * scale
-    camera.shift_x = camera.shift_y = 0.0
+    camera.shift_x, camera.shift_y = x / width, y / width
+    camera[_KEY] = _text(field)
 
 
-def has_field_of_view(camera: bpy.types.Camera, width: float, distance: float) -> bool:
-    """Whether the picture is as `set_field_of_view` makes it."""
-    straight = camera.type == "PERSP" and camera.sensor_fit == "HORIZONTAL" and camera.shift_x == camera.shift_y == 0.0
-    return straight and abs(camera.sensor_width / camera.lens * distance / width - 1.0) < _ROUNDING
+def has_field_of_view(camera: bpy.types.Camera) -> bool:
+    """Whether a camera's picture is as `set_field_of_view` made it."""
+    if _KEY not in camera:
+        return True
+    x, y, distance, width, _ = field_of(camera)
+    now = camera.sensor_width / camera.lens * distance / abs(width) - 1.0, camera.shift_x, camera.shift_y
+    return (
+        camera.type == "PERSP"
+        and camera.sensor_fit == "HORIZONTAL"
+        and all(abs(a - b) < _ROUNDING for a, b in zip(now, (0.0, x / abs(width), y / abs(width)), strict=True))
+    )
 
 
-def set_up_camera(camera: bpy.types.Camera, system: PinholeSystem, m: int) -> None:
-    """Set up camera data for module `m`, with the field of view of the default virtual detector."""
-    set_field_of_view(camera, float(system.detector_side[m]), float(system.collimator_length[m]))
-    b, radius = float(system.pinhole_distance[m]), float(system.roi_radius[m])
-    camera.clip_start = min(1.0, 0.01 * b)
-    camera.clip_end = 20.0 * (b + radius)
-    camera.display_size = 0.3 * float(system.detector_side[m])
+def is_set_to(camera: bpy.types.Camera, field: Field) -> bool:
+    """Whether a camera was last set to that field."""
+    return bool(camera.get(_KEY) == _text(field))
+
+
+def field_of(camera: bpy.types.Camera) -> Field:
+    """The field that a camera was last set to."""
+    return _field(camera[_KEY])
+
+
+def _text(field: Field) -> str:
+    """A field as cameras keep it: distance and side of a square one in the middle, as all were once; else all of it."""
+    x, y, distance, width, height = field
+    return repr((distance, width) if x == y == 0 and width == height else tuple(field))
+
+
+@lru_cache(maxsize=4096)
+def _field(text: str) -> Field:
+    numbers: Any = literal_eval(text)
+    return numbers if len(numbers) > 2 else (0.0, 0.0, *numbers, numbers[1])
+
+
+def set_up_camera(camera: bpy.types.Camera, field: Field, distance: float) -> None:
+    """Set up the camera data of a module that sees `field` from `distance` to the isocentre, mm."""
+    set_field_of_view(camera, field)
+    camera.clip_start = min(1.0, 0.01 * distance)
+    camera.clip_end = 40.0 * distance
+    camera.display_size = 0.3 * abs(field[3])
     camera.passepartout_alpha = 0.9

@@ -1,29 +1,18 @@
-"""How modules look: the meshes of collimators, crystals and the ROI sphere, and their colours."""
+"""How modules look: the meshes of their parts and of the ROI sphere, and their colours."""
 
 import bmesh
 import bpy
 import numpy as np
 
 from ...core.geometry import part_colors
-from ...core.geometry.collimator import Collimator, Construction
-from ...core.geometry.module_parts import Solid, check_watertight, collimator_solid, crystal_solid
+from ...core.geometry.module_parts import Solid, check_watertight
 from ..blender import compat
-from .module_values import ModuleNumbers
 
 # By `Object.mphdrr_module.part`: the material's name, and its colour and gloss. Exported solids look the same.
-LOOKS = {
-    "COLLIMATOR": ("mphDRR collimator", part_colors.LOOKS["collimator"]),
-    "CRYSTAL": ("mphDRR crystal", part_colors.LOOKS["crystal"]),
-    "ROI": ("mphDRR ROI", part_colors.Look((0.25, 0.62, 1.0, 0.12), metallic=0.0, roughness=0.5)),  # pale blue
-}
-
-
-def part_solid(part: str, numbers: ModuleNumbers, construction: Construction) -> Solid:
-    """The solid of a module's "COLLIMATOR" or "CRYSTAL"; raises `InputError` where it cannot be built."""
-    l, side = numbers.collimator_length, numbers.detector_side
-    if part == "COLLIMATOR":
-        return collimator_solid(Collimator(numbers.pinhole_diameter, l, side, construction))
-    return crystal_solid(l, side, numbers.detector_thickness)
+LOOKS = {kind.upper(): (f"mphDRR {kind}", look) for kind, look in part_colors.LOOKS.items()}
+PARTS = tuple(LOOKS)
+"""What hangs on a module's camera."""
+LOOKS["ROI"] = "mphDRR ROI", part_colors.Look((0.25, 0.62, 1.0, 0.12), metallic=0.0, roughness=0.5)  # pale blue
 
 
 def new_mesh(name: str, solid: Solid, material: bpy.types.Material) -> bpy.types.Mesh:
@@ -33,6 +22,13 @@ def new_mesh(name: str, solid: Solid, material: bpy.types.Material) -> bpy.types
     reshape_mesh(mesh, solid)
     mesh.materials.append(material)
     return mesh
+
+
+def has_shape(mesh: bpy.types.Mesh, solid: Solid) -> bool:
+    """Whether the points of a mesh are those of `solid`."""
+    points = np.empty(3 * len(mesh.vertices), np.float32)
+    mesh.attributes["position"].data.foreach_get("vector", points)
+    return np.array_equal(points, solid[0].astype(np.float32).ravel())
 
 
 def reshape_mesh(mesh: bpy.types.Mesh, solid: Solid) -> None:

@@ -15,7 +15,7 @@ from mathutils import Matrix
 from numpy.typing import NDArray
 
 from ..blender import objects
-from . import following
+from . import collimators, following
 
 _HOME = "mphdrr_home"  # custom property of a plane: its place on its camera (4, 4)
 _START = "mphdrr_start"  # custom property of a part that is dragged: world matrix (4, 4) of its camera when that began
@@ -30,7 +30,7 @@ def place(item: bpy.types.Object, matrix: Matrix) -> None:
 
 def is_part(item: bpy.types.Object) -> bool:
     """Whether a module is moved by it."""
-    return item.mphdrr_module.part in following.PARTS or _HOME in item
+    return item.mphdrr_module.part in collimators.PARTS or _HOME in item
 
 
 def is_dragging() -> bool:
@@ -80,7 +80,7 @@ def carry(items: Iterable[bpy.types.Object], dragging: bool) -> set[bpy.types.Ob
 
 
 def finish(item: bpy.types.Object) -> None:
-    """Of a part that was dragged: its camera is where the last motion led it, and the part at its place on it."""
+    """End the drag of a part: its camera goes where the last motion led it, and the part to its place on it."""
     carry([item], dragging=False)
     put_back(item)
 

@@ -49,8 +49,8 @@ def _follow(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph, aim: bool) -
         return
     moved |= _carry(off)
     for collection in _local(scanner.scanners(scene)):
-        found = scanner.modules(collection)
-        following.refresh(collection, found if structure else [camera for camera in found if camera in moved], aim)
+        own = (camera for camera in moved if collection.all_objects.get(camera.name) == camera)
+        following.refresh(collection, scanner.modules(collection) if structure else list(own), aim)
         if structure:
             _look_for_copies(collection)
 

@@ -38,7 +38,7 @@ def mapping(
     with `only_roi`, without what lies outside the ROI sphere. The scanner is by default that of the panels.
     """
     collection = collection or scanner.required_scanner(scene)
-    system = scanner.read_scanner(collection)
+    system = scanner.read_pinholes(collection)
     grid = Grid.centered((voxels,) * 3, (side or 2 * float(system.roi_radius.max())) / voxels)
     require(_BYTES * grid.n_voxels, f"a map of {voxels}^3 voxels")
     name, folder, owner = _name(quantity), storage.folder(), collection.name

@@ -10,13 +10,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core.errors import InputError
+from ...core.geometry.frames import affine_matrix, rotations
+from ...core.geometry.module_parts import ModulePart
 from ...core.geometry.ring_fits import ring_order
-from ...core.recording import recorded_warnings
+from ...core.geometry.scanner import Scanner
+from ...core.geometry.system import PinholeSystem
 from ..blender import ids, objects
 from ..blender.updates import FUNCTIONS
-from . import cameras, collimators, following, scanner
-from .following import PARTS
-from .module_values import add_module, module_numbers
+from . import cameras, collimators, following, pinholes, scanner
+from .collimators import PARTS
+from .module_values import imported_module, kind_of, remember, with_design
 from .scanner_parts import clear, new_part, parts_and_others
 
 _OURS = re.compile(r"(Module|Collimator|Crystal) \d+(\.\d+)?")  # a name that the extension gave
@@ -35,7 +38,7 @@ def copied_cameras(collection: bpy.types.Collection) -> list[bpy.types.Object]:
 
 
 def orphan_parts(collection: bpy.types.Collection) -> list[bpy.types.Object]:
-    """Collimators and crystals whose camera was deleted."""
+    """Parts whose camera was deleted."""
     return [
         item
         for item in collection.all_objects
@@ -45,9 +48,10 @@ def orphan_parts(collection: bpy.types.Collection) -> list[bpy.types.Object]:
 
 
 def bare_cameras(collection: bpy.types.Collection) -> list[bpy.types.Object]:
-    """Modules with neither collimator nor crystal: copies whose original was deleted."""
+    """Modules without parts, of a kind that has some: copies whose original was deleted."""
     parts = following.parts_of(collection, scanner.modules(collection))
-    return [camera for camera, own in parts.items() if not own]
+    bare = [camera for camera, own in parts.items() if not own]
+    return bare if bare and kind_of(collection).parts is not Scanner.parts else []
 
 
 def untidy_text(collection: bpy.types.Collection) -> str:
@@ -68,7 +72,8 @@ def tidy(collection: bpy.types.Collection) -> tuple[list[int], int]:
     Returns the new modules' numbers, and how many parts were removed. Where a shape cannot be built nothing is changed.
     """
     copied, orphans, numbers = copied_cameras(collection), orphan_parts(collection), []
-    _require_solids(collection, [*copied, *bare_cameras(collection)])
+    for camera in (*copied, *bare_cameras(collection)):
+        _solids(collection, camera)  # refuses what cannot be, before anything is changed
     objects.remove_objects(orphans)
     for camera in copied:
         adopt(collection, camera)
@@ -81,15 +86,16 @@ def tidy(collection: bpy.types.Collection) -> tuple[list[int], int]:
     return numbers, len(orphans)
 
 
-def adopt(
-    collection: bpy.types.Collection, camera: bpy.types.Object, center: NDArray[np.float64] | None = None
-) -> None:
-    """Make the copy of a module's camera a module of its own, with its pinhole at `center` (3,), mm, or where it stands."""
+def adopt(collection: bpy.types.Collection, camera: bpy.types.Object, module: Scanner | None = None) -> None:
+    """Make the copy of a module's camera a module of its own: `module`, or what its place and values make of it."""
     found = [o for o in scanner.modules(collection) if o != camera]
     number = max(o.mphdrr_module.number for o in found) + 1
     if not following.parts_of(collection, [camera])[camera]:
         _add_parts(collection, camera)
-    add_module(camera, number, max(o.mphdrr_module.index for o in found) + 1, center)
+    camera.mphdrr_module.number = number
+    remember([camera], module or _read(collection, camera))
+    camera.mphdrr_module.number, camera.mphdrr_module.added = number, True
+    camera.mphdrr_module.index = max(o.mphdrr_module.index for o in found) + 1
     camera.name = ids.module_name(number, len(found) + 1)
     if camera.data.users > 1:
         camera.data = camera.data.copy()
@@ -100,20 +106,25 @@ def adopt(
             part.data.name = part.name
 
 
-def _require_solids(collection: bpy.types.Collection, modules: Sequence[bpy.types.Object]) -> None:
-    """Raise InputError where a module's parts cannot be built, before anything is changed."""
-    for camera in modules:
-        construction = following.construction(collection.mphdrr_scanner)
-        for part in PARTS:
-            collimators.part_solid(part, module_numbers(camera), construction)
+def _read(collection: bpy.types.Collection, camera: bpy.types.Object) -> Scanner:
+    """A module as it stands now, or, while that is impossible, as it was imported."""
+    try:
+        return scanner.read_module(collection, camera)
+    except InputError:
+        return imported_module(kind_of(collection), camera)
+
+
+def _solids(collection: bpy.types.Collection, camera: bpy.types.Object) -> Sequence[ModulePart]:
+    """A module's parts; raises InputError where they cannot be built."""
+    construction = pinholes.construction(collection.mphdrr_scanner, kind_of(collection))
+    return _read(collection, camera).parts(construction)
 
 
 def _add_parts(collection: bpy.types.Collection, camera: bpy.types.Object) -> None:
-    construction = following.construction(collection.mphdrr_scanner)
-    for part in PARTS:
+    for built in _solids(collection, camera):
+        part = built.kind.upper()
         name = ids.part_name(camera.name, part)
-        solid = collimators.part_solid(part, module_numbers(camera), construction)
-        item = new_part(camera, part, name, collimators.new_mesh(name, solid, collimators.part_material(part)))
+        item = new_part(camera, part, name, collimators.new_mesh(name, built.solid, collimators.part_material(part)))
         item.hide_viewport, item.hide_render = camera.hide_viewport, camera.hide_render
         for home in camera.users_collection:
             home.objects.link(item)
@@ -125,55 +136,71 @@ def duplicate(
     """Make `count` copies of each module, `angle` radians apart about the world's z axis; returns their camera objects.
 
     With `follow_ring` a copy's z and distance from the z axis are those of the ring at its azimuth, linear between
-    neighbours and constant beyond the arc's ends. Raises InputError, and leaves the scene as it was, where a module
-    already stands in a copy's place or its shapes cannot be built.
+    neighbours and constant beyond the arc's ends; it keeps its tilt. Raises InputError, and leaves the scene as it was,
+    where a module already stands in a copy's place or its shapes cannot be built.
     """
-    _require_solids(collection, modules)
-    taken = [module_numbers(o).center for o in scanner.modules(collection)]
-    places = [
-        (camera, place)
-        for camera in modules
-        for place in _along_ring(collection, camera, np.linspace(angle, count * angle, count), follow_ring)
-    ]
-    for camera, place in places:
-        if np.linalg.norm(np.array(taken) - place, axis=1).min() < 1e-3:
-            raise InputError(
-                f"a copy of module {camera.mphdrr_module.number} would stand in the place of another module: "
-                "choose another angle or count"
-            )
-        taken.append(place)
+    taken = [_place(o) for o in scanner.modules(collection)]
+    angles = np.linspace(angle, count * angle, count)
+    copies: list[tuple[bpy.types.Object, Scanner]] = []
+    for camera in modules:
+        _solids(collection, camera)
+        module = scanner.read_module(collection, camera)
+        poses = _along_ring(collection, camera, module, angles, follow_ring)
+        for pose in poses:
+            if np.linalg.norm(np.array(taken) - pose[:3, 3], axis=1).min() < 1e-3:
+                raise InputError(
+                    f"a copy of module {camera.mphdrr_module.number} would stand in the place of another module: "
+                    "choose another angle or count"
+                )
+            taken.append(pose[:3, 3])
+            copies.append((camera, with_design(camera, module.at_poses(pose[None]))))
     made = []
-    for camera, place in places:
+    for camera, module in copies:
         copy = camera.copy()
         copy.data = camera.data.copy()
         copy.animation_data_clear()
         for home in camera.users_collection:
             home.objects.link(copy)
-        objects.set_world_matrix(copy, cameras.camera_matrices(place[None])[0])
-        adopt(collection, copy, place)
+        objects.set_world_matrix(copy, cameras.matrices_of(module.poses())[0])
+        adopt(collection, copy, module)
         made.append(copy)
     following.refresh(collection)
     return made
 
 
+def _place(camera: bpy.types.Object) -> NDArray[np.float64]:
+    return objects.world_matrix(camera)[:3, 3]
+
+
 def _along_ring(
-    collection: bpy.types.Collection, camera: bpy.types.Object, angles: NDArray[np.float64], follow_ring: bool
+    collection: bpy.types.Collection,
+    camera: bpy.types.Object,
+    module: Scanner,
+    angles: NDArray[np.float64],
+    follow_ring: bool,
 ) -> NDArray[np.float64]:
-    """Places (N, 3), mm, at `angles` (N,) about z from a module."""
-    x, y, height = module_numbers(camera).center
+    """Poses (N, 4, 4) at `angles` (N,) about z from a module's, turned as the direction to the isocentre is."""
+    pose = module.poses()[0]
+    x, y, height = pose[:3, 3]
     azimuth, radius = np.arctan2(y, x), np.hypot(x, y)
     if follow_ring:
-        in_ring = [o for o in scanner.modules(collection) if o.mphdrr_module.ring == camera.mphdrr_module.ring]
-        ring = np.array([module_numbers(o).center for o in in_ring])
+        ring = [_place(o) for o in scanner.modules(collection) if o.mphdrr_module.ring == camera.mphdrr_module.ring]
+        places = np.array(ring)
         # Azimuths relative to the module, so that an arc across +-pi stays in one piece.
-        others = _wrapped(np.arctan2(ring[:, 1], ring[:, 0]) - azimuth)
+        others = _wrapped(np.arctan2(places[:, 1], places[:, 0]) - azimuth)
         order = np.argsort(others)
         radius, height = (
             np.interp(_wrapped(angles), others[order], values[order])
-            for values in (np.hypot(*ring[:, :2].T), ring[:, 2])
+            for values in (np.hypot(*places[:, :2].T), places[:, 2])
         )
-    turned = azimuth + angles
-    return np.column_stack(np.broadcast_arrays(radius * np.cos(turned), radius * np.sin(turned), height))
+    to = azimuth + angles
+    there = np.column_stack(np.broadcast_arrays(radius * np.cos(to), radius * np.sin(to), height))
+    before, after = module.aimed(pose[None, :3, 3]), module.aimed(there)
+    if before is None or after is None:
+        turns = rotations(angles[:, None] * [0.0, 0.0, 1.0])
+    else:
+        turns = after[:, :3, :3] @ before[:, :3, :3].transpose(0, 2, 1)
+    return affine_matrix(turns @ pose[:3, :3], there)
 
 
 def _wrapped(angles: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -215,10 +242,10 @@ def renumber(collection: bpy.types.Collection, order: Literal["RINGS", "LIST"] =
     untidy = untidy_text(collection)
     if untidy:
         raise InputError(f"scanner '{collection.name}': {untidy}: press Tidy Modules in the Design panel first")
-    with recorded_warnings():  # where the cameras look does not matter here
-        system = scanner.read_scanner(collection)
-    found = scanner.modules(collection)
-    places = ring_order(system) if order == "RINGS" else np.arange(len(found))
+    system, found = scanner.read_scanner(collection), scanner.modules(collection)
+    places = np.arange(len(found))
+    if order == "RINGS":
+        places = ring_order(system) if isinstance(system, PinholeSystem) else np.argsort(system.rings(), kind="stable")
     parts = following.parts_of(collection, found)
     names: list[tuple[bpy.types.ID, str]] = []
     with following.writing():

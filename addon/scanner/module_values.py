@@ -1,12 +1,14 @@
-"""A module's numbers on its camera object, in float64.
+"""A module's values on its camera object, numbers in float64.
 
 Blender keeps places and properties as float32. `Object.mphdrr_module.exact` has the float64 numbers beside them; each is
 valid as long as the visible one is its rounding. A number that the user has typed is read as the decimal typed.
 """
 
 import json
-from collections import namedtuple
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
+from functools import lru_cache
+from types import SimpleNamespace
 from typing import Any
 
 import bpy
@@ -14,161 +16,241 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core.errors import InputError
-from ...core.geometry.design_formulas import collimator_length
-from ...core.geometry.system import LENGTHS, PinholeSystem
+from ...core.geometry.columns import Column
+from ...core.geometry.frames import module_poses
+from ...core.geometry.scanner import Scanner, scanner_kind
+from ...core.system_source import SystemSource
 from ..blender import objects
 from ..blender.decimals import typed
-from . import cameras
+from . import cameras, columns
 
 FROM_ROI, TYPED = "FROM_ROI", "TYPED"  # `mphdrr_module.length_mode`
-_DESIGNED_FROM = ("pinhole_diameter", "detector_side", "roi_radius")  # with b, what the design formula takes
-_TURNED = 1e-4  # rad: rotations kept as float32 angles agree to better than 1e-6
-_FORMULA = 1e-9  # of l: an imported l this close to the design formula's was calculated with it
+_AIMED = 1e-4  # of a rotation's matrix, about rad
+_ROUNDING = 4e-6  # of a rotation's matrix: rotations kept as float32 angles agree to better than 1e-6
+
+Kind = type[Scanner]
+_Rows = dict[str, list[Any]]
+"""Attribute of a scanner -> its values, module by module."""
 
 
-_made_of: Any = namedtuple  # Any: mypy knows only fields that are written out
-_Fields: Any = _made_of("_Fields", ("number", "center", *LENGTHS))
+def kind_of(collection: bpy.types.Collection) -> Kind:
+    """The class of a scanner in the scene."""
+    return scanner_kind(collection.mphdrr_scanner.kind)
 
 
-class ModuleNumbers(_Fields):
-    """A module's number, its pinhole's place (3,) in the world and its dimensions, in float64 and mm."""
-
-    @property
-    def pinhole_distance(self) -> float:
-        """b: pinhole centre to isocentre."""
-        return float(np.linalg.norm(self.center))
+def designed(kind: Kind) -> list[Column]:
+    """The columns of a kind that follow from the others, if nobody types them: the collimator's length."""
+    return [column for column in kind.columns.scalars.values() if callable(column.blank)]
 
 
-def system_of(modules: Sequence[ModuleNumbers], source: Any = None) -> PinholeSystem:
-    """A system of these modules; raises `InputError` where their numbers are impossible."""
-    lengths: Any = {name: np.array([getattr(numbers, name) for numbers in modules]) for name in LENGTHS}
-    centers, own = np.array([numbers.center for numbers in modules]), np.array([numbers.number for numbers in modules])
-    return PinholeSystem(centers, **lengths, numbers=own, source=source)
+def write_modules(cameras_: Sequence[bpy.types.Object], system: Scanner) -> None:
+    """Make objects the cameras of a system's modules; `l` follows the ROI where the design formula gives it."""
+    rows, rings = _rows(system), system.rings().tolist()
+    follow = [column.is_default(system) for column in designed(type(system))]
+    for m, camera in enumerate(cameras_):
+        module = camera.mphdrr_module
+        for name, column in system.columns.scalars.items():  # before is_module, which lets an edit rebuild the module
+            setattr(module, name, columns.shown(column, rows[name][m]))
+        module.length_mode = FROM_ROI if follow and all(defaults[m] for defaults in follow) else TYPED
+        module.ring = rings[m]
+        module.part, module.is_module = "CAMERA", True
+    remember(cameras_, system)
 
 
-def write_module(camera: bpy.types.Object, system: PinholeSystem, m: int, ring: int) -> None:
-    """Make an object the camera of module `m`; `l` follows the ROI where the design formula gives it."""
-    module = camera.mphdrr_module
-    values = {name: float(getattr(system, name)[m]) for name in LENGTHS}
-    for name, value in values.items():  # before is_module, which lets an edit rebuild the module
-        setattr(module, name, value)
-    d, side, roi = (values[name] for name in _DESIGNED_FROM)
-    error = abs(float(collimator_length(float(system.pinhole_distance[m]), d, side, roi)) - values["collimator_length"])
-    module.length_mode = FROM_ROI if error <= _FORMULA * values["collimator_length"] else TYPED
-    module.ring = ring
-    remember(camera, system, m)
-    module.part, module.is_module = "CAMERA", True
+def remember(cameras_: Sequence[bpy.types.Object], system: Scanner) -> None:
+    """Store the modules of `system` as what those of the cameras were when they were imported or saved."""
+    rows, poses = _rows(system), system.poses().tolist()
+    for m, camera in enumerate(cameras_):
+        module = camera.mphdrr_module
+        module.number, module.index, module.added = rows["numbers"][m], m, False
+        values = {name: row[m] for name, row in rows.items()}
+        module.exact = json.dumps({**values, "pose": poses[m], "mode": module.length_mode})
 
 
-def remember(camera: bpy.types.Object, system: PinholeSystem, m: int) -> None:
-    """Store module `m` of `system` as what the camera's module was when it was imported or saved."""
-    module = camera.mphdrr_module
-    module.number, module.index, module.added = int(np.asarray(system.numbers)[m]), m, False
-    _write_exact(
-        camera, ModuleNumbers(module.number, system.centers[m], *(float(getattr(system, name)[m]) for name in LENGTHS))
-    )
-
-
-def add_module(camera: bpy.types.Object, number: int, index: int, center: NDArray[np.float64] | None = None) -> None:
-    """Make the copy of a module's camera a module of its own, at `center` (3,), mm, by default where it stands."""
-    module, numbers = camera.mphdrr_module, module_numbers(camera)
-    numbers = numbers._replace(number=number, center=numbers.center if center is None else center)
-    if module.length_mode == FROM_ROI:
-        (numbers,) = _with_lengths([numbers])
-    module.number, module.index, module.added = number, index, True
-    _write_exact(camera, numbers)
-
-
-def _write_exact(camera: bpy.types.Object, numbers: ModuleNumbers) -> None:
-    values = {**numbers._asdict(), "center": numbers.center.tolist(), "mode": camera.mphdrr_module.length_mode}
-    camera.mphdrr_module.exact = json.dumps(values)
+def _rows(system: Scanner) -> _Rows:
+    return {name: getattr(system, name).tolist() for name in ("numbers", *system.columns.fields)}
 
 
 def exact_values(camera: bpy.types.Object) -> dict[str, Any]:
-    """The numbers as imported, in float64: the fields of `ModuleNumbers` and "mode"; empty on other objects."""
-    return json.loads(camera.mphdrr_module.exact or "{}")
+    """The module as imported, in float64: its attributes, its "pose" and "mode"; empty on other objects."""
+    return _parsed(camera.mphdrr_module.exact)
 
 
-def module_numbers(camera: bpy.types.Object) -> ModuleNumbers:
-    """The module as it stands now.
+@lru_cache(maxsize=4096)
+def _parsed(text: str) -> dict[str, Any]:
+    values: dict[str, Any] = json.loads(text or "{}")
+    if "center" in values:  # by versions that knew no tilt
+        center = values.pop("center")
+        values |= {"centers": center, "tilt": [0.0] * 3, "pose": module_poses([center])[0].tolist()}
+        values["numbers"] = values.pop("number")
+    return values
 
-    Numbers that have not changed are as imported. An `l` that follows the ROI is calculated in float64 once a number in
-    its formula has changed; where the formula has no solution (a pinhole inside the ROI) `l` keeps its last value.
+
+def imported_module(kind: Kind, camera: bpy.types.Object) -> Scanner:
+    """A module as it was imported, as a scanner of its own."""
+    exact = exact_values(camera)
+    return kind.of({name: [exact[name]] for name in ("numbers", *kind.columns.fields) if name in exact})
+
+
+def with_design(camera: bpy.types.Object, module: Scanner) -> Scanner:
+    """A copy of a camera's module with the values by formula that follow its own, if the camera's do."""
+    if camera.mphdrr_module.length_mode != FROM_ROI:
+        return module
+    needed = module.columns.needed_values(module)
+    return module.replace(**{column.field: column.default(needed) for column in designed(type(module))})
+
+
+def read_modules(
+    kind: Kind, cameras_: Sequence[bpy.types.Object], matrices: NDArray[np.float64], source: SystemSource | None = None
+) -> Scanner:
+    """Modules as they stand now; `matrices` (M, 4, 4) are the cameras' world matrices. Raises `InputError` if impossible.
+
+    What has not changed is as imported. A camera that is turned has a tilted module, and none if it is aimed. An `l` that
+    follows the ROI is calculated in float64 once a number in its formula has changed.
     """
-    return numbers_of([camera], objects.world_matrix(camera)[None])[0]
+    known = [exact_values(camera) for camera in cameras_]
+    rows = _shown(kind, cameras_, known)
+    poses, moved, turned = _poses(cameras_, matrices, known)
+    if moved.any():
+        poses[moved] = _straightened(kind, poses[moved], turned[moved])
+        _carry(kind, rows, known, poses, np.flatnonzero(moved).tolist())
+    _design(kind, rows, cameras_, known)
+    return kind.of({name: np.array(row) for name, row in rows.items()} | {"source": source})
 
 
-def numbers_of(cameras_: Sequence[bpy.types.Object], matrices: NDArray[np.float64]) -> list[ModuleNumbers]:
-    """`module_numbers` of each module; `matrices` (M, 4, 4) are the cameras' world matrices."""
-    found: list[ModuleNumbers] = []
-    designed = []
-    for camera, place in zip(cameras_, matrices[:, :3, 3].tolist(), strict=True):
-        module, exact = camera.mphdrr_module, exact_values(camera)
-        values = {name: getattr(module, name) for name in LENGTHS}
-        for name, value in values.items():
-            known = exact.get(name)
-            values[name] = known if known is not None and np.float32(known) == value else typed(value)
-        numbers = ModuleNumbers(module.number, _center(camera, place, exact.get("center")), **values)
-        if module.length_mode == FROM_ROI:
-            now = [FROM_ROI, numbers.center.tolist(), *(values[name] for name in _DESIGNED_FROM)]
-            if now == [exact.get(name) for name in ("mode", "center", *_DESIGNED_FROM)]:
-                numbers = numbers._replace(collimator_length=exact["collimator_length"])
-            else:
-                designed.append(len(found))
-        found.append(numbers)
-    for i, numbers in zip(designed, _with_lengths([found[i] for i in designed]), strict=True):
-        found[i] = numbers
-    return found
-
-
-def _with_lengths(modules: Sequence[ModuleNumbers]) -> list[ModuleNumbers]:
-    """The modules with the design formula's `l`."""
-    given = [[numbers.pinhole_distance for numbers in modules]]
-    given += [[getattr(numbers, name) for numbers in modules] for name in _DESIGNED_FROM]
+def readings(
+    kind: Kind, cameras_: Sequence[bpy.types.Object], matrices: NDArray[np.float64]
+) -> Iterator[tuple[list[int], Scanner | InputError]]:
+    """Indices of modules and what is read of them: all together, but one by one where that is refused."""
     try:
-        lengths = collimator_length(*given).tolist()
-    except InputError:  # `read_scanner` and the module's `problem` say what is wrong
-        return list(modules) if len(modules) == 1 else [_with_lengths([numbers])[0] for numbers in modules]
-    return [numbers._replace(collimator_length=l) for numbers, l in zip(modules, lengths, strict=True)]
+        yield list(range(len(cameras_))), read_modules(kind, cameras_, matrices)
+    except InputError as error:
+        if len(cameras_) == 1:
+            yield [0], error
+            return
+        for m, camera in enumerate(cameras_):
+            for _, found in readings(kind, [camera], matrices[m : m + 1]):
+                yield [m], found
 
 
-def _center(camera: bpy.types.Object, place: list[float], exact: list[float] | None) -> NDArray[np.float64]:
-    """Pinhole centre (3,), mm: the coordinates of `exact` as long as they are those of the camera's `place`."""
-    is_free = camera.parent is None and not len(camera.constraints)
+def _shown(kind: Kind, cameras_: Sequence[bpy.types.Object], known: Sequence[dict[str, Any]]) -> _Rows:
+    """The modules' values by their properties, at their places as imported."""
+    modules = [camera.mphdrr_module for camera in cameras_]
+    rows: _Rows = {"numbers": [module.number for module in modules]}
+    for name, (column, *_) in kind.columns.fields.items():
+        if column.axis is None:
+            rows[name] = [
+                columns.value_of(column, getattr(module, name), exact.get(name))
+                for module, exact in zip(modules, known, strict=True)
+            ]
+        else:
+            rows[name] = [exact.get(name, [0.0] * 3) for exact in known]
+    return rows
+
+
+def _poses(
+    cameras_: Sequence[bpy.types.Object], matrices: NDArray[np.float64], known: Sequence[dict[str, Any]]
+) -> tuple[NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_]]:
+    """The modules' poses (M, 4, 4), as imported where the cameras stand so; which (M,) are moved or turned, and turned."""
+    was = np.array([exact["pose"] for exact in known])
+    now = cameras.poses_of(matrices)
+    place, old = now[:, :3, 3], was[:, :3, 3]
+    for m, axis in np.argwhere(place.astype(np.float32) != old.astype(np.float32)).tolist():
+        if cameras_[m].parent is None and not len(cameras_[m].constraints):
+            place[m, axis] = typed(place[m, axis])
+    rounding = 4 * np.spacing(np.abs(old).max(axis=1).astype(np.float32))
+    stays = np.abs(place - old) <= rounding[:, None]
+    turned = np.abs(now[:, :3, :3] - was[:, :3, :3]).max(axis=(1, 2)) > _ROUNDING
+    place[stays] = old[stays]
+    now[~turned, :3, :3] = was[~turned, :3, :3]
+    return now, turned | ~stays.all(axis=1), turned
+
+
+def _straightened(kind: Kind, poses: NDArray[np.float64], turned: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Poses (M, 4, 4) without rounding where they are aimed, and with a proper rotation where they were turned."""
+    left, _, right = np.linalg.svd(poses[turned, :3, :3])
+    poses[turned, :3, :3] = left @ right
+    exact = kind.aimed(poses[:, :3, 3])
+    if exact is not None:
+        aimed = np.abs(poses - exact).max(axis=(1, 2)) <= _AIMED
+        poses[aimed] = exact[aimed]
+    return poses
+
+
+def _carry(
+    kind: Kind, rows: _Rows, known: Sequence[dict[str, Any]], poses: NDArray[np.float64], which: Sequence[int]
+) -> None:
+    """Write the attributes into `rows` that modules have at their poses; one by one where they cannot be together."""
+    names = kind.columns.fields
+    now = {name: np.array([rows[name][m] for m in which]) for name in ("numbers", *kind.columns.scalars)}
+    try:
+        imported = kind.of({name: np.array([known[m].get(name, rows[name][m]) for m in which]) for name in names})
+        there = imported.at_poses(poses[which], **now)
+    except InputError:
+        if len(which) == 1:
+            raise
+        for m in which:
+            _carry(kind, rows, known, poses, [m])
+        return
+    for name in names.keys() - now.keys():
+        for m, value in zip(which, getattr(there, name).tolist(), strict=True):
+            rows[name][m] = value
+
+
+def _design(kind: Kind, rows: _Rows, cameras_: Sequence[bpy.types.Object], known: Sequence[dict[str, Any]]) -> None:
+    """Write the values that follow from the others into `rows`, as imported where these have not changed."""
+    needed = {kind.columns[name].field for name in kind.columns.needed}
+    changed = []
+    for m, (camera, exact) in enumerate(zip(cameras_, known, strict=True)):
+        if camera.mphdrr_module.length_mode != FROM_ROI:
+            continue
+        if exact.get("mode") == FROM_ROI and all(rows[name][m] == exact[name] for name in needed):
+            for column in designed(kind):
+                rows[column.field][m] = exact[column.field]
+        else:
+            changed.append(m)
+    given = SimpleNamespace(**{name: np.array([rows[name][m] for m in changed]) for name in needed})
+    for column in designed(kind) if changed else ():
+        with suppress(InputError):  # the system itself is refused for the same reason
+            for m, value in zip(changed, column.default(kind.columns.needed_values(given)).tolist(), strict=True):
+                rows[column.field][m] = value
+
+
+def changes(found: Sequence[bpy.types.Object]) -> tuple[list[bool], list[bool]]:
+    """Which modules were moved or turned since they were imported, and of which the number or other values changed."""
+    if not found:
+        return [], []
+    known = [exact_values(camera) for camera in found]
+    _, moved, _ = _poses(found, objects.world_matrices(found), known)
+    shown = {"numbers": None} | columns.known_columns()
+    edited = [
+        any(
+            columns.value_of(column, getattr(camera.mphdrr_module, name), exact[name]) != exact[name]
+            if column else camera.mphdrr_module.number != exact[name]
+            for name, column in shown.items() if name in exact
+        )
+        for camera, exact in zip(found, known, strict=True)
+    ]  # fmt: skip
+    return moved.tolist(), edited
+
+
+def aim_of(kind: Kind, matrices: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """The world matrices (M, 4, 4) with which cameras look at the isocentre from where they stand, and which do so, upright.
+
+    `matrices` (M, 4, 4) are those that they have. Of a kind that is not aimed, and at the isocentre itself, all are right.
+    """
+    poses, off_centre = cameras.poses_of(matrices), np.any(matrices[:, :3, 3], axis=1)
+    exact = kind.aimed(poses[off_centre, :3, 3])
     if exact is None:
-        return np.array([typed(x) if is_free else x for x in place])
-    rounding = 4 * float(np.spacing(np.float32(max(map(abs, exact)))))
-    now = []
-    for x, known in zip(place, exact, strict=True):
-        x = typed(x) if is_free else x
-        now.append(known if abs(x - known) <= rounding else x)
-    return np.array(now)
+        return matrices, np.ones(len(matrices), bool)
+    aimed, found = ~off_centre, matrices.copy()
+    found[off_centre] = cameras.matrices_of(exact)
+    aimed[off_centre] = np.abs(poses[off_centre] - exact)[:, :3, :3].max(axis=(1, 2)) <= _AIMED
+    return found, aimed
 
 
-def is_moved(camera: bpy.types.Object) -> bool:
-    """Whether the pinhole is not where it was imported."""
-    center = exact_values(camera).get("center")
-    return _center(camera, objects.world_matrix(camera)[:3, 3].tolist(), center).tolist() != center
-
-
-def is_edited(camera: bpy.types.Object) -> bool:
-    """Whether the module's number, or one of its lengths, is not as it was imported."""
-    exact, numbers = exact_values(camera), module_numbers(camera)
-    return any(getattr(numbers, name) != exact.get(name) for name in ("number", *LENGTHS))
-
-
-def off_aim(cameras_: Iterable[bpy.types.Object]) -> list[int]:
-    """Numbers of the modules whose cameras do not look at the isocentre, or are rolled."""
+def off_aim(collection: bpy.types.Collection, cameras_: Iterable[bpy.types.Object]) -> list[int]:
+    """Numbers of a scanner's modules whose cameras do not look at the isocentre, or are rolled."""
     found = list(cameras_)
-    aimed = are_aimed(objects.world_matrices(found))
+    _, aimed = aim_of(kind_of(collection), objects.world_matrices(found))
     return [camera.mphdrr_module.number for camera, is_aimed in zip(found, aimed, strict=True) if not is_aimed]
-
-
-def are_aimed(matrices: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Whether cameras of these world matrices (M, 4, 4) look at the isocentre, upright: (M,)."""
-    aimed = np.any(matrices[:, :3, 3], axis=1)  # at the isocentre there is no direction to it
-    rotation = matrices[aimed, :3, :3]
-    rotation /= np.linalg.norm(rotation, axis=1, keepdims=True)
-    error = np.abs(rotation - cameras.camera_matrices(matrices[aimed, :3, 3])[:, :3, :3])
-    aimed[aimed] = error.max(axis=(1, 2)) <= _TURNED
-    return aimed

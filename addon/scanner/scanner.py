@@ -1,7 +1,7 @@
-"""The scanner in the scene: built from a `PinholeSystem`, found, read back and changed.
+"""The scanner in the scene: built from a `Scanner` of any kind, found, read back and changed.
 
 A scanner is a collection with a sub-collection for each ring; a module is a camera object (`Object.mphdrr_module`) whose
-children are its collimator and its crystal.
+children are its parts: its collimator and its crystal.
 """
 
 import json
@@ -13,16 +13,16 @@ import bpy
 import numpy as np
 from mathutils import Quaternion
 
-from ...core.errors import InputError, warn
-from ...core.geometry import checks
+from ...core.errors import InputError
 from ...core.geometry.collimator import Construction
+from ...core.geometry.scanner import SCANNERS, Scanner
 from ...core.geometry.system import PinholeSystem
 from ...core.workbook import ColumnMap, QuantityCells, SystemSource
 from ..blender import ids, objects
-from . import cameras, following, framing
+from . import cameras, collimators, following, framing, pinholes
 from .following import modules
-from .module_values import is_edited, is_moved, numbers_of, off_aim, remember, system_of
-from .scanner_parts import NewScanner, clear, losses, modules_text
+from .module_values import aim_of, changes, kind_of, off_aim, read_modules, remember
+from .scanner_parts import NewScanner, clear, losses
 
 _DEFAULT = Construction()
 _UNIT = 0.001  # m: a millimetre
@@ -31,7 +31,7 @@ _SMALLEST_REACH = 1.0  # mm, of a scanner without modules
 
 def build_scanner(
     scene: bpy.types.Scene,
-    system: PinholeSystem,
+    system: Scanner,
     name: str = "",
     *,
     construction: Construction = _DEFAULT,
@@ -40,6 +40,7 @@ def build_scanner(
 ) -> bpy.types.Collection:
     """Put a scanner into the scene, in place of one of the same name; returns its collection.
 
+    `construction` is that of pinholes' collimators. One with tilted modules does not keep them aimed.
     The scene's units become millimetres and its render resolution `shape`, pixels (n_v, n_u). The name is by default that of
     the workbook's file. The user's objects in the old scanner move to the scene's own collection. Raises InputError, and
     leaves the scene as it was, where a collimator cannot be built, or changes (`losses`) would be lost without `replace`.
@@ -51,7 +52,7 @@ def build_scanner(
         raise InputError(
             f"scanner '{name}' has changed since it was imported ({'; '.join(lost)}): set replace=True to drop the changes"
         )
-    new = NewScanner(system, system.parts(construction))
+    new = NewScanner(system, system.parts(construction if isinstance(system, PinholeSystem) else None))
     hidden: set[int] = set()
     if old is None:
         collection = bpy.data.collections.new(name)
@@ -65,17 +66,20 @@ def build_scanner(
         set_visible(new.cameras[number], False)
 
     properties = collection.mphdrr_scanner
-    properties.scanner_name = name
+    properties.scanner_name, properties.kind = name, system.kind
     for setting, value in asdict(construction).items():
         setattr(properties, setting, value.upper() if isinstance(value, str) else value)
     properties.is_scanner = properties.parts_free = True
+    if off_aim(collection, new.cameras.values()):
+        properties.keep_aimed = False
     _write_source(properties, system)
     following.refresh(collection)
 
-    n_v, n_u = shape
+    (n_v, n_u), (width, height) = shape, np.abs(system.fields()[0, 3:]).tolist()
     render = scene.render
     render.resolution_x, render.resolution_y, render.resolution_percentage = n_u, n_v, 100
-    render.pixel_aspect_x, render.pixel_aspect_y = max(1.0, n_v / n_u), max(1.0, n_u / n_v)
+    longer = (width / n_u) / (height / n_v)  # how many times as wide as high a pixel is
+    render.pixel_aspect_x, render.pixel_aspect_y = max(1.0, longer), max(1.0, 1 / longer)
     if old is None or not is_set_up(scene):
         set_up_scene(scene, collection)
     first = next(iter(new.cameras.values()))
@@ -85,11 +89,10 @@ def build_scanner(
     return collection
 
 
-def remember_source(collection: bpy.types.Collection, system: PinholeSystem) -> None:
+def remember_source(collection: bpy.types.Collection, system: Scanner) -> None:
     """Store `system`, which has the scanner's modules in their order, as what it was imported as: it has been saved."""
     with following.writing():
-        for m, camera in enumerate(modules(collection)):
-            remember(camera, system, m)
+        remember(modules(collection), system)
     _write_source(collection.mphdrr_scanner, system)
 
 
@@ -105,7 +108,7 @@ def source(collection: bpy.types.Collection) -> SystemSource | None:
     return SystemSource(**values)
 
 
-def _write_source(properties: bpy.types.PropertyGroup, system: PinholeSystem) -> None:
+def _write_source(properties: bpy.types.PropertyGroup, system: Scanner) -> None:
     values, known = {}, system.source
     if known is not None:
         columns = "" if known.columns is None else known.columns.to_toml()
@@ -116,12 +119,12 @@ def _write_source(properties: bpy.types.PropertyGroup, system: PinholeSystem) ->
     properties.quick_ranges = json.dumps(quick_ranges(system))
 
 
-def default_name(system: PinholeSystem) -> str:
+def default_name(system: Scanner) -> str:
     """Name of a system's scanner when none is given: its workbook's, without the suffix."""
     return ids.SCANNER if system.source is None else system.source.path.stem or ids.SCANNER
 
 
-def quick_ranges(system: PinholeSystem) -> list[tuple[int, int]]:
+def quick_ranges(system: Scanner) -> list[tuple[int, int]]:
     """Up to three ranges (first, last) of module numbers, each of half the rings: 1-40, 21-60, 41-80 of 4 x 20."""
     rings, numbers = system.rings(), np.asarray(system.numbers)
     n_rings = int(rings.max()) + 1
@@ -139,7 +142,7 @@ def set_up_scene(scene: bpy.types.Scene, collection: bpy.types.Collection, rotat
     """Set the scene's units for a scanner, and look at the whole of it, if given from the view's `rotation`."""
     units = scene.unit_settings
     units.system, units.scale_length, units.length_unit = "METRIC", _UNIT, "MILLIMETERS"
-    reaches = [o.mphdrr_module.pinhole_distance + o.mphdrr_module.collimator_length for o in modules(collection)]
+    reaches = [o.mphdrr_module.pinhole_distance + cameras.field_of(o.data)[2] for o in modules(collection)]
     framing.look(collection, max(reaches, default=_SMALLEST_REACH), rotation)
 
 
@@ -150,8 +153,9 @@ def is_set_up(scene: bpy.types.Scene) -> bool:
 
 
 def scanners(scene: bpy.types.Scene) -> list[bpy.types.Collection]:
-    """The scanners in the scene."""
-    return [c for c in scene.collection.children_recursive if c.mphdrr_scanner.is_scanner]
+    """The scanners in the scene, of the kinds that are known."""
+    found = [c for c in scene.collection.children_recursive if c.mphdrr_scanner.is_scanner]
+    return [c for c in found if c.mphdrr_scanner.kind in SCANNERS]
 
 
 def find_scanner(scene: bpy.types.Scene, name: str) -> bpy.types.Collection | None:
@@ -192,16 +196,18 @@ def module(collection: bpy.types.Collection, number: int) -> bpy.types.Object:
     raise InputError(f"scanner '{collection.name}' has no module {number}")
 
 
-def read_scanner(collection: bpy.types.Collection, *, aimed: bool = False) -> PinholeSystem:
-    """The scanner as it stands in the scene now: the cameras' places, and the numbers in their properties.
+def read_scanner(collection: bpy.types.Collection) -> Scanner:
+    """The scanner as it stands in the scene now: the cameras' places and directions, and the values in their properties.
 
-    Numbers that have not changed come back exactly, in float64. The system's modules all look at the isocentre: a camera
-    that does not is named in an `InputWarning`, or refused if `aimed`. The system has its source (the workbook) only while
-    everything is as it was imported. Raises InputError for no modules, equal module numbers and impossible lengths.
+    Values that have not changed come back exactly, in float64. A pinhole's camera that does not look at the isocentre, to
+    1e-4 rad, is that of a tilted module. The system has its source (the workbook) only while everything is as it was
+    imported. What a script has moved just now is followed first: Blender has not yet called for it. Raises InputError for no
+    modules, equal module numbers and impossible values.
     """
+    following.refresh(collection)
     found = modules(collection)
     if not found:
-        raise InputError(f"collection '{collection.name}' has no pinhole modules: import a geometry first")
+        raise InputError(f"collection '{collection.name}' has no modules: import a geometry first")
     by_number: dict[int, bpy.types.Object] = {}
     for camera in found:
         other = by_number.setdefault(camera.mphdrr_module.number, camera)
@@ -210,18 +216,25 @@ def read_scanner(collection: bpy.types.Collection, *, aimed: bool = False) -> Pi
                 f"'{other.name}' and '{camera.name}' both have module number {camera.mphdrr_module.number}: "
                 f"press Tidy Modules in the Design panel, or delete one"
             )
-    off = off_aim(found)
-    if off:
-        text = f"scanner '{collection.name}': {modules_text(off)} not aimed at the isocentre"
-        cure = "press Aim at Isocentre in the Design panel"
-        if aimed:
-            raise InputError(f"{text}, which a geometry file cannot express: {cure}")
-        warn(f"{text}, but calculated as if aimed: {cure}")
-    as_imported = len(found) == collection.mphdrr_scanner.n_modules and not any(
-        camera.mphdrr_module.added or is_moved(camera) or is_edited(camera) for camera in found
+    is_added = any(camera.mphdrr_module.added for camera in found)
+    as_imported = (
+        len(found) == collection.mphdrr_scanner.n_modules and not is_added and not any(map(any, changes(found)))
     )
-    numbers = numbers_of(found, objects.world_matrices(found))
-    return system_of(numbers, source(collection) if as_imported else None)
+    known = source(collection) if as_imported else None
+    return read_modules(kind_of(collection), found, objects.world_matrices(found), known)
+
+
+def read_pinholes(collection: bpy.types.Collection) -> PinholeSystem:
+    """`read_scanner` of one that must have pinholes, or `InputError`."""
+    system = read_scanner(collection)
+    if not isinstance(system, PinholeSystem):
+        raise InputError(f"scanner '{collection.name}' has no pinholes: it is of the kind {system.kind}")
+    return system
+
+
+def read_module(collection: bpy.types.Collection, camera: bpy.types.Object) -> Scanner:
+    """One module of a scanner as it stands now, as a scanner of its own."""
+    return read_modules(kind_of(collection), [camera], objects.world_matrix(camera)[None])
 
 
 def check_geometry(collection: bpy.types.Collection) -> tuple[list[str], list[bpy.types.Object]]:
@@ -229,32 +242,27 @@ def check_geometry(collection: bpy.types.Collection) -> tuple[list[str], list[bp
 
     Returns the findings, and the camera objects of the modules concerned.
     """
-    construction = following.construction(collection.mphdrr_scanner)
-    report = checks.check_geometry(read_scanner(collection), **asdict(construction))
-    found, concerned = report.messages(), []
+    system, found = read_pinholes(collection), modules(collection)
     with following.writing():
-        collection.mphdrr_scanner.findings = json.dumps(found)
-        for camera in modules(collection):
-            own = report.messages(camera.mphdrr_module.number)
-            camera.mphdrr_module.finding = "; ".join(own)
-            concerned += [camera] if own else []
-    return found, concerned
+        findings = pinholes.check(collection.mphdrr_scanner, system, found)
+    return findings, [camera for camera in found if camera.mphdrr_module.finding]
 
 
 def aim_modules(collection: bpy.types.Collection) -> list[int]:
     """Turn every camera that does not look at the isocentre; returns their modules' numbers."""
-    off = off_aim(modules(collection))
-    for camera in modules(collection):
-        if camera.mphdrr_module.number in off:
-            center = objects.world_matrix(camera)[None, :3, 3]
-            objects.set_world_matrix(camera, cameras.camera_matrices(center)[0])
+    found = modules(collection)
+    turned = []
+    for camera, matrix, aimed in zip(found, *aim_of(kind_of(collection), objects.world_matrices(found)), strict=True):
+        if not aimed:
+            objects.set_world_matrix(camera, matrix)
+            turned.append(camera.mphdrr_module.number)
     following.refresh(collection)
-    return sorted(off)
+    return sorted(turned)
 
 
 def set_visible(camera: bpy.types.Object, visible: bool) -> None:
-    """Show or hide a module with its collimator and crystal, in the viewport and in renders."""
-    _set_hidden([camera, *(c for c in camera.children if c.mphdrr_module.part in following.PARTS)], not visible)
+    """Show or hide a module with its parts, in the viewport and in renders."""
+    _set_hidden([camera, *(c for c in camera.children if c.mphdrr_module.part in collimators.PARTS)], not visible)
 
 
 def show_modules(collection: bpy.types.Collection, first: int, last: int, mode: str = "ONLY") -> int:

@@ -4,6 +4,7 @@ import hashlib
 import math
 from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 import bpy
 import numpy as np
@@ -11,13 +12,14 @@ import numpy as np
 from ...core.errors import InputError, warn
 from ...core.exchange import FORMATS, write_geometry
 from ...core.geometry.scanner import Detector
-from ...core.geometry.system import LENGTHS, PinholeSystem
+from ...core.geometry.system import PinholeSystem
 from ...core.progress import Progress, stages_of
 from ...core.recording import recorded_warnings
 from ...core.workbook import read_system, write_system
 from ..blender import jobs, storage
 from ..blender.decimals import typed
-from . import following, scanner
+from . import pinholes, scanner
+from .module_values import kind_of
 
 WORKBOOK_SUFFIXES = (".xlsx", ".xlsm")
 _EQUAL = 1e-9  # mm, or share of a length above 1 mm
@@ -28,10 +30,9 @@ def exporting_scanner(collection: bpy.types.Collection, path: Path, use_template
 
     With `use_template` it is written into a copy of the scanner's present workbook, by the column map that this was read
     by; a new one is made where that workbook has gone (`InputWarning`). Raises InputError, and leaves the scanner as it was,
-    where a camera is not aimed or the file cannot be written.
+    where the file cannot be written.
     """
-    following.refresh(collection)
-    system = scanner.read_scanner(collection, aimed=True)
+    system = scanner.read_pinholes(collection)
     template = _template(collection) if use_template else None
     source = scanner.source(collection) if template is not None else None
     columns, name = source.columns if source is not None else None, collection.name
@@ -69,11 +70,13 @@ def exporting_for_program(
     """The job that writes the scanner as it stands in the scene in one of `FORMATS`, its collimators as they are built.
 
     `path` is a new folder for formats of several files; the images described are `system.views(shape, detector, ...)`.
-    Raises InputError where a camera does not look at the isocentre or the format cannot express the scanner.
+    Raises InputError where the format cannot express the scanner.
     """
-    options = asdict(following.construction(collection.mphdrr_scanner))
-    options["opening_degrees"] = typed(math.degrees(options.pop("opening_angle")))
-    system = scanner.read_scanner(collection, aimed=True)
+    built = pinholes.construction(collection.mphdrr_scanner, kind_of(collection))
+    options = {} if built is None else asdict(built)
+    if built is not None:
+        options["opening_degrees"] = typed(math.degrees(options.pop("opening_angle")))
+    system: Any = scanner.read_scanner(collection)  # of a kind that the format refuses or takes
     views = system.views(shape, detector, magnification=magnification)
     known = {name: value for name, value in options.items() if name in FORMATS[format].options}
 
@@ -104,9 +107,9 @@ def _difference(one: PinholeSystem, other: PinholeSystem) -> str:
     """Where two systems differ, in words."""
     if not np.array_equal(one.numbers, other.numbers):
         return "the modules' numbers"
-    for name in ("centers", *LENGTHS):
-        a, b = (getattr(system, name).reshape(len(one), -1) for system in (one, other))
-        wrong = (np.abs(a - b) > _EQUAL * np.maximum(1.0, np.abs(a))).any(axis=1)
-        if wrong.any():
-            return f"{name} of module {one.numbers[int(wrong.argmax())]}"
+    for column in one.columns.values():
+        a, b = column.of(one), column.of(other)
+        wrong = a != b if column.is_text else np.abs(a - b) > _EQUAL * np.maximum(1.0, np.abs(a))
+        if column.role != "derived" and wrong.any():
+            return f"{column.title} of module {one.numbers[int(wrong.argmax())]}"
     return ""

@@ -4,18 +4,19 @@ from collections.abc import Sequence
 from typing import Any
 
 import bpy
+import numpy as np
 
 from ...core.geometry.module_parts import ModulePart
-from ...core.geometry.system import PinholeSystem
+from ...core.geometry.scanner import Scanner
 from ..blender import ids, objects
-from . import cameras, collimators
-from .module_values import is_edited, is_moved, off_aim, write_module
+from . import cameras, collimators, pinholes
+from .module_values import changes, write_modules
 
 
 class NewScanner:
-    """The datablocks of a scanner that is not in the scene yet: `cameras` by module number, `rings` and the `roi` sphere."""
+    """The datablocks of a scanner that is not in the scene yet: `cameras` by module number, `rings`, a `roi` if any."""
 
-    def __init__(self, system: PinholeSystem, parts: Sequence[ModulePart]) -> None:
+    def __init__(self, system: Scanner, parts: Sequence[ModulePart]) -> None:
         self.cameras: dict[int, bpy.types.Object] = {}
         self.rings: list[bpy.types.Collection] = []
         self._named: list[tuple[bpy.types.ID, str]] = []  # names are free only after the old scanner has gone
@@ -23,31 +24,32 @@ class NewScanner:
         try:
             self._make_cameras(system)
             self._make_parts(system, parts)
-            self.roi = self._make_roi(float(system.roi_radius.max()))
+            self.roi = self._make_roi(system)
         except BaseException:
             bpy.data.batch_remove([datablock for datablock, _ in self._named])
             bpy.data.batch_remove([m for m in self._materials.values() if m.users == 0])
             raise
 
-    def _make_cameras(self, system: PinholeSystem) -> None:
-        rings = system.rings()
+    def _make_cameras(self, system: Scanner) -> None:
+        rings, poses, fields = system.rings(), system.poses(), system.fields()
         for ring in range(int(rings.max()) + 1):
             collection = self._keep(bpy.data.collections.new(ids.ring_name(ring)), ids.ring_name(ring))
             collection.mphdrr_scanner.is_ring = True
             self.rings.append(collection)
-        matrices = cameras.camera_matrices(system.centers)
-        for m, number in enumerate(system.numbers.tolist()):
+        for number, ring, pose, matrix, field in zip(
+            system.numbers.tolist(), rings.tolist(), poses, cameras.matrices_of(poses), fields.tolist(), strict=True
+        ):
             name = ids.module_name(number, len(system))
             data = self._keep(bpy.data.cameras.new(name), name)
-            cameras.set_up_camera(data, system, m)
+            cameras.set_up_camera(data, tuple(field), float(np.linalg.norm(pose[:3, 3])))
             camera = self._keep(bpy.data.objects.new(name, data), name)
             self.cameras[number] = camera
-            objects.set_world_matrix(camera, matrices[m])
+            objects.set_world_matrix(camera, matrix)
             camera.lock_scale = (True, True, True)  # or its collimator would grow with it
-            write_module(camera, system, m, int(rings[m]))
-            self.rings[rings[m]].objects.link(camera)
+            self.rings[ring].objects.link(camera)
+        write_modules(list(self.cameras.values()), system)
 
-    def _make_parts(self, system: PinholeSystem, parts: Sequence[ModulePart]) -> None:
+    def _make_parts(self, system: Scanner, parts: Sequence[ModulePart]) -> None:
         for part in parts:
             camera, kind = self.cameras[part.number], part.kind.upper()
             name = ids.part_name(ids.module_name(part.number, len(system)), kind)
@@ -55,15 +57,11 @@ class NewScanner:
             child = self._keep(new_part(camera, kind, name, mesh), name)
             self.rings[camera.mphdrr_module.ring].objects.link(child)
 
-    def _make_roi(self, radius: float) -> bpy.types.Object:
-        mesh = self._keep(collimators.new_sphere("ROI", radius, self._materials["ROI"]), "ROI")
-        roi = self._keep(bpy.data.objects.new("ROI", mesh), "ROI")
-        roi.mphdrr_module.part = "ROI"
-        roi.hide_select = True
-        # Circles: the solid viewport draws no volume behind or inside a transparent surface. Renders show the sphere.
-        roi.display_type, roi.display_bounds_type = "BOUNDS", "SPHERE"
-        roi.lock_location = roi.lock_rotation = roi.lock_scale = (True, True, True)
-        roi.visible_shadow = False
+    def _make_roi(self, system: Scanner) -> bpy.types.Object | None:
+        roi = pinholes.new_roi(system, self._materials["ROI"])
+        if roi is not None:
+            self._keep(roi.data, "ROI")
+            self._keep(roi, "ROI")
         return roi
 
     def _keep(self, datablock: Any, name: str) -> Any:
@@ -77,11 +75,12 @@ class NewScanner:
                 datablock.name = name
         for ring in self.rings:
             collection.children.link(ring)
-        collection.objects.link(self.roi)
+        if self.roi is not None:
+            collection.objects.link(self.roi)
 
 
 def new_part(camera: bpy.types.Object, part: str, name: str, mesh: bpy.types.Mesh) -> bpy.types.Object:
-    """A module's collimator or crystal, parented to its camera. Its mesh is its own, so that it can be reshaped."""
+    """A part of a module, parented to its camera. Its mesh is its own, so that it can be reshaped."""
     item = bpy.data.objects.new(name, mesh)
     item.parent = camera
     item.lock_scale = (True, True, True)  # moving it moves the module (`grabbing.py`)
@@ -93,14 +92,17 @@ def losses(collection: bpy.types.Collection) -> list[str]:
     """The changes that replacing the scanner would undo, a phrase each; empty if it is as it was imported."""
     parts, others = parts_and_others(collection)
     found = [o for o in parts if o.mphdrr_module.is_module]
+    added = [o.mphdrr_module.added for o in found]
+    moved, edited = changes(found)
+    by_others = [o.animation_data is not None or len(o.constraints) > 0 for o in found]
     lost = []
-    for what, is_lost in (
-        ("moved or turned", lambda o: is_moved(o) or off_aim([o])),
-        ("with changed numbers", is_edited),
-        ("added", lambda o: o.mphdrr_module.added),
-        ("with animation or constraints", lambda o: o.animation_data is not None or len(o.constraints)),
+    for what, flags in (
+        ("moved or turned", [is_moved and not is_new for is_moved, is_new in zip(moved, added, strict=True)]),
+        ("with changed numbers", [is_edited and not is_new for is_edited, is_new in zip(edited, added, strict=True)]),
+        ("added", added),
+        ("with animation or constraints", by_others),
     ):
-        numbers = [o.mphdrr_module.number for o in found if is_lost(o)]
+        numbers = [o.mphdrr_module.number for o, is_lost in zip(found, flags, strict=True) if is_lost]
         if numbers:
             lost.append(f"{modules_text(numbers)} {what}")
     gone = collection.mphdrr_scanner.n_modules - sum(not o.mphdrr_module.added for o in found)

@@ -5,8 +5,10 @@ import gpu
 import numpy as np
 from numpy.typing import NDArray
 
+from ...core.geometry.system import PinholeSystem
 from ..blender import objects, windows
-from . import following, scanner, selection
+from . import cameras, following, scanner, selection
+from .module_values import kind_of
 
 # By the setting: the lines' colour, and which of the points of `lines` they join.
 _DRAWN = {
@@ -31,10 +33,12 @@ def lines(context: bpy.types.Context) -> dict[str, NDArray[np.float64]]:
     active = selection.active_module(context)
     chosen = following.modules(collection) if state.sight_all else [active] if active else []
     shown = [camera for camera in chosen if camera.visible_get()]
-    sizes = np.array([(o.mphdrr_module.collimator_length, o.mphdrr_module.detector_side) for o in shown]).reshape(-1, 2)
-    depth, side = (scene.mphdrr_projections.magnification * sizes).T
-    local = np.zeros((len(shown), 6, 3))  # the pinhole, the detector's corners and its middle
-    local[:, 1:5, :2], local[:, 1:, 2] = _CORNERS * side[:, None, None] / 2, -depth[:, None]
+    # A pinhole's detector is drawn magnified; that of another kind stands where it is.
+    scale = scene.mphdrr_projections.magnification if kind_of(collection) is PinholeSystem else 1.0
+    fields = scale * np.array([cameras.field_of(o.data) for o in shown]).reshape(-1, 5)
+    local = np.zeros((len(shown), 6, 3))  # the source, the detector's corners and its middle
+    local[:, 1:] = (fields[:, :3] * [1, 1, -1])[:, None]
+    local[:, 1:5, :2] += _CORNERS * fields[:, None, 3:] / 2
     matrices = objects.world_matrices(shown)
     points = local @ matrices[:, :3, :3].transpose(0, 2, 1) + matrices[:, None, :3, 3]
     return {name: points[:, _DRAWN[name][1]].reshape(-1, 2, 3) for name in wanted}

@@ -10,6 +10,7 @@ from ..validation import radians, real_array
 
 # z and a principal ray are parallel if the sine of the angle between them is below this.
 _PARALLEL = 1e-9
+_ROUNDING = 1e-14  # rad
 
 
 def principal_rays(centers: ArrayLike) -> NDArray[np.float64]:
@@ -28,11 +29,17 @@ def module_frames(centers: ArrayLike) -> NDArray[np.float64]:
     and ``v = k x u``: right-handed and orthonormal. With +v up, +u is to the LEFT as seen from the pinhole.
     """
     k = principal_rays(centers)
-    u = np.cross([0.0, 0.0, 1.0], k)
+    u = _cross(np.array([0.0, 0.0, 1.0]), k)
     parallel = np.linalg.norm(u, axis=1) < _PARALLEL
     u[parallel] = np.cross([1.0, 0.0, 0.0], k[parallel])
     u /= np.linalg.norm(u, axis=1)[:, None]
-    return np.stack([u, np.cross(k, u), k], axis=1)
+    return np.stack([u, _cross(k, u), k], axis=1)
+
+
+def _cross(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+    """numpy.cross of (..., 3) to the same digits; of a few vectors, four times as fast."""
+    (ax, ay, az), (bx, by, bz) = np.moveaxis(a, -1, 0), np.moveaxis(b, -1, 0)
+    return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=-1)
 
 
 def tilted(frames: NDArray[np.float64], tilt: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -47,8 +54,9 @@ def tilted(frames: NDArray[np.float64], tilt: NDArray[np.float64]) -> NDArray[np
 
 
 def tilts(frames: NDArray[np.float64], turned: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Rotation vectors (M, 3), rad, about u, v and k of `frames` (M, 3, 3) that make them `turned`."""
-    return rotation_vectors((turned @ frames.transpose(0, 2, 1)).transpose(0, 2, 1))
+    """Rotation vectors (M, 3), rad, about u, v and k of `frames` (M, 3, 3) that make them `turned`; 0 within rounding."""
+    found = rotation_vectors((turned @ frames.transpose(0, 2, 1)).transpose(0, 2, 1))
+    return np.where(np.abs(found).max(axis=1, keepdims=True) > _ROUNDING, found, 0.0)
 
 
 def rotations(vectors: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -149,15 +149,20 @@ class Scanner(ABC):
 
     @abstractmethod
     def poses(self) -> NDArray[np.float64]:
-        """World-from-module poses (M, 4, 4): columns u, v, k and the source's place, mm."""
+        """World-from-module poses (M, 4, 4): columns u, v, k, at right angles to its image, and the source's place, mm."""
 
     def frames(self) -> NDArray[np.float64]:
         """Module frames (M, 3, 3), rows u, v, k."""
         return self.poses()[:, :3, :3].transpose(0, 2, 1)
 
     @abstractmethod
-    def at_poses(self, poses: NDArray[np.float64]) -> Self:
-        """The scanner with its modules moved and turned as rigid bodies to these poses (M, 4, 4)."""
+    def at_poses(self, poses: NDArray[np.float64], **changes: Any) -> Self:
+        """The scanner with its modules moved and turned as rigid bodies to these poses (M, 4, 4), and other `changes`."""
+
+    @classmethod
+    def aimed(cls, places: NDArray[np.float64]) -> NDArray[np.float64] | None:
+        """The poses (M, 4, 4) in which modules at `places` (M, 3), mm, look at the isocentre; None if the kind has none."""
+        return None
 
     @abstractmethod
     def views(
@@ -170,8 +175,15 @@ class Scanner(ABC):
     ) -> Views:
         """The modules' images, of n_v rows and n_u columns, as the settings of a run ask for them."""
 
+    def fields(self) -> NDArray[np.float64]:
+        """What each module's camera sees, (M, 5), mm: `Views.fields` of its image."""
+        return self.views((1, 1)).fields(self.poses())
+
     def parts(self, construction: Any = None) -> Sequence[ModulePart]:
-        """The modules' solids for the scene and for files, built as a kind's `construction` says; none by default."""
+        """The modules' solids for the scene and for files, built as a kind's `construction` says; none by default.
+
+        A module has at most one part of each kind.
+        """
         return ()
 
     def rings(self) -> NDArray[np.int64]:
@@ -189,5 +201,7 @@ class Scanner(ABC):
 
 def repeated(rows: NDArray[Any]) -> NDArray[np.bool_]:
     """Which rows (M,) of an array (M, ...) stand there before."""
+    if len(rows) == 1:
+        return np.zeros(1, bool)
     _, first, inverse = np.unique(rows, axis=0, return_index=True, return_inverse=True)
     return first[inverse.reshape(-1)] != np.arange(len(rows))

@@ -15,7 +15,7 @@ from ..validation import lengths, positive, real_array, whole_shape
 from .collimator import Collimator, Construction
 from .columns import ColumnTable
 from .design_formulas import roi_radius_seen
-from .frames import affine_matrix, module_frames, tilted, tilts
+from .frames import affine_matrix, module_frames, module_poses, tilted, tilts
 from .module_parts import ModulePart, collimator_solid, crystal_solid
 from .pinhole_columns import PINHOLE_COLUMNS
 from .scanner import Detector, Scanner, repeated
@@ -105,10 +105,21 @@ class PinholeSystem(Scanner):
         """World-from-module poses (M, 4, 4): columns u, v, k and the pinhole centre, mm."""
         return affine_matrix(self.frames().transpose(0, 2, 1), self.centers)
 
-    def at_poses(self, poses: NDArray[np.float64]) -> Self:
+    def at_poses(self, poses: NDArray[np.float64], **changes: Any) -> Self:
         """The system with its pinholes, and their modules turned with them, at these poses (M, 4, 4)."""
         centers = poses[:, :3, 3]
-        return self.replace(centers=centers, tilt=tilts(module_frames(centers), poses[:, :3, :3].transpose(0, 2, 1)))
+        tilt = tilts(module_frames(centers), poses[:, :3, :3].transpose(0, 2, 1))
+        return self.replace(centers=centers, tilt=tilt, **changes)
+
+    @classmethod
+    def aimed(cls, places: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The poses (M, 4, 4) without tilt of modules whose pinholes are at `places` (M, 3), mm."""
+        return module_poses(places)
+
+    def fields(self) -> NDArray[np.float64]:
+        """The crystal's side in front of the pinhole, as far as the crystal is behind it: (M, 5), mm."""
+        none, side = np.zeros(len(self)), self.detector_side
+        return np.stack([none, none, self.collimator_length, side, side], axis=1)
 
     def collimators(self, construction: Construction | None = None) -> list[Collimator]:
         """Each module's collimator; `InputError` names a module whose collimator cannot be built like that."""

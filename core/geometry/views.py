@@ -76,6 +76,19 @@ class Views:
             return targets + (self.sources[m] - self.detector_centers[m]), targets
         return np.broadcast_to(self.sources[m], (n_v * n_u, 3)), targets
 
+    def fields(self, poses: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Where the images stand in front of cameras at `poses` (M, 4, 4), whose columns are u, v and k: (M, 5), mm.
+
+        They are x, y and distance of each image's middle, and its width and height, in camera space: X = -u, Y = v, Z = -k.
+        Width and height are negative where the image is upside down, as on a pinhole's real detector.
+        """
+        u, v, k = np.moveaxis(poses[:, :3, :3], 2, 0)
+        to_middle = self.detector_centers - self.sources
+        n_v, n_u = self.shape
+        width, height = n_u * np.sum(self.u_steps * u, axis=1), n_v * np.sum(self.v_steps * v, axis=1)
+        places = [-np.sum(to_middle * u, axis=1), np.sum(to_middle * v, axis=1), np.sum(to_middle * k, axis=1)]
+        return np.stack([*places, width, height], axis=1)
+
     def projection_matrices(self) -> NDArray[np.float64]:
         """Matrices (M, 3, 4) from homogeneous world points, mm, to ``(column, row, 1)`` times a factor.
 

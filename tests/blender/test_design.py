@@ -13,7 +13,6 @@ import mphdrr.core as mph
 from mphdrr.addon import registration
 from mphdrr.addon.blender import objects
 from mphdrr.addon.scanner import collimators, following, live_scanner, module_edits, scanner
-from mphdrr.addon.scanner.module_values import module_numbers
 from mphdrr.core.errors import InputError, InputWarning
 from mphdrr.core.geometry.system import PinholeSystem
 
@@ -86,8 +85,8 @@ def test_moved_module_stays_aimed_and_its_length_follows(collection, roi_system)
     camera.location.z += 7.25
     update()
     assert_consistent(collection)
-    system = scanner.read_scanner(collection)  # with no warning: it is aimed
-    assert scanner.off_aim([camera]) == [] and camera.mphdrr_module.aimed
+    system = scanner.read_scanner(collection)
+    assert scanner.off_aim(collection, [camera]) == [] and camera.mphdrr_module.aimed
     assert system.centers[2, :2].tolist() == roi_system.centers[2, :2].tolist(), "x and y were not touched"
     assert system.centers[2, 2] == pytest.approx(roi_system.centers[2, 2] + 7.25, abs=1e-5)
     b, d, side, roi = (system.pinhole_distance, system.pinhole_diameter, system.detector_side, system.roi_radius)
@@ -106,8 +105,8 @@ def test_typed_numbers_are_the_decimals_that_were_typed(collection):
     camera.mphdrr_module.detector_thickness = 6.35
     camera.location.x = 187.3
     update()
-    numbers = module_numbers(camera)
-    assert (numbers.pinhole_diameter, numbers.detector_thickness, numbers.center[0]) == (2.7, 6.35, 187.3)
+    read = scanner.read_module(collection, camera)
+    assert (read.pinhole_diameter[0], read.detector_thickness[0], read.centers[0, 0]) == (2.7, 6.35, 187.3)
     assert_consistent(collection)
 
 
@@ -118,7 +117,7 @@ def test_typed_length_stays_until_it_comes_from_the_roi_again(collection):
     assert module.length_mode == "TYPED"
     camera.location.x *= 1.1
     update()
-    assert module_numbers(camera).collimator_length == 61.7
+    assert scanner.read_module(collection, camera).collimator_length == 61.7
     assert module.roi_seen != pytest.approx(60.0, rel=1e-3)
     assert_consistent(collection)
     module.length_mode = "FROM_ROI"
@@ -156,7 +155,7 @@ def test_turning_is_left_to_the_user_and_moving_aims_again(collection):
     assert camera.rotation_euler == turned and not camera.mphdrr_module.aimed
     camera.location.z += 1.0
     update()
-    assert camera.mphdrr_module.aimed and scanner.off_aim([camera]) == []
+    assert camera.mphdrr_module.aimed and scanner.off_aim(collection, [camera]) == []
     collection.mphdrr_scanner.keep_aimed = False
     rotation = camera.rotation_euler.copy()
     camera.location.z += 1.0
@@ -186,7 +185,7 @@ def test_hidden_parented_and_animated_modules(scene, collection):
     bench.location = (3.0, -2.0, 11.0)
     bench.rotation_euler.z = 0.4
     update()
-    assert scanner.off_aim(scanner.modules(collection)) == []
+    assert scanner.off_aim(collection, scanner.modules(collection)) == []
     assert_consistent(collection)
 
     animated = scanner.module(collection, 6)
@@ -371,7 +370,7 @@ def test_duplicates_stand_along_the_ring(collection, roi_system):
         bpy.ops.mphdrr.duplicate_modules(count=1, angle=0.0)
 
     made = module_edits.duplicate(collection, [scanner.module(collection, 1)], 1, np.radians(30.0), follow_ring=True)
-    x, y, z = module_numbers(made[0]).center
+    x, y, z = scanner.read_module(collection, made[0]).centers[0]
     radii = np.hypot(*roi_system.centers[:2, :2].T)
     assert min(radii) < np.hypot(x, y) < max(radii) and z == pytest.approx(-30.0)
     update()
@@ -477,8 +476,8 @@ def test_opening_angle_and_place_of_the_edge_are_drawn_exported_and_checked(coll
 
 
 def test_only_what_has_changed_is_rebuilt(collection, monkeypatch):
-    reshaped = []
-    monkeypatch.setattr(collimators, "reshape_mesh", lambda mesh, solid: reshaped.append(mesh))
+    reshaped, reshape = [], collimators.reshape_mesh
+    monkeypatch.setattr(collimators, "reshape_mesh", lambda mesh, solid: (reshaped.append(mesh), reshape(mesh, solid)))
     following.refresh(collection)
     assert reshaped == []
     camera = scanner.module(collection, 3)

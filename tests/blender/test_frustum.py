@@ -5,7 +5,6 @@ from __future__ import annotations
 import bpy
 import numpy as np
 import pytest
-from mathutils import Euler
 
 import mphdrr.core as mph
 from mphdrr.addon.blender import ids, jobs, objects, storage
@@ -170,13 +169,16 @@ def test_it_goes_with_its_module_and_says_what_is_not_true_any_more(shown, scene
 
 def test_a_module_that_is_turned_away_has_its_frustum_where_its_views_are(shown, scene, ring_system):
     camera = choose(3)
-    camera.rotation_euler = Euler((0.3, -1.0, 2.0))
+    camera.rotation_euler.y += 0.05
+    camera.rotation_euler.z -= 0.04
     bpy.context.view_layer.update()
     bpy.ops.mphdrr.show_in_perspective(planes=2)
     (frustum,) = frustums.frustums(scene)
     assert frustum.parent == camera
     bpy.context.view_layer.update()
-    g = grid_of(shown, ring_system, 2, 2, "k")
+    tilted = scanner.read_scanner(scanner.active_scanner(scene))
+    assert np.linalg.norm(tilted.tilt[2]) > 0.03
+    g = grid_of(shown, tilted, 2, 2, "k")
     np.testing.assert_allclose(corners(frustums.layers(frustum)[1]), expected_corners(g, 1), atol=2e-4)
 
 

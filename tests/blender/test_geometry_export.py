@@ -31,7 +31,7 @@ def collection(scene, own):
 
 def assert_equal(one, other) -> None:
     assert one.numbers.tolist() == other.numbers.tolist()
-    for name in ("centers", *LENGTHS):
+    for name in ("centers", "tilt", *LENGTHS):
         assert np.allclose(getattr(one, name), getattr(other, name), rtol=1e-9, atol=1e-9), name
 
 
@@ -93,12 +93,12 @@ def test_modules_keep_the_order_of_the_workbook_and_added_ones_come_last(collect
     assert not scanner.module(collection, 17).mphdrr_module.added
 
 
-def test_camera_off_aim_is_refused_by_its_number(collection, own, tmp_path):
-    before = own.read_bytes()
+def test_a_turned_camera_is_a_tilted_module_in_the_workbook(collection, own, tmp_path):
     scanner.module(collection, 7).rotation_euler.y += 0.1
-    with pytest.raises(RuntimeError, match=r"module 7 not aimed at the isocentre.*Aim at Isocentre"):
-        bpy.ops.mphdrr.export_geometry(filepath=str(own))
-    assert own.read_bytes() == before
+    bpy.ops.mphdrr.export_geometry(filepath=str(own), use_template=False)
+    tilted = read_system(own)
+    assert_equal(tilted, scanner.read_scanner(collection))
+    assert np.flatnonzero(np.any(tilted.tilt, axis=1)).tolist() == [6]
     bpy.ops.mphdrr.aim_modules()
     bpy.ops.mphdrr.export_geometry(filepath=str(own))
     assert_equal(read_system(own), scanner.read_scanner(collection))

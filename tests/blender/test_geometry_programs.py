@@ -34,8 +34,10 @@ def test_it_is_the_scene_as_it_stands(collection, scene, tmp_path):
     assert views.shape == (30, 40)
 
 
-def test_refuses_a_camera_that_is_off_aim(collection, tmp_path):
-    collection.mphdrr_scanner.keep_aimed = False
+def test_a_turned_camera_is_written_as_a_tilted_module(collection, tmp_path):
     scanner.module(collection, 7).rotation_euler[1] += 0.1
-    with pytest.raises(RuntimeError, match="module 7"):
-        bpy.ops.mphdrr.export_for_program(format="astra", filepath=str(tmp_path / "a.npz"))
+    bpy.ops.mphdrr.export_for_program(format="mphdrr", filepath=str(tmp_path / "a.json"))
+    system, _ = read_geometry(tmp_path / "a.json")
+    expected = scanner.read_scanner(collection)
+    assert np.array_equal(system.tilt, expected.tilt) and np.flatnonzero(np.any(system.tilt, axis=1)).tolist() == [6]
+    assert np.linalg.norm(system.tilt[6]) == pytest.approx(0.1, abs=0.05)

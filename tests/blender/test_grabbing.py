@@ -32,7 +32,8 @@ def part(camera: bpy.types.Object, name: str) -> bpy.types.Object:
 @pytest.mark.parametrize("name", ["COLLIMATOR", "CRYSTAL", "PLANE"])
 def test_the_module_goes_where_a_part_is_put(collection, name):
     camera = scanner.module(collection, 3)
-    item, before, numbers = part(camera, name), camera.matrix_world.copy(), scanner.read_scanner(collection).centers
+    scanner_before = scanner.read_scanner(collection)
+    item, before, numbers = part(camera, name), camera.matrix_world.copy(), scanner_before.centers
     local = item.matrix_basis.copy()
     item.matrix_world = MOTION @ item.matrix_world
     for _ in range(3):  # what the handler writes is an update again
@@ -41,14 +42,15 @@ def test_the_module_goes_where_a_part_is_put(collection, name):
     assert np.allclose(item.matrix_parent_inverse @ item.matrix_basis, local, atol=1e-6), (
         "it is where it was on its module"
     )
-    with pytest.warns(match="module 3 not aimed"):
-        after = scanner.read_scanner(collection)
+    after = scanner.read_scanner(collection)
+    motion = np.array(MOTION)[:3, :3]
+    assert np.allclose(after.frames()[2], scanner_before.frames()[2] @ motion.T, atol=1e-6), "tilted as the part was"
     assert after.centers[2] == pytest.approx(list(MOTION @ before.translation), abs=1e-4)
     assert np.array_equal(np.delete(after.centers, 2, 0), np.delete(numbers, 2, 0))
     collection.mphdrr_scanner.keep_aimed = True
     item.location.z += 2.0
     bpy.context.view_layer.update()
-    assert camera.mphdrr_module.aimed and scanner.off_aim([camera]) == []
+    assert camera.mphdrr_module.aimed and scanner.off_aim(collection, [camera]) == []
 
 
 def test_a_drag_goes_from_where_it_began(collection, monkeypatch):

@@ -52,6 +52,11 @@ def move(item: bpy.types.Object, distance: float) -> None:
     bpy.context.view_layer.update()
 
 
+def turn(item: bpy.types.Object, angle: float) -> None:
+    item.rotation_euler.y += angle
+    bpy.context.view_layer.update()
+
+
 def shown_array(number: int = 3) -> np.ndarray:
     return images.projection_array(bpy.data.images[ids.projection_name(number, 8)])
 
@@ -84,6 +89,7 @@ def derenzo() -> bpy.types.Object:
 
 EDITS = {
     "Module 03 moved": (lambda: move(module(3), 1.0), lambda: move(module(3), -1.0)),
+    "Module 04 turned": (lambda: turn(module(4), 0.01), lambda: turn(module(4), -0.01)),
     "modules 3, 5 moved": (lambda: (move(module(3), 1.0), move(module(5), 2.0)), None),
     "Module 02: d 2.3 mm, now 2.3000002 mm": (
         lambda: setattr(module(2).mphdrr_module, "pinhole_diameter", 2.3000002),
@@ -126,7 +132,6 @@ def test_whatever_changes_is_said_until_it_goes_back(render, scene, said):
 def test_what_does_not_change_the_images_leaves_the_run_current(render, scene):
     render()
     derenzo().name = "Cold rods"
-    module(2).rotation_euler.x += 0.1  # projected as if aimed
     scene.mphdrr_display.colors = "GREY"
     set_(backend="NUMPY")
     bpy.ops.mphdrr.add_nema(voxels=12)

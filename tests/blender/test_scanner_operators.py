@@ -72,9 +72,9 @@ def test_aim_turns_moved_modules_back(scene, small_workbook):
     bpy.ops.mphdrr.import_geometry(filepath=str(small_workbook))
     collection = scanner.active_scanner(scene)
     scanner.module(collection, 12).rotation_euler.y += 0.2
-    assert scanner.off_aim(scanner.modules(collection)) == [12]
+    assert scanner.off_aim(collection, scanner.modules(collection)) == [12]
     bpy.ops.mphdrr.aim_modules()
-    assert scanner.off_aim(scanner.modules(collection)) == []
+    assert scanner.off_aim(collection, scanner.modules(collection)) == []
 
 
 @pytest.mark.parametrize("operator", ["show_modules", "look_through_module", "aim_modules"])

@@ -10,7 +10,8 @@ import numpy as np
 
 from ...core.errors import InputError, warn
 from ...core.exchange import FORMATS, write_geometry
-from ...core.geometry.system import LENGTHS, Detector, PinholeSystem
+from ...core.geometry.scanner import Detector
+from ...core.geometry.system import LENGTHS, PinholeSystem
 from ...core.progress import Progress, stages_of
 from ...core.recording import recorded_warnings
 from ...core.workbook import read_system, write_system

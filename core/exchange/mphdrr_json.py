@@ -8,7 +8,8 @@ from typing import Any
 from ..arrays import table_rows
 from ..errors import InputError
 from ..files import read_bytes
-from ..geometry.system import LATER_LENGTHS, LENGTHS, PinholeSystem
+from ..geometry.scanner import Scanner, scanner_kind
+from ..geometry.system import PinholeSystem
 from ..geometry.views import Views
 from .format import Format
 
@@ -21,18 +22,20 @@ _CONVENTIONS = {
     "pixel": "row i, column j lies at detector_center + (j - (columns - 1)/2) u_step + (i - (rows - 1)/2) v_step",
     "projection_matrix": "3 x 4, homogeneous world point to (column, row, 1) times depth; 0 is the centre of pixel 0",
 }
-# Names in the file -> fields of PinholeSystem and of Views.
-_MODULE = {"number": "numbers", "pinhole_center": "centers"} | {name: name for name in LENGTHS}
+_FILE_NAMES = {"centers": "pinhole_center"}
+"""Attribute of a scanner -> its name in the file, where that is another."""
 _VIEW = {"source": "sources", "detector_center": "detector_centers", "u_step": "u_steps", "v_step": "v_steps"}
 
 
-def _write(system: PinholeSystem, views: Views, temporary: Path) -> None:
-    modules = {name: getattr(system, field) for name, field in _MODULE.items()} | {"frame": system.frames()}
+def _write(system: Scanner, views: Views, temporary: Path) -> None:
+    modules = {"number": system.numbers, "frame": system.frames()}
+    modules |= {_FILE_NAMES.get(name, name): values for name, values in system.filled().items()}
     images = {name: getattr(views, field) for name, field in _VIEW.items()}
     images["projection_matrix"] = views.projection_matrices()
     document = {
         "kind": _KIND,
         "version": _VERSION,
+        "scanner": system.kind,
         "conventions": _CONVENTIONS,
         "modules": table_rows(modules),
         "rows": views.shape[0],
@@ -42,7 +45,7 @@ def _write(system: PinholeSystem, views: Views, temporary: Path) -> None:
     temporary.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
 
 
-def read_geometry(path: str | os.PathLike[str]) -> tuple[PinholeSystem, Views]:
+def read_geometry(path: str | os.PathLike[str]) -> tuple[Scanner, Views]:
     """Read what `write_geometry` wrote in the format ``"mphdrr"``, bit for bit; `InputError` for any other file."""
     content = read_bytes(path)
     try:
@@ -52,10 +55,14 @@ def read_geometry(path: str | os.PathLike[str]) -> tuple[PinholeSystem, Views]:
         if document.get("version") != _VERSION:
             raise InputError(f"version {document.get('version')!r}; this mphDRR reads {_VERSION}")
         modules = document["modules"]
-        lacked = [name for name in LATER_LENGTHS if not any(name in one for one in modules)]
-        system: Any = {field: [one[name] for one in modules] for name, field in _MODULE.items() if name not in lacked}
+        kind = scanner_kind(document.get("scanner", PinholeSystem.kind))
+        given: dict[str, Any] = {"numbers": [one["number"] for one in modules]}
+        for field, (column, *_) in kind.columns.fields.items():
+            name = _FILE_NAMES.get(field, field)
+            if not column.has_constant_blank or any(name in one for one in modules):
+                given[field] = [one[name] for one in modules]
         views: Any = {field: [one[name] for one in document["views"]] for name, field in _VIEW.items()}
-        return PinholeSystem(**system), Views(**views, shape=(document["rows"], document["columns"]))
+        return kind.of(given), Views(**views, shape=(document["rows"], document["columns"]))
     except InputError as error:
         reason = str(error)
     except (ValueError, RecursionError) as error:

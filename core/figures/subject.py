@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..geometry.collimator import Construction
-from ..geometry.system import PinholeSystem, chosen_modules
+from ..geometry.system import AnyScanner, PinholeSystem, chosen_modules
 from ..runs.display import Display
 from ..runs.run import ProjectionRun
 from ..volumes.volume import Volume
@@ -42,6 +42,6 @@ class Subject:
     modules: str | None = None
     """Which modules, such as "1-40" or "1-20,41"; all where it is None."""
 
-    def chosen(self, system: PinholeSystem) -> PinholeSystem:
+    def chosen(self, system: AnyScanner) -> AnyScanner:
         """The modules of `system` that are to be shown."""
         return chosen_modules(system, self.modules)

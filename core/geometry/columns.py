@@ -77,6 +77,11 @@ class Column:
         return "derived" if self.derived else "needed" if self.blank is None else "optional"
 
     @property
+    def has_constant_blank(self) -> bool:
+        """Whether a blank cell has a value of its own, whatever the others are."""
+        return self.blank is not None and not callable(self.blank)
+
+    @property
     def is_text(self) -> bool:
         """Whether its values are texts, not numbers."""
         return self.kind in ("choice", "text")

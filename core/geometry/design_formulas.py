@@ -29,14 +29,18 @@ def collimator_length(b: ArrayOrTensor, d: ArrayOrTensor, Ld: ArrayOrTensor, R: 
     return (Ld - d) * (b**2 - R**2) / (b * d + 2 * R * namespace(squared).sqrt(squared))
 
 
-def roi_radius_seen(b: ArrayOrTensor, d: ArrayOrTensor, Ld: ArrayOrTensor, l: ArrayOrTensor) -> ArrayOrTensor:
+def roi_radius_seen(
+    b: ArrayOrTensor, d: ArrayOrTensor, Ld: ArrayOrTensor, l: ArrayOrTensor, aside: ArrayOrTensor = 0.0
+) -> ArrayOrTensor:
     """Radius R, mm, of the largest sphere at the isocentre that the module's field of view holds, or 0.
 
     The inverse of `collimator_length`: ``R = (b (Ld - d) - d l) / sqrt(4 l^2 + (Ld - d)^2)``. Every ray from this sphere
     through any point of the hole meets the crystal's front face. Arguments are as there, with the collimator length l, mm.
+    Of a tilted module, b is the isocentre's height above the pinhole plane, and `aside` its distance from the axis along u
+    or along v, whichever is more, mm: ``R`` is less by ``2 l aside / sqrt(4 l^2 + (Ld - d)^2)``.
     """
     b, d, Ld, l = _numbers({"d": "0", "Ld": "d", "l": "0", "b": "0"}, b=b, d=d, Ld=Ld, l=l)
-    return ((b * (Ld - d) - d * l) / namespace(l).hypot(2 * l, Ld - d)).clip(min=0.0)
+    return ((b * (Ld - d) - d * l - 2 * l * aside) / namespace(l).hypot(2 * l, Ld - d)).clip(min=0.0)
 
 
 def _numbers(limits: dict[str, str], **given: ArrayOrTensor) -> list[Any]:

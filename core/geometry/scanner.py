@@ -8,21 +8,29 @@ from __future__ import annotations
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import fields, replace
-from typing import Any, ClassVar, Self
+from dataclasses import fields
+from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InputError
 from ..system_source import SystemSource
-from ..validation import freeze, real_array
+from ..validation import freeze, one_of, real_array
 from .columns import ColumnTable, Values, vector
 from .module_parts import ModulePart
 from .views import Views
 
+Detector = Literal["virtual", "real"]
+
 SCANNERS: dict[str, type[Scanner]] = {}
 """Name -> class, of the kinds of scanners; each enters itself when it is defined."""
+
+
+def scanner_kind(name: str) -> type[Scanner]:
+    """The class of a kind of scanner, or `InputError`."""
+    one_of(name, SCANNERS, "kind of scanner")
+    return SCANNERS[name]
 
 
 class Scanner(ABC):
@@ -97,27 +105,40 @@ class Scanner(ABC):
 
     def replace(self, **changes: Any) -> Self:
         """The same with other values of these attributes, those of `more` among them."""
-        own = {f.name for f in fields(self)}  # type: ignore[arg-type]
-        more = {**self.more, **{name: value for name, value in changes.items() if name not in own}}
-        return replace(self, **{n: v for n, v in changes.items() if n in own}, more=more)  # type: ignore[type-var]
+        kept = {name: getattr(self, name) for name in (*self.columns.fields, "numbers", "source")}
+        return self.of({**kept, **changes})
+
+    @classmethod
+    def of(cls, values: Mapping[str, Any]) -> Self:
+        """The scanner with these attributes, of which some may be columns without a field of the class."""
+        own = {f.name for f in fields(cls)}  # type: ignore[arg-type]
+        more = {name: value for name, value in values.items() if name not in own}
+        return cls(**{name: value for name, value in values.items() if name in own}, more=more)  # type: ignore[call-arg]
 
     @classmethod
     def from_values(cls, values: Values, numbers: ArrayLike | None = None, source: SystemSource | None = None) -> Self:
         """The scanner whose typed columns hold `values` (M,), mm, rad or texts; blank ones may be left out."""
-        own = {f.name for f in fields(cls)}  # type: ignore[arg-type]
-        given: dict[str, Any] = {}
+        given: dict[str, Any] = {"numbers": numbers, "source": source}
         for name, columns in cls.columns.fields.items():
-            if columns[0].axis is None and columns[0].name in values:
-                given[name] = values[columns[0].name]
-            elif any(column.name in values for column in columns):
-                n = len(next(values[c.name] for c in columns if c.name in values))
-                given[name] = np.stack([values.get(c.name, np.zeros(n)) for c in columns], axis=1)
-        more = {name: given.pop(name) for name in list(given) if name not in own}
-        return cls(**given, numbers=numbers, source=source, more=more)  # type: ignore[call-arg]
+            own = {column.name: values[column.name] for column in columns if column.name in values}
+            if own and columns[0].axis is None:
+                given[name] = own[columns[0].name]
+            elif own:
+                absent = np.zeros(len(next(iter(own.values()))))
+                given[name] = np.stack([own.get(column.name, absent) for column in columns], axis=1)
+        return cls.of(given)
 
     def values(self) -> dict[str, NDArray[Any]]:
         """The values (M,) of the typed columns by name, mm, rad or texts."""
         return {name: self.columns[name].of(self) for name in self.columns.typed}
+
+    def filled(self) -> dict[str, NDArray[Any]]:
+        """The attributes that columns hold, without those in which all cells of a workbook could be blank."""
+        found = {}
+        for name, columns in self.columns.fields.items():
+            if not columns[0].has_constant_blank or not all(c.is_default(self).all() for c in columns):
+                found[name] = getattr(self, name)
+        return found
 
     def _refuse(self, bad: NDArray[np.bool_], message: str) -> None:
         """Refuse the first module that is `bad`; `message` is a template of its attributes."""
@@ -130,13 +151,24 @@ class Scanner(ABC):
     def poses(self) -> NDArray[np.float64]:
         """World-from-module poses (M, 4, 4): columns u, v, k and the source's place, mm."""
 
+    def frames(self) -> NDArray[np.float64]:
+        """Module frames (M, 3, 3), rows u, v, k."""
+        return self.poses()[:, :3, :3].transpose(0, 2, 1)
+
     @abstractmethod
     def at_poses(self, poses: NDArray[np.float64]) -> Self:
         """The scanner with its modules moved and turned as rigid bodies to these poses (M, 4, 4)."""
 
     @abstractmethod
-    def views(self, shape: tuple[int, int]) -> Views:
-        """The modules' images, of n_v rows and n_u columns."""
+    def views(
+        self,
+        shape: tuple[int, int] = (256, 256),
+        detector: Detector = "virtual",
+        magnification: float = 10.0,
+        pitch: ArrayLike | None = None,
+        offset: ArrayLike = (0.0, 0.0),
+    ) -> Views:
+        """The modules' images, of n_v rows and n_u columns, as the settings of a run ask for them."""
 
     def parts(self, construction: Any = None) -> Sequence[ModulePart]:
         """The modules' solids for the scene and for files, built as a kind's `construction` says; none by default."""
@@ -149,6 +181,10 @@ class Scanner(ABC):
     def reach(self) -> float:
         """Radius, mm, of a sphere around the isocentre with the modules' sources in it."""
         return float(np.linalg.norm(self.poses()[:, :3, 3], axis=1).max())
+
+    def region_radius(self) -> float:
+        """Radius, mm, of the sphere around the isocentre that is looked at: by default to halfway to the nearest source."""
+        return float(np.linalg.norm(self.poses()[:, :3, 3], axis=1).min()) / 2
 
 
 def repeated(rows: NDArray[Any]) -> NDArray[np.bool_]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Literal, Self
+from typing import Any, ClassVar, Self, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,13 +14,12 @@ from ..system_source import SystemSource
 from ..validation import lengths, positive, real_array, whole_shape
 from .collimator import Collimator, Construction
 from .columns import ColumnTable
+from .design_formulas import roi_radius_seen
 from .frames import affine_matrix, module_frames, tilted, tilts
 from .module_parts import ModulePart, collimator_solid, crystal_solid
 from .pinhole_columns import PINHOLE_COLUMNS
-from .scanner import Scanner, repeated
+from .scanner import Detector, Scanner, repeated
 from .views import Views
-
-Detector = Literal["virtual", "real"]
 
 LENGTHS = {name: column.help for name, column in PINHOLE_COLUMNS.scalars.items() if column.kind == "length"}
 """The modules' dimensions: fields of `PinholeSystem`, with what they are."""
@@ -30,6 +29,9 @@ LATER_LENGTHS: tuple[str, ...] = ()
 _RING_GAP = 0.2
 _SAME_PLACE = 1e-6
 """mm; two pinholes closer than this are one in a workbook."""
+
+
+AnyScanner = TypeVar("AnyScanner", bound=Scanner)
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,6 +88,19 @@ class PinholeSystem(Scanner):
         """Module frames (M, 3, 3), rows u, v, k: those of `core.geometry.frames.module_frames`, tilted."""
         return tilted(module_frames(self.centers), self.tilt)
 
+    def isocentres(self) -> NDArray[np.float64]:
+        """The isocentre in each module's frame (M, 3), mm from its pinhole along u, v and k: (0, 0, b) without tilt."""
+        turned = np.any(self.tilt, axis=1)[:, None]
+        aimed = self.pinhole_distance[:, None] * [0.0, 0.0, 1.0]
+        return np.where(turned, -np.einsum("mij,mj->mi", self.frames(), self.centers), aimed)
+
+    def roi_radius_seen(self) -> NDArray[np.float64]:
+        """Radius (M,), mm, of the largest sphere at the isocentre that each module's field of view holds, or 0."""
+        u, v, height = self.isocentres().T
+        sizes = self.pinhole_diameter, self.detector_side, self.collimator_length
+        seen = roi_radius_seen(np.where(height > 0, height, 1.0), *sizes, aside=np.maximum(abs(u), abs(v)))
+        return np.where(height > 0, seen, 0.0)
+
     def poses(self) -> NDArray[np.float64]:
         """World-from-module poses (M, 4, 4): columns u, v, k and the pinhole centre, mm."""
         return affine_matrix(self.frames().transpose(0, 2, 1), self.centers)
@@ -118,6 +133,10 @@ class PinholeSystem(Scanner):
             parts.append(ModulePart(number, "collimator", f"{name} collimator", collimator_solid(built), pose))
             parts.append(ModulePart(number, "crystal", f"{name} crystal", crystal, pose))
         return parts
+
+    def region_radius(self) -> float:
+        """R, mm, the largest one."""
+        return float(self.roi_radius.max())
 
     def rings(self) -> NDArray[np.int64]:
         """Index (M,) of each module's ring, from 0 along +z. Pinholes at about the same z form a ring."""
@@ -185,7 +204,7 @@ def same_place(centers: NDArray[np.float64]) -> tuple[int, int] | None:
     return (int(earlier[later[0]]), int(later[0])) if len(later) else None
 
 
-def chosen_modules(system: PinholeSystem, text: str | None, name: str = "--modules") -> PinholeSystem:
+def chosen_modules(system: AnyScanner, text: str | None, name: str = "--modules") -> AnyScanner:
     """The modules of `system` whose numbers `text` lists ("1-40", "1-20,41", "60-"); all for None.
 
     `name` is what messages call the text.

@@ -5,11 +5,13 @@ A material's coefficient at any energy is the sum of its elements' `mass_attenua
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache, partial
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError, naming
+from ..arrays import is_tensor
+from ..errors import InputError, naming, warn
 from ..geometry.collimator import edge_slope
 from ..geometry.system import PinholeSystem
 from ..validation import positive
@@ -98,18 +100,19 @@ def attenuation(material: str, energy: float) -> float:
 
 def module_coefficients(
     aperture: str | float | None,
-    crystal: str | float | None,
+    crystal: str | float | NDArray[np.float64] | None,
     lines: Sequence[tuple[float, float]],
     system: PinholeSystem,
     opening_angle: float,
-) -> tuple[float | None, float | None]:
-    """One attenuation coefficient, 1/mm, for the apertures and one for the crystals, effective over all photon energies.
+) -> tuple[float | None, float | NDArray[np.float64] | None]:
+    """Attenuation coefficients, 1/mm, of the apertures and of the crystals, effective over all photon energies.
 
     With these coefficients as many photons along the axis pass the mean hole, by Paix's
     ``d_e^2 = d (d + 2 / mu tan(alpha / 2))``, and are stopped by the mean crystal behind it, as of all lines together.
 
     Materials are as in `attenuation`; numbers and None are returned unchanged. Lines are energies, keV, and numbers of
-    photons, as in `Isotope.lines`, and the opening angle is alpha, rad.
+    photons, as in `Isotope.lines`, and the opening angle is alpha, rad. A module with a `crystal_material` has the
+    coefficient (M,) of that, for its own thickness, unless `crystal` has a number for each module.
     """
     photons = np.array([photons for _, photons in lines])
     if isinstance(aperture, str):
@@ -117,11 +120,29 @@ def module_coefficients(
         depth = 2 / mu * edge_slope(opening_angle)
         aperture = float(mu.min() / np.average(mu.min() / mu, weights=photons))  # d_e^2 is linear in 1/mu
         photons = photons * (system.pinhole_diameter.mean() + depth)
-    if isinstance(crystal, str):
-        mu, thickness = _at_lines(crystal, lines, "crystal_mu"), system.detector_thickness.mean()
+
+    def stopping(material: str, thickness: float, name: str) -> float:
+        mu = _at_lines(material, lines, name)
         passed = np.average(np.exp((mu.min() - mu) * thickness), weights=photons)
-        crystal = float(mu.min() - np.log(passed) / thickness)
-    return aperture, crystal
+        return float(mu.min() - np.log(passed) / thickness)
+
+    if isinstance(crystal, str):
+        crystal = stopping(crystal, system.detector_thickness.mean(), "crystal_mu")
+    own = system.crystal_material
+    named = own != ""
+    if not named.any() or is_tensor(crystal) or isinstance(crystal, np.ndarray):
+        return aperture, crystal
+    if not lines:
+        warn("the modules' crystal materials are not used: without an isotope their photons have no energy")
+        return aperture, crystal
+    if crystal is None and not named.all():
+        number = system.numbers[np.argmin(named)]
+        raise InputError(
+            f"module {number} has no crystal material, others have: expected one for each, or crystal_mu for the rest"
+        )
+    stopping_own = lru_cache(maxsize=None)(partial(stopping, name="crystal_material"))
+    each = zip(own.tolist(), system.detector_thickness.tolist(), strict=True)
+    return aperture, np.array([stopping_own(*one) if one[0] else crystal for one in each], np.float64)
 
 
 def _known(material: str) -> Material:

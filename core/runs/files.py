@@ -8,7 +8,6 @@ import io
 import json
 import os
 from collections.abc import Callable
-from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,8 @@ from numpy.typing import NDArray
 from ..errors import InputError, reading
 from ..files import require_file, write_bytes
 from ..geometry.grid import Grid
-from ..geometry.system import LATER_LENGTHS, LENGTHS, PinholeSystem
+from ..geometry.scanner import Scanner, scanner_kind
+from ..geometry.system import PinholeSystem
 from ..geometry.views import Views
 from ..hdf5 import numbers, opened, pack
 from ..volumes.formats import numpy_files
@@ -40,23 +40,54 @@ _CONVENTIONS = (
 
 _RAYS = ("sources", "detector_centers", "u_steps", "v_steps")
 
-# Name, unit and contents of the arrays beside projections and volume, whose units are attributes.
-_ARRAYS: dict[str, tuple[str, Callable[[ProjectionRun], Any]]] = {
-    "geometry/number": ("", lambda run: run.system.numbers),
-    "geometry/ring": ("", lambda run: run.system.rings()),
-    "geometry/center": ("mm", lambda run: run.system.centers),
-    **{f"geometry/{name}": ("mm", attrgetter(f"system.{name}")) for name in ("pinhole_distance", *LENGTHS)},
-    "geometry/pose": ("mm", lambda run: run.system.poses()),
-    "geometry/intrinsics": ("pixel", lambda run: run.intrinsics()),
-    "geometry/projection_matrix": ("pixel", lambda run: run.views.projection_matrices()),
-    **{f"views/{name}": ("mm", attrgetter(f"views.{name}")) for name in _RAYS},
-}
+_FILE_NAMES = {"centers": "center"}
+"""Attribute of a scanner -> its name in files, where that is another."""
+_UNITS = {"length": "mm", "angle": "rad"}
+_PINHOLE = "pinhole"
+"""The kind of scanner of files that name none."""
+_KIND, _TEXTS = "scanner", "texts"
+"""Attributes: the kind of scanner where it is another, and the texts of its columns, as JSON."""
+
+
+def _geometry(scanner: Scanner) -> dict[str, tuple[str, NDArray[Any]]]:
+    """Unit and contents of the arrays of a scanner, by name."""
+    found = {"number": ("", scanner.numbers), "ring": ("", scanner.rings()), "pose": ("mm", scanner.poses())}
+    if isinstance(scanner, PinholeSystem):
+        found["pinhole_distance"] = ("mm", scanner.pinhole_distance)
+    for name, values in scanner.filled().items():
+        column = scanner.columns.fields[name][0]
+        if not column.is_text:
+            found[_FILE_NAMES.get(name, name)] = (_UNITS.get(column.kind, ""), values)
+    return {f"geometry/{name}": item for name, item in found.items()}
+
+
+def _texts(scanner: Scanner) -> dict[str, list[str]]:
+    """Attribute -> the texts of a column."""
+    filled = scanner.filled().items()
+    return {name: values.tolist() for name, values in filled if scanner.columns.fields[name][0].is_text}
+
+
+def _scanner(arrays: dict[str, NDArray[Any]], attributes: dict[str, Any]) -> Scanner:
+    """The scanner that a file holds."""
+    kind = scanner_kind(attributes.get(_KIND, _PINHOLE))
+    given = {"numbers": arrays["geometry/number"], **json.loads(attributes.get(_TEXTS, "{}"))}
+    for name, (column, *_) in kind.columns.fields.items():
+        place = f"geometry/{_FILE_NAMES.get(name, name)}"
+        if place in arrays:
+            given[name] = arrays[place]
+        elif name not in given and not column.has_constant_blank:
+            raise InputError(f"array {place} is missing")
+    return kind.of(given)
+
+
 _VOLUME = ("volume/array", "volume/affine")
 """Which a measured run does not have."""
 _BACKGROUND = "background"  # in the unit of the projections; where there is none, nothing but the volume was projected
 _ATTRIBUTES, _SHA256 = "attributes", "sha256"
 _COMPRESS_FROM = 1 << 16  # bytes: below, compressing costs more than it saves
 
+_Arrays = dict[str, tuple[str, NDArray[Any]]]
+"""Unit and contents of arrays by name."""
 _Contents = tuple[dict[str, NDArray[Any]], dict[str, Any]]
 """Arrays and attributes by name."""
 
@@ -67,20 +98,34 @@ def write_run(run: ProjectionRun, path: str | os.PathLike[str]) -> None:
     `InputError` for another suffix, where torch is missing for .pt, or the file cannot be written: the old one then stays.
     """
     packed, _ = _format(Path(path))
-    arrays = {"projections": run.projections} | {name: get(run) for name, (_, get) in _ARRAYS.items()}
-    of_volume: dict[str, Any] = {}
+    of_volume, of_scanner = {}, {}
     if run.volume is not None:
-        arrays |= dict(zip(_VOLUME, (run.volume.array, run.volume.grid.affine), strict=True))
         of_volume = {"volume_quantity": run.volume.quantity, "volume_unit": run.volume.unit}
-    if np.any(run.background):
-        arrays[_BACKGROUND] = np.asarray(run.background)
+    if run.system.kind != _PINHOLE:
+        of_scanner[_KIND] = run.system.kind
+    if texts := _texts(run.system):
+        of_scanner[_TEXTS] = json.dumps(texts)
     attributes = {
         "format": _FORMAT, "format_version": 1 if of_volume else _FORMAT_VERSION, "conventions": _CONVENTIONS,
         "projections_unit": run.unit, **of_volume, "seed": "none" if run.seed is None else int(run.seed),
-        "workbook": run.workbook, "workbook_sha256": run.workbook_sha256,
+        "workbook": run.workbook, "workbook_sha256": run.workbook_sha256, **of_scanner,
         "settings": json.dumps(dict(run.settings)), "versions": json.dumps(dict(run.versions)),
     }  # fmt: skip
-    write_bytes(path, packed(arrays, attributes))
+    write_bytes(path, packed(_arrays(run), attributes))
+
+
+def _arrays(run: ProjectionRun) -> _Arrays:
+    """Name, unit and contents of all arrays of a run's file."""
+    views = run.views
+    found = {"projections": (run.unit, run.projections), **_geometry(run.system)}
+    found["geometry/intrinsics"] = ("pixel", run.intrinsics())
+    found["geometry/projection_matrix"] = ("pixel", views.projection_matrices())
+    found |= {f"views/{name}": ("mm", getattr(views, name)) for name in _RAYS}
+    if run.volume is not None:
+        found |= {_VOLUME[0]: (run.volume.unit, run.volume.array), _VOLUME[1]: ("mm", run.volume.grid.affine)}
+    if np.any(run.background):
+        found[_BACKGROUND] = (run.unit, np.asarray(run.background))
+    return found
 
 
 def read_run(path: str | os.PathLike[str]) -> ProjectionRun:
@@ -99,10 +144,10 @@ def _run_of(arrays: dict[str, NDArray[Any]], attributes: dict[str, Any]) -> Proj
     if sha256 not in (None, _sha256(arrays, attributes)):
         raise InputError("changed: its arrays or attributes are not those that were written")
     is_measured = int(attributes["format_version"]) == _FORMAT_VERSION
-    for name in ("projections", *(() if is_measured else _VOLUME), *_ARRAYS):
-        if name not in arrays and name.removeprefix("geometry/") not in LATER_LENGTHS:
+    system = _scanner(arrays, attributes)
+    for name in ("projections", *(() if is_measured else _VOLUME), *(f"views/{name}" for name in _RAYS)):
+        if name not in arrays:
             raise InputError(f"array {name} is missing")
-    lengths: Any = {name: arrays[f"geometry/{name}"] for name in LENGTHS if f"geometry/{name}" in arrays}
     rays: Any = {name: arrays[f"views/{name}"] for name in _RAYS}
     volume, seed = None, attributes["seed"]
     if not is_measured:
@@ -112,7 +157,7 @@ def _run_of(arrays: dict[str, NDArray[Any]], attributes: dict[str, Any]) -> Proj
     n_v, n_u = arrays["projections"].shape[1:]
     return ProjectionRun(
         arrays["projections"],
-        PinholeSystem(arrays["geometry/center"], **lengths, numbers=arrays["geometry/number"]),
+        system,
         Views(**rays, shape=(n_v, n_u)),
         volume,
         unit=str(attributes["projections_unit"]),
@@ -134,21 +179,17 @@ def _sha256(arrays: dict[str, NDArray[Any]], attributes: dict[str, Any]) -> str:
     return digest.hexdigest()
 
 
-def _packed_hdf5(arrays: dict[str, NDArray[Any]], attributes: dict[str, Any]) -> memoryview:
+def _packed_hdf5(arrays: _Arrays, attributes: dict[str, Any]) -> memoryview:
     """Arrays as datasets with a `unit`, in chunks of one view each, so that one view reads alone; attributes on the root."""
-    unit = attributes["projections_unit"]
-    units = {"projections": unit, _BACKGROUND: unit}
-    units |= dict(zip(_VOLUME, (attributes.get("volume_unit"), "mm"), strict=True))
-    units |= {name: unit for name, (unit, _) in _ARRAYS.items()}
 
     def fill(file: Any) -> None:
         file.attrs.update(attributes)
-        for name, array in arrays.items():
+        for name, (unit, array) in arrays.items():
             packed: dict[str, Any] = {}
             if array.nbytes >= _COMPRESS_FROM:
                 packed = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
                 packed["chunks"] = (1, *array.shape[1:])
-            file.create_dataset(name, data=array, **packed).attrs["unit"] = units[name]
+            file.create_dataset(name, data=array, **packed).attrs["unit"] = unit
 
     return pack(_FORMAT, {}, fill)
 
@@ -170,8 +211,9 @@ def _read_hdf5(path: Path) -> _Contents:
     return arrays, attributes
 
 
-def _packed_npz(arrays: dict[str, NDArray[Any]], attributes: dict[str, Any]) -> memoryview:
+def _packed_npz(described: _Arrays, attributes: dict[str, Any]) -> memoryview:
     """Arrays by name, attributes as JSON text."""
+    arrays = {name: array for name, (_, array) in described.items()}
     text = json.dumps({**attributes, _SHA256: _sha256(arrays, attributes)})
     return numpy_files.packed({**arrays, _ATTRIBUTES: np.array(text)})
 
@@ -181,9 +223,10 @@ def _read_npz(path: Path) -> _Contents:
     return arrays, json.loads(str(arrays.pop(_ATTRIBUTES, "{}")))
 
 
-def _packed_pt(arrays: dict[str, NDArray[Any]], attributes: dict[str, Any]) -> memoryview:
+def _packed_pt(described: _Arrays, attributes: dict[str, Any]) -> memoryview:
     """Only tensors, text and whole numbers: ``torch.load(path, weights_only=True)`` reads them."""
     torch, memory = _torch(), io.BytesIO()
+    arrays = {name: array for name, (_, array) in described.items()}
     tensors = {name: torch.from_numpy(np.array(array, order="C")) for name, array in arrays.items()}
     torch.save({_ATTRIBUTES: {**attributes, _SHA256: _sha256(arrays, attributes)}, **tensors}, memory)
     return memory.getbuffer()
@@ -203,7 +246,7 @@ def _torch() -> Any:
     return torch
 
 
-_Format = tuple[Callable[[dict[str, NDArray[Any]], dict[str, Any]], memoryview], Callable[[Path], _Contents]]
+_Format = tuple[Callable[[_Arrays, dict[str, Any]], memoryview], Callable[[Path], _Contents]]
 _FORMATS: dict[str, _Format] = {
     ".h5": (_packed_hdf5, _read_hdf5),
     ".hdf5": (_packed_hdf5, _read_hdf5),

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InputError, naming, warn
 from ..files import read_bytes
-from ..geometry.system import Detector, PinholeSystem
+from ..geometry.scanner import Detector, Scanner
 from ..memory import require
 from ..progress import Stages
 from ..validation import instance, one_of, positive, real_numbers, require_finite, shape_text
@@ -35,7 +35,7 @@ _KEPT = ("system.", "attenuation.", "counts.", "model.", "detector.", "compute."
 
 def counts_run(
     counts: ArrayLike,
-    system: PinholeSystem,
+    system: Scanner,
     frames: str | Sequence[int | None] | None = None,
     orientation: str | Sequence[str] | None = None,
     time: float | None = None,
@@ -85,7 +85,7 @@ def counts_run(
         `frames`, `orientation` or `time` is missing, `frames` is not the modules' numbers in some order, or the numbers are
         no counts.
     """
-    instance(system, PinholeSystem, "counts: system")
+    instance(system, Scanner, "counts: system")
     array = real_numbers(counts, "counts")
     if array.ndim != 3 or not array.size or array.dtype.kind not in "fiu":
         raise InputError(
@@ -126,7 +126,7 @@ def counts_run(
     return run
 
 
-def recipe_counts(recipe: Recipe, system: PinholeSystem, stages: Stages = lambda stage: None) -> ProjectionRun:
+def recipe_counts(recipe: Recipe, system: Scanner, stages: Stages = lambda stage: None) -> ProjectionRun:
     """The run of the measured counts that a recipe names; `InputError` as of `read_counts` and `counts_run`.
 
     Warns where a file says another exposure time or pixel size than is given.
@@ -168,7 +168,7 @@ def require_told(frames: Any, orientation: Any, time: Any, found: Counts) -> Non
         raise InputError(f"{what}; say {', and '.join(missing)}")
 
 
-def frame_numbers(frames: Any, count: int, system: PinholeSystem) -> list[int | None]:
+def frame_numbers(frames: Any, count: int, system: Scanner) -> list[int | None]:
     """The modules' numbers in the order of `count` frames; `InputError` unless each module has one frame.
 
     None of a frame that is not used.

@@ -7,7 +7,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..errors import InputError, warn
-from ..geometry.system import Detector, PinholeSystem
+from ..geometry.scanner import Detector, Scanner
+from ..geometry.system import PinholeSystem
 from ..geometry.views import Views
 from ..memory import require
 from ..physics.noise import sample_counts
@@ -19,7 +20,7 @@ from .run import ProjectionRun
 
 
 def project_run(
-    system: PinholeSystem,
+    system: Scanner,
     volume: Volume,
     shape: tuple[int, int] = (256, 256),
     detector: Detector = "virtual",
@@ -91,13 +92,13 @@ def project_run(
     )
 
 
-def warn_of_images(volume: Volume, system: PinholeSystem, views: Views, magnification: float, model: Model) -> None:
+def warn_of_images(volume: Volume, system: Scanner, views: Views, magnification: float, model: Model) -> None:
     """Warn where images of a volume hardly are what is wanted: activity below 0, pixels beside crystals, unseen parts."""
     lowest, highest = float(volume.array.min()), float(volume.array.max())
     if isinstance(model, Emission) and lowest < -0.1 * abs(highest):  # interpolation leaves less
         warn(f"the activity is {lowest:g} to {highest:g} kBq/mL: what is below 0 makes counts below 0")
     if isinstance(model, Emission) and not model.within_crystal:
-        _warn_of_no_crystal(system, views, magnification)
+        _warn_of_no_crystal(model.system, views, magnification)
     _warn_of_unseen(volume, views, ends_at_plane=not isinstance(model, Emission))
 
 

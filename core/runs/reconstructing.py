@@ -205,7 +205,7 @@ def _compare_with_record(run: ProjectionRun, recipe: Recipe, has_mu: bool) -> No
 def reconstruction_grid(run: ProjectionRun, recipe: Recipe) -> Grid:
     """The voxels that a recipe asks for: by default a cube around the run's ROI, of 64 voxels along each side."""
     n_x, n_y, n_z = np.broadcast_to(recipe["reconstruction.voxels"], 3).tolist()
-    spacing = recipe["reconstruction.spacing"] or 2 * float(run.system.roi_radius.max()) / np.array([n_x, n_y, n_z])
+    spacing = recipe["reconstruction.spacing"] or 2 * run.system.region_radius() / np.array([n_x, n_y, n_z])
     return Grid.centered((n_x, n_y, n_z), np.broadcast_to(spacing, 3), recipe["reconstruction.center"])
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ..arrays import checked
 from ..errors import InputError
-from ..geometry.system import PinholeSystem
+from ..geometry.scanner import Scanner
 from ..geometry.views import Views
 from ..projector.models import checked_background
 from ..validation import freeze, real_numbers
@@ -41,7 +41,7 @@ class ProjectionRun:
     """
 
     projections: NDArray[np.float32]  # (M, n_v, n_u), column index along +u, row index along +v
-    system: PinholeSystem  # the M modules
+    system: Scanner  # the M modules
     views: Views  # the M images' rays
     volume: Volume | None = None  # what was projected; None where the images were measured
     unit: str = ""  # of the projections, such as "kBq/mL mm"

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from ..geometry.frames import euler_pose
 from ..geometry.grid import Grid
-from ..geometry.system import PinholeSystem, chosen_modules
+from ..geometry.scanner import Scanner
+from ..geometry.system import chosen_modules
 from ..geometry.views import Views
 from ..phantoms.kinds import KINDS
 from ..phantoms.language import parse_phantom, read_phantom
@@ -40,7 +41,7 @@ _Source = tuple[Volume, Volume | None, Recipe]
 
 def run_recipe(
     recipe: Recipe,
-    system: PinholeSystem | None = None,
+    system: Scanner | None = None,
     volume: Volume | None = None,
     mu: Volume | None = None,
     stages: Stages = lambda stage: None,
@@ -98,14 +99,14 @@ def run_recipe(
         )  # fmt: skip
 
 
-def recipe_views(recipe: Recipe, system: PinholeSystem) -> Views:
+def recipe_views(recipe: Recipe, system: Scanner) -> Views:
     """The views of a recipe's detector."""
     shape = recipe["detector.rows"], recipe["detector.columns"]
     plane, magnification, pitch = (recipe[f"detector.{name}"] for name in ("plane", "magnification", "pitch"))
     return system.views(shape, plane, magnification, pitch)
 
 
-def recipe_model(recipe: Recipe, system: PinholeSystem, mu: Volume | None = None) -> Model:
+def recipe_model(recipe: Recipe, system: Scanner, mu: Volume | None = None) -> Model:
     """The model that a recipe asks for; `mu` is what attenuates. `InputError` where the settings do not go together."""
     cls = _MODELS[recipe["model.kind"]]
     given = recipe.fields("model", cls)

@@ -49,7 +49,7 @@ def scanner() -> PinholeSystem:
 
 @pytest.fixture
 def system(rng: np.random.Generator) -> PinholeSystem:
-    """Twelve modules in two rings, all numbers different."""
+    """Twelve modules in two rings, all numbers different, tilted by up to 3 degrees."""
     angles = np.linspace(0.1, 5.5, 6)
     ring = np.stack([220 * np.cos(angles), 180 * np.sin(angles), np.full(6, 30.0)], axis=1)
     centers = np.concatenate([ring * [1, 1, -1], ring]) + rng.uniform(-2, 2, (12, 3))
@@ -61,6 +61,7 @@ def system(rng: np.random.Generator) -> PinholeSystem:
         detector_thickness=rng.uniform(5, 12, 12),
         roi_radius=75.0,
         numbers=np.arange(101, 113),
+        tilt=np.random.default_rng(3).uniform(-0.03, 0.03, (12, 3)),
     )
 
 

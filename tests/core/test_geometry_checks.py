@@ -132,7 +132,7 @@ def test_field_of_view_beside_the_roi(rng):
 
 
 def test_a_pyramid_whose_apex_is_beyond_the_roi_sees_nothing():
-    assert unseen_share(b=100.0, d=20.0, slope=0.05, radius=50.0) == pytest.approx(1.0, rel=1e-9)
+    assert unseen_share([0.0, 0.0, 100.0], d=20.0, slope=0.05, radius=50.0) == pytest.approx(1.0, rel=1e-9)
 
 
 def test_a_module_in_front_blocks_the_rays_that_meet_it():

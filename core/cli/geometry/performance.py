@@ -6,7 +6,6 @@ import math
 import numpy as np
 
 from ...arrays import table_rows
-from ...geometry.design_formulas import roi_radius_seen
 from ...physics.performance import magnification, resolution, sensitivity
 from ...physics.sampling import sampling_gaps
 from ..options import print_answer, read_workbook
@@ -28,8 +27,7 @@ def _run(arguments: argparse.Namespace) -> None:
     points, optics = [arguments.point], optics_of(arguments, system)
     counts = 1e6 * sensitivity(system, points, optics=optics)[0]
     fwhm = resolution(system, points, optics=optics)[0]
-    b, d, l, side = system.pinhole_distance, system.pinhole_diameter, system.collimator_length, system.detector_side
-    radius = roi_radius_seen(b, d, side, l)
+    radius = system.roi_radius_seen()
     columns = {
         "number": system.numbers,
         "ring": system.rings() + 1,

@@ -50,7 +50,7 @@ def check_geometry(
         overlaps=find_overlaps(hulls),
         near_pairs=find_near_pairs(system, collimators),
         swallowed_pinholes=find_swallowed_pinholes(system, hulls),
-        intrusions=find_intrusions(system, construction),
+        intrusions=find_intrusions(system, collimators),
         uncovered=find_uncovered(system),
         blocked=find_blocked(system, hulls),
         vignetted=find_vignetted(system, collimators),

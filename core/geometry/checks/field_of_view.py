@@ -2,7 +2,7 @@
 
 **Coverage.** A module sees a point fully if the rays from it through every point of the hole meet the crystal. At depth x in
 front of the pinhole these are the points within ``w(x) = x s - d/2`` of the axis along u and v, with ``s = (Ld - d)/(2 l)``.
-The largest sphere at the isocentre that fits has the radius `roi_radius_seen`.
+The largest sphere at the isocentre that fits has the radius `PinholeSystem.roi_radius_seen`.
 
 **Blocking.** `RAYS` rays run from each pinhole's centre over the cone of its ROI; each stands for the same solid angle (a
 spiral by the golden angle: H. Vogel, Math. Biosci. 44 (1979) 179-189). About ten of them fall into a thousandth of the cone.
@@ -13,7 +13,7 @@ more than the parts do: a ray that enters a collimator through its hole ends in 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..design_formulas import roi_radius_seen
+from ..frames import module_frames
 from ..system import PinholeSystem
 from .hulls import TOUCH, Hulls
 from .report import Blocked, Uncovered
@@ -29,47 +29,61 @@ _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(64)  # type: ignore[no-untype
 
 def find_uncovered(system: PinholeSystem) -> tuple[Uncovered, ...]:
     """Modules whose field of view is smaller than their ROI by more than `SLACK`."""
-    b, d, radius = system.pinhole_distance, system.pinhole_diameter, system.roi_radius
+    d, radius, seen = system.pinhole_diameter, system.roi_radius, system.roi_radius_seen()
     slope = (system.detector_side - d) / (2 * system.collimator_length)
-    seen = roi_radius_seen(b, d, system.detector_side, system.collimator_length)
-    columns = (column.tolist() for column in (system.numbers, b, d, slope, radius, seen))
     return tuple(
-        Uncovered(number, radius, seen, unseen_share(b, d, slope, radius))
-        for number, b, d, slope, radius, seen in zip(*columns, strict=True)
-        if radius - seen > SLACK
-    )
+        Uncovered(
+            int(system.numbers[m]), float(radius[m]), float(seen[m]),
+            unseen_share(system.isocentres()[m], d[m], slope[m], radius[m]),
+        )
+        for m in np.flatnonzero(radius - seen > SLACK)
+    )  # fmt: skip
 
 
-def unseen_share(b: float, d: float, slope: float, radius: float) -> float:
-    """Fraction of the volume of the sphere of `radius`, mm, at the isocentre that is outside the field of view.
+def unseen_share(middle: Array, d: float, slope: float, radius: float) -> float:
+    """Fraction of the volume of a sphere of `radius`, mm, that is outside the field of view.
 
-    The volume is integrated over planes across the axis: in each, the field of view is a square of half-width w(x) and the
-    sphere a concentric disc.
+    Its `middle` (3,) is in the module's frame, mm. The volume is integrated over planes across the axis: in each, the field
+    of view is a square of half-width w(x) around the axis, and the sphere a disc around `middle`.
     """
-    ends = [b - radius, b + radius]
-    # The square's corners and sides reach the rim of the disc where c w^2 = radius^2 - (x - b)^2, with c = 2 and 1.
-    for c in (2.0, 1.0):
-        roots = np.roots([c * slope**2 + 1, -(c * slope * d + 2 * b), c * d**2 / 4 + b**2 - radius**2])
+    u, v, h = middle
+    ends = [h - radius, h + radius, d / (2 * slope)]  # with the pyramid's apex
+    # Where the square's sides and corners reach the rim of the disc: (w - a)^2 [+ (w - c)^2] = radius^2 - (x - h)^2.
+    aside = [(a,) for a in (u, -u, v, -v)] + [(a, c) for a in (u, -u) for c in (v, -v)]
+    for places in aside:
+        constants = [d / 2 + place for place in places]
+        n, total, squares = len(places), sum(constants), sum(c**2 for c in constants)
+        roots = np.roots([n * slope**2 + 1, -2 * (slope * total + h), squares + h**2 - radius**2])
         ends += roots[np.isreal(roots)].real.tolist()
-    ends.append(d / (2 * slope))  # the pyramid's apex
-    planes = np.unique(np.clip(ends, b - radius, b + radius))
+    planes = np.unique(np.clip(ends, h - radius, h + radius))
     low, high = planes[:-1, None], planes[1:, None]
     # In steps of an angle, because the integrand behaves like a square root at the ends of the pieces.
     angle = (_NODES + 1) * np.pi / 2
     x = low + (high - low) * (1 - np.cos(angle)) / 2
     weight = (high - low) / 2 * np.sin(angle) * _WEIGHTS * np.pi / 2
-    disc = np.sqrt(np.maximum(radius**2 - (x - b) ** 2, 0.0))
-    half = np.clip(x * slope - d / 2, 0.0, disc)
-    with np.errstate(invalid="ignore"):
-        segments = 4 * (disc**2 * np.arccos(half / disc) - half * np.sqrt(disc**2 - half**2))
-    unseen = np.where(half**2 * 2 <= disc**2, np.pi * disc**2 - 4 * half**2, segments)
-    return float((weight * unseen).sum() / (4 / 3 * np.pi * radius**3))
+    disc = np.sqrt(np.maximum(radius**2 - (x - h) ** 2, 0.0))
+    half = np.maximum(x * slope - d / 2, 0.0)
+    ends_u, ends_v = ((half - x, -half - x) for x in (u, v))
+    corners = ((_disc_below(disc, a, c), i == j) for i, a in enumerate(ends_u) for j, c in enumerate(ends_v))
+    seen = sum(area if adds else -area for area, adds in corners)
+    return float((weight * (np.pi * disc**2 - seen)).sum() / (4 / 3 * np.pi * radius**3))
+
+
+def _disc_below(radius: Array, a: Array, b: Array) -> Array:
+    """Area of the part of discs around 0 in which one coordinate is below `a` and the other below `b`."""
+    a, b = np.clip(a, -radius, radius), np.clip(b, -radius, radius)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        sectors = [radius**2 * np.arcsin(np.nan_to_num(x / radius)) + x * np.sqrt(radius**2 - x**2) for x in (a, b)]
+    inside = a * b + (sectors[0] + sectors[1]) / 2 + np.pi * radius**2 / 4
+    below = [sector + np.pi * radius**2 / 2 for sector in sectors]  # with one of the bounds alone
+    both = np.where(a < 0, np.where(b < 0, 0.0, below[0]), np.where(b < 0, below[1], sectors[0] + sectors[1]))
+    return np.where(a**2 + b**2 < radius**2, inside, both)
 
 
 def find_blocked(system: PinholeSystem, hulls: Hulls) -> tuple[Blocked, ...]:
     """Pairs of a module and another one that some of its rays hit."""
     found = []
-    b, frames = system.pinhole_distance, system.frames()
+    b, frames = system.pinhole_distance, module_frames(system.centers)  # whose axes go through the isocentre
     for m, number in enumerate(system.numbers.tolist()):
         radius, pinhole = system.roi_radius[m], system.centers[m]
         parts = _candidates(hulls, pinhole, frames[m, 2], b[m], radius)

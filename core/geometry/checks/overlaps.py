@@ -12,7 +12,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..collimator import Collimator, Construction
+from ..collimator import Collimator
 from ..system import PinholeSystem
 from .hulls import TOUCH, Hulls
 from .report import Intrusion, NearPair, Overlap, SwallowedPinhole
@@ -92,11 +92,11 @@ def find_swallowed_pinholes(system: PinholeSystem, hulls: Hulls) -> tuple[Swallo
     return tuple(found)
 
 
-def find_intrusions(system: PinholeSystem, construction: Construction) -> tuple[Intrusion, ...]:
-    """Modules that reach into the largest ROI.
-
-    The axis meets the isocentre, so the nearest point of a module is the middle of its plate's front face.
-    """
+def find_intrusions(system: PinholeSystem, collimators: Sequence[Collimator]) -> tuple[Intrusion, ...]:
+    """Modules that reach into the largest ROI: how deep the nearest point of their plate's front face is inside."""
     radius = float(system.roi_radius.max())
-    depth = radius - (system.pinhole_distance + construction.front)
+    front = np.array([(body.front_half_width, body.construction.front) for body in collimators])
+    u, v, height = system.isocentres().T
+    beside = [np.maximum(abs(x) - front[:, 0], 0.0) for x in (u, v)]
+    depth = radius - np.sqrt(beside[0] ** 2 + beside[1] ** 2 + (height + front[:, 1]) ** 2)
     return tuple(Intrusion(int(system.numbers[m]), radius, float(depth[m])) for m in np.flatnonzero(depth > TOUCH))

@@ -22,11 +22,13 @@ MOST_THROUGH = 0.01
 def find_vignetted(system: PinholeSystem, collimators: Sequence[Collimator]) -> tuple[Vignetted, ...]:
     """Modules whose plate leaves less than `FEWEST_OPEN` of the hole open to the steepest rays from their ROI."""
     found = []
-    b, radius = system.pinhole_distance.tolist(), system.roi_radius.tolist()
+    b, radius, isocentres = system.pinhole_distance.tolist(), system.roi_radius.tolist(), system.isocentres()
     for m, body in enumerate(collimators):
         if radius[m] >= b[m]:  # the pinhole is inside the ROI, which is found as an intrusion
             continue
-        needed = needed_angle(b[m], body.diameter, radius[m])
+        needed = needed_angle(isocentres[m, 2], body.diameter, radius[m], math.hypot(*isocentres[m, :2]))
+        if needed >= math.pi:  # tilted so far that its ROI reaches behind the plate
+            continue
         share, built = body.open_share(math.tan(needed / 2)), body.construction
         if share < FEWEST_OPEN:
             number = int(system.numbers[m])
@@ -34,13 +36,15 @@ def find_vignetted(system: PinholeSystem, collimators: Sequence[Collimator]) -> 
     return tuple(found)
 
 
-def needed_angle(b: float, d: float, radius: float) -> float:
+def needed_angle(b: float, d: float, radius: float, aside: float = 0.0) -> float:
     """The smallest opening angle, rad, at which a plate of any thickness leaves the whole hole open to the whole ROI.
 
     It is twice the steepest ray's angle to the axis; that ray is tangent to the ROI and passes the hole's far rim.
-    `b`, `d` and `radius` (below b) are in mm.
+    `b`, `d` and `radius` (below b) are in mm; of a tilted module, b is the isocentre's height above the pinhole plane and
+    `aside` its distance from the axis.
     """
-    return 2 * (math.atan(d / (2 * b)) + math.asin(radius / math.hypot(b, d / 2)))
+    across = aside + d / 2
+    return 2 * (math.atan2(across, b) + math.asin(min(radius / math.hypot(b, across), 1.0)))
 
 
 def find_thin_plates(

@@ -11,10 +11,10 @@ import bpy
 from bpy.props import BoolProperty, CollectionProperty, EnumProperty, IntProperty, StringProperty
 
 from ...core.errors import InputError
-from ...core.geometry.columns import ANGLE_UNITS, LENGTH_UNITS
+from ...core.geometry.columns import ANGLE_UNITS, LENGTH_UNITS, Column
+from ...core.geometry.system import PinholeSystem
 from ...core.recording import recorded_warnings
 from ...core.workbook import ColumnMap, MappedColumn, MappedTable, draft_column_map, preview_workbook, read_system
-from ...core.workbook.quantities import POSITION, QUANTITIES, TYPED
 from ..blender import choices
 
 MAX_TABLES = 9
@@ -44,7 +44,7 @@ def _unit_of_all_changed(self: ColumnMapProperties, context: bpy.types.Context) 
         return
     self.filled = False  # until all units are set
     for quantity in self.quantities:
-        if QUANTITIES[quantity.name].kind == "length":
+        if PinholeSystem.columns[quantity.name].kind == "length":
             quantity.unit = self.unit
     self.filled = True
     update(self)
@@ -158,13 +158,13 @@ def fill(form: ColumnMapProperties, workbook: Path, columns: ColumnMap | None = 
         row.skip_rows = ", ".join(map(str, table.skip_rows))
         if table.rows is not None:
             row.rows = table.rows.upper().replace(" ", "_")
-        known |= {column.quantity: (i, column) for column in table.columns if column.quantity in QUANTITIES}
+        known |= {column.quantity: (i, column) for column in table.columns if column.quantity in PinholeSystem.columns}
     if not form.tables:
         form.tables.add()
-    for name in dict.fromkeys((*TYPED, *known)):
+    for name in dict.fromkeys((*PinholeSystem.columns.typed, *known)):
         quantity = form.quantities.add()
         quantity.name = name
-        quantity.table = 1 if name in POSITION else len(form.tables)
+        quantity.table = 1 if name in PinholeSystem.columns.position else len(form.tables)
         if name in known:
             quantity.table, column = known[name]
             quantity.column = column.column
@@ -229,15 +229,20 @@ def update(form: ColumnMapProperties) -> None:
 def _preview(workbook: Path, columns: ColumnMap) -> tuple[int, list[list[str]]]:
     """How many modules the workbook has; headings, then the numbers of the first modules and the last, mm."""
     system = read_system(workbook, columns)
-    names = [name for name in QUANTITIES if name in (*TYPED, "b")]
-    numbers = zip(*(QUANTITIES[name].of(system).tolist() for name in names), strict=True)
+    columns_of = [c for c in system.columns.values() if c.name == "b" or not (c.derived or _is_blank(c, system))]
+    values = zip(*(c.of(system).tolist() for c in columns_of), strict=True)
     rows = [
-        [str(module), *(f"{value:.3f}" for value in values)]
-        for module, values in zip(system.numbers.tolist(), numbers, strict=True)
+        [str(module), *(value if isinstance(value, str) else f"{value:.3f}" for value in row)]
+        for module, row in zip(system.numbers.tolist(), values, strict=True)
     ]
     if len(rows) > _FIRST + 2:
         rows[_FIRST:-1] = [["..."] * len(rows[0])]
-    return len(system), [["Module", *names], *rows]
+    return len(system), [["Module", *(c.name for c in columns_of)], *rows]
+
+
+def _is_blank(column: Column, system: PinholeSystem) -> bool:
+    """Whether a column that modules may have is one that none has."""
+    return column.role == "optional" and not column.formula and bool(column.is_default(system).all())
 
 
 def accept(form: ColumnMapProperties) -> ColumnMap:

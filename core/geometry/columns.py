@@ -87,6 +87,18 @@ class Column:
         return self.kind in ("choice", "text")
 
     @property
+    def expected(self) -> str:
+        """What a cell of it must hold, for messages."""
+        words = {"whole": "a whole number", "text": "a text", "choice": f"one of {', '.join(self.choices)}"}
+        return words.get(self.kind, "a number")
+
+    def word(self, text: str) -> str | None:
+        """What a text in a cell is: itself, or the word of a choice whatever its case; None if it is none of these."""
+        if self.kind != "choice" or text == self.blank:
+            return text
+        return next((word for word in self.choices if word.casefold() == text.casefold()), None)
+
+    @property
     def units(self) -> dict[str, float]:
         """Unit -> mm or rad; the first is that of a heading without one. "" is that of a plain number."""
         known = {"length": LENGTH_UNITS, "angle": ANGLE_UNITS}.get(self.kind, {"": 1.0})
@@ -102,12 +114,14 @@ class Column:
         """Whose number messages say that of a blank cell is."""
         return "the design formula's" if callable(self.blank) else self.text_of(self.blank)
 
+    def number_of(self, value: Any, digits: int = 6) -> str:
+        """A value of it, in mm or rad, as tables show it: a text, or a number in the unit of a heading without one."""
+        return str(value) if self.is_text else f"{value / next(iter(self.units.values())):.{digits}g}"
+
     def text_of(self, value: Any, digits: int = 6) -> str:
-        """A value of it, in mm or rad, as messages show it, in the unit of a heading without one."""
-        if self.is_text:
-            return repr(str(value))
-        unit, factor = next(iter(self.units.items()))
-        return f"{value / factor:.{digits}g} {unit}".rstrip()
+        """A value of it, in mm or rad, as messages show it: a quoted text, or a number with its unit."""
+        shown = self.number_of(value, digits)
+        return repr(shown) if self.is_text else f"{shown} {next(iter(self.units))}".rstrip()
 
     def of(self, scanner: Any) -> NDArray[Any]:
         """Its values (M,) in a scanner, mm or rad."""

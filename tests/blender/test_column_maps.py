@@ -14,9 +14,9 @@ import pytest
 
 from mphdrr.addon.scanner import column_maps, scanner
 from mphdrr.core.errors import InputError
+from mphdrr.core.geometry.columns import LENGTH_UNITS
 from mphdrr.core.geometry.system import PinholeSystem
 from mphdrr.core.workbook import ColumnMap, draft_column_map, read_system
-from mphdrr.core.workbook.quantities import LENGTH_UNITS
 
 CM = {"x1": "Mitte x (Zentimeter)", "y1": "Mitte y (Zentimeter)", "z1": "Mitte z (Zentimeter)"}
 

@@ -44,8 +44,8 @@ class Column:
     kind: Kind = "length"
     derived: Callable[[Any], NDArray[np.float64]] | None = None
     """A function of the scanner that gives its values (M,), mm or rad, of a column that follows from the others."""
-    undefined: Callable[[Any], NDArray[np.bool_]] | None = None
-    """A function of the scanner: where (M,) the formula divides by 0, and any value is right."""
+    undefined: Callable[[Values], NDArray[np.bool_]] | None = None
+    """A function of the needed columns: where (M,) the formula divides by 0, and any value is right."""
     unlike_formula: Callable[[Any], NDArray[np.bool_]] | None = None
     """A function of the scanner: where (M,) the formula does not give the value of a derived column."""
     headings: tuple[str, ...] = ()

@@ -177,7 +177,7 @@ PINHOLE_COLUMNS = ColumnTable(
             titles=("", "pinhole azimuth (radians)"),
             kind="angle",
             formula="=(ATAN2({x1},{y1}))",
-            undefined=lambda s: _planar_range(s) == 0,
+            undefined=lambda needed: np.hypot(needed["x1"], needed["y1"]) == 0,
             hints="azimuth",
         ),
         Column(
@@ -222,7 +222,6 @@ PINHOLE_COLUMNS = ColumnTable(
         Column(
             "slope",
             derived=_slope,
-            undefined=lambda s: np.isinf(_slope(s)),
             headings=("S", "3D slope"),
             place="Coordinates!F",
             formula="={b}/{x1}",

@@ -148,7 +148,7 @@ class ColumnMap:
 def column_map(
     columns: ColumnMap | str | os.PathLike[str] | None, workbook: str | os.PathLike[str], scanner: type[Scanner]
 ) -> ColumnMap | None:
-    """The column map of `workbook` for a kind of scanner, given as such or as its file's path; `InputError` if incomplete."""
+    """The column map of `workbook` for a kind of scanner, given as such or by its file; `InputError` if incomplete."""
     if columns is None:
         return None
     name = str(columns)

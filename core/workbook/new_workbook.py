@@ -1,6 +1,7 @@
 """A scanner in a new workbook, or in a new sheet for one, in one pass and with its own values in the formulas."""
 
 import io
+import math
 import re
 import zipfile
 from pathlib import Path
@@ -26,6 +27,7 @@ _NORMAL, _HEADING, _FOUR_DECIMALS = range(3)
 _FIRST_ROW = 3
 _LARGEST_NUMBER = 2**53 - 1
 """The first module's row, and the largest module's number that a cell holds exactly."""
+_INFINITE = math.inf, -math.inf
 
 
 def new_workbook(system: Scanner) -> tuple[bytes, dict[str, Any]]:
@@ -59,14 +61,15 @@ def new_sheets(system: Scanner, styled: bool = True) -> tuple[dict[str, dict[int
     main = places[declared.leading][0]
     titles = sorted(dict.fromkeys(title for title, _ in places.values()), key=lambda title: title == main)
     numbers = [(number, "") for number in system.numbers.tolist()]
-    cells = {title: {1: _column(1, ("", "Definitions"), numbers, _NORMAL if styled else 0)} for title in titles}
+    heading = _HEADING if styled else _NORMAL
+    cells = {title: {1: _column(1, ("", "Definitions"), numbers, (heading, _NORMAL))} for title in titles}
     stored: dict[str, Any] = {}
     for column in (*declared.values(), *declared.unread):
         if column.name in declared.optional and not column.formula and column.is_default(system).all():
             continue
         (title, at), content = places[column.name], _content(column, system, places)
-        style = _FOUR_DECIMALS if title == main and not column.is_text else _NORMAL
-        cells[title][at] = _column(at, column.headed(), content, style if styled else None)
+        style = _FOUR_DECIMALS if styled and title == main and not column.is_text else _NORMAL
+        cells[title][at] = _column(at, column.headed(), content, (heading, style))
         rows = enumerate(content, start=_FIRST_ROW)
         stored |= {f"{title}!{cell_name((row, at))}": value for row, (value, formula) in rows if formula}
     return {title: _rows(its) for title, its in cells.items()}, stored
@@ -93,13 +96,20 @@ def _content(column: Column, system: Scanner, places: dict[str, tuple[str, int]]
     if not column.formula:
         return [(value, "") for value in values]
     by_formula = column.follows_formula(system)
-    undefined = by_formula & column.undefined(system) if column.undefined else np.zeros(len(system), np.bool_)
+    undefined = np.zeros(len(system), np.bool_)
+    if column.undefined is not None:
+        undefined = by_formula & column.undefined(system.columns.needed_values(system))
     quoted = {its: its if re.fullmatch(r"\w+", its) else f"'{its}'" for its, _ in places.values()}
     before = {name: "" if its == title else f"{quoted[its]}!" for name, (its, _) in places.items()}
     content = []
     for row, (value, own, bad) in enumerate(zip(values, by_formula, undefined, strict=True), start=_FIRST_ROW):
         cells = {name: before[name] + cell_name((row, at)) for name, (_, at) in places.items()}
-        content.append((CellError("#DIV/0!") if bad else value, column.formula.format_map(cells) if own else ""))
+        content.append(
+            (
+                CellError("#DIV/0!") if bad or value in _INFINITE else value,
+                column.formula.format_map(cells) if own else "",
+            )
+        )
     return content
 
 
@@ -108,7 +118,7 @@ def refuse_unreadable(system: Scanner) -> None:
     cannot, numbers, declared = "the new workbook cannot hold this system", system.numbers, system.columns
     if len(numbers) > MAX_MODULES:
         raise InputError(f"{cannot}: it has {len(numbers)} modules, expected at most {MAX_MODULES}")
-    with np.errstate(over="ignore"):
+    with np.errstate(over="ignore", invalid="ignore"):
         held = {"number": numbers.astype(np.float64), **{name: column.of(system) for name, column in declared.items()}}
     for name, values in held.items():
         most = _LARGEST_NUMBER if name == "number" else np.finfo(np.float64).max
@@ -127,13 +137,12 @@ def refuse_unreadable(system: Scanner) -> None:
             raise InputError(f"{cannot}, with it: the new workbook: {place(name, i)} {why(i)}")
 
 
-def _column(at: int, titles: tuple[str, str], content: list[tuple[Any, str]], style: int | None) -> list[str]:
-    """The XML of a column's cells, from row 1 down: its titles, then values with their formulas."""
-    styles = [0 if style is None else s for s in (_HEADING, _HEADING, *[style] * len(content))]
-    rows = zip([*((title, "") for title in titles), *content], styles, strict=True)
-    return [
-        _cell(cell_name((row, at)), value, its, formula) for row, ((value, formula), its) in enumerate(rows, start=1)
-    ]
+def _column(at: int, titles: tuple[str, str], content: list[tuple[Any, str]], styles: tuple[int, int]) -> list[str]:
+    """The XML of a column's cells, from row 1 down: its titles, then values with their formulas, in these two styles."""
+    heading, style = styles
+    cells = [_cell(cell_name((row, at)), title, heading) for row, title in enumerate(titles, start=1)]
+    rows = enumerate(content, start=_FIRST_ROW)
+    return cells + [_cell(cell_name((row, at)), value, style, formula) for row, (value, formula) in rows]
 
 
 def _cell(place: str, value: Any, style: int, formula: str = "") -> str:

@@ -4,7 +4,7 @@ import math
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Generic
+from typing import Any, Generic
 
 import numpy as np
 from numpy.typing import NDArray
@@ -85,7 +85,7 @@ class Reading(Generic[AnyScanner]):
     """What is read from a workbook; `given` is what the cells hold, numbers in their units, NaN or "" for nothing."""
 
     layout: Layout
-    given: Values
+    given: dict[str, NDArray[Any]]
     system: AnyScanner
 
 
@@ -103,18 +103,17 @@ def read(book: Book, scanner: type[AnyScanner], columns: ColumnMap | None = None
         cells[name].refuse(bad, why)
     defaults = {name: declared[name].default(values) for name in declared.optional}
     values |= defaults
-    for name in declared.optional:
-        if name in cells:
+    for name in declared:  # causes before their effects
+        undefined = declared[name].undefined
+        if name in cells and name in declared.derived:
+            given[name] = cells[name].values(True, None if undefined is None else undefined(values))
+        elif name in cells and name in declared.optional:
             given[name] = cells[name].values(columns is None or declared[name].is_text)
             in_sheet = cells[name].in_code(given[name])
             _refuse_not_positive(cells[name], in_sheet)
             values[name] = np.where(absent(given[name]), defaults[name], in_sheet)
     with naming(book.path.name):
         system = scanner.from_values(values, np.array(numbers), _source(book, layout, columns))
-    for name in declared.derived:
-        if name in cells:
-            undefined = declared[name].undefined  # on the z axis a spreadsheet's ATAN2 shows #DIV/0!
-            given[name] = cells[name].values(True, None if undefined is None else undefined(system))
     for doubtful in _doubtful(book, cells, given, defaults, system):
         warn(doubtful, 4)
     return Reading(layout, given, system)

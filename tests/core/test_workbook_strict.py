@@ -408,10 +408,10 @@ def in_units(units: dict[str, str]):
                 )
                 if heading is None or PINHOLE_COLUMNS[heading.name].kind != "length":
                     continue
-                unit = units.get(heading.quantity, units[""])
-                sheet.cell(1, column).value = f"{heading.quantity} ({unit})" if heading.quantity != "range" else None
-                sheet.cell(2, column).value = f"pinhole range [{unit}]" if heading.quantity == "range" else None
-                if heading.quantity == "H":
+                unit = units.get(heading.name, units[""])
+                sheet.cell(1, column).value = f"{heading.name} ({unit})" if heading.name != "range" else None
+                sheet.cell(2, column).value = f"pinhole range [{unit}]" if heading.name == "range" else None
+                if heading.name == "H":
                     sheet.cell(1, column).value = f"l+b+Td, {unit}"
                 for row in range(3, sheet.max_row + 1):
                     sheet.cell(row, column).value /= LENGTH_UNITS[unit]

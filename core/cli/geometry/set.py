@@ -21,7 +21,7 @@ _SHORT = {
     "roi_radius": "roi",
 }
 _TYPES: dict[str, type] = {"whole": int, "text": str, "choice": str}
-_METAVARS = {"length": "MM", "angle": "DEG", "text": "TEXT", "choice": None}
+_METAVARS = {"length": "MM", "angle": "DEG", "text": "TEXT"}
 
 
 def _options() -> dict[str, tuple[Column, ...]]:
@@ -38,15 +38,16 @@ def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     add = parser.add_argument
     add("-o", "--output", required=True, metavar="OUT", help="workbook to write; FILE itself is replaced")
     add("--modules", metavar="RANGE", help="those to change, such as 1-40 or 1-20,41; default: all")
-    for name, columns in _options().items():
-        column, many = columns[0], {"nargs": len(columns)} if columns[0].axis is not None else {}
-        metavar: Any = (
-            tuple(c.name.rpartition("_")[2].upper() for c in columns) if many else _METAVARS.get(column.kind, "N")
-        )
-        words = {"choices": column.choices} if column.kind == "choice" else {}
-        what = "; ".join(c.help for c in columns) + ", degrees" * (column.kind == "angle")
-        kind = _TYPES.get(column.kind, float)
-        add(f"--{_option(name)}", dest=name, type=kind, metavar=metavar, help=what, **many, **words)  # type: ignore[arg-type]
+    for name, its in _options().items():
+        column, many = its[0], its[0].axis is not None
+        letters = tuple(c.name.rpartition("_")[2].upper() for c in its)
+        more: dict[str, Any] = {"nargs": len(its)} if many else {}
+        if column.kind == "choice":
+            more["choices"] = column.choices
+        else:
+            more["metavar"] = letters if many else _METAVARS.get(column.kind, "N")
+        what = ", ".join(dict.fromkeys(c.help for c in its)) + "; degrees" * (column.kind == "angle")
+        add(f"--{_option(name)}", dest=name, type=_TYPES.get(column.kind, float), help=what, **more)
     length = (
         "l, collimator length, or 'design' for the design formula's; default: those that follow the formula go on "
         "following it, the others stay"
@@ -60,6 +61,7 @@ def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
 
 
 def _option(name: str) -> str:
+    """The option of a field."""
     return _SHORT.get(name, name.replace("_", "-"))
 
 

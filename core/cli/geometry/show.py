@@ -35,12 +35,15 @@ def _run(arguments: argparse.Namespace) -> None:
         "{d:5.2f} {Ld:6.2f} {Td:6.2f} {R:6.2f}"
     )
     more = _shown(system)
-    heading += "".join(f" {name:>{_width(name, texts)}}" for name, texts in more.items())
-    ends = ["".join(f" {text:>{_width(name, more[name])}}" for name, text in row.items()) for row in table_rows(more)]
-    end_of = dict(zip(system.numbers.tolist(), ends or [""] * len(system), strict=True))
+    width = {name: max(map(len, (name, *texts))) for name, texts in more.items()}
+    heading += "".join(f" {name:>{width[name]}}" for name in more)
+    ends = {
+        number: "".join(f" {texts[i]:>{width[name]}}" for name, texts in more.items())
+        for i, number in enumerate(system.numbers.tolist())
+    }
     units = [f", {name} in {system.columns[name].unit}" for name in more if system.columns[name].unit]
     footer = "lengths in mm, angles in radians" + "".join(units)
-    lines = [heading, *(line.format(**row) + end_of[row["number"]] for row in rows), footer]
+    lines = [heading, *(line.format(**row) + ends[row["number"]] for row in rows), footer]
     print_answer(arguments, {"modules": rows, "units": "mm, radians"}, lines)
 
 
@@ -69,7 +72,3 @@ def _shown(system: PinholeSystem) -> dict[str, list[str]]:
     declared = system.columns
     more = [declared[name] for name in declared.optional if name != "l" and not declared[name].is_default(system).all()]
     return {c.name: [c.number_of(value) for value in c.of(system).tolist()] for c in more}
-
-
-def _width(name: str, texts: list[str]) -> int:
-    return max(map(len, (name, *texts)))

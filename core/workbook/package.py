@@ -120,7 +120,7 @@ class Package:
                 new.writestr(zipfile.ZipInfo(part), new_data[part], zipfile.ZIP_DEFLATED)
         return out.getvalue()
 
-    def with_last(self, name: str, parent: str, element: str, **attributes: str) -> bytes:
+    def with_last(self, name: str, parent: str, element: str, /, **attributes: str) -> bytes:
         """A member's XML with one more element at the end of the first one called `parent`, and in its namespace."""
         data = self.read(name)
         found = next((e for e in self.elements(name) if e.name == parent and e.end > e.inner), None)

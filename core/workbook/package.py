@@ -85,11 +85,11 @@ class Package:
 
     def content_type(self, part: str) -> str:
         """The content type of a member."""
-        said = {}
+        types = {}
         for e in self.elements(CONTENT_TYPES):
             key = e.attributes.get("PartName", "").lstrip("/") or f".{e.attributes.get('Extension', '')}"
-            said[key.casefold()] = e.attributes.get("ContentType", "")
-        return said.get(part.casefold()) or said.get(f".{part.rpartition('.')[2].casefold()}", "")
+            types[key.casefold()] = e.attributes.get("ContentType", "")
+        return types.get(part.casefold()) or types.get(f".{part.rpartition('.')[2].casefold()}", "")
 
     def with_parts(self, parts: dict[str, bytes], removed: Iterable[str] = (), owner: str = "") -> bytes:
         """The archive with other bytes for `parts`, new ones last, without the `removed` members that `owner` refers to.

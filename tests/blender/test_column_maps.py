@@ -86,9 +86,12 @@ def quantity(form, name):
 
 def assert_equal(one: PinholeSystem, other: PinholeSystem) -> None:
     np.testing.assert_array_equal(one.numbers, other.numbers)
-    for field in dataclasses.fields(PinholeSystem):
-        if field.name not in ("numbers", "source"):
-            np.testing.assert_allclose(getattr(one, field.name), getattr(other, field.name), rtol=1e-9, atol=1e-9)
+    for name in PinholeSystem.columns.typed:
+        column = PinholeSystem.columns[name]
+        if column.is_text:
+            np.testing.assert_array_equal(column.of(one), column.of(other))
+        else:
+            np.testing.assert_allclose(column.of(one), column.of(other), rtol=1e-9, atol=1e-9)
 
 
 # The settings

@@ -39,7 +39,9 @@ def _detector_back(system: Any) -> NDArray[np.float64]:
 def _detector_end(system: Any) -> NDArray[np.float64]:
     """Middle (M, 3) of the crystal's back, mm."""
     aimed = system.centers * (_detector_back(system) / system.pinhole_distance)[:, None]
-    off = system.principal_rays - principal_rays(system.centers)  # 0 without tilt
+    if not system.tilt.any():  # as the workbook's formula has it, to the last digit
+        return aimed
+    off = system.principal_rays - principal_rays(system.centers)
     return aimed - off * (system.collimator_length + system.detector_thickness)[:, None]
 
 

@@ -6,12 +6,11 @@ the pinhole's distance b. Its radiographs are plausible, but are not what the sc
 look from the other side in z (`c_arm_views` has both).
 """
 
-from dataclasses import replace
-
 from numpy.typing import ArrayLike
 
 from ..validation import lengths as checked_lengths
 from ..validation import one_of, positive, whole_shape
+from .frames import module_frames
 from .system import PinholeSystem, warn_of_size
 from .views import Views
 
@@ -63,7 +62,7 @@ def c_arm_views(
     radius = positive(lengths, "lengths") / 2 * system.collimator_length[:, None]
     if pitch is not None:
         warn_of_size(shape[::-1], pitches, lengths * system.detector_side[:, None], f"side, {lengths:g} Ld,")
-    if elevation == "diffdrr":
-        system = replace(system, centers=system.centers * [1, 1, -1])
-    u, v, k = system.frames().transpose(1, 0, 2)
+    # It looks at the isocentre from where the module is, whatever the module's tilt.
+    mirrored = [1, 1, -1] if elevation == "diffdrr" else 1
+    u, v, k = module_frames(system.centers * mirrored).transpose(1, 0, 2)
     return Views(-radius * k, radius * k, pitch_u * u, pitch_v * v, shape)

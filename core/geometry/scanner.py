@@ -107,8 +107,8 @@ class Scanner(ABC):
 
     def replace(self, **changes: Any) -> Self:
         """The same with other values of these attributes, those of `more` among them."""
-        kept = {name: getattr(self, name) for name in (*self.columns.fields, "numbers", "source")}
-        return self.of({**kept, **changes})
+        own = {f.name: getattr(self, f.name) for f in fields(self)}  # type: ignore[arg-type]
+        return self.of({**own.pop("more"), **own, **changes})
 
     @classmethod
     def of(cls, values: Mapping[str, Any]) -> Self:

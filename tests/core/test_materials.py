@@ -134,7 +134,7 @@ def test_a_material_by_name_is_its_coefficient_at_the_isotopes_photons(edge, sys
 
 def test_several_lines_count_as_they_do_together(system):
     """Tungsten's K edge is between Tl-201's two strongest lines, 68.9 and 70.8 keV; Ga-67's are far apart."""
-    system = dataclasses.replace(system[:2], pinhole_diameter=2.3, detector_thickness=10.0)
+    system = dataclasses.replace(system[:2], pinhole_diameter=2.3, detector_thickness=10.0, tilt=0.0)
     points = system.principal_rays[0] * np.linspace(-40, 40, 5)[:, None]  # on the axis of module 0
     materials = {"aperture_mu": "tungsten", "crystal_mu": "NaI"}
     for isotope, window in (("Tl-201", None), ("Ga-67", (80, 330))):

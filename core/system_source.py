@@ -9,8 +9,7 @@ from typing import Any
 class QuantityCells:
     """The cells of one quantity."""
 
-    # "number", "x1", "y1", "z1", "b", "l", "H", "x2", "y2", "z2", "range", "azimuth", "elevation", "d", "R", "Ld" or "Td"
-    quantity: str
+    quantity: str  # "number", or the name of a column of the scanner's kind (core.geometry), such as "x1"
     sheet: str
     column: str  # its letters
     rows: tuple[int, ...]  # of each of `SystemSource.numbers`, in their order; all the same if one value holds for all

@@ -8,7 +8,7 @@ from bpy.app.translations import pgettext_iface as iface
 
 from ..addon.blender.layouts import draw_all, labelled
 from ..addon.scanner.column_maps import ColumnMapProperties, ColumnMapQuantity
-from ..core.workbook.quantities import DERIVED, QUANTITIES
+from ..core.geometry.system import PinholeSystem
 
 WIDTH = 1000  # of the dialog, pixels
 _LINE = 170  # characters that fit in it
@@ -22,9 +22,14 @@ def draw(layout: bpy.types.UILayout, form: ColumnMapProperties) -> None:
     row = layout.row()
     draw_all(row, form, "n_tables", "unit")
     _tables(layout, form)
-    compared = [quantity for quantity in form.quantities if quantity.name in DERIVED]
+    compared = [quantity for quantity in form.quantities if quantity.name in PinholeSystem.columns.derived]
     split = layout.split(factor=0.6) if compared else layout
-    _columns(split, "Quantity", [quantity for quantity in form.quantities if quantity.name not in DERIVED], 0.38)
+    _columns(
+        split,
+        "Quantity",
+        [quantity for quantity in form.quantities if quantity.name not in PinholeSystem.columns.derived],
+        0.38,
+    )
     if compared:
         _columns(split, "Compared", compared, 0.2)
     _result(layout, form)
@@ -53,7 +58,9 @@ def _columns(layout: bpy.types.UILayout, head: str, quantities: list[ColumnMapQu
         cell.label(text=text)
     for quantity in quantities:
         name, table, column, unit, seen = _cells(box, factor)
-        described = () if quantity.name in DERIVED else QUANTITIES[quantity.name].headings[1:2]
+        described = (
+            () if quantity.name in PinholeSystem.columns.derived else PinholeSystem.columns[quantity.name].headings[1:2]
+        )
         name.label(text=" ".join([quantity.name, *(f"({text})" for text in described)]))
         table.prop(quantity, "table", text="")
         column.prop(quantity, "column", text="")

@@ -14,8 +14,9 @@ from ..addon.scanner import column_maps, scanner
 from ..addon.scanner.scanner_files import WORKBOOK_SUFFIXES
 from ..core.errors import InputError
 from ..core.geometry.collimator import Construction
+from ..core.geometry.scanner import SCANNERS, Scanner
 from ..core.geometry.system import PinholeSystem
-from ..core.workbook import ColumnMap, read_system
+from ..core.workbook import ColumnMap, kinds_in, read_scanner
 from . import column_map_dialog
 
 
@@ -78,7 +79,7 @@ class MPHDRR_OT_import_geometry(bpy.types.Operator):
                 column_maps.fill(form, self._workbook(), self._columns())
                 return self._ask_columns(context)
             with warnings_reported(self):
-                system = read_system(self._workbook(), self._columns())
+                system = read_scanner(self._workbook(), self._kind(), self._columns())
         except InputError as error:
             if self._dialog_can_help(form, error):
                 return self._ask_columns(context)
@@ -96,7 +97,7 @@ class MPHDRR_OT_import_geometry(bpy.types.Operator):
                 )
         return run_reported(self, lambda: self._build(context, system))
 
-    def _build(self, context: bpy.types.Context, system: PinholeSystem) -> str:
+    def _build(self, context: bpy.types.Context, system: Scanner) -> str:
         collection = scanner.build_scanner(
             context.scene,
             system,
@@ -141,6 +142,11 @@ class MPHDRR_OT_import_geometry(bpy.types.Operator):
         if not self.filepath:
             raise InputError("no file given: set filepath to a workbook (.xlsx)")
         return Path(bpy.path.abspath(self.filepath))
+
+    def _kind(self) -> str:
+        """The kind of scanner in the workbook: the first that it holds, where several are known."""
+        found = kinds_in(self._workbook()) if len(SCANNERS) > 1 and self._columns() is None else ()
+        return next(iter(found), PinholeSystem.kind)
 
     def _columns(self) -> ColumnMap | None:
         if self.chosen_columns:

@@ -2,20 +2,19 @@
 
 import hashlib
 import math
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import bpy
 import numpy as np
 
+from ...core import workbook
 from ...core.errors import InputError, warn
 from ...core.exchange import FORMATS, write_geometry
-from ...core.geometry.scanner import Detector
-from ...core.geometry.system import PinholeSystem
+from ...core.geometry.scanner import Detector, Scanner
 from ...core.progress import Progress, stages_of
 from ...core.recording import recorded_warnings
-from ...core.workbook import read_system, write_system
 from ..blender import jobs, storage
 from ..blender.decimals import typed
 from . import pinholes, scanner
@@ -32,25 +31,25 @@ def exporting_scanner(collection: bpy.types.Collection, path: Path, use_template
     by; a new one is made where that workbook has gone (`InputWarning`). Raises InputError, and leaves the scanner as it was,
     where the file cannot be written.
     """
-    system = scanner.read_pinholes(collection)
+    system = scanner.read_scanner(collection)
     template = _template(collection) if use_template else None
     source = scanner.source(collection) if template is not None else None
     columns, name = source.columns if source is not None else None, collection.name
 
-    def work(progress: Progress) -> PinholeSystem:
+    def work(progress: Progress) -> Scanner:
         stages_of(progress)("writing the workbook")
-        own = write_system(system, path, template, columns).columns
+        own = workbook.write_system(system, path, template, columns).columns
         with recorded_warnings():  # the writer has already warned of the template's doubts
-            written = read_system(path, own)
+            written = workbook.read_scanner(path, system.kind, own)
         different = _difference(system, written)
         if different:
             raise InputError(
                 f"{path}: was written, but reads back differently ({different}); the scene keeps its numbers"
             )
         # The scene's own float64 numbers, which may differ in the last digit.
-        return replace(system, source=written.source)
+        return system.replace(source=written.source)
 
-    def finish(written: PinholeSystem) -> str:
+    def finish(written: Scanner) -> str:
         collection = bpy.data.collections.get(name)
         if collection is not None:
             scanner.remember_source(collection, written)
@@ -103,7 +102,7 @@ def _template(collection: bpy.types.Collection) -> Path | None:
     return path
 
 
-def _difference(one: PinholeSystem, other: PinholeSystem) -> str:
+def _difference(one: Scanner, other: Scanner) -> str:
     """Where two systems differ, in words."""
     if not np.array_equal(one.numbers, other.numbers):
         return "the modules' numbers"

@@ -44,6 +44,10 @@ class Column:
     kind: Kind = "length"
     derived: Callable[[Any], NDArray[np.float64]] | None = None
     """A function of the scanner that gives its values (M,), mm or rad, of a column that follows from the others."""
+    undefined: Callable[[Values], NDArray[np.bool_]] | None = None
+    """A function of the needed columns: where (M,) the formula divides by 0, and any value is right."""
+    unlike_formula: Callable[[Any], NDArray[np.bool_]] | None = None
+    """A function of the scanner: where (M,) the formula does not give the value of a derived column."""
     headings: tuple[str, ...] = ()
     """The texts that head it. Texts of one letter are case-sensitive, others are not."""
     place: str = ""
@@ -64,8 +68,8 @@ class Column:
     """The words that a choice may be."""
     help: str = ""
     """What it is, for help texts and tooltips."""
-    depends_on_length: bool = False
-    """Whether it is derived from l, and hence from all the digits of an l that is shown rounded."""
+    rounded_with: str = ""
+    """The typed column, l, from all whose digits it is derived, though a sheet may show them rounded."""
 
     @property
     def role(self) -> Literal["needed", "optional", "derived"]:
@@ -83,6 +87,18 @@ class Column:
         return self.kind in ("choice", "text")
 
     @property
+    def expected(self) -> str:
+        """What a cell of it must hold, for messages."""
+        words = {"whole": "a whole number", "text": "a text", "choice": f"one of {', '.join(self.choices)}"}
+        return words.get(self.kind, "a number")
+
+    def word(self, text: str) -> str | None:
+        """What a text in a cell is: itself, or the word of a choice whatever its case; None if it is none of these."""
+        if self.kind != "choice" or text == self.blank:
+            return text
+        return next((word for word in self.choices if word.casefold() == text.casefold()), None)
+
+    @property
     def units(self) -> dict[str, float]:
         """Unit -> mm or rad; the first is that of a heading without one. "" is that of a plain number."""
         known = {"length": LENGTH_UNITS, "angle": ANGLE_UNITS}.get(self.kind, {"": 1.0})
@@ -98,12 +114,14 @@ class Column:
         """Whose number messages say that of a blank cell is."""
         return "the design formula's" if callable(self.blank) else self.text_of(self.blank)
 
+    def number_of(self, value: Any, digits: int = 6) -> str:
+        """A value of it, in mm or rad, as tables show it: a text, or a number in the unit of a heading without one."""
+        return str(value) if self.is_text else f"{value / next(iter(self.units.values())):.{digits}g}"
+
     def text_of(self, value: Any, digits: int = 6) -> str:
-        """A value of it, in mm or rad, as messages show it, in the unit of a heading without one."""
-        if self.is_text:
-            return repr(str(value))
-        unit, factor = next(iter(self.units.items()))
-        return f"{value / factor:.{digits}g} {unit}".rstrip()
+        """A value of it, in mm or rad, as messages show it: a quoted text, or a number with its unit."""
+        shown = self.number_of(value, digits)
+        return repr(shown) if self.is_text else f"{shown} {next(iter(self.units))}".rstrip()
 
     def of(self, scanner: Any) -> NDArray[Any]:
         """Its values (M,) in a scanner, mm or rad."""
@@ -120,11 +138,26 @@ class Column:
         """Which modules (M,) have the value of a blank cell."""
         return self.same(self.default(scanner.columns.needed_values(scanner)), self.of(scanner))
 
-    def same(self, one: NDArray[Any], other: NDArray[Any]) -> NDArray[np.bool_]:
-        """Where values (M,) are equal: numbers to 1e-9, relative, texts letter by letter."""
+    def follows_formula(self, scanner: Any) -> NDArray[np.bool_]:
+        """Which modules (M,) have the value that its formula gives."""
+        if self.derived is None:
+            return self.is_default(scanner) if self.formula else np.zeros(len(scanner), dtype=np.bool_)
+        return np.ones(len(scanner), dtype=np.bool_) if self.unlike_formula is None else ~self.unlike_formula(scanner)
+
+    def same(self, one: NDArray[Any], other: NDArray[Any], within: float = AGREEING) -> NDArray[np.bool_]:
+        """Where values (M,) are equal: numbers to `within`, relative, texts letter by letter."""
         if self.is_text:
             return np.asarray(one, np.str_) == other
-        return np.abs(one - other) <= AGREEING * np.abs(other)
+        return np.abs(one - other) <= within * np.abs(other)
+
+    def headed(self, unit: str = "") -> tuple[str, str]:
+        """The symbol and the description that head it in a workbook, whose numbers are in `unit` (default: the first)."""
+        usual = next(iter(self.units))
+        symbol, description = self.titles or (*self.headings, "")[:2]
+        if unit in ("", usual) and (self.titles or not self.unit):
+            return symbol, description
+        stated = f" ({unit or usual})"
+        return (symbol, description + stated) if description else (symbol + stated, "")
 
     def checked(self, values: Any, n: int | None) -> NDArray[Any]:
         """`values`, one for each of `n` modules or one for all, as an array of its kind, or `InputError`."""
@@ -159,8 +192,10 @@ class Column:
 class ColumnTable(Mapping[str, Column]):
     """A kind of scanner's columns by name; causes stand before their effects, so that the cause of an error is refused."""
 
-    def __init__(self, columns: Iterable[Column]) -> None:
+    def __init__(self, columns: Iterable[Column], unread: Iterable[Column] = ()) -> None:
         self._columns = {column.name: column for column in columns}
+        self.unread = tuple(unread)
+        """Columns of a workbook that are known and written, but not read."""
 
     def __getitem__(self, name: str) -> Column:
         return self._columns[name]
@@ -176,7 +211,7 @@ class ColumnTable(Mapping[str, Column]):
 
     def with_columns(self, *columns: Column) -> "ColumnTable":
         """A table that has these, too."""
-        return ColumnTable([*self.values(), *columns])
+        return ColumnTable([*self.values(), *columns], self.unread)
 
     def _names(self, *roles: str) -> tuple[str, ...]:
         return tuple(column.name for column in self.values() if column.role in roles)
@@ -205,6 +240,11 @@ class ColumnTable(Mapping[str, Column]):
     def position(self) -> tuple[str, ...]:
         """The needed coordinates, x1, y1, z1 of pinholes: they stand in one table, which has a row for each module."""
         return tuple(name for name in self.needed if self[name].axis is not None)
+
+    @cached_property
+    def leading(self) -> str:
+        """The column whose table has a row for each module: the first coordinate, if there is any."""
+        return (*self.position, *self.needed)[0]
 
     @cached_property
     def dimensions(self) -> tuple[str, ...]:

@@ -50,6 +50,12 @@ def _planar_range(system: Any) -> NDArray[np.float64]:
     return np.hypot(system.centers[:, 0], system.centers[:, 1])
 
 
+def _slope(system: Any) -> NDArray[np.float64]:
+    """The users' "3D slope" (M,): the distance to the isocentre, in units of x1."""
+    with np.errstate(divide="ignore", over="ignore"):
+        return system.pinhole_distance / system.centers[:, 0]
+
+
 # Causes stand before their effects, so that the cause of an error is the cell that is refused.
 PINHOLE_COLUMNS = ColumnTable(
     (
@@ -143,7 +149,7 @@ PINHOLE_COLUMNS = ColumnTable(
             titles=("l + b+Td", ""),
             formula="={b}+{l}+{Td}",
             hints="td",
-            depends_on_length=True,
+            rounded_with="l",
         ),
         *(
             Column(
@@ -151,7 +157,8 @@ PINHOLE_COLUMNS = ColumnTable(
                 derived=lambda s, i=i: _detector_end(s)[:, i],  # type: ignore[misc]
                 place=f"Coordinates!{'IJK'[i]}",
                 formula=f"={{{axis}1}}*{{H}}/{{b}}",
-                depends_on_length=True,
+                unlike_formula=lambda s: s.tilt.any(axis=1),
+                rounded_with="l",
             )
             for i, axis in enumerate("xyz")
         ),
@@ -172,6 +179,7 @@ PINHOLE_COLUMNS = ColumnTable(
             titles=("", "pinhole azimuth (radians)"),
             kind="angle",
             formula="=(ATAN2({x1},{y1}))",
+            undefined=lambda needed: np.hypot(needed["x1"], needed["y1"]) == 0,
             hints="azimuth",
         ),
         Column(
@@ -192,6 +200,7 @@ PINHOLE_COLUMNS = ColumnTable(
                 kind="angle",
                 unit="deg",
                 headings=(f"tilt_{axis}", f"tilt about {axis}", f"tilt {axis}"),
+                titles=(f"tilt_{axis}", f"tilt about {axis} (degrees)"),
                 place=f"Coordinates!{'XYZ'[i]}",
                 hints="tilt",
                 plausible=(-0.5, 0.5),
@@ -210,5 +219,14 @@ PINHOLE_COLUMNS = ColumnTable(
             blank="",
             help="material of the crystal; blank: that of the model for all",
         ),
-    )
+    ),
+    unread=(
+        Column(
+            "slope",
+            derived=_slope,
+            headings=("S", "3D slope"),
+            place="Coordinates!F",
+            formula="={b}/{x1}",
+        ),
+    ),
 )

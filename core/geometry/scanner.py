@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import fields
 from typing import Any, ClassVar, Literal, Self
 
@@ -22,6 +22,8 @@ from .module_parts import ModulePart
 from .views import Views
 
 Detector = Literal["virtual", "real"]
+
+Fault = tuple[str, NDArray[np.bool_], Callable[[int], str]]
 
 SCANNERS: dict[str, type[Scanner]] = {}
 """Name -> class, of the kinds of scanners; each enters itself when it is defined."""
@@ -139,6 +141,15 @@ class Scanner(ABC):
             if not columns[0].has_constant_blank or not all(c.is_default(self).all() for c in columns):
                 found[name] = getattr(self, name)
         return found
+
+    @classmethod
+    def faults(cls, values: Values, numbers: Sequence[int], place: Callable[[str, int], str]) -> Iterator[Fault]:
+        """What no scanner of this kind has, of positive `values` of the needed columns of modules with these `numbers`.
+
+        `place` gives the cell of a column and a module's index, for messages. Each fault is the column whose cell is at
+        fault, the modules (M,) for which it is, and a function that tells why it is that of a module, after the cell.
+        """
+        yield from ()
 
     def _refuse(self, bad: NDArray[np.bool_], message: str) -> None:
         """Refuse the first module that is `bad`; `message` is a template of its attributes."""

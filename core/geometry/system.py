@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, Self, TypeVar
 
@@ -13,12 +13,12 @@ from ..errors import InputError, naming, warn
 from ..system_source import SystemSource
 from ..validation import lengths, positive, real_array, whole_shape
 from .collimator import Collimator, Construction
-from .columns import ColumnTable
+from .columns import ColumnTable, Values
 from .design_formulas import roi_radius_seen
 from .frames import affine_matrix, module_frames, module_poses, tilted, tilts
 from .module_parts import ModulePart, collimator_solid, crystal_solid
 from .pinhole_columns import PINHOLE_COLUMNS
-from .scanner import Detector, Scanner, repeated
+from .scanner import Detector, Fault, Scanner, repeated
 from .views import Views
 
 LENGTHS = {name: column.help for name, column in PINHOLE_COLUMNS.scalars.items() if column.kind == "length"}
@@ -73,6 +73,28 @@ class PinholeSystem(Scanner):
             "its pinhole is {pinhole_distance:g} mm from the isocentre, inside the ROI of {roi_radius:g} mm",
         )
         self._refuse(repeated(self.centers), "another module has the same pinhole centre")
+
+    @classmethod
+    def faults(cls, values: Values, numbers: Sequence[int], place: Callable[[str, int], str]) -> Iterator[Fault]:
+        """Holes wider than the crystal, pinholes at the isocentre or inside the ROI, and two at one place."""
+        d, side, roi = values["d"], values["Ld"], values["R"]
+        wide = "has d = {:g} mm, expected less than Ld = {:g} mm in {}"
+        yield "d", d >= side, lambda i: wide.format(d[i], side[i], place("Ld", i))
+        centers = np.stack([values[name] for name in ("x1", "y1", "z1")], axis=1)
+        puts = [f"and y1, z1 put the pinhole of module {number}" for number in numbers]
+        with np.errstate(over="ignore"):
+            b = np.linalg.norm(centers, axis=1)
+        yield "x1", b == 0, lambda i: f"{puts[i]} at the isocentre, expected outside the ROI"
+        yield "x1", np.isinf(b), lambda i: f"{puts[i]} too far away to compute, expected millimetres"
+        outside = "{} {:g} mm from the isocentre, expected outside the ROI of {:g} mm in {}"
+        yield "x1", b <= roi, lambda i: outside.format(puts[i], b[i], roi[i], place("R", i))
+        first, again = same_place(centers) or (0, len(centers))
+        twice = "{} at the place of module {} ({}), expected another place"
+        yield (
+            "x1",
+            np.arange(len(centers)) == again,
+            lambda i: twice.format(puts[i], numbers[first], place("x1", first)),
+        )
 
     @property
     def pinhole_distance(self) -> NDArray[np.float64]:

@@ -1,16 +1,18 @@
-"""The users' geometry workbook (.xlsx): the pinholes' coordinates and their dimensions.
+"""The users' geometry workbook (.xlsx): the pinholes' coordinates and their dimensions, and scanners of other kinds.
 
-Both ways:   quantities (the table of the columns), book, sheet_xml, workbook_xml and package (the file),
-             calculation and formulas (the values of its formulas)
+Which columns there are is declared in `core.geometry`: `pinhole_columns`, and the table of another kind.
+
+Both ways:   book, sheet_xml, workbook_xml and package (the file), calculation and formulas (the values of its formulas),
+             agreement (when a cell's value is right)
 Reading:     headings, headed_table and recognition (what a workbook's headings say, and doubts), column_map and draft (what
-             a person says), layout (which cells hold which quantity), reader
+             a person says), layout (which cells hold which column), reader
 Writing:     writer, edit (the cells that change, and the rows that move with the modules)
 """
 
 from ..system_source import QuantityCells, SystemSource
 from .column_map import ColumnMap, MappedColumn, MappedTable
 from .draft import ColumnMapDraft, draft_column_map, preview_workbook
-from .reader import read_system
+from .reader import kinds_in, read_scanner, read_system
 from .writer import WrittenWorkbook, write_system
 
 __all__ = [
@@ -22,7 +24,9 @@ __all__ = [
     "SystemSource",
     "WrittenWorkbook",
     "draft_column_map",
+    "kinds_in",
     "preview_workbook",
+    "read_scanner",
     "read_system",
     "write_system",
 ]

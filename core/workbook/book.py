@@ -49,6 +49,13 @@ class Book:
             self.workbook, self._cell, lambda _, cell: cell.formula is not None, self._relied_on
         )
 
+    def sheet(self, name: str, why: str) -> "Sheet":
+        """A sheet, or `InputError`, which tells `why` it is wanted."""
+        if name not in self.sheets:
+            names = ", ".join(self.sheets) or "none"
+            raise InputError(f"{self.path.name}: has no sheet {name}{why}; its sheets are {names}")
+        return self.sheets[name]
+
     def _relied_on(self, place: Place, computed: Any) -> Any:
         stored = self._cell(place).value
         if not isinstance(computed, Uncomputed) or stored is None:

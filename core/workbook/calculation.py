@@ -7,8 +7,8 @@ from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
 from typing import Any
 
+from .agreement import agree
 from .formulas import NotComputable, Surroundings, calculate, operands, tokens_of
-from .quantities import agree
 from .sheet_xml import Cell, CellError, Reference, Unreadable, reference
 from .workbook_xml import Place, WorkbookXml
 
@@ -111,7 +111,7 @@ class Recalculation:
         self,
         workbook: WorkbookXml,
         changed: Collection[Place],
-        required: Mapping[Place, float],
+        required: Mapping[Place, float | str],
         expected: Mapping[Place, float],
     ) -> None:
         self.values: dict[Place, Any] = {}

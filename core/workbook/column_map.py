@@ -11,9 +11,10 @@ from typing import Any, Literal, get_args
 
 from ..errors import InputError
 from ..files import write_bytes
+from ..geometry.columns import ColumnTable
+from ..geometry.scanner import Scanner, scanner_kind
 from ..toml import parse_toml, read_toml, toml_value
 from .headings import unit_of
-from .quantities import DIMENSIONS, POSITION, QUANTITIES
 from .sheet_xml import MAX_COLUMN, MAX_ROW
 
 Joined = Literal["by number", "in order", "one for all"]
@@ -25,12 +26,12 @@ _KEYS |= {"rows": str, "number": str, "columns": dict}
 
 @dataclass(frozen=True)
 class MappedColumn:
-    """A column of one quantity: its symbol, such as x1, Td or azimuth, the column's letters and the unit."""
+    """A column of a sheet: the name of the scanner's column in it, such as x1, Td or azimuth, its letters and the unit."""
 
     quantity: str
     column: str
     unit: str
-    """mm, cm, m, in, µm, dm, ft, mil or 0.1 mm; rad or deg. Empty in a draft if it is not known."""
+    """mm, cm, m, in, µm, dm, ft, mil or 0.1 mm; rad or deg. Empty for texts and plain numbers, and in a draft if unknown."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "unit", unit_of(self.unit) or self.unit)  # "um" and "inches" are units, too
@@ -67,30 +68,32 @@ class MappedTable:
 
 @dataclass(frozen=True)
 class ColumnMap:
-    """Which cells of a workbook hold which quantity, given by a person instead of its headings.
+    """Which cells of a workbook hold which column of a scanner, given by a person instead of its headings.
 
-    The first of the `tables` holds x1, y1 and z1. d, R, Ld and Td must be in some table; without l, the design formula is
-    used. A map read by `from_toml` or `read` may be incomplete: `faults` tells.
+    Of pinholes, the first of the `tables` holds x1, y1 and z1; d, R, Ld and Td must be in some table; without l, the design
+    formula is used. A map read by `from_toml` or `read` may be incomplete: `faults` lists what is missing.
     """
 
     tables: tuple[MappedTable, ...]
 
-    def faults(self) -> list[str]:
-        """Why the map cannot be used, a line for each reason; empty if it is complete."""
+    def faults(self, kind: str = "pinhole") -> list[str]:
+        """Why the map cannot be used for a kind of scanner, a line for each reason; empty if it is complete."""
+        declared = scanner_kind(kind).columns
+        first = declared.position or (declared.leading,)
         if not self.tables:
-            return ["the column map has no [[tables]], expected one with x1, y1, z1 first"]
-        faults = [fault for i, table in enumerate(self.tables) for fault in _table_faults(table, i)]
+            return [f"the column map has no [[tables]], expected one with {', '.join(first)} first"]
+        faults = [fault for i, table in enumerate(self.tables) for fault in _table_faults(table, i, declared)]
         places: dict[str, str] = {}
         for i, table in enumerate(self.tables):
             for c in table.columns:
                 if c.quantity in places:
                     faults.append(f"{_of(i, c.quantity)} is in {places[c.quantity]} too, expected each quantity once")
                 places.setdefault(c.quantity, _of(i))
-        for name in POSITION:
+        for name in first:
             if places.get(name) != _of(0):
                 found = f"{places[name]} has {name}" if name in places else f"{_of(0)} has no column {name}"
-                faults.append(f"{found}, expected x1, y1, z1 in the first table")
-        faults += [f"no table has a column {name}" for name in DIMENSIONS if name not in places]
+                faults.append(f"{found}, expected {', '.join(first)} in the first table")
+        faults += [f"no table has a column {name}" for name in declared.needed if name not in {*places, *first}]
         # A column may be used twice in the same rows only for the modules' numbers.
         used: dict[tuple[str, str], list[tuple[set[int], str]]] = {}
         for i, table in enumerate(self.tables):
@@ -143,9 +146,9 @@ class ColumnMap:
 
 
 def column_map(
-    columns: ColumnMap | str | os.PathLike[str] | None, workbook: str | os.PathLike[str]
+    columns: ColumnMap | str | os.PathLike[str] | None, workbook: str | os.PathLike[str], scanner: type[Scanner]
 ) -> ColumnMap | None:
-    """The column map of `workbook`, given as such or as the path of its file; `InputError` if it is not complete."""
+    """The column map of `workbook` for a kind of scanner, given as such or by its file; `InputError` if incomplete."""
     if columns is None:
         return None
     name = str(columns)
@@ -153,7 +156,7 @@ def column_map(
         name = f"{Path(workbook).name}: column map"
     else:
         columns = ColumnMap.read(columns)
-    for fault in columns.faults():
+    for fault in columns.faults(scanner.kind):
         raise InputError(f"{name}: {fault} ({_HELP})")
     return columns
 
@@ -162,7 +165,7 @@ def _of(i: int, name: str = "") -> str:
     return f"table {i + 1}" + (f".{name}" if name else "")
 
 
-def _table_faults(table: MappedTable, i: int) -> Iterator[str]:
+def _table_faults(table: MappedTable, i: int, declared: ColumnTable) -> Iterator[str]:
     if not 1 <= table.first_row <= table.last_row <= MAX_ROW:
         yield f"{_of(i)}: rows {table.first_row} to {table.last_row}, expected the first row, then the last"
     elif not table.row_numbers():
@@ -173,11 +176,11 @@ def _table_faults(table: MappedTable, i: int) -> Iterator[str]:
     if not table.columns:
         yield f"{_of(i)} has no columns"
     for c in table.columns:
-        quantity = QUANTITIES.get(c.quantity)
-        if quantity is None:
-            yield f"{_of(i, c.quantity)}: no such quantity, expected {', '.join(QUANTITIES)}"
-        elif c.unit not in quantity.units:
-            yield f"{_of(i, c.quantity)}: unit {c.unit!r}, expected {', '.join(quantity.units)}"
+        known = declared.get(c.quantity)
+        if known is None:
+            yield f"{_of(i, c.quantity)}: no such quantity, expected {', '.join(declared)}"
+        elif c.unit not in known.units:
+            yield f"{_of(i, c.quantity)}: unit {c.unit!r}, expected {', '.join(filter(None, known.units)) or 'none'}"
         if not _is_column(c.column):
             yield f"{_of(i, c.quantity)}: column {c.column!r}, expected letters such as B"
     if table.number is not None and not _is_column(table.number):

@@ -5,13 +5,14 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 from ..errors import InputError
+from ..geometry.columns import ColumnTable
+from ..geometry.scanner import scanner_kind
 from ..recording import recorded_warnings
 from .book import HEADING_ROWS, Book, Outdated, Sheet, shortened
 from .calculation import Uncomputed
 from .column_map import ColumnMap, Joined, MappedColumn, MappedTable
 from .headed_table import HeadedTable
-from .headings import heading_of, is_number_heading, may_mean
-from .quantities import DERIVED, NEEDED, OPTIONAL, POSITION, QUANTITIES, TYPED
+from .headings import is_number_heading, vocabulary
 from .recognition import recognize, recognized_layout
 
 
@@ -30,43 +31,45 @@ class ColumnMapDraft:
         self.columns.write(path, "\n".join(lines))
 
 
-def draft_column_map(path: str | os.PathLike[str]) -> ColumnMapDraft:
-    """A best guess at a workbook's column map, for a person to check.
+def draft_column_map(path: str | os.PathLike[str], kind: str = "pinhole") -> ColumnMapDraft:
+    """A best guess at a workbook's column map for a kind of scanner, for a person to check.
 
-    For a workbook that `read_system` understands, it is the map that says the same.
+    For a workbook that `read_scanner` understands, it is the map that says the same.
     """
-    book = Book(path)
-    found = recognize(book)
+    book, scanner = Book(path), scanner_kind(kind)
+    declared, found = scanner.columns, recognize(book, scanner)
     questions, certain = found.doubts, True
     try:
         with recorded_warnings():  # given when the workbook is read
-            recognized_layout(book)
+            recognized_layout(book, scanner)
     except InputError as error:
         questions, certain = questions or [str(error).removeprefix(f"{book.path.name}: ")], False
-    optional = found.tables.keys() - set(NEEDED) if certain else ()
+    optional = found.tables.keys() - set(declared.needed) if certain else ()
     partial = {name for name in optional if _has_gaps(found.tables[name], name)}
     chosen = {name: table for name, table in found.tables.items() if name not in partial}
     tables = [mapped for table in dict.fromkeys(chosen.values()) for mapped in _mapped(table, chosen, certain)]
-    for name in OPTIONAL:
-        if name in partial and found.tables[name].has_numbers(name):
-            used = QUANTITIES[name].blank_is.removesuffix("'s")
+    for name in declared.optional:
+        if name in partial and found.tables[name].is_filled(name):
+            used = declared[name].blank_is.removesuffix("'s")
             questions.append(f"{name} stands in some rows only and is left out here: {used} is then used for all")
-    missing = [name for name in TYPED if name not in found.tables]
-    _add_guesses(tables, found.sheets, missing if not certain else [])
+    missing = [name for name in declared.typed if name not in found.tables and not declared[name].is_text]
+    if not certain:
+        _add_guesses(tables, found.sheets, declared, missing)
     if missing and not tables:
         tables = [MappedTable(next(iter(book.sheets), "Coordinates"), 2, 2, ())]
-    tables.sort(key=lambda table: not any(c.quantity in POSITION for c in table.columns))
+    leading = {declared.leading, *declared.position}
+    tables.sort(key=lambda table: leading.isdisjoint(c.quantity for c in table.columns))
     for i, table in enumerate(tables):
         joined: Joined = "by number" if tables[0].number and table.number else "in order"
         tables[i] = replace(table, rows=None if i == 0 else table.rows or joined)
     columns = ColumnMap(tuple(tables))
-    return ColumnMapDraft(columns, tuple(dict.fromkeys([*questions, *columns.faults()])))
+    return ColumnMapDraft(columns, tuple(dict.fromkeys([*questions, *columns.faults(kind)])))
 
 
 def _has_gaps(table: HeadedTable, name: str) -> bool:
-    """Whether cells of a column are blank or cannot be computed, which a map does not allow."""
+    """Whether cells of a column are blank or cannot be computed, which a map allows of texts alone."""
     values = [table.sheet.value(row, table.columns[name][0]) for row in table.rows]
-    return any(value is None or isinstance(value, Uncomputed) for value in values)
+    return not table.declared[name].is_text and any(value is None or isinstance(value, Uncomputed) for value in values)
 
 
 def _mapped(table: HeadedTable, chosen: dict[str, HeadedTable], certain: bool) -> Iterator[MappedTable]:
@@ -74,10 +77,10 @@ def _mapped(table: HeadedTable, chosen: dict[str, HeadedTable], certain: bool) -
     rows, sheet = table.rows or (table.first_row,), table.sheet
     each: dict[str, tuple[int, str]] = {}
     once: dict[str, tuple[int, str]] = {}
-    for name in (*TYPED, *DERIVED):
+    for name in (*table.declared.typed, *table.declared.derived):
         if chosen.get(name) is table:
             column, unit = table.columns[name]
-            is_single = table.is_single(name) and (len(rows) > 1 or table is not chosen.get("x1"))
+            is_single = table.is_single(name) and (len(rows) > 1 or table is not chosen.get(table.declared.leading))
             (once if is_single else each)[name] = column, unit if certain or table.units(column) else ""
     if each:
         yield _mapped_table(sheet, rows, each, table.first_heading, table.label_column)
@@ -100,11 +103,13 @@ def _mapped_table(
     return table.with_rows(rows)
 
 
-def _add_guesses(tables: list[MappedTable], sheets: dict[str, Sheet], missing: list[str]) -> None:
+def _add_guesses(
+    tables: list[MappedTable], sheets: dict[str, Sheet], declared: ColumnTable, missing: list[str]
+) -> None:
     """Add columns whose headings speak of what is missing, to the table with the same rows if there is one."""
     used = {(table.sheet, c.column) for table in tables for c in table.columns}
     for name in missing:
-        guesses = (guess for sheet in sheets.values() for guess in _guesses(sheet, name))
+        guesses = (guess for sheet in sheets.values() for guess in _guesses(sheet, declared, name))
         guess = next((guess for guess in guesses if (guess.sheet, guess.columns[0].column) not in used), None)
         if guess is None:
             continue
@@ -117,18 +122,19 @@ def _add_guesses(tables: list[MappedTable], sheets: dict[str, Sheet], missing: l
             tables.append(guess)
 
 
-def _guesses(sheet: Sheet, name: str) -> Iterator[MappedTable]:
-    """Columns with numbers under a heading that may mean a quantity."""
+def _guesses(sheet: Sheet, declared: ColumnTable, name: str) -> Iterator[MappedTable]:
+    """Columns with numbers under a heading that may mean a column of the scanner."""
+    words = vocabulary(declared)
     headings = {at: text for at, text in sheet.texts.items() if at[0] <= HEADING_ROWS}
     numbers = {column for (_, column), text in headings.items() if is_number_heading(text)}
     for (row, column), text in headings.items():
         below = [r for r in sheet.rows if r > row and type(sheet.value(r, column)) is float]
-        if below and name in may_mean(text) and heading_of(text) is None:
-            rows, said = range(below[0], below[-1] + 1), {name: (column, "")}
-            if len(rows) == 1 and name not in POSITION:
-                yield _mapped_table(sheet, rows, said, row, rows_are="one for all")
+        if below and name in words.may_mean(text) and words.heading_of(text) is None:
+            rows, columns = range(below[0], below[-1] + 1), {name: (column, "")}
+            if len(rows) == 1 and name not in declared.position:
+                yield _mapped_table(sheet, rows, columns, row, rows_are="one for all")
             else:
-                yield _mapped_table(sheet, rows, said, row, next(iter(numbers)) if len(numbers) == 1 else None)
+                yield _mapped_table(sheet, rows, columns, row, next(iter(numbers)) if len(numbers) == 1 else None)
 
 
 def preview_workbook(

@@ -1,4 +1,4 @@
-"""The numbers of a system put into the cells of a workbook, whose rows move with the modules.
+"""The values of a scanner put into the cells of a workbook, whose rows move with the modules.
 
 Its formulas are not recalculated yet.
 """
@@ -7,40 +7,41 @@ import itertools
 import math
 from collections import Counter
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from ..errors import InputError, warn
-from ..geometry.system import PinholeSystem
+from ..geometry.scanner import Scanner
+from .agreement import EXACT, agree, text_of
 from .book import module_number
-from .column_map import ColumnMap
+from .column_map import ColumnMap, MappedColumn
 from .formulas import areas_in
-from .layout import Column, Table
-from .quantities import DERIVED, EXACT, OPTIONAL, QUANTITIES, TYPED, agree
+from .layout import ColumnCells, Table, absent
 from .reader import Reading
-from .sheet_xml import SheetXml, moved
+from .sheet_xml import MAX_COLUMN, SheetXml, cell_name, moved
 from .workbook_xml import Place, WorkbookXml
 
 _SAME = 1e-12
 """NumPy's last digit of the same number may depend on where in memory it lies."""
 
 
-def matched(system: PinholeSystem, old: PinholeSystem, numbered: bool) -> list[int | None]:
+def matched(system: Scanner, old: Scanner, numbered: bool) -> list[int | None]:
     """The index in `old` of each module of `system`, None for a new one.
 
-    Modules are found by their numbers; renumbered ones by the exact position of their pinholes. If no pinhole has moved,
-    or if a workbook without numbers cannot tell the new numbers, their order counts.
+    Modules are found by their numbers; renumbered ones by the exact place of their source. If none has moved, or if a
+    workbook without numbers cannot tell the new numbers, their order counts.
     """
-    if np.array_equal(system.centers, old.centers):
+    places, old_places = ([tuple(row) for row in one.poses()[:, :3, 3].tolist()] for one in (system, old))
+    if places == old_places:
         return list(range(len(old)))
     index = {int(number): j for j, number in enumerate(old.numbers)}
     numbers = [int(number) for number in system.numbers]
     if not numbered and not set(numbers) <= set(index):
         return [i if i < len(old) else None for i in range(len(system))]
     found = [index.get(number) for number in numbers]
-    taken = set(found)
-    at_position = {tuple(center): j for j, center in enumerate(old.centers) if j not in taken}
-    return [at_position.get(tuple(system.centers[i])) if j is None else j for i, j in enumerate(found)]
+    at_place = {place: j for j, place in enumerate(old_places) if j not in set(found)}
+    return [at_place.get(places[i]) if j is None else j for i, j in enumerate(found)]
 
 
 class Rows:
@@ -142,31 +143,36 @@ def _columns(table: Table, rows: Sequence[int]) -> list[int]:
 
 
 class Edit:
-    """The cells of a workbook changed such that it holds another system; `InputError` if it cannot."""
+    """The cells of a workbook changed such that it holds another scanner; `InputError` if it cannot."""
 
-    def __init__(self, system: PinholeSystem, reading: Reading, workbook: WorkbookXml) -> None:
+    def __init__(self, system: Scanner, reading: Reading[Scanner], workbook: WorkbookXml) -> None:
         self.system = system
         self.old, self.given, self.layout = reading.system, reading.given, reading.layout
         self.columns, self.modules = self.layout.columns, self.layout.modules
-        self.workbook = workbook
-        self.is_default = {name: QUANTITIES[name].is_default(system) for name in OPTIONAL}
+        self.workbook, declared = workbook, system.columns
+        self.is_default = {name: declared[name].is_default(system) for name in declared.optional}
+        self.added = {
+            name: None for name in declared.optional if name not in self.columns and not self.is_default[name].all()
+        }
         self.numbered = self.modules.number_column is not None  # whether the workbook has the modules' numbers
         self.old_of = matched(system, self.old, self.numbered)
-        self.required: dict[Place, float] = {}
-        """Cell -> the number that it must hold, typed or by its formula."""
+        self.required: dict[Place, float | str] = {}
+        """Cell -> the number or text that it must hold, typed or by its formula."""
         self.expected: dict[Place, float] = {}
         """Cell of a right formula of H, x2, y2 or z2 -> the number that it should give from now on."""
         self.unsettled: set[Place] = set()
-        """The cells of these two that held other numbers, or none."""
-        self._refuse_unheld()
+        """The cells of these two that held other values, or none."""
+        self._warn_of_unheld_numbers()
+        for name in self.added:
+            self._add_column(name)
         self.rows = {table: self._rows_after(table, rows) for table, rows in self.layout.rows_of.items()}
         for rows in self.rows.values():
             rows.move(workbook)
         self._number_modules()
-        for name in TYPED:
+        for name in declared.typed:
             if name in self.columns:
                 self._require(self.columns[name])
-        for name in DERIVED:
+        for name in declared.derived:
             if name in self.columns:
                 self._derive(self.columns[name])
         for table, rows in self.rows.items():
@@ -180,30 +186,53 @@ class Edit:
                 )
 
     def column_map(self) -> ColumnMap | None:
-        """The column map that the workbook was read by, if any, with the rows that the modules have now."""
+        """The column map that the workbook was read by, if any, with the rows and columns that it has now."""
         read_by = self.old.source.columns if self.old.source else None
         if read_by is None:
             return None
-        tables = [self.columns[said.columns[0].quantity].table for said in read_by.tables]
-        rows = [sorted(self.rows[table].new if table in self.rows else table.rows) for table in tables]
-        return ColumnMap(tuple(said.with_rows(its) for said, its in zip(read_by.tables, rows, strict=True)))
+        tables = []
+        for mapped in read_by.tables:
+            table = self.columns[mapped.columns[0].quantity].table
+            rows = self.rows[table].new if table in self.rows else table.rows
+            more = [self.columns[name] for name in self.added if table is self.modules]
+            columns = [MappedColumn(c.name, cell_name((1, c.column)).removesuffix("1"), c.unit) for c in more]
+            tables.append(replace(mapped.with_rows(sorted(rows)), columns=(*mapped.columns, *columns)))
+        return ColumnMap(tuple(tables))
 
-    def _refuse_unheld(self) -> None:
-        file, sheet = self.workbook.name, self.modules.sheet.name
+    def _warn_of_unheld_numbers(self) -> None:
         numbers = self.system.numbers
         if not self.numbered and not np.array_equal(numbers, np.arange(1, len(numbers) + 1)):
             warn(
-                f"{file}: sheet {sheet} has no column of the modules' numbers: {several(numbers)} will be read as "
-                "1, 2, ... in the order of their rows",
+                f"{self.workbook.name}: sheet {self.modules.sheet.name} has no column of the modules' numbers: "
+                f"{several(numbers)} will be read as 1, 2, ... in the order of their rows",
                 4,
             )
-        for name, is_default in self.is_default.items():
-            if name not in self.columns and not is_default.all():
-                i, quantity = np.argmin(is_default), QUANTITIES[name]
-                raise InputError(
-                    f"{file}: sheet {sheet} has no column headed {name} for the {quantity.title} of module {numbers[i]}, "
-                    f"{quantity.text_of(quantity.of(self.system)[i])}, which is not {quantity.blank_is}"
-                )
+
+    def _add_column(self, name: str) -> None:
+        """Add a column that the workbook lacks at the right of the modules' sheet, with its headings.
+
+        A length is in the unit of the modules' coordinates there. What has a formula stays refused: the sheet would go on
+        calculating with it.
+        """
+        table, declared, numbers = self.modules, self.system.columns[name], self.system.numbers
+        title, sheet = table.sheet.name, self.workbook.sheet(table.sheet.name)
+        right = max(self.workbook.extent(title)[1], *(area.right for area in sheet.merged), 0) + 1
+        if declared.formula or right > MAX_COLUMN:
+            i = int(np.argmin(self.is_default[name]))
+            raise InputError(
+                f"{self.workbook.name}: sheet {title} has no column headed {name} for the {declared.title} of module "
+                f"{numbers[i]}, {declared.text_of(declared.of(self.system)[i])}, which is not {declared.blank_is}"
+            )
+        unit = (
+            self.columns[self.system.columns.leading].unit if declared.kind == "length" else next(iter(declared.units))
+        )
+        table.columns[name] = right, unit
+        self.layout.add(table, name, table.rows)
+        self.given[name] = np.array(["" if declared.is_text else math.nan] * len(self.old))
+        symbol, description = declared.headed(unit)
+        heads = (symbol, description) if len(table.heading_rows) == 2 else (description or symbol,)
+        for row, text in zip(table.heading_rows, heads, strict=False):
+            sheet.type((row, right), text)
 
     def _rows_after(self, table: Table, old: tuple[int, ...]) -> Rows:
         shared = {c.column for c in self.columns.values() if c.table.sheet is table.sheet and c.shared}
@@ -216,9 +245,9 @@ class Edit:
         spread = not self.numbered and any(self._is_spread(column) for column in self.columns.values())
         return Rows(table, old, own, shared, keep_first=bool(shared) or spread)
 
-    def _is_spread(self, column: Column) -> bool:
-        """Whether the modules need different numbers in place of one cell of a table with one row for all."""
-        new = QUANTITIES[column.quantity].of(self.system)
+    def _is_spread(self, column: ColumnCells) -> bool:
+        """Whether the modules need different values in place of one cell of a table with one row for all."""
+        new = column.declared.of(self.system)
         return column.table not in self.layout.rows_of and bool(np.any(new != new[0]))
 
     def _number_modules(self) -> None:
@@ -234,7 +263,7 @@ class Edit:
                     was = None if j is None else float(self.old.numbers[j])
                     self._demand((table.sheet.name, rows.new[i], table.number_column), float(number), was)
 
-    def _rows_of_all(self, column: Column) -> tuple[int, ...]:
+    def _rows_of_all(self, column: ColumnCells) -> tuple[int, ...]:
         """Rows for all modules in a table that had one row for all; without numbers, as far apart as the coordinates'."""
         sheet, table, first = self.workbook.sheet(column.table.sheet.name), column.table, column.table.rows[0]
         coordinates = self.rows[self.modules].new
@@ -256,56 +285,64 @@ class Edit:
                     self._demand(place, float(self.system.numbers[i]), None)
         return found
 
-    def _require(self, column: Column) -> None:
-        """Demand the numbers of a quantity, in the column's unit."""
-        name, sheet = column.quantity, self.workbook.sheet(column.table.sheet.name)
-        new, old = (QUANTITIES[name].of(system) for system in (self.system, self.old))
+    def _require(self, column: ColumnCells) -> None:
+        """Demand the values of a column of the scanner, in the cells' unit."""
+        name, sheet, read_by = column.name, self.workbook.sheet(column.table.sheet.name), self.old.source
+        new, old = (column.in_cells(column.declared.of(system)).tolist() for system in (self.system, self.old))
+        given, blank = self.given[name].tolist(), absent(self.given[name])
+        # By a column map, each cell of numbers must be filled.
+        is_default = self.is_default.get(name)
+        if name in self.added and read_by is not None and read_by.columns is not None:
+            is_default = None
         rows, old_of = self.rows.get(column.table), self.old_of
         places: Sequence[int]
         if rows is None and self._is_spread(column):
             places = self._rows_of_all(column)
-        elif rows is None or (column.shared and np.all(new == new[0])):
+        elif rows is None or (column.shared and all(value == new[0] for value in new)):
             places, old_of = column.rows[:1], [0]
         else:
             places = rows.new
         for i, row in enumerate(places):
-            if name in OPTIONAL and self.is_default[name][i] and sheet.cell((row, column.column)).blank:
+            if is_default is not None and is_default[i] and sheet.cell((row, column.column)).blank:
                 was_cell = sheet.original.get((self.rows[column.table].source(i), column.column))
                 if was_cell is None or was_cell.blank:
                     continue  # and it is read as the default
             j = old_of[i]
-            number, was = float(new[i] / column.factor), None if j is None else float(old[j] / column.factor)
-            if j is not None and old[j] == new[i] and not math.isnan(self.given[name][j]):
-                number = float(self.given[name][j])
-            self._demand((sheet.name, row, column.column), number, was)
+            as_it_was = j is not None and old[j] == new[i] and not blank[j]
+            value = given[j] if as_it_was else new[i]
+            self._demand((sheet.name, row, column.column), value, None if j is None else old[j])
 
-    def _demand(self, place: Place, number: float, was: float | None) -> None:
-        """Demand a number of a cell, and type it where there is no formula; `was` is the module's number so far."""
-        self.required[place] = number
-        if was is None or not agree(was, number):
+    def _demand(self, place: Place, value: float | str, was: float | str | None) -> None:
+        """Demand a value of a cell, and type it where there is no formula; `was` is the module's value so far."""
+        self.required[place] = value
+        if was is None or not agree(was, value):
             self.unsettled.add(place)
         cell = self.workbook.cell(place)
-        held = float(module_number(cell.value) or 0) if type(cell.value) is str else cell.value
-        if cell.formula is None and cell.array is None and (type(held) is not float or held != number):
-            self.workbook.sheet(place[0]).type(place[1:], number)
+        held = cell.value
+        if isinstance(value, str):
+            held = text_of(held)
+        elif type(held) is str:
+            held = float(module_number(held) or 0)
+        if cell.formula is None and cell.array is None and (type(held) is not type(value) or held != value):
+            self.workbook.sheet(place[0]).type(place[1:], value)
 
-    def _derive(self, column: Column) -> None:
+    def _derive(self, column: ColumnCells) -> None:
         """Type derived numbers that change, and expect those of H, x2, y2, z2 of formulas that were right.
 
-        The formulas of these four may refer to one cell for all modules where each has its own now.
+        The formulas of these four may refer to one cell for all modules where each has its own now, and know of no tilt.
         """
-        quantity, sheet = QUANTITIES[column.quantity], self.workbook.sheet(column.table.sheet.name)
-        new, old = (quantity.of(system) / column.factor for system in (self.system, self.old))
+        declared, sheet = column.declared, self.workbook.sheet(column.table.sheet.name)
+        new, old = (column.in_cells(declared.of(system)).tolist() for system in (self.system, self.old))
         rows = self.rows[column.table]
         for i, (row, j) in enumerate(zip(rows.new, self.old_of, strict=True)):
             source = rows.source(i)
-            was, number = sheet.original.get((source, column.column)), float(new[i])
+            was, number = sheet.original.get((source, column.column)), new[i]
             if was is None or (j is not None and math.isclose(old[j], number, rel_tol=_SAME, abs_tol=_SAME)):
                 continue
             if was.formula is None and type(was.value) is float:
                 sheet.type((row, column.column), number)
-            elif was.formula is not None and was.array is None and quantity.depends_on_length:
-                right = float(old[rows.old.index(source)])
+            elif was.formula is not None and was.array is None and declared.rounded_with:
+                right = old[rows.old.index(source)]
                 shown = column.table.sheet.value(source, column.column)
                 was_right = type(shown) is float and abs(shown - right) <= EXACT * max(abs(right), 1)
                 if was_right and (j is None or not agree(right, number)):

@@ -2,21 +2,19 @@
 
 import re
 from collections import defaultdict
-from dataclasses import dataclass
 from functools import cached_property
 
+from ..geometry.scanner import SCANNERS, Scanner
 from .book import HEADING_ROWS, Book, Sheet, module_number
 from .formulas import areas_in
-from .headings import Heading, heading_of, is_label_heading, is_number_heading, plain, unit_of
-from .quantities import DIMENSIONS, POSITION, QUANTITIES, TYPED
+from .headings import Heading, Vocabulary, is_label_heading, is_number_heading, plain, unit_of, vocabulary
+from .layout import Table
 from .sheet_xml import At
 
 SCANNER_SHEETS = frozenset(("coordinates", "main"))
 """Sheets that hold the scanner in the users' workbooks."""
 OTHER_SHEETS = frozenset(("mdsl cloud import", "theta", "values", "design table"))
 """Sheets that users' workbooks have beside these, whatever they hold."""
-IGNORED_HEADINGS = frozenset(("s", "3d slope"))
-"""Headings in the users' workbooks whose columns are not read."""
 
 _ROWS_APART = 2
 """A row of symbols and a row of descriptions that are further apart do not belong together."""
@@ -24,16 +22,14 @@ _SUMMARY = re.compile(r"\b(SUM|AVERAGE|MEAN|MEDIAN|MIN|MAX|COUNT|COUNTA|STDEV|VA
 _NUMERIC = re.compile(r"[\d.,eE+\-\s]+")
 
 
-@dataclass(eq=False)
-class HeadedTable:
+class HeadedTable(Table):
     """A sheet with headings that are understood, `headings`: column -> {row: what it says}, and what is under them."""
 
-    sheet: Sheet
-    headings: dict[int, dict[int, Heading]]
-
-    def __post_init__(self) -> None:
-        rows = [row for said in self.headings.values() for row in said]
+    def __init__(self, sheet: Sheet, words: Vocabulary, headings: dict[int, dict[int, Heading]]) -> None:
+        self.sheet, self.words, self.declared, self.headings = sheet, words, words.columns, headings
+        rows = [row for heads in self.headings.values() for row in heads]
         self.first_heading, self.last_heading = min(rows), max(rows)
+        self.heading_rows = tuple(dict.fromkeys((self.first_heading, self.last_heading)))
 
     @cached_property
     def first_row(self) -> int:
@@ -47,17 +43,17 @@ class HeadedTable:
         return {at: text for at, text in self.sheet.texts.items() if self.first_heading <= at[0] < self.first_row}
 
     @cached_property
-    def columns(self) -> dict[str, tuple[int, str]]:
-        """Quantity -> its first column, and the unit."""
+    def columns(self) -> dict[str, tuple[int, str]]:  # type: ignore[override]
+        """Column of the scanner -> its first column in the sheet, and the unit."""
         found: dict[str, tuple[int, str]] = {}
         for column in sorted(self.headings):
-            quantity = self.quantity(column)
-            found.setdefault(quantity, (column, [*self.units(column), *QUANTITIES[quantity].units][0]))
+            name = self.name_of(column)
+            found.setdefault(name, (column, [*self.units(column), *self.declared[name].units][0]))
         return found
 
-    def quantity(self, column: int) -> str:
-        """The quantity that the first heading of a column names."""
-        return next(iter(self.headings[column].values())).quantity
+    def name_of(self, column: int) -> str:
+        """The scanner's column that the first heading of a column names."""
+        return next(iter(self.headings[column].values())).name
 
     def units(self, column: int) -> dict[str, At]:
         """The units that the headings of a column name, and a unit in a row of its own."""
@@ -66,7 +62,7 @@ class HeadedTable:
             if at[1] == column:
                 heading = self.headings[column].get(at[0])
                 unit = unit_of(text) if heading is None else heading.unit
-                if unit is not None and unit in QUANTITIES[self.quantity(column)].units:
+                if unit is not None and unit in self.declared[self.name_of(column)].units:
                     found.setdefault(unit, at)
         return found
 
@@ -76,7 +72,7 @@ class HeadedTable:
 
     @cached_property
     def other_heads(self) -> dict[int, list[At]]:
-        """The texts at the head of the columns without a quantity."""
+        """The texts at the head of the columns that are not the scanner's."""
         columns = {column for _, column in self.head} - self.headings.keys()
         return {column: [at for at in self.head if at[1] == column] for column in sorted(columns)}
 
@@ -86,9 +82,18 @@ class HeadedTable:
         rows = set(self.rows)
         return {column for row, column in self.sheet.cells if row in rows and is_number(self.sheet, row, column)}
 
-    def has_numbers(self, quantity: str) -> bool:
-        """Whether the table has a column of a quantity, with numbers in it."""
-        return quantity in self.columns and self.columns[quantity][0] in self.numeric
+    @cached_property
+    def text_columns(self) -> set[int]:
+        """The sheet's columns that hold texts of the scanner."""
+        return {column for column in self.headings if self.declared[self.name_of(column)].is_text}
+
+    def is_filled(self, name: str) -> bool:
+        """Whether the table has this column of the scanner, with anything for it in the modules' rows."""
+        if name not in self.columns:
+            return False
+        column = self.columns[name][0]
+        texts = column in self.text_columns and any(self.sheet.value(row, column) is not None for row in self.rows)
+        return texts or column in self.numeric
 
     @cached_property
     def label_headings(self) -> dict[str, At]:
@@ -99,14 +104,15 @@ class HeadedTable:
         """The headings over numbers that are not understood: of each column the first, and the texts of all."""
         found = []
         for column in self.other_heads.keys() & self.numeric - {self.label_column}:
-            texts = {at: text for at in self.other_heads[column] if not _says_nothing(text := self.head[at])}
+            texts = {at: text for at in self.other_heads[column] if not self.words.is_known(text := self.head[at])}
             found += [(min(texts), " ".join(texts.values()))] if texts else []
         return sorted(found)
 
     @cached_property
     def _key_columns(self) -> list[int]:
-        """The columns that make a row one of the table's: x1, y1, z1, or whatever typed quantities there are."""
-        names = POSITION if self.columns.keys() >= set(POSITION) else TYPED
+        """The columns that make a row one of the table's: x1, y1, z1, or whatever typed columns there are."""
+        position = self.declared.position
+        names = position if position and self.columns.keys() >= set(position) else self.declared.typed
         return sorted(self.columns[name][0] for name in names if name in self.columns)
 
     @cached_property
@@ -116,7 +122,7 @@ class HeadedTable:
         return {column: at for column, at in heads.items() if self._values(column)}
 
     @cached_property
-    def label_column(self) -> int | None:
+    def label_column(self) -> int | None:  # type: ignore[override]
         """The column of the modules' numbers or names: one that is headed so, or one without heading at the left."""
         if self.number_columns:
             return next(iter(self.number_columns))
@@ -134,7 +140,8 @@ class HeadedTable:
     @cached_property
     def _filled_rows(self) -> list[int]:
         """The rows with anything but a note in the key columns, or with typed dimensions."""
-        typed = [self.columns[name][0] for name in TYPED if name in self.columns and name not in POSITION]
+        position = self.declared.position
+        typed = [self.columns[name][0] for name in self.declared.typed if name in self.columns and name not in position]
         found: list[int] = []
         for row in self.sheet.rows:
             if row < self.first_row or row in self.summaries:
@@ -163,7 +170,7 @@ class HeadedTable:
         return bool(_SUMMARY.search(formula)) and any(area.left <= column <= area.right for area in areas)
 
     @cached_property
-    def rows(self) -> tuple[int, ...]:
+    def rows(self) -> tuple[int, ...]:  # type: ignore[override]
         """The rows of the modules, including those with a number and nothing else: a blank is to be refused."""
         if self.label_column is None:
             return tuple(self._filled_rows)
@@ -171,41 +178,45 @@ class HeadedTable:
         numbered = [row for row in below if module_number(self.sheet.value(row, self.label_column)) is not None]
         return tuple(sorted({*self._filled_rows, *numbered}))
 
-    def is_single(self, quantity: str) -> bool:
-        """Whether a dimension is given once for all modules, in the table's first row."""
-        column = self.columns[quantity][0]
+    def is_single(self, name: str) -> bool:
+        """Whether a column that each module must have is given once for all of them, in the table's first row."""
+        column = self.columns[name][0]
         filled = [row for row in self.rows if self.sheet.value(row, column) is not None]
-        return quantity in DIMENSIONS and filled == [*self.rows[:1]]
+        return name in self.declared.dimensions and filled == [*self.rows[:1]]
 
 
-def _says_nothing(heading: str) -> bool:
-    """Whether a heading is known to say nothing of the quantities."""
-    return is_number_heading(heading) or is_label_heading(heading) or plain(heading).casefold() in IGNORED_HEADINGS
+def sheets_of(book: Book, scanner: type[Scanner]) -> dict[str, Sheet]:
+    """The sheets that may hold a kind of scanner: its own one, or all that are not another kind's own."""
+    if scanner.sheet:
+        name = book.workbook.title(scanner.sheet) or scanner.sheet
+        return {name: book.sheet(name, f", which holds a scanner of the kind {scanner.kind}")}
+    others = {kind.sheet.casefold() for kind in SCANNERS.values()}
+    return {name: sheet for name, sheet in book.sheets.items() if name.casefold() not in others}
 
 
-def headed_tables(book: Book) -> tuple[dict[str, Sheet], list[HeadedTable]]:
-    """The sheets that may hold the scanner, and the tables in them, in the workbook's order.
+def headed_tables(book: Book, scanner: type[Scanner]) -> tuple[dict[str, Sheet], list[HeadedTable]]:
+    """The sheets that may hold a kind of scanner, and the tables in them, in the workbook's order.
 
     `OTHER_SHEETS` are passed over, unless sheets other than `SCANNER_SHEETS` hold tables.
     """
-    sheets = {name: sheet for name, sheet in book.sheets.items() if plain(name).casefold() not in OTHER_SHEETS}
-    tables = [table for sheet in sheets.values() if (table := headed_table(sheet)) is not None]
-    if all(
-        plain(table.sheet.name).casefold() in SCANNER_SHEETS for table in tables if any(map(table.has_numbers, TYPED))
-    ):
-        return sheets, tables
-    return book.sheets, [table for sheet in book.sheets.values() if (table := headed_table(sheet)) is not None]
+    sheets, words = sheets_of(book, scanner), vocabulary(scanner.columns)
+    usual = {name: sheet for name, sheet in sheets.items() if plain(name).casefold() not in OTHER_SHEETS}
+    tables = [table for sheet in usual.values() if (table := headed_table(sheet, words)) is not None]
+    filled = [table.sheet.name for table in tables if any(map(table.is_filled, scanner.columns.typed))]
+    if all(plain(name).casefold() in SCANNER_SHEETS for name in filled):
+        return usual, tables
+    return sheets, [table for sheet in sheets.values() if (table := headed_table(sheet, words)) is not None]
 
 
-def headed_table(sheet: Sheet) -> HeadedTable | None:
+def headed_table(sheet: Sheet, words: Vocabulary) -> HeadedTable | None:
     """A sheet's table, None if it has no heading: the row with most headings, and the rows close to it."""
     rows: dict[int, dict[int, Heading]] = defaultdict(dict)
     for (row, column), text in sheet.texts.items():
-        if row <= HEADING_ROWS and (heading := heading_of(text)) is not None:
+        if row <= HEADING_ROWS and (heading := words.heading_of(text)) is not None:
             rows[row][column] = heading
     if not rows:
         return None
-    main = max(rows, key=lambda row: (len({heading.quantity for heading in rows[row].values()}), -row))
+    main = max(rows, key=lambda row: (len({heading.name for heading in rows[row].values()}), -row))
     chosen = {main}
     for step in (-1, 1):
         for row in sorted(rows, key=lambda row: step * row):
@@ -216,7 +227,7 @@ def headed_table(sheet: Sheet) -> HeadedTable | None:
     for row in sorted(chosen):
         for column, heading in rows[row].items():
             headings[column][row] = heading
-    return HeadedTable(sheet, dict(headings))
+    return HeadedTable(sheet, words, dict(headings))
 
 
 def is_number(sheet: Sheet, row: int, column: int) -> bool:

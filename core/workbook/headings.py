@@ -1,16 +1,16 @@
 """What the texts of a geometry workbook say: headings, units, notes and number formats.
 
-A heading is understood as a whole or not at all: it is one of the texts in the table of quantities (blanks and case
-aside), alone or with a known unit: "x1 (mm)", "x1 [cm]", "x1, cm", "x1/cm", "x1 in cm".
+A heading is understood as a whole or not at all: it is one of those that the columns of a kind of scanner have (blanks
+and case aside), alone or with a known unit: "x1 (mm)", "x1 [cm]", "x1, cm", "x1/cm", "x1 in cm".
 """
 
 import re
 import unicodedata
 from collections.abc import Iterable
+from functools import lru_cache
 from typing import NamedTuple
 
-from ..geometry.columns import ANGLE_UNITS
-from .quantities import QUANTITIES, TYPED
+from ..geometry.columns import ANGLE_UNITS, ColumnTable
 
 _NUMBER_HEADINGS = (
     "definitions, number, no, no., nr, nr., #, module, modules, module number, module no, module no., module #, "
@@ -45,26 +45,18 @@ _OTHER_UNIT_WORDS = (
 _VERSIONS = "actual cad cmm corrected effective final half inner max mean measured new nominal old outer surveyed true"
 """Words that say which one of several values of a quantity a column holds."""
 
-_QUANTITY_OF = {
-    text if len(text) == 1 else text.casefold(): quantity.name
-    for quantity in QUANTITIES.values()
-    for text in quantity.headings
-}
 _UNIT_OF = {
     unicodedata.normalize("NFKC", word).casefold(): unit
     for unit, words in _UNIT_WORDS.items()
     for word in words.split()
 }
 _OTHER_WORDS = frozenset(_OTHER_UNIT_WORDS.split()) - set(_UNIT_OF)
-_HINTS = {name: frozenset(quantity.hints.split()) for name, quantity in QUANTITIES.items()}
 
 _WITH_UNIT = re.compile(
     r"(?P<name>.+?)\s*(?:\((?:in )?(?P<a>[^()]+)\)|\[(?:in )?(?P<b>[^\[\]]+)\]|[,/]\s*(?P<c>\S+)|\sin\s(?P<d>\S+))"
 )
 _BRACKETED_UNIT = re.compile(r"\((?:in )?([^()]+)\)|\[(?:in )?([^\[\]]+)\]|(.+)")
 _WORD = re.compile(r"[^\W\d_]+")
-_VAGUE = frozenset(_WORD.findall(" ".join([_VERSIONS, *_QUANTITY_OF, *_UNIT_OF, *map(" ".join, _HINTS.values())])))
-"""Words that tell no quantity from those of the table."""
 _FILLERS = frozenset(["in", "all", "are", "is", "lengths", "length", "values", "value", "the"])
 # "in" is also a word and "m" a letter: they are units in brackets, or after a number or "in", or at the end.
 _IN_BRACKETS = re.compile(r"[(\[]\s*(in|m|\"|''|″)\.?\s*[)\]]")
@@ -83,9 +75,9 @@ _SCALED = re.compile(r"[0#?],+(?![0#?,])")
 
 
 class Heading(NamedTuple):
-    """What a heading says: the quantity, and its unit if it names one."""
+    """What a heading says: the column, and its unit if it names one."""
 
-    quantity: str
+    name: str
     unit: str | None
 
 
@@ -100,21 +92,61 @@ def quoted(text: str) -> str:
     return repr(text if len(text) <= 60 else text[:59] + "…")
 
 
-def heading_of(text: str) -> Heading | None:
-    """What a heading says, None if it is not understood as a whole."""
-    text = plain(text)
-    if (name := _quantity_of(text)) is not None:
-        return Heading(name, None)
-    match = _WITH_UNIT.fullmatch(text)
-    if match is None or (name := _quantity_of(match["name"])) is None:
-        return None
-    unit = _UNIT_OF.get((match["a"] or match["b"] or match["c"] or match["d"]).strip().casefold())
-    return Heading(name, unit) if unit in QUANTITIES[name].units else None
+class Vocabulary:
+    """The headings of a kind of scanner's `columns`."""
+
+    def __init__(self, columns: ColumnTable) -> None:
+        self.columns = columns
+        self._named = {_folded(text): column.name for column in columns.values() for text in column.headings}
+        self._hints = {name: frozenset(column.hints.split()) for name, column in columns.items()}
+        words = [_VERSIONS, *self._named, *_UNIT_OF, *(column.hints for column in columns.values())]
+        self._vague = frozenset(_WORD.findall(" ".join(words)))
+        """Words that tell no column from the others."""
+        self._unread = {text.casefold() for column in columns.unread for text in column.headings}
+
+    def heading_of(self, text: str) -> Heading | None:
+        """What a heading says, None if it is not understood as a whole."""
+        text = plain(text)
+        if (name := self._name_of(text)) is not None:
+            return Heading(name, None)
+        match = _WITH_UNIT.fullmatch(text)
+        if match is None or (name := self._name_of(match["name"])) is None:
+            return None
+        unit = _UNIT_OF.get((match["a"] or match["b"] or match["c"] or match["d"]).strip().casefold())
+        return Heading(name, unit) if unit in self.columns[name].units else None
+
+    def _name_of(self, text: str) -> str | None:
+        return self._named.get(_folded(re.sub(r"\s*\+\s*", "+", text)))
+
+    def may_mean(self, text: str) -> list[str]:
+        """The columns that a heading may be about, by its words."""
+        words = set(re.findall(r"[^\W_]+", plain(text).casefold()))
+        return [name for name, hints in self._hints.items() if words & hints]
+
+    def rivals(self, text: str) -> list[str]:
+        """The typed columns for whose own heading one that is not understood may be taken.
+
+        It contains their heading, or says nothing else in its words: "x1 (old)", "measured x", but not "z axis of the ray".
+        """
+        words = re.findall(r"[^\W_]+", plain(text))
+        within = {self._name_of(" ".join(words[i : i + n])) for i in range(len(words)) for n in range(1, 12)}
+        vague = self._vague.issuperset(_WORD.findall(plain(text).casefold()))
+        return [name for name in self.may_mean(text) if name in self.columns.typed and (vague or name in within)]
+
+    def is_known(self, text: str) -> bool:
+        """Whether a heading is known to say nothing of the columns."""
+        return is_number_heading(text) or is_label_heading(text) or plain(text).casefold() in self._unread
 
 
-def _quantity_of(text: str) -> str | None:
-    text = re.sub(r"\s*\+\s*", "+", text)
-    return _QUANTITY_OF.get(text if len(text) == 1 else text.casefold())
+@lru_cache(maxsize=64)
+def vocabulary(columns: ColumnTable) -> Vocabulary:
+    """The headings of these columns; made once for each table."""
+    return Vocabulary(columns)
+
+
+def _folded(text: str) -> str:
+    """A heading as it is compared: one letter as it stands, more without case."""
+    return text if len(text) == 1 else text.casefold()
 
 
 def unit_of(text: str) -> str | None:
@@ -133,32 +165,15 @@ def is_label_heading(text: str) -> bool:
     return plain(text).casefold() in _LABEL_HEADINGS.split(", ")
 
 
-def may_mean(text: str) -> list[str]:
-    """The quantities that a heading may be about, by its words."""
-    words = set(re.findall(r"[^\W_]+", plain(text).casefold()))
-    return [name for name, hints in _HINTS.items() if words & hints]
-
-
-def rivals(text: str) -> list[str]:
-    """The typed quantities for whose own heading one that is not understood may be taken.
-
-    It contains their heading, or says nothing else in its words: "x1 (old)", "measured x", but not "z axis of the ray".
-    """
-    words = re.findall(r"[^\W_]+", plain(text))
-    within = {_quantity_of(" ".join(words[i : i + n])) for i in range(len(words)) for n in range(1, 12)}
-    vague = _VAGUE.issuperset(_WORD.findall(plain(text).casefold()))
-    return [name for name in may_mean(text) if name in TYPED and (vague or name in within)]
-
-
 def units_mentioned(text: str, alone: bool = False) -> list[str]:
     """The length units that a note speaks of, if `alone` only if it says nothing else; its own word for other units."""
     folded = plain(text).casefold()
     words = _WORD.findall(re.sub(r"['’](?=\w)", "", folded))
     if alone:
         whole = unit_of(text)
-        said = [] if re.search(r"\d", folded) else [word for word in words if word not in _FILLERS]
-        known = _units_among(said)
-        found = [whole] if whole else known if len(known) == len(said) else []
+        meant = [] if re.search(r"\d", folded) else [word for word in words if word not in _FILLERS]
+        known = _units_among(meant)
+        found = [whole] if whole else known if len(known) == len(meant) else []
     else:
         found = _units_among(word for word in words if word not in ("in", "m"))
         found += ["in" if mark != "m" else "m" for mark in _IN_BRACKETS.findall(folded)]

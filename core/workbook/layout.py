@@ -1,20 +1,21 @@
-"""Which cells hold which quantity of which module, whether the headings say so or a column map."""
+"""Which cells hold which column of which module, whether the headings say so or a column map."""
 
 import itertools
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError, warn
+from ..geometry.columns import ColumnTable
+from .agreement import text_of
 from .book import HEADING_ROWS, Book, Sheet, module_number
 from .calculation import Uncomputed
 from .column_map import ColumnMap
-from .headings import heading_of, shows_as_stored
-from .quantities import QUANTITIES
+from .headings import shows_as_stored, vocabulary
 
 MAX_MODULES = 10_000
 
@@ -22,22 +23,25 @@ Label = int | str
 """What a row calls its module: a number, or a name such as "M01"."""
 
 
-@dataclass(frozen=True, eq=False)
 class Table:
-    """Rows of a sheet that hold modules; `columns` is quantity -> column and unit.
+    """Rows of a sheet that hold modules; `columns` is name -> column of the sheet and unit, of those that are `declared`.
 
-    `labels` has what the rows call their modules in the `label_column`; `InputError` if that does not tell them apart.
+    `heading_rows` are the first and the last row of its headings, `label_column` that of the modules' numbers or names.
     """
 
     sheet: Sheet
+    declared: ColumnTable
     columns: dict[str, tuple[int, str]]
     rows: tuple[int, ...]
-    label_column: int | None = None
-    labels: tuple[Label, ...] | None = field(init=False)
+    heading_rows: tuple[int, ...]
+    label_column: int | None
+    labels: tuple[Label, ...] | None = None
+    """What the rows call their modules, once it is read."""
 
-    def __post_init__(self) -> None:
-        column = self.label_column
-        object.__setattr__(self, "labels", None if column is None else _labels(self.sheet, self.rows, column))
+    def read_labels(self) -> None:
+        """Read what the rows call their modules; `InputError` if that does not tell them apart."""
+        if self.label_column is not None:
+            self.labels = _labels(self.sheet, self.rows, self.label_column)
 
     @cached_property
     def numbers(self) -> tuple[int, ...] | None:
@@ -56,16 +60,17 @@ class Table:
         return self.numbers or tuple(range(1, len(self.rows) + 1))
 
 
-class Column:
-    """The cells of one quantity; `factor` is their unit in mm or rad.
+class ColumnCells:
+    """The cells of one column of the scanner; `factor` is their unit in mm or rad.
 
     `rows` has the row of each module of the table of `modules`, all the same if one cell holds for all (`shared`).
     """
 
-    def __init__(self, table: Table, quantity: str, modules: Table, rows: tuple[int, ...]) -> None:
-        self.table, self.quantity, self.modules, self.rows = table, quantity, modules, rows
-        self.column, self.unit = table.columns[quantity]
-        self.factor = QUANTITIES[quantity].units[self.unit]
+    def __init__(self, table: Table, name: str, modules: Table, rows: tuple[int, ...]) -> None:
+        self.table, self.name, self.modules, self.rows = table, name, modules, rows
+        self.declared = table.declared[name]
+        self.column, self.unit = table.columns[name]
+        self.factor = self.declared.units[self.unit]
         self.shared = len(rows) > 1 and len(set(rows)) == 1
 
     def where(self, i: int) -> str:
@@ -76,24 +81,43 @@ class Column:
         """Sheet and cell of module index `i`."""
         return self.table.sheet.place(self.rows[i], self.column)
 
-    def numbers(self, optional: bool = False, ignored: NDArray[np.bool_] | None = None) -> NDArray[np.float64]:
-        """The numbers (M,) in the cells, in their unit; `InputError` if one holds no number.
+    def values(self, optional: bool = False, ignored: NDArray[np.bool_] | None = None) -> NDArray[Any]:
+        """What the cells hold (M,), numbers in their unit; `InputError` if one holds something else.
 
-        NaN where they are `ignored`, or where a cell is blank or cannot be computed if they are `optional`.
+        NaN, or "" for a text, where they are `ignored`, or where a cell is blank, or its formula cannot be computed here but
+        by the package, if they are `optional`.
         """
-        numbers, sheet = np.full(len(self.rows), math.nan), self.table.sheet
+        absent = "" if self.declared.is_text else math.nan
+        found, sheet = [absent] * len(self.rows), self.table.sheet
         for i, row in enumerate(self.rows):
             if ignored is not None and ignored[i]:
                 continue
             value = sheet.value(row, self.column)
-            absent = value is None or isinstance(value, Uncomputed)
-            if isinstance(value, float) and math.isfinite(value) and not sheet.is_date(row, self.column):
-                numbers[i] = value
-            elif isinstance(value, float) or not (optional and absent):
-                of = "" if self.shared else f" of module {self.modules.module_numbers[i]}"
-                found = sheet.found(row, self.column)
-                raise InputError(f"{self.where(i)} {found}, expected {self.quantity}{of}, a number")
-        return numbers
+            known = isinstance(value, Uncomputed) and bool(self.declared.derived or self.declared.formula)
+            if not (optional and (value is None or known)):
+                held = None if value is None or sheet.is_date(row, self.column) else self._held(value)
+                if held is None:
+                    of = "" if self.shared else f" of module {self.modules.module_numbers[i]}"
+                    seen = sheet.found(row, self.column)
+                    raise InputError(f"{self.where(i)} {seen}, expected {self.name}{of}, {self.declared.expected}")
+                found[i] = held
+        return np.array(found, np.str_ if self.declared.is_text else np.float64)
+
+    def _held(self, value: Any) -> float | str | None:
+        """What a cell with this value holds, None if it is nothing for this column."""
+        if self.declared.is_text:
+            text = text_of(value)
+            return None if text is None or self.declared.word(text) is None else text
+        number = value if type(value) is float and math.isfinite(value) else None
+        return None if number is None or (self.declared.kind == "whole" and number % 1) else number
+
+    def in_code(self, given: NDArray[Any]) -> NDArray[Any]:
+        """Numbers in the cells' unit as mm or rad, texts as the scanner has them."""
+        return np.array([self.declared.word(text) for text in given]) if self.declared.is_text else given * self.factor
+
+    def in_cells(self, values: NDArray[Any]) -> NDArray[Any]:
+        """Numbers in mm or rad in the cells' unit; texts as they are."""
+        return values if self.declared.is_text else values / self.factor
 
     def refuse(self, bad: NDArray[np.bool_], why: Callable[[int], str]) -> None:
         """Raise `InputError` for the first module of `bad` (M,), if any."""
@@ -102,74 +126,85 @@ class Column:
             raise InputError(f"{self.where(i)} {why(i)}")
 
 
-@dataclass(frozen=True, eq=False)
+def absent(given: NDArray[Any]) -> NDArray[np.bool_]:
+    """Where (M,) a column's cells hold nothing."""
+    return given == "" if given.dtype.kind == "U" else np.isnan(given)
+
+
 class Layout:
     """Where a workbook's numbers are.
 
     `modules` is the table of x1, y1, z1; `rows_of` has the row of each module in every table with a row for each.
     """
 
-    modules: Table
-    columns: dict[str, Column] = field(default_factory=dict)
-    rows_of: dict[Table, tuple[int, ...]] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        sheet, rows = self.modules.sheet, self.modules.rows
+    def __init__(self, modules: Table) -> None:
+        sheet, rows, leading = modules.sheet, modules.rows, modules.declared.position or (modules.declared.leading,)
         where = f"{sheet.book.path.name}: sheet {sheet.name} has"
         if not rows:
-            raise InputError(f"{where} no modules, expected rows with x1, y1, z1")
+            raise InputError(f"{where} no modules, expected rows with {', '.join(leading)}")
         if len(rows) > MAX_MODULES:
             raise InputError(f"{where} {len(rows)} modules, expected at most {MAX_MODULES}")
-        self.rows_of[self.modules] = rows
+        self.modules = modules
+        self.columns: dict[str, ColumnCells] = {}
+        self.rows_of: dict[Table, tuple[int, ...]] = {modules: rows}
+
+    def add(self, table: Table, name: str, rows: tuple[int, ...]) -> None:
+        """Take a column's cells from these rows of a table."""
+        self.columns[name] = ColumnCells(table, name, self.modules, rows)
 
 
-def mapped_layout(book: Book, columns: ColumnMap) -> Layout:
+class _MappedTable(Table):
+    """A table as a column map describes it."""
+
+    def __init__(self, book: Book, declared: ColumnTable, mapped: Any) -> None:
+        from openpyxl.utils import column_index_from_string as index
+
+        self.sheet, self.declared = book.sheet(mapped.sheet, ", which the column map names"), declared
+        self.columns = {c.quantity: (index(c.column), c.unit) for c in mapped.columns}
+        self.rows = mapped.row_numbers()
+        self.heading_rows = (mapped.header_row,) if mapped.header_row else ()
+        self.label_column = None if mapped.number is None else index(mapped.number)
+        self.read_labels()
+
+
+def mapped_layout(book: Book, declared: ColumnTable, columns: ColumnMap) -> Layout:
     """The layout that a complete column map describes."""
-    from openpyxl.utils import column_index_from_string as index
-
-    tables = []
-    for said in columns.tables:
-        if said.sheet not in book.sheets:
-            raise InputError(
-                f"{book.path.name}: has no sheet {said.sheet}, which the column map names; its sheets are "
-                f"{', '.join(book.sheets)}"
-            )
-        cells = {c.quantity: (index(c.column), c.unit) for c in said.columns}
-        number = None if said.number is None else index(said.number)
-        tables.append(Table(book.sheets[said.sheet], cells, said.row_numbers(), number))
+    tables: list[Table] = []
+    for mapped in columns.tables:
+        tables.append(_MappedTable(book, declared, mapped))
         for contradiction in itertools.islice(_contradictions(tables[-1]), 1):
             warn(contradiction, 2)
     modules, layout = tables[0], Layout(tables[0])
-    for table, said in zip(tables, columns.tables, strict=True):
+    for table, mapped in zip(tables, columns.tables, strict=True):
         rows = modules.rows
-        if said.rows == "one for all":
+        if mapped.rows == "one for all":
             rows = (table.rows[0],) * len(modules.rows)
-        elif said.rows == "in order":
+        elif mapped.rows == "in order":
             rows = layout.rows_of[table] = in_order(modules, table)
-        elif said.rows == "by number":
+        elif mapped.rows == "by number":
             if modules.labels is None:
                 raise InputError(
-                    f"{book.path.name}: the column map matches the rows of sheet {said.sheet} by number, but its first "
+                    f"{book.path.name}: the column map matches the rows of sheet {mapped.sheet} by number, but its first "
                     "table has no number, expected the column of the modules' numbers there"
                 )
             rows = layout.rows_of[table] = by_label(modules, table)
         for name in table.columns:
-            layout.columns[name] = Column(table, name, modules, rows)
+            layout.add(table, name, rows)
     return layout
 
 
 def _contradictions(table: Table) -> Iterator[str]:
-    """The headings and number formats of mapped columns that say another unit or quantity than the map."""
-    sheet, first = table.sheet, table.rows[0]
+    """The headings and number formats of mapped columns that say another unit or column than the map."""
+    sheet, first, heading_of = table.sheet, table.rows[0], vocabulary(table.declared).heading_of
     for name, (column, unit) in table.columns.items():
-        used = f"the column map says {name} in {unit}, which is used"
+        used = f"the column map says {name} in {unit}, which is used" if unit else f"the column map says {name}"
         for row in range(max(1, first - HEADING_ROWS), first):
             heading = heading_of(sheet.texts.get((row, column), ""))
-            if heading is not None and (heading.quantity != name or heading.unit not in (None, unit)):
-                said = heading.quantity + (f" in {heading.unit}" if heading.unit else "")
-                yield f"{sheet.where(row, column)} says {said}, {used}"
+            if heading is not None and (heading.name != name or heading.unit not in (None, unit)):
+                says = heading.name + (f" in {heading.unit}" if heading.unit else "")
+                yield f"{sheet.where(row, column)} says {says}, {used}"
         shown = sheet.number_format(first, column)
-        if not shows_as_stored(shown, unit):
+        if not table.declared[name].is_text and not shows_as_stored(shown, unit):
             yield f"{sheet.where(first, column)} is shown as {shown!r}, {used}"
 
 

@@ -19,7 +19,7 @@ from ..memory import readable_size
 
 MAX_PART_BYTES = 128 * 2**20
 """Of a sheet and the like, unpacked: 100 000 rows of 20 columns take 80 MiB."""
-_CONTENT_TYPES = "[Content_Types].xml"
+CONTENT_TYPES = "[Content_Types].xml"
 _START_TAG = re.compile(rb"""<(?:[^>"']|"[^"]*"|'[^']*')*>""")
 
 
@@ -74,7 +74,7 @@ class Package:
 
     def relations(self, part: str) -> list[tuple[str, str, str]]:
         """(id, last word of the type, member) of what `part` ("" for the package) refers to inside the package."""
-        name = _relations_part(part)
+        name = relations_part(part)
         if name.casefold() not in self._members:
             return []
         return [
@@ -85,26 +85,26 @@ class Package:
 
     def content_type(self, part: str) -> str:
         """The content type of a member."""
-        said = {}
-        for e in self.elements(_CONTENT_TYPES):
+        types = {}
+        for e in self.elements(CONTENT_TYPES):
             key = e.attributes.get("PartName", "").lstrip("/") or f".{e.attributes.get('Extension', '')}"
-            said[key.casefold()] = e.attributes.get("ContentType", "")
-        return said.get(part.casefold()) or said.get(f".{part.rpartition('.')[2].casefold()}", "")
+            types[key.casefold()] = e.attributes.get("ContentType", "")
+        return types.get(part.casefold()) or types.get(f".{part.rpartition('.')[2].casefold()}", "")
 
     def with_parts(self, parts: dict[str, bytes], removed: Iterable[str] = (), owner: str = "") -> bytes:
-        """The archive with other bytes for `parts` and without the `removed` members that `owner` refers to.
+        """The archive with other bytes for `parts`, new ones last, without the `removed` members that `owner` refers to.
 
         All other members keep their bytes, order, dates and attributes.
         """
         new_data = {part.casefold(): data for part, data in parts.items()}
         gone = {part.casefold() for part in removed}
         if gone:
-            relations = _relations_part(owner)
+            relations = relations_part(owner)
             new_data[relations.casefold()] = self._without(
                 relations, "Relationship", lambda attributes: _target(owner, attributes).casefold() in gone
             )
-            new_data[_CONTENT_TYPES.casefold()] = self._without(
-                _CONTENT_TYPES, "Override", lambda a: a.get("PartName", "").lstrip("/").casefold() in gone
+            new_data[CONTENT_TYPES.casefold()] = self._without(
+                CONTENT_TYPES, "Override", lambda a: a.get("PartName", "").lstrip("/").casefold() in gone
             )
         out = io.BytesIO()
         with zipfile.ZipFile(out, "w") as new, warnings.catch_warnings():
@@ -116,7 +116,19 @@ class Package:
                 member = copy.copy(info)
                 new.writestr(member, new_data[key] if key in new_data else self._archive.read(info))
                 member.external_attr = info.external_attr  # zipfile makes a file mode of 0
+            for part in [part for part in new_data if part.casefold() not in self._members]:
+                new.writestr(zipfile.ZipInfo(part), new_data[part], zipfile.ZIP_DEFLATED)
         return out.getvalue()
+
+    def with_last(self, name: str, parent: str, element: str, /, **attributes: str) -> bytes:
+        """A member's XML with one more element at the end of the first one called `parent`, and in its namespace."""
+        data = self.read(name)
+        found = next((e for e in self.elements(name) if e.name == parent and e.end > e.inner), None)
+        if found is None:
+            raise InputError(f"{self.name}: its part {name} has no {parent}, expected one that a sheet can be added to")
+        given = {"xmlns": found.namespace, **{key.replace("_", ":"): value for key, value in attributes.items()}}
+        text = b"".join(b' %b="%b"' % (key.encode(), escaped(value)) for key, value in given.items())
+        return spliced(data, [(found.close, found.close, b"<%b%b/>" % (element.encode(), text))])
 
     def _without(self, name: str, element: str, is_meant: Callable[[dict[str, str]], bool]) -> bytes:
         found = self.elements(name)
@@ -125,7 +137,8 @@ class Package:
         )
 
 
-def _relations_part(part: str) -> str:
+def relations_part(part: str) -> str:
+    """The member that lists what a member refers to."""
     folder, base = posixpath.split(part)
     return posixpath.join(folder, "_rels", f"{base}.rels")
 

@@ -1,4 +1,4 @@
-"""Which cells hold which quantity, by a workbook's headings, and the doubts about that.
+"""Which cells hold which column of a scanner, by a workbook's headings, and the doubts about that.
 
 A doubt is anything that may make a number mean something else than its heading says: a heading, a unit or a table that
 is unaccounted for. `recognized_layout` refuses a workbook with any; `core.workbook.draft` asks a person.
@@ -11,12 +11,12 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 from ..errors import InputError, warn
-from ..geometry.columns import LENGTH_UNITS
+from ..geometry.columns import LENGTH_UNITS, ColumnTable
+from ..geometry.scanner import Scanner
 from .book import HEADING_ROWS, Book, Sheet
-from .headed_table import HeadedTable, headed_table, headed_tables, is_number
-from .headings import UNIT_WORDS, heading_of, may_mean, quoted, rivals, shows_as_stored, unit_of, units_mentioned
-from .layout import Column, Layout, Table, by_label, in_order
-from .quantities import DERIVED, NEEDED, OPTIONAL, POSITION, QUANTITIES, TYPED
+from .headed_table import HeadedTable, headed_table, headed_tables, is_number, sheets_of
+from .headings import UNIT_WORDS, quoted, shows_as_stored, unit_of, units_mentioned, vocabulary
+from .layout import Layout, by_label, in_order
 from .sheet_xml import At
 
 _HELP = "a column map can say what is meant (columns='map.toml', --columns map.toml; docs/workbook.md)"
@@ -27,82 +27,91 @@ _ABOUT_ALL = re.compile(
 
 
 class Recognized(NamedTuple):
-    """What the headings say: the sheets that may hold the scanner, quantity -> its table, and the doubts."""
+    """What the headings say: the sheets that may hold the scanner, its columns' tables, and the doubts."""
 
     sheets: dict[str, Sheet]
     tables: dict[str, HeadedTable]
     doubts: list[str]
 
 
-def recognize(book: Book) -> Recognized:
-    """Find the tables of the scanner in a workbook, and collect the doubts about them."""
-    sheets, candidates = headed_tables(book)
+def recognize(book: Book, scanner: type[Scanner]) -> Recognized:
+    """Find the tables of a scanner in a workbook, and collect the doubts about them."""
+    sheets, candidates = headed_tables(book, scanner)
+    declared = scanner.columns
     tables: dict[str, HeadedTable] = {}
     doubts, missing = [], []
-    for name in TYPED:
+    for name in declared.typed:
         having = [table for table in candidates if name in table.columns]
-        filled = [table for table in having if table.has_numbers(name)]
+        filled = [table for table in having if table.is_filled(name)]
         if len(filled) > 1:
             first, second = (t.sheet.place(t.first_heading, t.columns[name][0]) for t in filled[:2])
             doubts.append(f"{first} and {second}, of two sheets, are both headed as {name}, expected one such column")
         if having:
             tables[name] = (filled or having)[0]
-        elif name in NEEDED:
-            missing.append(_missing(book, sheets, name))
-    if (modules := tables.get("x1")) is not None:
-        tables.update({name: modules for name in DERIVED if name in modules.columns})
-        for name in POSITION:
+        elif name in declared.needed:
+            missing.append(_missing(book, sheets, declared, name))
+    if (modules := tables.get(declared.leading)) is not None:
+        tables.update({name: modules for name in declared.derived if name in modules.columns})
+        for name in declared.position:
             if name in tables and tables[name] is not modules:
                 doubts.append(
-                    f"x1 is in sheet {modules.sheet.name} but {name} in sheet {tables[name].sheet.name}, expected one table"
+                    f"{declared.leading} is in sheet {modules.sheet.name} but {name} in sheet "
+                    f"{tables[name].sheet.name}, expected one table"
                 )
-        hidden = book.workbook.hidden
-        for other in book.sheets.values() if modules.sheet.name in hidden else ():
-            table = None if other.name in hidden else headed_table(other)
-            if table is not None and table.columns.keys() >= set(POSITION) and table.rows:
-                doubts.append(f"sheet {modules.sheet.name} is hidden, but {other.name} is shown, expected one of them")
+        doubts += _shown_twins(book, scanner, modules)
     for table in dict.fromkeys(tables.values()):
-        doubts += _doubts_about(table, {*TYPED, *(name for name, its in tables.items() if its is table)})
+        own = {*declared.typed, *(name for name, its in tables.items() if its is table)}
+        doubts += _doubts_about(table, own)
     return Recognized(sheets, tables, doubts + missing)
 
 
-def _missing(book: Book, sheets: dict[str, Sheet], name: str) -> str:
+def _shown_twins(book: Book, scanner: type[Scanner], modules: HeadedTable) -> Iterator[str]:
+    """Sheets that are shown and have what that of the `modules`, which is hidden, has."""
+    hidden = book.workbook.hidden
+    for other in sheets_of(book, scanner).values() if modules.sheet.name in hidden else ():
+        table = None if other.name in hidden else headed_table(other, modules.words)
+        if (
+            table is not None
+            and table.rows
+            and table.columns.keys() >= {scanner.columns.leading, *scanner.columns.position}
+        ):
+            yield f"sheet {modules.sheet.name} is hidden, but {other.name} is shown, expected one of them"
+
+
+def _missing(book: Book, sheets: dict[str, Sheet], declared: ColumnTable, name: str) -> str:
+    words = vocabulary(declared)
     close = [
         f"{sheet.place(*at)} {quoted(text)}"
         for sheet in sheets.values()
         for at, text in sheet.texts.items()
-        if at[0] <= HEADING_ROWS and name in may_mean(text) and heading_of(text) is None
+        if at[0] <= HEADING_ROWS and name in words.may_mean(text) and words.heading_of(text) is None
     ]
     saw = f"not understood: {', '.join(close[:3])}" if close else f"its sheets are {', '.join(book.sheets) or 'none'}"
-    return f"no sheet has a column headed {name} or {QUANTITIES[name].headings[1]!r}; {saw}"
+    return f"no sheet has a column headed {' or '.join([name, *map(repr, declared[name].headings[1:2])])}; {saw}"
 
 
-def recognized_layout(book: Book) -> Layout:
+def recognized_layout(book: Book, scanner: type[Scanner]) -> Layout:
     """The layout that a workbook's headings describe; `InputError` if there is any doubt."""
-    recognized = recognize(book)
-    for doubt in recognized.doubts:
+    found = recognize(book, scanner)
+    for doubt in found.doubts:
         raise _unclear(book, doubt)
-    coordinates = recognized.tables["x1"]
-    tables = {
-        headed: Table(headed.sheet, headed.columns, headed.rows, headed.label_column)
-        for headed in dict.fromkeys(recognized.tables.values())
-    }
-    modules = tables[coordinates]
+    modules = found.tables[scanner.columns.leading]
+    for table in dict.fromkeys(found.tables.values()):
+        table.read_labels()
     layout = Layout(modules)
-    for name, headed in recognized.tables.items():
-        table, once = tables[headed], headed.is_single(name)
+    for name, table in found.tables.items():
+        once = table.is_single(name)
         if not table.rows:
             raise InputError(f"{book.path.name}: sheet {table.sheet.name} has no numbers under {name}")
         if table not in layout.rows_of and not (once and len(table.rows) == 1):
             try:
-                layout.rows_of[table] = _matched_rows(modules, table, coordinates, headed)
+                layout.rows_of[table] = _matched_rows(modules, table)
             except InputError:
                 if not once:
                     raise
-        rows = (table.rows[0],) * len(modules.rows) if once else layout.rows_of[table]
-        layout.columns[name] = Column(table, name, modules, rows)
-    for note in _notes(layout, recognized):
-        warn(f"{book.path.name}: {note}", 4)
+        layout.add(table, name, (table.rows[0],) * len(modules.rows) if once else layout.rows_of[table])
+    for note in _notes(layout, found):
+        warn(f"{book.path.name}: {note}", 5)
     return layout
 
 
@@ -110,50 +119,50 @@ def _unclear(book: Book, doubt: str) -> InputError:
     return InputError(f"{book.path.name}: {doubt}; {_HELP}")
 
 
-def _matched_rows(modules: Table, table: Table, coordinates: HeadedTable, headed: HeadedTable) -> tuple[int, ...]:
+def _matched_rows(modules: HeadedTable, table: HeadedTable) -> tuple[int, ...]:
     """The row of each module in another sheet: by the modules' numbers or names if both have them, else in order."""
-    book, own, other = modules.sheet.book, coordinates.label_headings, headed.label_headings
-    sheets = f"sheet {modules.sheet.name}", f"sheet {table.sheet.name}"
+    book, own, other = modules.sheet.book, modules.label_headings, table.label_headings
+    here, there = f"sheet {modules.sheet.name}", f"sheet {table.sheet.name}"
     if modules.labels is not None and table.labels is not None:
         rows = by_label(modules, table)
     else:
         rows = in_order(modules, table)
         for row, its in zip(modules.rows, rows, strict=True):
             if row - modules.rows[0] != its - rows[0]:
-                together = f"row {row} of {sheets[0]} and row {its} of {sheets[1]} would belong together"
+                together = f"row {row} of {here} and row {its} of {there} would belong together"
                 raise _unclear(book, f"{together}, but blank rows differ: expected the modules' numbers in both")
         if table.numbers is not None and list(table.numbers) != sorted(table.numbers):
-            unsorted = f"the modules' numbers in {sheets[1]} are in no order, {sheets[0]} has none"
+            unsorted = f"the modules' numbers in {there} are in no order, {here} has none"
             raise _unclear(book, f"{unsorted}, expected numbers in both")
-        for heading, at in other.items():
-            if heading not in own:
-                heads = f"{table.sheet.place(*at)} heads names of modules, which {sheets[0]} does not have"
-                raise _unclear(book, f"{heads}, expected a column in both that says which rows belong together")
+        for heading in (heading for heading in other if heading not in own):
+            heads = f"{table.sheet.place(*other[heading])} heads names of modules, which {here} does not have"
+            raise _unclear(book, f"{heads}, expected a column in both that says which rows belong together")
     for heading in own.keys() & other.keys():
         for row, its in zip(modules.rows, rows, strict=True):
-            here, there = (row, own[heading][1]), (its, other[heading][1])
-            one, another = modules.sheet.value(*here), table.sheet.value(*there)
+            at, its_at = (row, own[heading][1]), (its, other[heading][1])
+            one, another = modules.sheet.value(*at), table.sheet.value(*its_at)
             if one != another:
-                is_one = f"{modules.sheet.place(*here)} is {one!r} but {table.sheet.place(*there)}"
+                is_one = f"{modules.sheet.place(*at)} is {one!r} but {table.sheet.place(*its_at)}"
                 raise _unclear(book, f"{is_one}, in the matching row, is {another!r}, expected the same")
     return rows
 
 
-def _notes(layout: Layout, recognized: Recognized) -> Iterator[str]:
+def _notes(layout: Layout, found: Recognized) -> Iterator[str]:
     """What a person should know of a workbook without doubts, as texts of warnings."""
-    table, modules = recognized.tables["x1"], layout.modules
-    unknown = {(its, at): text for its in dict.fromkeys(recognized.tables.values()) for at, text in its.unknown()}
-    absent = [QUANTITIES[name] for name in OPTIONAL if name not in recognized.tables and table.unknown()]
-    without = [f"no column is headed {q.name}, so the {q.title} is {q.blank_is}; " for q in absent if q.formula]
-    if without or any(map(may_mean, unknown.values())):
-        places = ", ".join(f"{its.sheet.place(*at)} {quoted(text)}" for (its, at), text in unknown.items())
+    declared, tables = layout.modules.declared, list(dict.fromkeys(found.tables.values()))
+    modules = found.tables[declared.leading]
+    unknown = {table.sheet.place(*at): text for table in tables for at, text in table.unknown()}
+    absent = [declared[name] for name in declared.optional if name not in found.tables and declared[name].formula]
+    without = [f"no column is headed {c.name}, so the {c.title} is {c.blank_is}; " for c in absent if modules.unknown()]
+    if without or any(map(modules.words.may_mean, unknown.values())):
+        places = ", ".join(f"{place} {quoted(text)}" for place, text in unknown.items())
         yield f"{''.join(without)}{places}: not understood and not read"
     used = {column.table.sheet.name for column in layout.columns.values()}
     units = {column.unit for column in layout.columns.values() if column.unit in LENGTH_UNITS}
-    said = " and ".join(sorted(units))
+    stated = " and ".join(sorted(units))
     others = (
-        f"{sheet.place(*at)} says {quoted(text)}, where the headings of the scanner's sheets say {said}, which was used"
-        for name, sheet in recognized.sheets.items()
+        f"{sheet.place(*at)} says {quoted(text)}, where the headings of the scanner's sheets say {stated}, which was used"
+        for name, sheet in found.sheets.items()
         if name not in used
         for at, text in sheet.texts.items()
         if _ABOUT_ALL.search(text) and any(units != {unit} for unit in units_mentioned(text))
@@ -167,13 +176,13 @@ def _notes(layout: Layout, recognized: Recognized) -> Iterator[str]:
         )
 
 
-def _doubts_about(table: HeadedTable, quantities: set[str]) -> Iterator[str]:
-    """The doubts about a table that these quantities are read from, each as the text of a message."""
-    used = [table.columns[name] for name in table.columns if name in quantities]
+def _doubts_about(table: HeadedTable, names: set[str]) -> Iterator[str]:
+    """The doubts about a table from which these columns are read, each as the text of a message."""
+    used = [table.columns[name] for name in table.columns if name in names and not table.declared[name].is_text]
     lengths = {unit for _, unit in used if unit in LENGTH_UNITS}
     yield from _headings(table)
     for at, text in table.unknown():
-        for name in rivals(text)[:1]:
+        for name in table.words.rivals(text)[:1]:
             yield f"{table.sheet.place(*at)} is headed {quoted(text)}, which is not understood and may mean {name}"
     numbers = [table.sheet.place(*at) for at in table.number_columns.values()]
     if len(numbers) > 1:
@@ -185,42 +194,41 @@ def _doubts_about(table: HeadedTable, quantities: set[str]) -> Iterator[str]:
 
 
 def _headings(table: HeadedTable) -> Iterator[str]:
-    """Columns with the same quantity, or with headings that say different things or more than a quantity and unit."""
-    for column, said in sorted(table.headings.items()):
-        quantity, place = table.quantity(column), table.heading_place(column)
+    """Columns of one name, or with headings that say different things or more than a name and unit."""
+    for column, heads in sorted(table.headings.items()):
+        name, place = table.name_of(column), table.heading_place(column)
         for at, text in table.head.items():
             if at[1] != column:
                 continue
-            heading = said.get(at[0])
-            if heading is None and unit_of(text) not in QUANTITIES[quantity].units:
+            heading = heads.get(at[0])
+            if heading is None and unit_of(text) not in table.declared[name].units:
                 yield (
-                    f"{table.sheet.place(*at)} holds {quoted(text)} in the heading of {quantity}, expected its name and a "
+                    f"{table.sheet.place(*at)} holds {quoted(text)} in the heading of {name}, expected its name and a "
                     "unit alone"
                 )
-            if heading is not None and heading.quantity != quantity:
+            if heading is not None and heading.name != name:
                 yield (
-                    f"{table.sheet.place(*at)} is headed as {heading.quantity} but {place} as {quantity}, expected "
-                    "one of them"
+                    f"{table.sheet.place(*at)} is headed as {heading.name} but {place} as {name}, expected one of them"
                 )
         units = [(unit, table.sheet.place(*at)) for unit, at in table.units(column).items()]
         if len(units) > 1:
             (unit, cell), (other, its) = units[:2]
-            yield f"{cell} says {unit} but {its} {other}, expected one unit of {quantity}"
+            yield f"{cell} says {unit} but {its} {other}, expected one unit of {name}"
         for area in table.sheet.merged:
-            if area.left < area.right and area.left <= column <= area.right and area.top in said:
-                yield f"{table.sheet.place(area.top, area.left)} heads several columns as {quantity}, merged"
-        first, _ = table.columns[quantity]
+            if area.left < area.right and area.left <= column <= area.right and area.top in heads:
+                yield f"{table.sheet.place(area.top, area.left)} heads several columns as {name}, merged"
+        first, _ = table.columns[name]
         if first != column:
-            yield f"{table.heading_place(first)} and {place} are both headed as {quantity}, expected one such column"
+            yield f"{table.heading_place(first)} and {place} are both headed as {name}, expected one such column"
 
 
 def _other_tables(table: HeadedTable) -> Iterator[str]:
     """Headings apart from the table's: a second table, or a second heading."""
     apart: dict[int, dict[str, int]] = defaultdict(dict)
     for (row, column), text in table.sheet.texts.items():
-        heading = heading_of(text)
+        heading = None if column in table.text_columns and row in table.rows else table.words.heading_of(text)
         if heading is not None and not table.first_heading <= row < table.first_row:
-            apart[row][heading.quantity] = column
+            apart[row][heading.name] = column
     for row, found in sorted(apart.items()):
         over_numbers = any(is_number(table.sheet, row + 1, column) for column in found.values())
         if row < table.first_heading or len(found) > 1 or over_numbers:
@@ -268,6 +276,8 @@ def _notes_with_units(table: HeadedTable, lengths: set[str]) -> Iterator[str]:
             others_numbers = column in table.numeric - {table.label_column} and not only_a_unit
             if column in table.headings or others_numbers:
                 continue
+        elif row in modules and column in table.text_columns:
+            continue
         for unit in units_mentioned(text, alone=row in modules):
             others = (sheet.texts[other] for other in texts_of_row[row] if other != at)
             explained = unit in UNIT_WORDS and any(map(units_mentioned, others))

@@ -121,9 +121,9 @@ class Cell:
         """The number of its style, None for the default."""
         return self.origin.element.attributes.get("s") if self.origin else None
 
-    def typed(self, value: float | None) -> Cell:
-        """The cell with a number, or nothing, instead of its content."""
-        return replace(self, value=value, formula=None, single_array=False)
+    def typed(self, value: float | str | None) -> Cell:
+        """The cell with a number or a text, or nothing, instead of its content."""
+        return replace(self, value=None if value == "" else value, formula=None, single_array=False)
 
 
 _BLANK = Cell()
@@ -210,8 +210,8 @@ class SheetXml:
         """The cell, a blank one if the sheet has none there."""
         return self.cells.get(at, _BLANK)
 
-    def type(self, at: At, value: float | None) -> None:
-        """Put a number, or nothing, into a cell."""
+    def type(self, at: At, value: float | str | None) -> None:
+        """Put a number or a text, or nothing, into a cell."""
         self.refuse_array(at)
         self.cells[at] = self.cell(at).typed(value)
 

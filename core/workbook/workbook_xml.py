@@ -1,11 +1,12 @@
 """The sheets of a workbook file as cells that can be changed, and the file with the changes."""
 
+import itertools
 import re
 from functools import cached_property
 
 from ..errors import InputError
 from .formulas import areas_in, operands
-from .package import Package, spliced, with_attribute
+from .package import CONTENT_TYPES, Package, relations_part, spliced, with_attribute
 from .sheet_xml import MAIN, STRICT, At, Cell, Reference, SheetXml, cell_name, reference, shared_strings
 
 KINDS = {
@@ -16,6 +17,8 @@ _BEFORE_CALC_PR = (
     *("fileVersion", "fileSharing", "workbookPr", "workbookProtection", "bookViews", "sheets", "functionGroups"),
     *("externalReferences", "definedNames"),
 )
+_RELATIONS = "http://schemas.openxmlformats.org/officeDocument/2006/relationships"
+_WORKSHEET = "application/vnd.openxmlformats-officedocument.spreadsheetml.worksheet+xml"
 Place = tuple[str, int, int]
 """Sheet, row, column."""
 
@@ -227,6 +230,22 @@ class WorkbookXml:
         parts[self._part] = self._recalculated_on_load()
         stale_chain = "calcChain" in self._related and any(s.formulas_added_or_removed for s in changed.values())
         return self.package.with_parts(parts, [self._related["calcChain"]] if stale_chain else [], self._part)
+
+    def with_sheet(self, title: str, rows: str) -> bytes:
+        """The workbook with one more sheet, last, that consists of these rows' XML."""
+        add, taken = self.package.with_last, {name.casefold() for name in self.package.names}
+        number = next(n for n in itertools.count(1) if f"xl/worksheets/sheet{n}.xml" not in taken)
+        part, key, kind = f"xl/worksheets/sheet{number}.xml", f"rIdSheet{number}", f"{_RELATIONS}/worksheet"
+        ids = [int(e.attributes.get("sheetId", "0")) for e in self._elements if e.name == "sheet"]
+        named = {"name": title, "sheetId": str(max(ids, default=0) + 1), "xmlns_r": _RELATIONS, "r_id": key}
+        relations = relations_part(self._part)
+        parts = {
+            self._part: add(self._part, "sheets", "sheet", **named),
+            relations: add(relations, "Relationships", "Relationship", Id=key, Type=kind, Target=f"/{part}"),
+            CONTENT_TYPES: add(CONTENT_TYPES, "Types", "Override", PartName=f"/{part}", ContentType=_WORKSHEET),
+            part: f'<worksheet xmlns="{MAIN}"><sheetData>{rows}</sheetData></worksheet>'.encode(),
+        }
+        return self.package.with_parts(parts)
 
     def _recalculated_on_load(self) -> bytes:
         root, data = self._elements[0], self.package.read(self._part)

@@ -1,37 +1,28 @@
-"""`write_system`: a `PinholeSystem` into a new geometry workbook, or a copy of one in which nothing else changes."""
+"""`write_system`: a scanner into a new geometry workbook, or a copy of one in which nothing else changes."""
 
-import io
 import os
-import zipfile
 from collections import defaultdict
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-from xml.sax.saxutils import escape
 
 import numpy as np
 
 from ..errors import InputError, warn
 from ..files import replacing, write_bytes
-from ..geometry.system import PinholeSystem, same_place
+from ..geometry.scanner import Scanner
 from ..recording import recorded_warnings
+from ..validation import instance
 from .book import Book
 from .calculation import Recalculation
 from .column_map import ColumnMap, column_map
 from .edit import Edit, several
-from .layout import MAX_MODULES
-from .quantities import OPTIONAL, QUANTITIES, TYPED
+from .new_workbook import new_sheets, new_workbook
 from .reader import read
-from .sheet_xml import CellError
 from .workbook_xml import KINDS, Place, WorkbookXml
 
-_PARTS = Path(__file__).with_name("new_workbook.txt")
-"""The XML of a new workbook, its parts one after another, with their names above them."""
-_NORMAL, _HEADING, _FOUR_DECIMALS = range(3)
-"""Its styles of cells."""
-_FIRST_ROW = 3
-_LARGEST_NUMBER = 2**53 - 1
-"""The first module's row, and the largest module's number that a cell holds exactly."""
+_WITHIN = 2e-9
+"""Largest relative error of a number that is written and read back."""
 
 
 @dataclass(frozen=True)
@@ -50,25 +41,28 @@ class WrittenWorkbook:
 
 
 def write_system(
-    system: PinholeSystem,
+    system: Scanner,
     path: str | os.PathLike[str],
     template: str | os.PathLike[str] | None = None,
     columns: ColumnMap | str | os.PathLike[str] | None = None,
 ) -> WrittenWorkbook:
-    """Write a scanner's geometry workbook.
+    """Write a scanner's geometry workbook: pinholes, or a scanner of another kind.
 
     In a copy of `template`, only the cells that differ are written; modules are found by their numbers (or their order,
     without numbers), and cells as by `read_system`. A formula stays if it still gives the system's number (to 1e-9,
     relative). Each formula that depends on a changed cell stores its new value, or none if it cannot be calculated here,
     and the workbook is marked to be recalculated. All other parts of the file stay byte for byte. Removed modules leave
-    empty rows, added ones come below the last, and modules in another order take the contents of their rows along.
+    empty rows, added ones come below the last, and modules in another order take the contents of their rows along. A column
+    that modules may have (a tilt, the crystal's material) and that the copy lacks is added at the right of the modules'
+    sheet, and the sheet of another kind of scanner as the last one.
 
     Parameters
     ----------
     path
         The file to write, .xlsx or .xlsm like the template; it may be the template, which is then replaced.
     template
-        The workbook to copy. Default: a new one in the users' layout, with the sheets Main and Coordinates.
+        The workbook to copy. Default: a new one in the layout of the kind: for pinholes the users', with the sheets Main and
+        Coordinates.
     columns
         The template's column map, or the path of one. Default: the one that the system was read by, if any.
 
@@ -79,8 +73,7 @@ def write_system(
         at `path` is then as it was. An `InputWarning` is given of formulas that had to be replaced by numbers or store no
         value, and of ranges that leave added modules out.
     """
-    if not isinstance(system, PinholeSystem):
-        raise InputError(f"write_system: expected a PinholeSystem, got {type(system).__name__}")
+    instance(system, Scanner, "write_system")
     target = Path(path)
     suffix = target.suffix.lower()
     if suffix not in KINDS:
@@ -88,32 +81,52 @@ def write_system(
     if template is None:
         if suffix != ".xlsx":
             raise InputError(f"{target}: a workbook without a template has no macros, expected a name ending in .xlsx")
-        content, values = _new_workbook(system)
+        content, values = new_workbook(system)
         write_bytes(target, content)
         return WrittenWorkbook(target.absolute(), (), values, ())
     read_by = None if system.source is None else system.source.columns
     if columns is not None:
-        read_by = column_map(columns, template)
+        read_by = column_map(columns, template, type(system))
     with replacing(target) as temporary:
         book = Book(template)
-        workbook = book.workbook
-        if workbook.suffix is None:
-            raise InputError(
-                f"{workbook.name}: is neither an .xlsx nor an .xlsm workbook inside, expected it saved as one"
-            )
-        if workbook.suffix != suffix:
-            has = "has macros" if workbook.suffix == ".xlsm" else "is a workbook without macros"
-            raise InputError(
-                f"{target}: the template {workbook.name} {has}, expected a name ending in {workbook.suffix}"
-            )
-        with recorded_warnings():  # they were given when the system was read
-            reading = read(book, read_by)
-        edit = Edit(system, reading, workbook)
-        edited = workbook.changed
-        recalculated = Recalculation(workbook, {*edited, *edit.unsettled}, edit.required, edit.expected)
-        temporary.write_bytes(workbook.to_bytes())
-        own = edit.column_map()
-        _refuse_other_system(temporary, workbook.name, own, system, edit.numbered)
+        _refuse_other_suffix(book.workbook, target)
+        if system.sheet and book.workbook.title(system.sheet) is None:
+            written = _with_new_sheet(system, book.workbook, target, temporary)
+        else:
+            written = _edited(system, book, read_by, target, temporary)
+    return written
+
+
+def _refuse_other_suffix(workbook: WorkbookXml, target: Path) -> None:
+    if workbook.suffix is None:
+        raise InputError(f"{workbook.name}: is neither an .xlsx nor an .xlsm workbook inside, expected it saved as one")
+    if workbook.suffix != target.suffix.lower():
+        has = "has macros" if workbook.suffix == ".xlsm" else "is a workbook without macros"
+        raise InputError(f"{target}: the template {workbook.name} {has}, expected a name ending in {workbook.suffix}")
+
+
+def _with_new_sheet(system: Scanner, workbook: WorkbookXml, target: Path, temporary: Path) -> WrittenWorkbook:
+    """Write the workbook with the sheet of a kind of scanner that it lacks."""
+    sheets, stored = new_sheets(system, styled=False)
+    ((title, rows),) = sheets.items()
+    temporary.write_bytes(workbook.with_sheet(title, "".join(rows.values())))
+    _refuse_other_system(temporary, workbook.name, None, system, numbered=True)
+    filled = Book(temporary).sheet(title, "").cells.items()
+    cells = tuple(workbook.text((title, *at)) for at, cell in sorted(filled) if not cell.blank)
+    return WrittenWorkbook(target.absolute(), cells, stored, ())
+
+
+def _edited(system: Scanner, book: Book, read_by: ColumnMap | None, target: Path, temporary: Path) -> WrittenWorkbook:
+    """Write the workbook with its cells changed such that it holds a scanner."""
+    workbook = book.workbook
+    with recorded_warnings():  # they were given when the system was read
+        reading = read(book, type(system), read_by)
+    edit = Edit(system, reading, workbook)
+    edited = workbook.changed
+    recalculated = Recalculation(workbook, {*edited, *edit.unsettled}, edit.required, edit.expected)
+    temporary.write_bytes(workbook.to_bytes())
+    own = edit.column_map()
+    _refuse_other_system(temporary, workbook.name, own, system, edit.numbered)
     _warn_of_formulas(workbook, recalculated)
     return WrittenWorkbook(
         path=target.absolute(),
@@ -124,13 +137,11 @@ def write_system(
     )
 
 
-def _refuse_other_system(
-    path: Path, name: str, columns: ColumnMap | None, system: PinholeSystem, numbered: bool
-) -> None:
-    """Refuse a workbook that would be read as another system: a template may be laid out so that it cannot hold it."""
+def _refuse_other_system(path: Path, name: str, columns: ColumnMap | None, system: Scanner, numbered: bool) -> None:
+    """Refuse a workbook that would be read as another scanner: a template may be laid out so that it cannot hold it."""
     try:
         with recorded_warnings():
-            back = read(Book(path), columns)
+            back = read(Book(path), type(system), columns)
     except InputError as error:
         why = str(error).replace(str(path), name).replace(path.name, name)
         raise InputError(f"{name} cannot hold this system, with it: {why}") from error
@@ -139,18 +150,16 @@ def _refuse_other_system(
             f"{name} cannot hold this system: its modules {several(system.numbers)} would be read as "
             f"{several(back.system.numbers)}"
         )
-    for quantity in [QUANTITIES[name] for name in TYPED]:
-        if quantity.is_text:
-            continue
-        wanted, got = quantity.of(system), quantity.of(back.system)
-        differing = np.flatnonzero(np.abs(got - wanted) > 2e-9 * np.abs(wanted))
-        if len(differing):
-            i = int(differing[0])
-            column = back.layout.columns.get(quantity.name)
+    for declared in [system.columns[typed] for typed in system.columns.typed]:
+        wanted, got = declared.of(system), declared.of(back.system)
+        same = declared.same(got, wanted, _WITHIN)
+        if not same.all():
+            i = int(np.argmin(same))
+            column = back.layout.columns.get(declared.name)
             why = f": {column.place(i)} is read for all modules" if column is not None and column.shared else ""
             raise InputError(
-                f"{name} cannot hold this system: {quantity.name} = {quantity.text_of(wanted[i], 9)} of module "
-                f"{system.numbers[i]} would be read as {quantity.text_of(got[i], 9)}{why}"
+                f"{name} cannot hold this system: {declared.name} = {declared.text_of(wanted[i], 9)} of module "
+                f"{system.numbers[i]} would be read as {declared.text_of(got[i], 9)}{why}"
             )
 
 
@@ -169,80 +178,3 @@ def _warn_of_formulas(workbook: WorkbookXml, recalculated: Recalculation) -> Non
             f"{workbook.name}: {several(map(workbook.text, recalculated.cleared), shown=1)}: the formula's new value could "
             f"not be calculated ({first}); opening the workbook in Excel or LibreOffice and saving it stores the value"
         )
-
-
-def _new_workbook(system: PinholeSystem) -> tuple[bytes, dict[str, Any]]:
-    """A workbook in the users' layout, and the value that each formula stores: the system's own.
-
-    l is a number where it is not that of the formula.
-    """
-    _refuse_unreadable(system)
-    x1, y1 = system.centers[:, :2].T
-    with np.errstate(divide="ignore", over="ignore"):
-        slope = system.pinhole_distance / x1
-    divided_by_0 = {"slope": np.isinf(slope), "azimuth": np.hypot(x1, y1) == 0}
-    typed = {name: ~QUANTITIES[name].is_default(system) for name in OPTIONAL}
-    held = {name: q for name, q in QUANTITIES.items() if q.formula or name not in typed or typed[name].any()}
-    columns = [
-        *((name, q.place, q.titles or q.headings[:2], q.formula, q.of(system)) for name, q in held.items()),
-        *(("number", f"{title}!A", ("", "Definitions"), "", system.numbers) for title in ("Main", "Coordinates")),
-        ("slope", "Coordinates!F", ("S", "3D slope"), "={b}/{x1}", slope),
-    ]
-    cells: dict[str, dict[str, list[str]]] = {title: {} for title in ("Main", "Coordinates")}
-    stored: dict[str, Any] = {}
-    for name, place, titles, formula, values in columns:
-        title, letters = place.split("!")
-        style = _FOUR_DECIMALS if title == "Coordinates" and name != "number" else _NORMAL
-        column = [_cell(f"{letters}{row}", text, _HEADING) for row, text in enumerate(titles, start=1)]
-        places = {other: quantity.place.removeprefix(f"{title}!") for other, quantity in QUANTITIES.items()}
-        for i, value in enumerate(values.tolist()):
-            row, own = _FIRST_ROW + i, ""
-            if formula and not (name in typed and typed[name][i]):
-                own = formula.format_map({other: f"{its}{row}" for other, its in places.items()})
-                value = CellError("#DIV/0!") if name in divided_by_0 and divided_by_0[name][i] else value
-                stored[f"{place}{row}"] = value
-            column.append(_cell(f"{letters}{row}", value, style, own))
-        cells[title][letters] = column
-    parts = dict(part.split("\n", 1) for part in _PARTS.read_text(encoding="ascii").split("--- ")[1:])
-    memory = io.BytesIO()
-    with zipfile.ZipFile(memory, "w") as archive:
-        for part, xml in parts.items():
-            rows = _rows(cells.get(Path(part).stem, {}))
-            # Dated 1980, so that a system always gives the same file.
-            archive.writestr(zipfile.ZipInfo(part), xml.replace("<sheetData/>", rows), zipfile.ZIP_DEFLATED)
-    return memory.getvalue(), stored
-
-
-def _refuse_unreadable(system: PinholeSystem) -> None:
-    """Refuse a system that `read_system` would refuse in any workbook, or read as another."""
-    cannot, numbers = "the new workbook cannot hold this system", system.numbers
-    if len(numbers) > MAX_MODULES:
-        raise InputError(f"{cannot}: it has {len(numbers)} modules, expected at most {MAX_MODULES}")
-    with np.errstate(over="ignore"):
-        held = {"number": numbers.astype(np.float64), **{name: q.of(system) for name, q in QUANTITIES.items()}}
-    for name, values in held.items():
-        most = _LARGEST_NUMBER if name == "number" else np.finfo(np.float64).max
-        if values.dtype.kind == "f" and np.any(bad := ~(np.abs(values) <= most)):
-            i = int(np.argmax(bad))
-            raise InputError(f"{cannot}: {name} of module {numbers[i]} is {values[i]:g}, expected at most {most:g}")
-    if (same := same_place(system.centers)) is not None:
-        first, second = (f"Coordinates!B{_FIRST_ROW + i}" for i in same)
-        raise InputError(
-            f"{cannot}, with it: the new workbook: {second} and y1, z1 put the pinhole of module {numbers[same[1]]} at "
-            f"the place of module {numbers[same[0]]} ({first}), expected another place"
-        )
-
-
-def _cell(place: str, value: Any, style: int, formula: str = "") -> str:
-    """A cell's XML; an empty text is no value."""
-    kind = f' t="{"e" if isinstance(value, CellError) else "str"}"' if isinstance(value, str) else ""
-    shown = escape(value) if isinstance(value, str) else repr(value).removesuffix(".0")
-    content = (f"<f>{escape(formula[1:])}</f>" if formula else "") + (f"<v>{shown}</v>" if shown else "")
-    return f'<c r="{place}" s="{style}"{kind}>{content}</c>'
-
-
-def _rows(columns: dict[str, list[str]]) -> str:
-    """The XML of a sheet's cells, given by the letters of their columns."""
-    in_order = [columns[letters] for letters in sorted(columns, key=lambda letters: (len(letters), letters))]
-    rows = (f'<row r="{row}">{"".join(cells)}</row>' for row, cells in enumerate(zip(*in_order, strict=True), start=1))
-    return f"<sheetData>{''.join(rows)}</sheetData>"

@@ -14,9 +14,9 @@ import pytest
 
 from mphdrr.addon.scanner import column_maps, scanner
 from mphdrr.core.errors import InputError
+from mphdrr.core.geometry.columns import LENGTH_UNITS
 from mphdrr.core.geometry.system import PinholeSystem
 from mphdrr.core.workbook import ColumnMap, draft_column_map, read_system
-from mphdrr.core.workbook.quantities import LENGTH_UNITS
 
 CM = {"x1": "Mitte x (Zentimeter)", "y1": "Mitte y (Zentimeter)", "z1": "Mitte z (Zentimeter)"}
 
@@ -86,10 +86,12 @@ def quantity(form, name):
 
 def assert_equal(one: PinholeSystem, other: PinholeSystem) -> None:
     np.testing.assert_array_equal(one.numbers, other.numbers)
-    for field in dataclasses.fields(PinholeSystem):
-        if field.name not in ("numbers", "source", "more"):
-            a, b = getattr(one, field.name), getattr(other, field.name)
-            assert np.array_equal(a, b) if a.dtype.kind == "U" else np.allclose(a, b, rtol=1e-9, atol=1e-9), field.name
+    for name in PinholeSystem.columns.typed:
+        column = PinholeSystem.columns[name]
+        if column.is_text:
+            np.testing.assert_array_equal(column.of(one), column.of(other))
+        else:
+            np.testing.assert_allclose(column.of(one), column.of(other), rtol=1e-9, atol=1e-9)
 
 
 # The settings

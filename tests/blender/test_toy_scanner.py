@@ -8,6 +8,7 @@ from typing import Any, ClassVar, Self
 
 import bpy
 import numpy as np
+import openpyxl
 import pytest
 from bpy_extras.object_utils import world_to_camera_view
 from mathutils import Vector
@@ -26,10 +27,14 @@ from mphdrr.core.geometry.module_parts import BOX_FACES, ModulePart
 from mphdrr.core.geometry.scanner import Scanner
 from mphdrr.core.geometry.views import Views
 from mphdrr.core.runs.files import read_run
+from mphdrr.core.workbook import read_scanner
 
 
 def vector(name: str, attribute: str) -> list[Column]:
-    return [Column(f"{name}_{axis}", attribute, axis=i, help=f"{axis} of {name}") for i, axis in enumerate("xyz")]
+    return [
+        Column(f"{name}_{axis}", attribute, axis=i, headings=(f"{name}_{axis}",), help=f"{axis} of {name}")
+        for i, axis in enumerate("xyz")
+    ]
 
 
 COLUMNS = ColumnTable(
@@ -38,12 +43,22 @@ COLUMNS = ColumnTable(
         *vector("panel", "panel_centers"),
         *vector("u", "panel_u"),
         *vector("v", "panel_v"),
-        Column("width", "panel_width", help="width of the panel", plausible=(10, 2000)),
-        Column("height", "panel_height", help="height of the panel", plausible=(10, 2000)),
-        Column("turn", "gantry_angle", kind="angle", unit="deg", blank=0.0, help="angle of the gantry"),
-        Column("frames", "frames_per_turn", kind="whole", blank=1, help="frames in a turn"),
-        Column("tube", "anode", kind="choice", choices=("W", "Mo", "Rh"), blank="W", help="metal of the anode"),
-        Column("serial", "serial_number", kind="text", blank="", help="serial number"),
+        Column("width", "panel_width", headings=("width",), help="width of the panel", plausible=(10, 2000)),
+        Column("height", "panel_height", headings=("height",), help="height of the panel", plausible=(10, 2000)),
+        Column(
+            "turn", "gantry_angle", headings=("turn",), kind="angle", unit="deg", blank=0.0, help="angle of the gantry"
+        ),
+        Column("frames", "frames_per_turn", headings=("frames",), kind="whole", blank=1, help="frames in a turn"),
+        Column(
+            "tube",
+            "anode",
+            headings=("tube",),
+            kind="choice",
+            choices=("W", "Mo", "Rh"),
+            blank="W",
+            help="metal of the anode",
+        ),
+        Column("serial", "serial_number", headings=("serial",), kind="text", blank="", help="serial number"),
     )
 )
 
@@ -55,6 +70,7 @@ def xray():
     @dataclass(frozen=True, eq=False)
     class Xray(Scanner):
         kind: ClassVar[str] = "toy x-ray"
+        sheet: ClassVar[str] = "C-arms"
         columns: ClassVar[ColumnTable] = COLUMNS
 
         sources: Any
@@ -113,8 +129,8 @@ SQUARE = ((-1, -1), (1, -1), (1, 1), (-1, 1))
 
 
 @pytest.fixture
-def system(xray):
-    """Two sources, each opposite a panel that is neither square nor in the middle."""
+def system(xray, tmp_path):
+    """Two sources, each opposite a panel that is neither square nor in the middle, from a sheet of a workbook."""
     values = {
         "source": [[-700.3, 20.1, -5.0], [30.7, 650.9, 12.0]], "panel": [[420.0, -33.3, 40.7], [-25.0, -380.0, -21.1]],
         "u": [[0.0, 1.0, 0.0], [1.0, 0.0, 0.0]], "v": [[0.0, 0.0, 1.0], [0.0, 0.0, 1.0]],
@@ -123,7 +139,20 @@ def system(xray):
     rows = {f"{name}_{axis}": np.array(v)[:, i] for name, v in values.items() for i, axis in enumerate("xyz")}
     rows |= {"width": np.array([400.1, 380.0]), "height": np.array([300.0, 285.3]), "turn": np.radians([12.3, 45.6])}
     rows |= {"frames": np.array([360, 720]), "tube": np.array(["W", "Mo"]), "serial": np.array(["A-17 é", ""])}
-    return xray.from_values(rows, numbers=[3, 8])
+    book = openpyxl.Workbook()
+    book.active.title = xray.sheet
+    book.active.append(["number", *rows])
+    for m, number in enumerate((3, 8)):
+        own = {**rows, "turn": np.degrees(rows["turn"])}
+        book.active.append([number, *(values[m].item() for values in own.values())])
+    book.save(tmp_path / "toy.xlsx")
+    read = read_scanner(tmp_path / "toy.xlsx", xray.kind)
+    made = xray.from_values(rows, numbers=[3, 8])
+    assert all(
+        np.allclose(a, b) if a.dtype.kind != "U" else np.array_equal(a, b)
+        for a, b in zip(read.values().values(), made.values().values(), strict=True)
+    )
+    return read
 
 
 def assert_same(one: Scanner, other: Scanner) -> None:
@@ -217,3 +246,13 @@ def test_a_kind_that_is_not_known_is_refused(scene, system):
     collection.mphdrr_scanner.kind = "of another extension"
     with pytest.raises(InputError, match="of another extension"):
         scanner.read_scanner(collection)
+
+
+def test_its_workbook_is_imported_and_written(scene, system, tmp_path):
+    assert bpy.ops.mphdrr.import_geometry(filepath=str(tmp_path / "toy.xlsx")) == {"FINISHED"}
+    collection = scanner.active_scanner(scene)
+    assert_same(scanner.read_scanner(collection), system)
+    scanner.module(collection, 8).mphdrr_module.anode = "Rh"
+    bpy.context.view_layer.update()
+    assert bpy.ops.mphdrr.export_geometry(filepath=str(tmp_path / "edited.xlsx")) == {"FINISHED"}
+    assert_same(read_scanner(tmp_path / "edited.xlsx", system.kind), system.replace(anode=["W", "Rh"]))

@@ -14,7 +14,7 @@ import pytest
 import mphdrr.core as mph
 from mphdrr.core.cli import main
 from mphdrr.core.errors import InputError
-from mphdrr.core.workbook.quantities import LENGTH_UNITS
+from mphdrr.core.geometry.columns import LENGTH_UNITS
 
 from .test_workbook import CENTERS, assert_plain, plain, saved
 from .test_workbook import _typed as typed

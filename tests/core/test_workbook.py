@@ -22,10 +22,11 @@ from openpyxl.worksheet.worksheet import Worksheet
 
 from mphdrr.core.errors import InputError, InputWarning
 from mphdrr.core.geometry.design_formulas import collimator_length
+from mphdrr.core.geometry.pinhole_columns import PINHOLE_COLUMNS
 from mphdrr.core.workbook import read_system
+from mphdrr.core.workbook.agreement import tolerance
 from mphdrr.core.workbook.formulas import CellError, NotComputable, Surroundings, calculate
-from mphdrr.core.workbook.headings import heading_of
-from mphdrr.core.workbook.quantities import tolerance
+from mphdrr.core.workbook.headings import vocabulary
 
 from . import libreoffice
 
@@ -623,7 +624,7 @@ def test_formulas_beyond_arithmetic_are_not_computed(formula):
     ],
 )
 def test_headings_name_quantities(heading, quantity):
-    assert (heading_of(heading) or (None,))[0] == quantity
+    assert (vocabulary(PINHOLE_COLUMNS).heading_of(heading) or (None,))[0] == quantity
 
 
 # Refusals

@@ -19,8 +19,9 @@ from openpyxl.worksheet.worksheet import Worksheet
 
 import mphdrr.core as mph
 from mphdrr.core.errors import InputError, InputWarning
-from mphdrr.core.workbook.headings import Heading, heading_of
-from mphdrr.core.workbook.quantities import LENGTH_UNITS, QUANTITIES
+from mphdrr.core.geometry.columns import LENGTH_UNITS
+from mphdrr.core.geometry.pinhole_columns import PINHOLE_COLUMNS
+from mphdrr.core.workbook.headings import Heading, vocabulary
 
 from .test_workbook import _one_sheet, assert_plain, plain, read_edited, saved
 from .test_workbook import _typed as typed
@@ -390,8 +391,8 @@ def test_what_is_understood_is_read(kind, tmp_path):
 def test_units_are_understood_in_every_form(form, unit):
     named = {"CM": "cm", "inches": "in", "centimetres": "cm", "μm": "µm"}
     for name in ("x1", "Ld", "R", "l"):
-        assert heading_of(form.format(name, unit)) == Heading(name, named.get(unit, unit))
-    assert heading_of(form.format("pinhole azimuth", unit)) is None
+        assert vocabulary(PINHOLE_COLUMNS).heading_of(form.format(name, unit)) == Heading(name, named.get(unit, unit))
+    assert vocabulary(PINHOLE_COLUMNS).heading_of(form.format("pinhole azimuth", unit)) is None
 
 
 def in_units(units: dict[str, str]):
@@ -401,13 +402,16 @@ def in_units(units: dict[str, str]):
         typed(main, coordinates)
         for sheet in (main, coordinates):
             for column in range(2, sheet.max_column + 1):
-                heading = next((h for r in (1, 2) if (h := heading_of(sheet.cell(r, column).value))), None)
-                if heading is None or QUANTITIES[heading.quantity].kind != "length":
+                heading = next(
+                    (h for r in (1, 2) if (h := vocabulary(PINHOLE_COLUMNS).heading_of(sheet.cell(r, column).value))),
+                    None,
+                )
+                if heading is None or PINHOLE_COLUMNS[heading.name].kind != "length":
                     continue
-                unit = units.get(heading.quantity, units[""])
-                sheet.cell(1, column).value = f"{heading.quantity} ({unit})" if heading.quantity != "range" else None
-                sheet.cell(2, column).value = f"pinhole range [{unit}]" if heading.quantity == "range" else None
-                if heading.quantity == "H":
+                unit = units.get(heading.name, units[""])
+                sheet.cell(1, column).value = f"{heading.name} ({unit})" if heading.name != "range" else None
+                sheet.cell(2, column).value = f"pinhole range [{unit}]" if heading.name == "range" else None
+                if heading.name == "H":
                     sheet.cell(1, column).value = f"l+b+Td, {unit}"
                 for row in range(3, sheet.max_row + 1):
                     sheet.cell(row, column).value /= LENGTH_UNITS[unit]
@@ -453,7 +457,7 @@ def test_a_row_of_units_counts(tmp_path):
             for column in range(2, sheet.max_column + 1):
                 for row in (1, 2):
                     if (
-                        heading := heading_of(sheet.cell(row, column).value or "")
+                        heading := vocabulary(PINHOLE_COLUMNS).heading_of(sheet.cell(row, column).value or "")
                     ) is not None and heading.unit == "cm":
                         sheet.cell(row, column).value = sheet.cell(row, column).value.rstrip("(cm)[], ")
                         sheet.cell(3, column).value = "[cm]"

@@ -16,7 +16,6 @@ from openpyxl.workbook import Workbook
 from openpyxl.workbook.defined_name import DefinedName
 
 from mphdrr.core import PinholeSystem, WrittenWorkbook, collimator_length, read_system, write_system
-from mphdrr.core.workbook.quantities import DERIVED, QUANTITIES
 
 DIMENSIONS = {"d": "pinhole_diameter", "R": "roi_radius", "Ld": "detector_side", "Td": "detector_thickness"}
 
@@ -107,7 +106,7 @@ def laid_out(layout: Layout) -> Workbook:
     for name, at in dim.items():
         main[f"{at}{top + 2}"] = name
     b_formula = f"SQRT(SUMSQ({x}#,{y}#,{z}#))"
-    expected = {name: QUANTITIES[name].of(system) for name in DERIVED}
+    expected = {name: PinholeSystem.columns[name].of(system) for name in PinholeSystem.columns.derived}
     for i in range(n):
         row = first + i
         if layout.numbered:

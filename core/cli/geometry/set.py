@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 
 from ...errors import InputError
-from ...geometry.system import LENGTHS, PinholeSystem
+from ...geometry.columns import ANGLE_UNITS, Column
+from ...geometry.system import PinholeSystem
 from ...recording import recorded_warnings
 from ...workbook import write_system
-from ...workbook.quantities import QUANTITIES, needed_numbers
 from ..options import chosen_modules, output_path, print_answer, read_workbook
 from .arguments import add_action
 
@@ -20,8 +20,15 @@ _SHORT = {
     "detector_thickness": "thickness",
     "roi_radius": "roi",
 }
-_DIMENSIONS = {_SHORT.get(name, name.replace("_", "-")): name for name in LENGTHS if name != "collimator_length"}
-"""Option -> field; l is another matter."""
+_TYPES: dict[str, type] = {"whole": int, "text": str, "choice": str}
+_METAVARS = {"length": "MM", "angle": "DEG", "text": "TEXT"}
+
+
+def _options() -> dict[str, tuple[Column, ...]]:
+    """Field -> its columns, of those that an option sets; l, and where the modules are, are another matter."""
+    columns = PinholeSystem.columns
+    others = {columns[name].field for name in ("l", *columns.position)}
+    return {name: its for name, its in columns.fields.items() if name not in others}
 
 
 def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
@@ -30,8 +37,16 @@ def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     add = parser.add_argument
     add("-o", "--output", required=True, metavar="OUT", help="workbook to write; FILE itself is replaced")
     add("--modules", metavar="RANGE", help="those to change, such as 1-40 or 1-20,41; default: all")
-    for option, name in _DIMENSIONS.items():
-        add(f"--{option}", type=float, metavar="MM", help=LENGTHS[name])
+    for name, its in _options().items():
+        column, many = its[0], its[0].axis is not None
+        letters = tuple(c.name.rpartition("_")[2].upper() for c in its)
+        more: dict[str, Any] = {"nargs": len(its)} if many else {}
+        if column.kind == "choice":
+            more["choices"] = column.choices
+        else:
+            more["metavar"] = letters if many else _METAVARS.get(column.kind, "N")
+        what = ", ".join(dict.fromkeys(c.help for c in its)) + "; degrees" * (column.kind == "angle")
+        add(f"--{_option(name)}", dest=name, type=_TYPES.get(column.kind, float), help=what, **more)
     length = (
         "l, collimator length, or 'design' for the design formula's; default: those that follow the formula go on "
         "following it, the others stay"
@@ -42,6 +57,11 @@ def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     add("--order", metavar="N,N,...", help="the modules' numbers in the order they are to have")
     columns = "with --columns, also write the column map (.toml) of the new workbook"
     add("--write-columns", metavar="MAP", help=columns)
+
+
+def _option(name: str) -> str:
+    """The option of a field."""
+    return _SHORT.get(name, name.replace("_", "-"))
 
 
 def _run(arguments: argparse.Namespace) -> None:
@@ -67,13 +87,15 @@ def _run(arguments: argparse.Namespace) -> None:
 def _changed(system: PinholeSystem, arguments: argparse.Namespace) -> PinholeSystem:
     chosen = np.isin(system.numbers, chosen_modules(system, arguments.modules).numbers)
     changes: dict[str, Any] = {}
-    for option, name in _DIMENSIONS.items():
-        number = getattr(arguments, option.replace("-", "_"))
-        if number is not None:
-            changes[name] = np.where(chosen, number, getattr(system, name))
+    for name, columns in _options().items():
+        given = getattr(arguments, name)
+        if given is not None:
+            value = np.multiply(given, ANGLE_UNITS["deg"]) if columns[0].kind == "angle" else given
+            mask = chosen if columns[0].axis is None else chosen[:, None]
+            changes[name] = np.where(mask, value, getattr(system, name))
     if arguments.move is not None:
         changes["centers"] = np.where(chosen[:, None], system.centers + arguments.move, system.centers)
-    length = QUANTITIES["l"]
+    length = PinholeSystem.columns["l"]
     follows = length.is_default(system)
     if arguments.length is not None:
         follows = np.where(chosen, arguments.length == "design", follows)
@@ -82,11 +104,11 @@ def _changed(system: PinholeSystem, arguments: argparse.Namespace) -> PinholeSys
             changes["collimator_length"] = np.where(chosen, float(arguments.length), system.collimator_length)
         except ValueError:
             raise InputError(f"--length {arguments.length!r}: expected millimetres or 'design'") from None
-    system = dataclasses.replace(system, **changes)
+    system = system.replace(**changes)
     # Lengths that are the formula's to 1e-9 stay as they are, to the last digit.
     others = follows & ~length.is_default(system)
-    lengths = np.where(others, length.default(needed_numbers(system)), system.collimator_length)
-    system = dataclasses.replace(system, collimator_length=lengths)
+    lengths = np.where(others, length.default(system.columns.needed_values(system)), system.collimator_length)
+    system = system.replace(collimator_length=lengths)
     if arguments.remove is not None:
         removed = np.isin(system.numbers, chosen_modules(system, arguments.remove, "--remove").numbers)
         if removed.all():

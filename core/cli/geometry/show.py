@@ -7,7 +7,6 @@ from ...arrays import table_rows
 from ...errors import InputError
 from ...geometry.system import PinholeSystem
 from ...workbook import draft_column_map
-from ...workbook.quantities import DIMENSIONS, OPTIONAL, QUANTITIES
 from ..options import chosen_modules, output_path, print_answer, read_workbook
 from .arguments import add_action
 
@@ -39,7 +38,16 @@ def _run(arguments: argparse.Namespace) -> None:
         "{number:7d} {ring:5d} {x:8.2f} {y:8.2f} {z:8.2f} {b:8.2f} {l:8.3f} {azimuth:9.4f} {elevation:9.4f} "
         "{d:5.2f} {Ld:6.2f} {Td:6.2f} {R:6.2f}"
     )
-    lines = [heading, *(line.format(**row) for row in rows), "lengths in mm, angles in radians"]
+    more = _shown(system)
+    width = {name: max(map(len, (name, *texts))) for name, texts in more.items()}
+    heading += "".join(f" {name:>{width[name]}}" for name in more)
+    ends = {
+        number: "".join(f" {texts[i]:>{width[name]}}" for name, texts in more.items())
+        for i, number in enumerate(system.numbers.tolist())
+    }
+    units = [f", {name} in {system.columns[name].unit}" for name in more if system.columns[name].unit]
+    footer = "lengths in mm, angles in radians" + "".join(units)
+    lines = [heading, *(line.format(**row) + ends[row["number"]] for row in rows), footer]
     print_answer(arguments, {"modules": rows, "units": "mm, radians"}, lines)
 
 
@@ -56,6 +64,15 @@ def _write_columns(arguments: argparse.Namespace) -> None:
 
 
 def _rows(system: PinholeSystem) -> list[dict[str, Any]]:
-    columns = {"number": system.numbers, "ring": system.rings() + 1, **dict(zip("xyz", system.centers.T, strict=True))}
-    names = dict.fromkeys(("b", "l", "azimuth", "elevation", *DIMENSIONS, *OPTIONAL))
-    return table_rows({**columns, **{name: QUANTITIES[name].of(system) for name in names}})
+    positions = dict(zip("xyz", system.centers.T, strict=True))
+    columns = {"number": system.numbers, "ring": system.rings() + 1, **positions}
+    declared = system.columns
+    names = dict.fromkeys(("b", "l", "azimuth", "elevation", *declared.dimensions, *declared.optional))
+    return table_rows({**columns, **{name: declared[name].of(system) for name in names}})
+
+
+def _shown(system: PinholeSystem) -> dict[str, list[str]]:
+    """The texts of the columns that modules may have, and that some have: column -> a text for each module."""
+    declared = system.columns
+    more = [declared[name] for name in declared.optional if name != "l" and not declared[name].is_default(system).all()]
+    return {c.name: [c.number_of(value) for value in c.of(system).tolist()] for c in more}

@@ -1,16 +1,11 @@
-"""How numbers in cells are compared, and the names of the pinholes' columns."""
+"""Whether what a cell holds is what it should hold."""
 
-from ..geometry.columns import AGREEING, LENGTH_UNITS, Values
-from ..geometry.pinhole_columns import PINHOLE_COLUMNS
+from typing import Any
 
-QUANTITIES = PINHOLE_COLUMNS
-Numbers = Values
-NEEDED, OPTIONAL, DERIVED, TYPED = QUANTITIES.needed, QUANTITIES.optional, QUANTITIES.derived, QUANTITIES.typed
-POSITION, DIMENSIONS = QUANTITIES.position, QUANTITIES.dimensions
-needed_numbers = QUANTITIES.needed_values
+from ..geometry.columns import AGREEING, LENGTH_UNITS
 
 EXACT = 1e-6
-"""Two numbers of one quantity agree if they differ less: relative, and absolute in mm or rad."""
+"""Two numbers of one column agree if they differ less: relative, and absolute in mm or rad."""
 _COARSEST_ROUNDING = {unit: 0.005 / factor for unit, factor in LENGTH_UNITS.items()} | {
     "rad": 5e-4,
     "deg": 5e-3,
@@ -31,6 +26,15 @@ def tolerance(number: float, expected: float, unit: str) -> float:
     return max(EXACT * max(1.0 / LENGTH_UNITS.get(unit, 1.0), abs(expected)), rounding * (1 + 1e-9))
 
 
-def agree(value: object, wanted: float, at_least: float = 0.0) -> bool:
-    """Whether a cell's value is the number `wanted`, relative to it and `at_least`."""
+def agree(value: Any, wanted: float | str, at_least: float = 0.0) -> bool:
+    """Whether a cell's value is that text, or that number, relative to it and `at_least`."""
+    if isinstance(wanted, str):
+        return text_of(value) == wanted
     return type(value) is float and abs(value - wanted) <= AGREEING * max(abs(wanted), at_least)
+
+
+def text_of(value: Any) -> str | None:
+    """The text that a cell of texts holds: what it shows, "" if blank; None for fractions, errors and the like."""
+    if value is None or type(value) is str:
+        return (value or "").strip()
+    return f"{value:.0f}" if type(value) is float and value.is_integer() and abs(value) < 2**53 else None

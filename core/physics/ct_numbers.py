@@ -9,7 +9,7 @@ import math
 
 import numpy as np
 
-from ..arrays import ArrayOrTensor, checked, namespace
+from ..arrays import ArrayOrTensor, checked, is_tensor, namespace
 from ..errors import InputError, warn
 from ..memory import require
 from ..validation import freeze, instance, real_array
@@ -82,7 +82,11 @@ def diffdrr_density(hu: Volume | ArrayOrTensor, bone_attenuation_multiplier: flo
     factor = float(real_array(bone_attenuation_multiplier, "bone_attenuation_multiplier", ()))
     if isinstance(hu, Volume):
         require_quantity(hu.quantity, ("hu",), "diffdrr_density")
-    hu = hu.array if isinstance(hu, Volume) else checked(hu, "CT numbers", np.shape(hu), False)
+    hu = hu.array if isinstance(hu, Volume) else hu
+    if is_tensor(hu):
+        hu = checked(hu, "CT numbers", tuple(hu.shape), False)
+    else:
+        hu = real_array(hu, "CT numbers", None, np.float32)
     if not math.prod(hu.shape):
         raise InputError("CT numbers: expected at least one")
     library = namespace(hu)

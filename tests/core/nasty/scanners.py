@@ -66,6 +66,7 @@ def scanner(
 SCANNER = scanner()
 # In centimetres its distances still look like a small scanner's in millimetres: its size does not reveal the unit.
 BIG = scanner(BIG_CENTERS, 4.0, 150.0, 120.0, 20.0)
+VARIED = scanner(CENTERS, d=[2.0, 2.5, 3.0, 3.5], Ld=[50.0, 52.0, 54.0, 56.0], Td=[8.0, 9.0, 10.0, 11.0])
 
 
 def quantity(system: PinholeSystem, name: str) -> np.ndarray:

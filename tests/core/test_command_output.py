@@ -37,9 +37,9 @@ SHORT = [
 
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no /dev/full")
-@pytest.mark.parametrize("buffering", [-1, 1], ids=["in the end", "at once"])
-def test_output_that_cannot_be_written_is_one_line_of_every_command(monkeypatch, capsys, buffering):
-    for command in [(*words, "--help") for words in ALL] + SHORT[:4] + SHORT[5:]:
+@pytest.mark.parametrize(("buffering", "every"), [(-1, 1), (1, 5)], ids=["in the end", "at once"])
+def test_output_that_cannot_be_written_is_one_line_of_every_command(monkeypatch, capsys, buffering, every):
+    for command in [(*words, "--help") for words in list(ALL)[::every]] + SHORT[:4] + SHORT[5:]:
         with open("/dev/full", "w", buffering) as full, monkeypatch.context() as patch:
             patch.setattr(sys, "stdout", full)
             status = main(command)
@@ -49,9 +49,8 @@ def test_output_that_cannot_be_written_is_one_line_of_every_command(monkeypatch,
 
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no /dev/full")
-@pytest.mark.parametrize("arguments", ["--help", "geometry show {} --json"])
-def test_nothing_more_is_said_when_python_ends(arguments):
-    words = arguments.format(WORKBOOK).split()
+def test_nothing_more_is_said_when_python_ends():
+    words = f"geometry show {WORKBOOK} --json".split()
     for unbuffered in ("", "1"):
         said = run_python(
             f"import os, sys; os.dup2(os.open('/dev/full', os.O_WRONLY), 1)\n"
@@ -126,10 +125,10 @@ def typed(event_set, tmp_path, monkeypatch):
     ]
 
 
-@pytest.mark.parametrize("length", [256, 5000])
-def test_names_that_are_too_long_are_one_line_of_every_command_that_writes(typed, capsys, length):
+@pytest.mark.parametrize(("length", "commands"), [(256, WRITING), (5000, WRITING[::6])], ids=["name", "path"])
+def test_names_that_are_too_long_are_one_line_of_every_command_that_writes(typed, capsys, length, commands):
     capsys.readouterr()
-    for command in WRITING:
+    for command in commands:
         assert main(typed(command, "x" * length)) == 1, command
         said = capsys.readouterr().err
         assert said.count("\n") == 1 and said.startswith("mphdrr: ") and "File name too long" in said, (command, said)

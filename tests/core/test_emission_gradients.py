@@ -176,21 +176,21 @@ def test_images_are_those_of_the_projector(backend, which, system, rng):
 @pytest.mark.parametrize("which", ["shared", "own"])
 def test_gradient_by_every_number_of_a_camera(backend, which, system, rng):
     """Pose, collimator length, pitch, principal point and hole against central differences, through matter."""
-    grid = general_grid(rng, (12, 10, 11))
-    smooth = np.multiply.outer(np.multiply.outer(np.hanning(12), np.hanning(10)), np.hanning(11))
+    grid = general_grid(rng, (8, 7, 6))
+    smooth = np.multiply.outer(np.multiply.outer(np.hanning(8), np.hanning(7)), np.hanning(6))
     activity = mph.Volume(smooth, grid, "activity")
     mu_grid = grid_of_mu(which, grid, rng)
     mu = mph.Volume(rng.uniform(0.005, 0.03, mu_grid.shape), mu_grid, "mu")
     position, rotation, l = camera(system)
     base = torch.eye(4, dtype=torch.float64)
     base[:3, :3], base[:3, 3] = rotation, position
-    rows, columns = torch.meshgrid(*[torch.linspace(0, 3, 16, dtype=torch.float64)] * 2, indexing="ij")
+    rows, columns = torch.meshgrid(*[torch.linspace(0, 3, 8, dtype=torch.float64)] * 2, indexing="ij")
     weights = 1 + torch.sin(rows) * torch.cos(columns)
 
     def loss(p):
         pose = se3_exp(p[:6]) @ base
         image = emission_images(
-            activity, pose[:3, 3], pose[:3, :3], l * torch.exp(p[6]), 0.45 * torch.exp(p[7]), (16, 16), p[8:10],
+            activity, pose[:3, 3], pose[:3, :3], l * torch.exp(p[6]), 0.9 * torch.exp(p[7]), (8, 8), p[8:10],
             diameter=2 * torch.exp(p[10]), aperture_points=3, pixel_points=2, crystal_mu=0.1, crystal_thickness=10.0,
             time=1e5, mu=mu, backend=backend,
         )  # fmt: skip

@@ -51,10 +51,14 @@ def packed(folder: Path, shard_bytes: int = 10**9) -> Store:
 
 def assert_same_events(folder: Path, made: Path) -> None:
     for event, other in zip(events.EventSet(folder), events.EventSet(made), strict=True):
-        assert (event.number, event.row, event.attributes) == (other.number, other.row, other.attributes)
-        assert np.array_equal(event.truth.array, other.truth.array) and np.array_equal(event.pose, other.pose)
-        for model in ("lines", "emission"):
-            assert np.array_equal(event.images(model), other.images(model))
+        assert_same_event(event, other)
+
+
+def assert_same_event(event: events.Event, other: events.Event) -> None:
+    assert (event.number, event.row, event.attributes) == (other.number, other.row, other.attributes)
+    assert np.array_equal(event.truth.array, other.truth.array) and np.array_equal(event.pose, other.pose)
+    for model in ("lines", "emission"):
+        assert np.array_equal(event.images(model), other.images(model))
 
 
 def test_packed_events_are_the_same_and_come_back_byte_for_byte(whole, made):
@@ -89,7 +93,7 @@ def assert_same_events_of_first(folder: Path, made: Path) -> None:
         assert np.array_equal(event.images("lines"), other.images("lines"))
 
 
-@pytest.mark.parametrize("at", [0, 100, 512, 1000, 5000, 20_000, 30_000])
+@pytest.mark.parametrize("at", [100, 512, 20_000])
 def test_a_kill_while_packing_loses_nothing(whole, made, at, monkeypatch):
     """What reached the disk ends anywhere within the second event; the first one's own file is removed already."""
     store, write = SetFolder(whole).store, stores._write_member
@@ -270,7 +274,7 @@ def test_an_index_whose_heading_was_cut_or_is_just_begun_is_read_and_completed(w
     assert tree(whole) == tree(made)
 
 
-@pytest.mark.parametrize("kept", [1, 9, 14, 30, -40, -3, -1])
+@pytest.mark.parametrize("kept", [1, 14, -1])
 def test_a_row_of_the_index_that_was_cut_is_drawn_anew(whole, made, kept):
     """Alone at the end of the file, and with other rows written on behind it."""
     path, lines = whole / "index.csv", (made / "index.csv").read_text().splitlines(keepends=True)
@@ -359,7 +363,7 @@ def test_no_flipped_bit_of_an_event_reads_as_another_event(whole, made, count):
         changed[bit // 8] ^= 1 << bit % 8
         path.write_bytes(changed)
         try:
-            assert_same_events(whole, made)
+            assert_same_event(events.EventSet(whole)[1], events.EventSet(made)[1])
         except mph.InputError as error:
             assert "000001.h5" in str(error)
 

@@ -158,7 +158,7 @@ def test_tv_reaches_the_minimum_that_another_solver_finds(weight, nonnegative):
 
     bounds = [(0, None) if nonnegative else (None, None)] * GRID.n_voxels
     best = optimize.minimize(smoothed, np.zeros(GRID.n_voxels), jac=True, method="L-BFGS-B", bounds=bounds,
-                             options={"maxiter": 2000, "maxfun": 2500, "maxcor": 30, "ftol": 1e-13})  # fmt: skip
+                             options={"maxiter": 1000, "maxfun": 1200, "maxcor": 30, "ftol": 1e-13})  # fmt: skip
     result = mph.tv(A, NOISY, weight, 800, nonnegative)
     x = result.volume.array
     least = smoothed(best.x, 0.0 + 1e-12)[0]

@@ -34,8 +34,7 @@ def totals(grid, n, backend="auto", **options):
     return A(np.ones(grid.shape)).sum(axis=(1, 2), dtype=float)
 
 
-@pytest.mark.parametrize("n", [64, 128, 256, 512])
-@pytest.mark.parametrize("size", [0.5, 1.0, 4.0])
+@pytest.mark.parametrize(("n", "size"), [(64, 0.5), (64, 4.0), (128, 1.0), (512, 0.5)])
 def test_a_voxel_anywhere_counts_by_the_point_law(n, size, rng):
     """Through the ideal pinhole; parallel and rotated voxels, from a fraction of a pixel to several pixels."""
     places = in_ball(rng, 35, 3 if size < 1 and n == 64 else 6)
@@ -50,8 +49,7 @@ def test_a_voxel_counts_the_same_through_points_of_the_hole(n, size, rng):
         np.testing.assert_allclose(totals(grid, n, aperture_points=7), law(MODULES, grid), rtol=0.02)
 
 
-@pytest.mark.parametrize("shape", [(1, 1, 60), (60, 1, 1), (1, 40, 40)])
-@pytest.mark.parametrize("points", [1, 7])
+@pytest.mark.parametrize(("shape", "points"), [((1, 1, 60), 7), ((60, 1, 1), 1), ((1, 40, 40), 1)])
 def test_capillaries_and_sheets_of_one_voxel_count_by_the_point_law(shape, points, rng):
     for place in in_ball(rng, 10, 2):
         grid = mph.Grid.centered(shape, 1.0, place)
@@ -135,13 +133,14 @@ def test_adjoint_with_points_of_pixels_and_hole(backend, system, rng):
         {"pixel_points": 3, "aperture_points": 4, "crystal_mu": 0.1, "depth_layers": 2},
     ):
         model = mph.Emission(system[3:6], mu, tolerance=1e9, within_crystal=True, within_walls=True, **options)
-        assert_adjoint(mph.Projector(grid, system[3:6].views((10, 11)), model, backend, threads=2), rng)
-    assert_adjoint(mph.Projector(grid, system[3:6].views((10, 11)), mph.Transmission(5), backend), rng)
+        assert_adjoint(mph.Projector(grid, system[3:6].views((5, 6)), model, backend, threads=2), rng)
+    assert_adjoint(mph.Projector(grid, system[3:6].views((5, 6)), mph.Transmission(5), backend), rng)
 
 
 @pytest.mark.parametrize("backend", BACKENDS[1:])
 def test_backends_agree_on_points_of_pixels(backend, system, rng):
     grid = general_grid(rng, (9, 8, 7))
+    system = system[::4]
     x, views = rng.random(grid.shape), system.views((9, 11))
     for model in (mph.Emission(system, pixel_points=5, aperture_points=3, tolerance=1e9), mph.Transmission(8)):
         reference, y = (mph.Projector(grid, views, model, name)(x) for name in ("numpy", backend))

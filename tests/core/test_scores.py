@@ -132,7 +132,7 @@ def test_pairs_by_themselves_prove_nothing():
     assert below > 0.25 and np.mean([sector.resolved for sector in sectors]) < 0.05
 
 
-@pytest.mark.parametrize("voxel", [1.0, 1.6])
+@pytest.mark.parametrize("voxel", [pytest.param(1.0, marks=pytest.mark.long), 1.6])
 @pytest.mark.parametrize("phantom", [WIDE, NARROW, mph.DerenzoPhantom(
     30.0, (8.0, 6.0, 5.0, 4.0, 3.5, 3.0), 16.0, 0.0, cylinder_radius=34, cylinder_height=24, background=20)],
     ids=["wide", "narrow", "cold"])  # fmt: skip
@@ -266,9 +266,7 @@ def test_what_cannot_be_scored_is_nan_and_says_why(truth):
     assert np.isnan(empty.valley_to_peak) and empty.note == "the peaks are not above 0" and empty.resolved == 0
 
 
-@pytest.mark.parametrize(
-    ("low", "high"), [(-2.0, 2.8), (5.2, 10.0), (-14.0, -5.6), (3.0, 25.0), (-10.0, 3.0), (-3.5, 0.1)]
-)
+@pytest.mark.parametrize(("low", "high"), [(-2.0, 2.8), (-14.0, -5.6), (3.0, 25.0)])
 def test_where_the_volume_covers_a_part_of_the_rods_that_part_is_scored(low, high):
     """From one diameter on; else the score says how much of their length is covered, and never that rods lie outside."""
     pose = mph.euler_pose(0.4, 1.1, -0.7, (5, -3, 40))

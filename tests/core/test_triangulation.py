@@ -74,7 +74,7 @@ def test_the_place_is_the_most_likely_one():
     np.testing.assert_allclose(fit.standard_deviations**2, np.diag(fit.covariance))
 
 
-@pytest.mark.parametrize("parallel", [False, True])
+@pytest.mark.parametrize("parallel", [False, pytest.param(True, marks=pytest.mark.long)])
 def test_the_stated_covariance_holds_on_average(parallel):
     modules = [1, 4, 5]
     fits, exact = noisy_fits(odd_views(parallel), modules, general_covariances(3), 1000, 1)

@@ -22,6 +22,8 @@ RIGHT = "right"
 WARNED = "right, with a warning that names the place"
 WARNED_OF = "whatever was read, with a warning that names the place"
 REFUSED = "refused, naming the place"
+READ_OR_REFUSED = (RIGHT, REFUSED)
+DOUBTED = (REFUSED, WARNED_OF)
 
 Made = Book | Callable[[Path], Any]
 
@@ -70,13 +72,19 @@ class Case:
 
 @dataclass
 class Catalogue:
-    """Cases by name."""
+    """Cases by name; the place and the map of those that say none, or why they have none."""
 
     topic: str
+    place: str | tuple[str, ...] = ()
+    columns: str | None = None
+    unmappable: str = ""
     cases: dict[str, Case] = field(default_factory=dict)
 
     def add(self, name: str, make: Callable[..., Any] | Book, truth: PinholeSystem | None, *allowed: str, **more: Any):
         assert name not in self.cases, f"two cases are called {name}"
+        more = {"place": self.place, "unmappable": self.unmappable, **more}
+        if truth is not None and not more["unmappable"]:
+            more.setdefault("columns", self.columns)
         build = make if callable(make) else lambda: make
         for key in ("place", "needs"):
             if isinstance(more.get(key), str):

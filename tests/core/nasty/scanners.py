@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -65,6 +66,7 @@ def scanner(
 SCANNER = scanner()
 # In centimetres its distances still look like a small scanner's in millimetres: its size does not reveal the unit.
 BIG = scanner(BIG_CENTERS, 4.0, 150.0, 120.0, 20.0)
+VARIED = scanner(CENTERS, d=[2.0, 2.5, 3.0, 3.5], Ld=[50.0, 52.0, 54.0, 56.0], Td=[8.0, 9.0, 10.0, 11.0])
 
 
 def quantity(system: PinholeSystem, name: str) -> np.ndarray:
@@ -180,6 +182,40 @@ def one_sheet(
             cells[f"A{top + 1 + i}"] = int(system.numbers[i])
             cells[f"{column}{top + 1 + i}"] = float(f"{value / MILLIMETRES[of]:.15g}")
     return Book([Sheet(sheet, cells)])
+
+
+def with_cells(book: Book, **cells: Any) -> Book:
+    """The book with cells such as B3=1.0 in its first sheet or Main_P4=2.0 in sheet Main."""
+    for name, value in cells.items():
+        sheet, _, at = name.rpartition("_")
+        (book[sheet] if sheet else book.sheets[0])[at] = value
+    return book
+
+
+def with_gap(book: Book, below: int = 1, rows: int = 1) -> Book:
+    """The book, the rows below row `below` of its first sheet moved down."""
+    sheet = book.sheets[0]
+    moved = {}
+    for at, value in sheet.cells.items():
+        column, row = at.rstrip("0123456789"), int(at.lstrip("ABCDEFGHIJKLMNOPQRSTUVWXYZ"))
+        moved[f"{column}{row + rows * (row > below)}"] = value
+    sheet.cells = moved
+    return book
+
+
+def with_format(book: Book, code: str, columns: str) -> Book:
+    """The book, the number format of these columns' cells in its first sheet `code`."""
+    for column in columns:
+        for row in range(2, 6):
+            book.sheets[0].formats[f"{column}{row}"] = code
+    return book
+
+
+def scaled(book: Book, factor: float, cells: Iterable[str]) -> Book:
+    """The book, these cells of its first sheet times `factor`."""
+    for at in cells:
+        book.sheets[0][at] *= factor
+    return book
 
 
 # Column maps

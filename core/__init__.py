@@ -96,7 +96,9 @@ from .workbook import (
     SystemSource,
     WrittenWorkbook,
     draft_column_map,
+    kinds_in,
     preview_workbook,
+    read_scanner,
     read_system,
     write_system,
 )

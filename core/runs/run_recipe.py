@@ -25,7 +25,7 @@ from ..projector import Emission, InverseSquareSum, Model, Projector, Transmissi
 from ..volumes.rearranging import centered
 from ..volumes.volume import Volume
 from ..volumes.volume_files import read_volume, read_volume_of
-from ..workbook import read_system
+from ..workbook import read_scanner
 from .measured import recipe_counts
 from .projecting import Imaging, project_run, warn_of_energy
 from .recipe import Recipe, recorded_recipe
@@ -99,7 +99,7 @@ def recipe_system(recipe: Recipe, path: Callable[[str], str | Path] = Path) -> S
     file, columns = recipe["system.file"], recipe["system.columns"]
     if file is None:
         raise InputError("system.file: missing; name the geometry workbook")
-    system = read_system(path(file), columns=None if columns is None else path(columns))
+    system = read_scanner(path(file), recipe["system.kind"], None if columns is None else path(columns))
     return chosen_modules(system, recipe["system.modules"], _MODULES)
 
 

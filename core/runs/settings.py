@@ -183,6 +183,7 @@ def _argument(name: str, kind: type, text: str, absent: str = "", **more: Any) -
 
 _DECLARED = (
     Setting("system.file", str, None, "Geometry workbook (.xlsx, .xlsm)", is_path=True, option="--system"),
+    Setting("system.kind", str, "pinhole", "Kind of the scanner, of a workbook that holds several", option="--scanner-kind"),
     Setting("system.columns", str, None, "Column map (.toml): which cells hold what, where the headings do not say it; "
             "geometry show --write-columns makes a draft", is_path=True),
     Setting("system.modules", str, None, "Numbers of the modules, such as 1-40 or 1-20,41", "all"),

@@ -159,16 +159,21 @@ def test_modules_have_the_crystals_that_they_say(system):
         assert mph.Emission(system.replace(crystal_material="NaI")).crystal_mu is None
 
 
+def headed(name: str, letter: str) -> dict[str, Any]:
+    return {"headings": (name, f"{name} of tube"), "place": f"Tubes!{letter}"}
+
+
 @dataclass(frozen=True, eq=False)
 class Tubes(Scanner):
     """X-ray sources, each with a square panel that faces it."""
 
+    sheet: ClassVar[str] = "Tubes"
     columns: ClassVar[ColumnTable] = ColumnTable(
         [
-            *(Column(f"{axis}s", "spots", axis=i) for i, axis in enumerate("xyz")),
-            *(Column(f"{axis}p", "panels", axis=i) for i, axis in enumerate("xyz")),
-            Column("w", "width", plausible=(1, 1000)),
-            Column("kVp", "voltage", kind="number", blank=120.0),
+            *(Column(f"{axis}s", "spots", axis=i, **headed(f"{axis}s", "BCD"[i])) for i, axis in enumerate("xyz")),
+            *(Column(f"{axis}p", "panels", axis=i, **headed(f"{axis}p", "EFG"[i])) for i, axis in enumerate("xyz")),
+            Column("w", "width", plausible=(1, 1000), **headed("w", "H")),
+            Column("kVp", "voltage", kind="number", blank=120.0, **headed("kVp", "I")),
         ]
     )
     spots: Any
@@ -218,3 +223,16 @@ def test_a_second_kind_is_projected_saved_and_read_back(tubes, rng, tmp_path):
     np.testing.assert_allclose(moved.panels, tubes.panels, atol=1e-12)
     with pytest.raises(InputError, match="emission: expected a PinholeSystem, got Tubes"):
         mph.Emission(tubes)
+
+
+def test_a_recipe_says_which_kind_of_scanner_a_workbook_is_read_as(tubes, workbook, rng, tmp_path):
+    mph.write_system(tubes, tmp_path / "both.xlsx", template=workbook)
+    grid = mph.Grid.centered(6, 20.0)
+    volume = mph.Volume(rng.uniform(0, 0.02, grid.shape), grid, "mu")
+    given = {"system.file": str(tmp_path / "both.xlsx"), "detector.rows": 9, "detector.columns": 11}
+    (run,) = mph.run_recipe(mph.Recipe({**given, "system.kind": "tubes"}), volume=volume)
+    np.testing.assert_array_equal(run.projections, project_run(tubes, volume, (9, 11)).projections)
+    (pinholes,) = mph.run_recipe(mph.Recipe(given), volume=volume)
+    assert len(pinholes.system) == 80
+    with pytest.raises(InputError, match="kind of scanner 'sextant': expected one of pinhole, tubes"):
+        next(mph.run_recipe(mph.Recipe({**given, "system.kind": "sextant"}), volume=volume))

@@ -84,7 +84,7 @@ def xdotool(*what: object) -> None:
 def on_screen(x: float, y: float, kind: str = "VIEW_3D") -> tuple[int, int]:
     """Where on the screen a place of an editor's region is."""
     window, _, region = editor(kind)
-    return round(region.x + x), round(window.height - region.y - y)
+    return round(region.x + x), round(window.height - 1 - region.y - y)
 
 
 def frame(kind: str = "VIEW_3D") -> list[int]:

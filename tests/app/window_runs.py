@@ -50,7 +50,9 @@ def steps():
     yield from idle()
     yield 4
     changes("rendered")
-    bpy.context.scene.mphdrr_projections.active_run = 0  # as a click in the list does
+    bpy.context.scene.mphdrr_projections.active_run = 0  # as a click in the list does, which starts a job
+    yield lambda: runs.shown(bpy.context.scene).name == "As imported"
+    yield from idle()
     yield 4
     changes("chosen")
     seen["shown"] = runs.shown(bpy.context.scene).name

@@ -233,7 +233,7 @@ tolerance = 0.7
 """
 
 
-@pytest.mark.parametrize("has_scanner", [False, True])
+@pytest.mark.parametrize("has_scanner", [pytest.param(False, marks=pytest.mark.long), True])
 def test_an_opened_event_is_current_until_something_is_changed(recipe, scene, tmp_path, has_scanner):
     """Float64 in the recipe, float32 in the scene: the same numbers; 84 degrees are others."""
     pitch = TEXT.replace("columns = 8", "columns = 8\npitch = 12.345678901234567\nmagnification = 9.87654321")

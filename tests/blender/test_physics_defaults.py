@@ -99,7 +99,7 @@ def test_all_modules_or_a_range_of_real_numbers(scene, settings, ring_system):
     assert (settings.first, settings.last) == (0, 0)
 
 
-@pytest.mark.parametrize("name", list(PRESETS)[::3])
+@pytest.mark.parametrize("name", list(PRESETS)[::5])
 def test_a_preset_goes_with_every_choice_of_the_panel(settings, objects, ring_system, name):
     """What is chosen in any menu or by any switch before the preset or after it, the panel's model is made."""
     collection = scanner.build_scanner(settings.id_data, ring_system)

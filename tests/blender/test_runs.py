@@ -114,7 +114,9 @@ EDITS = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("said", EDITS)
+@pytest.mark.parametrize(
+    "said", [pytest.param(said, marks=() if i % 2 == 0 else pytest.mark.long) for i, said in enumerate(EDITS)]
+)
 def test_whatever_changes_is_said_until_it_goes_back(render, scene, said):
     set_(time=60.0)
     render()

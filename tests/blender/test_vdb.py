@@ -49,9 +49,11 @@ def test_several_volumes_share_a_file(tmp_path):
     assert grid.metadata["mphdrr_unit"] == "kBq/mL" and "made by" in grid.metadata["mphdrr_provenance"]
 
 
-@pytest.mark.parametrize("extreme", [0.0, -0.0, 1e-45, -3.4e38, 1 / 3])
-@pytest.mark.parametrize("mirror", [1, -1])
-@pytest.mark.parametrize("shift", [0.0, -0.5])  # -0.5: all files of version 0.1.0 under Blender 4.5
+# A shift of -0.5: all files of version 0.1.0 under Blender 4.5.
+@pytest.mark.parametrize(
+    ("extreme", "mirror", "shift"),
+    [(0.0, 1, 0.0), (-0.0, -1, -0.5), (1e-45, 1, -0.5), (-3.4e38, -1, 0.0), (1 / 3, 1, 0.0)],
+)
 def test_every_float_comes_back(tmp_path, extreme, mirror, shift):
     array = np.zeros((3, 4, 5), np.float32)
     array[1, 2, 3] = extreme
@@ -143,8 +145,7 @@ def test_grids_are_chosen_by_name(tmp_path):
     assert read_vdb(path).array.max() == 2  # the only one with numbers
 
 
-@pytest.mark.parametrize("shift", [0.0, -0.5])
-@pytest.mark.parametrize("mirror", [1, -1])
+@pytest.mark.parametrize(("shift", "mirror"), [(0.0, -1), (-0.5, 1)])
 def test_what_others_do_to_our_grids_counts(tmp_path, shift, mirror):
     """Houdini and the like keep the metadata when they move a grid, also one that was written for Blender 4.5's drawing."""
     volume = Volume(np.ones((3, 3, 3), np.float32), Grid((3, 3, 3), LINEAR @ np.diag([mirror, 1.0, 1.0, 1.0])), "mu")

@@ -22,6 +22,7 @@ from mphdrr.core.projector import Emission
 from mphdrr.core.volumes.volume import Volume
 from mphdrr.core.workbook import read_system
 
+from .small_events import WORKBOOK as FEWER_MODULES
 from .small_events import small_recipe
 
 WORKBOOK = Path(__file__).parents[2] / "examples" / "dc-spect-80.xlsx"
@@ -118,7 +119,7 @@ EVENT_RECIPE = f"""
 version = 1
 seed = 3
 [system]
-file = '{WORKBOOK}'
+file = '{FEWER_MODULES}'
 modules = "1-4,21-24"
 [detector]
 rows = 12

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 import re
 import subprocess
 import sys
@@ -56,6 +57,11 @@ def test_no_modules_import_each_other_in_a_circle():
     assert circles == {}, "what is in a circle, or imports something that is"
 
 
+@functools.cache
+def tree_of(path: Path) -> ast.Module:
+    return ast.parse(path.read_text(encoding="utf-8"))
+
+
 def module_of(path: Path) -> str:
     parts = path.relative_to(ROOT).with_suffix("").parts
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
@@ -66,7 +72,7 @@ def imported_modules(path: Path) -> set[str]:
     package = path.relative_to(ROOT).parent.parts
     modules = {module_of(source) for source in SOURCES}
     found = set()
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for node in ast.walk(tree_of(path)):
         if isinstance(node, ast.ImportFrom) and node.level:
             base = package[: len(package) - node.level + 1]
             module = ".".join((*base, node.module) if node.module else base)
@@ -85,7 +91,7 @@ def test_the_extension_starts_no_other_process_opens_no_connection_and_runs_no_t
     """As docs/extension-review.md says."""
     banned = {"subprocess", "multiprocessing", "socket", "http", "urllib", "requests", "ftplib", "webbrowser"}
     for path in SOURCES:
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        for node in ast.walk(tree_of(path)):
             names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
             names += [node.module or ""] if isinstance(node, ast.ImportFrom) and not node.level else []
             # Of mphdrr events make --workers, and of the look at HDF5 files that have no seal.

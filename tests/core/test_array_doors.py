@@ -108,9 +108,14 @@ def test_masks_labels_and_pictures_are_refused_too():
 
 
 @pytest.mark.parametrize(
-    ("value", "said"), [(np.nan, "nan"), (1e300, "1e+300"), (-np.inf, "-inf"), (2 + 1j, "complex128")]
+    ("value", "said", "what"),
+    [
+        (np.nan, "nan", "projections"),
+        (1e300, "1e+300", "volume/array"),
+        (-np.inf, "-inf", "background"),
+        (2 + 1j, "complex128", "projections"),
+    ],
 )
-@pytest.mark.parametrize("what", ["projections", "volume/array", "background"])
 def test_runs_that_hold_no_numbers_are_refused(value, said, what, tmp_path):
     volume = mph.Volume(np.ones(GRID.shape), GRID)
     views = SYSTEM.views(PIXELS)

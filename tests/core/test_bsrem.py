@@ -142,7 +142,7 @@ def even(scanner):
     return A, mask, A(10.0 * mask)
 
 
-@pytest.mark.parametrize("prior", [mph.Quadratic, mph.RelativeDifference, mph.TotalVariation])
+@pytest.mark.parametrize("prior", [mph.RelativeDifference, mph.TotalVariation])
 @pytest.mark.parametrize(("neighbors", "weight"), [pytest.param(6, 50.0, marks=pytest.mark.long), (26, 2.0)])
 def test_a_uniform_volume_in_its_mask_stays_so_up_to_its_edge(even, prior, neighbors, weight):
     A, mask, counts = even

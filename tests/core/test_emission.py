@@ -118,7 +118,7 @@ def test_counts_per_solid_angle_follow_the_formula(backend):
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-@pytest.mark.parametrize("magnification", [0.7, 2.0, 10.0])
+@pytest.mark.parametrize("magnification", [0.7, 10.0])
 def test_real_and_virtual_detector_count_the_same(backend, magnification, system, rng):
     """Point-inverted, and the same wherever the virtual detector is: in front of, inside or behind the volume."""
     grid = general_grid(rng, (9, 8, 7))

@@ -152,7 +152,7 @@ def test_all_damage_at_once(tmp_path, made, capsys):
 def test_a_changed_input_is_found_and_not_mended(tmp_path, made, capsys):
     folder = tmp_path / "set"
     shutil.copytree(made / "set", folder)
-    path = folder / "inputs" / "dc-spect-80.xlsx"
+    path = folder / "inputs" / WORKBOOK.name
     path.write_bytes(path.read_bytes() + b" ")
     assert main(["events", "check", str(folder), "--repair"]) == 1
     assert "put the original back" in capsys.readouterr().err

@@ -13,7 +13,7 @@ import mphdrr.core as mph
 from mphdrr.core.cli import main
 from mphdrr.core.events.templates import TEMPLATES, template_text
 
-from .small_events import WORKBOOK
+from .conftest import WORKBOOK
 
 EVENTS = 12
 

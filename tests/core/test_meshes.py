@@ -37,7 +37,7 @@ def content(volume: mph.Volume) -> float:
     return float(volume.array.sum(dtype=np.float64) * volume.grid.voxel_volume)
 
 
-@pytest.mark.parametrize("voxel", [30.0, 12.0, 5.0, 1.5])
+@pytest.mark.parametrize("voxel", [30.0, 5.0])
 def test_a_sphere_has_its_volume_on_any_grid(rng, voxel):
     ball = 4 / 3 * np.pi * 20**3
     n = int(60 / voxel) + 3

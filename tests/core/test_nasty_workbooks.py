@@ -161,13 +161,12 @@ MIXED = {"x1": "cm", "z1": "m", "d": "um", "Ld": "in", "l": "cm"}
 BACK = {
     **{
         f"headings in {unit}": (lambda unit=unit: one_sheet(headings=_in(unit), unit=unit), None)
-        for unit in ("cm", "m", "in", "um")
+        for unit in ("m", "um")
     },
     "headings in units of their own": (
         lambda: one_sheet(headings={q: f"{SYMBOLS[q]} ({u})" for q, u in MIXED.items()}, unit=MIXED),
         None,
     ),
-    "a map in cm": (lambda: one_sheet(headings=dict.fromkeys(SYMBOLS, "?"), unit="cm"), one_sheet_map("cm")),
     "a map in inches": (lambda: one_sheet(headings=dict.fromkeys(SYMBOLS, "?"), unit="in"), one_sheet_map("in")),
     "a map in units of their own": (
         lambda: one_sheet(headings=dict.fromkeys(SYMBOLS, "?"), unit=MIXED),
@@ -175,25 +174,15 @@ BACK = {
     ),
     "a map of a part of the rows": (one_sheet, one_sheet_map(first=3, last=5)),
     "a map without numbers": (one_sheet, one_sheet_map(number=None)),
-    "a map of the users' workbook": (users, users_map()),
     "a map in order": (users, users_map(dimensions={"rows": "in order", "number": None})),
     "the users' workbook": (users, None),
     **{
         name: (CASES[f"units: {name}"].make, CASES[f"units: {name}"].columns)
         for name in (
-            *(f"users' workbook in {unit}" for unit in ("cm", "in", "m")),
-            *("users' workbook, Main in cm", "'cm' merged over the coordinates", 'number format 0.000" cm"'),
-            *("units row below: inch", "every column in a unit of its own", "Units: | cm"),
+            *("users' workbook in cm", "users' workbook, Main in cm", "'cm' merged over the coordinates"),
+            *('number format 0.000" cm"', "units row below: inch", "Units: | cm"),
         )
     },
-    "words in German": (
-        lambda: one_sheet(
-            headings=dict(
-                zip(ONE_SHEET_COLUMNS, ["Lx", "Ly", "Lz", "Loch", "ROI", "Seite", "Dicke", "Länge"], strict=True)
-            )
-        ),
-        one_sheet_map(),
-    ),
 }
 
 

@@ -73,7 +73,7 @@ def test_line_integrals_of_a_box_are_its_chords(backend, monkeypatch):
     assert chords.max() > 15
 
 
-@pytest.mark.parametrize("points", [1, 3])
+@pytest.mark.parametrize("points", [pytest.param(1, marks=pytest.mark.long), 3])
 def test_the_adjoint_subsets_and_backends_agree(points, monkeypatch):
     monkeypatch.setenv("MPHDRR_CUDA_DEVICE", "cpu")
     grid = mph.Grid.centered((11, 9, 8), (1.0, 1.2, 0.9), center=(0.3, 0.2, -0.1))

@@ -88,7 +88,7 @@ def test_what_lies_outside_is_left_out():
     assert share == pytest.approx(0.5, abs=0.02)
 
 
-@pytest.mark.parametrize("spacing", [0.8, 1.5, 4.0])
+@pytest.mark.parametrize("spacing", [1.5, 4.0])
 def test_both_forms_agree_about_a_smooth_volume(spacing):
     """What lies in a cell is its value times its volume, whether voxels are smaller or larger than cells."""
     n = int(96 / spacing)

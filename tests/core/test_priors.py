@@ -31,8 +31,7 @@ def derivative(function, x, h=1e-5):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("neighbors", [6, 26])
-@pytest.mark.parametrize("with_anatomy", [False, True])
+@pytest.mark.parametrize(("neighbors", "with_anatomy"), [(6, True), (26, False)])
 def test_gradient_and_curvature_are_those_of_the_value(grid, anatomy, rng, kind, neighbors, with_anatomy):
     penalty = kind(0.7, neighbors=neighbors, anatomy=anatomy if with_anatomy else None).on(grid)
     x = rng.uniform(0, 5, SHAPE)
@@ -46,8 +45,7 @@ def test_gradient_and_curvature_are_those_of_the_value(grid, anatomy, rng, kind,
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("neighbors", [6, 26])
-@pytest.mark.parametrize("with_anatomy", [False, True])
+@pytest.mark.parametrize(("neighbors", "with_anatomy"), [(6, False), (26, True)])
 def test_a_penalty_inside_a_box_is_that_of_a_grid_that_ends_there(rng, kind, neighbors, with_anatomy):
     """Value, gradient and curvature, also where slabs of planes meet."""
     shape, box = (9, 70, 80), (slice(2, 8), slice(3, 60), slice(1, 77))

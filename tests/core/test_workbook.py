@@ -30,12 +30,6 @@ from mphdrr.core.workbook.headings import vocabulary
 
 from . import libreoffice
 
-try:
-    from hypothesis import HealthCheck, given, settings
-    from hypothesis import strategies as st
-except ImportError:  # the property tests skip
-    st = None
-
 pytestmark = pytest.mark.filterwarnings("error")
 
 SYMBOLS = ["", "x1", "y1", "z1", "b", "S", "l", "l + b+Td", "x2", "y2", "z2", "", "", ""]
@@ -777,63 +771,6 @@ def test_missing_heading_is_named(tmp_path):
         read_edited(tmp_path, lambda main, coordinates: main.delete_cols(4))
 
 
-def _zip_of(path: Path, members: dict[str, bytes]) -> None:
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
-        for name, content in members.items():
-            archive.writestr(name, content)
-
-
-def _damaged_sheet(path: Path, real: bytes, change: Callable[[bytes], bytes]) -> None:
-    path.write_bytes(real)
-    with zipfile.ZipFile(path) as archive:
-        members = {name: archive.read(name) for name in archive.namelist()}
-    members["xl/worksheets/sheet2.xml"] = change(members["xl/worksheets/sheet2.xml"])
-    _zip_of(path, members)
-
-
-OLE = bytes.fromhex("d0cf11e0a1b11ae1")
-BAD_FILES: dict[str, tuple[Callable[[Path, bytes], object], str]] = {
-    "missing": (lambda path, real: None, "no such file"),
-    "a folder": (lambda path, real: path.mkdir(), "is a folder, expected an .xlsx workbook"),
-    "empty": (lambda path, real: path.write_bytes(b""), "an empty file"),
-    "text": (lambda path, real: path.write_text("x1,y1,z1\n1,2,3\n"), "not an .xlsx workbook"),
-    "truncated": (lambda path, real: path.write_bytes(real[:20000]), "not an .xlsx workbook"),
-    "old format": (lambda path, real: path.write_bytes(OLE + bytes(600)), "an old Excel .xls file"),
-    "password": (
-        lambda path, real: path.write_bytes(OLE + bytes(600) + "EncryptedPackage".encode("utf-16-le")),
-        "protected by a password",
-    ),
-    "another zip": (lambda path, real: _zip_of(path, {"a.txt": b"hello"}), "not a whole .xlsx workbook"),
-    "OpenDocument": (lambda path, real: _zip_of(path, {"mimetype": b"", "content.xml": b""}), "an OpenDocument file"),
-    "binary workbook": (lambda path, real: _zip_of(path, {"xl/workbook.bin": b""}), "a binary .xlsb workbook"),
-    "broken XML": (
-        lambda path, real: _damaged_sheet(path, real, lambda xml: xml[:9000]),
-        "sheet Coordinates: not readable XML",
-    ),
-    "not a number": (
-        lambda path, real: _damaged_sheet(path, real, lambda xml: xml.replace(b"<v>277.002</v>", b"<v>NaN</v>")),
-        "Coordinates!B3 holds 'NaN', which is not a number, expected x1 of module 1",
-    ),
-    "infinite": (
-        lambda path, real: _damaged_sheet(path, real, lambda xml: xml.replace(b"<v>277.002</v>", b"<v>1e999</v>")),
-        "Coordinates!B3 is inf, expected x1 of module 1",
-    ),
-}
-
-
-@pytest.mark.parametrize("kind", BAD_FILES)
-def test_what_is_no_workbook_is_refused(kind, tmp_path, workbook):
-    make, expected = BAD_FILES[kind]
-    path = tmp_path / "scanner.xlsx"
-    make(path, workbook.read_bytes())
-    with pytest.raises(InputError) as refusal:
-        read_system(path)
-    message = str(refusal.value)
-    assert "scanner.xlsx" in message
-    assert expected in message
-    assert "\n" not in message
-
-
 def test_file_of_absurd_size_is_refused_unread(workbook, monkeypatch):
     monkeypatch.setattr("mphdrr.core.workbook.book.MAX_UNPACKED_BYTES", 100_000)
     with pytest.raises(InputError, match="unpacks to 139152 bytes, expected at most 100000"):
@@ -885,52 +822,3 @@ def test_too_many_modules_are_refused(tmp_path, monkeypatch):
     monkeypatch.setattr("mphdrr.core.workbook.layout.MAX_MODULES", 3)
     with pytest.raises(InputError, match="sheet Coordinates has 4 modules, expected at most 3"):
         read_edited(tmp_path, lambda main, coordinates: None)
-
-
-# Any scanner, any layout
-
-if st is not None:
-
-    @st.composite
-    def layouts(draw):
-        n = draw(st.integers(1, 30))
-        seed = draw(st.integers(0, 2**32 - 1))
-        columns = draw(st.permutations(range(8)))
-        gap = draw(st.integers(0, 3))
-        top = draw(st.integers(0, 17))
-        symbols = draw(st.booleans())
-        return n, seed, columns, gap, top, symbols
-
-    @settings(max_examples=10, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-    @given(layouts())
-    def test_any_order_of_columns_and_place_of_headings(tmp_path, layout):
-        n, seed, columns, gap, top, symbols = layout
-        rng = np.random.default_rng(seed)
-        directions = rng.normal(size=(n, 3))
-        centers = np.round(directions / np.linalg.norm(directions, axis=1)[:, None] * rng.uniform(110, 400, (n, 1)), 6)
-        sizes = np.round(rng.uniform([1, 20, 30, 3], [5, 100, 80, 12], (n, 4)), 6)
-        headings = ["Definitions", *DESCRIPTIONS[1:4], *(plain()["Main"].cell(2, c).value for c in range(2, 6))]
-        if symbols:
-            headings = ["Module", "x1", "y1", "z1", "d", "R", "Ld", "Td"]
-        numbers = rng.permutation(1000)[:n] + 1
-        table = [
-            headings,
-            *([int(k), *map(float, c), *map(float, s)] for k, c, s in zip(numbers, centers, sizes, strict=True)),
-        ]
-        book = Workbook()
-        for i, row in enumerate(table, start=top + 1):
-            for j, column in enumerate(columns):
-                book.active.cell(i, 1 + j * (gap + 1), row[column])
-        system = read_system(saved(book, tmp_path))
-        np.testing.assert_array_equal(system.centers, centers)
-        np.testing.assert_array_equal(system.numbers, numbers)
-        np.testing.assert_array_equal(
-            np.stack([system.pinhole_diameter, system.roi_radius, system.detector_side, system.detector_thickness], 1),
-            sizes,
-        )
-
-else:
-
-    @pytest.mark.skip(reason="hypothesis is not installed")
-    def test_any_order_of_columns_and_place_of_headings():
-        pass

@@ -303,30 +303,33 @@ def _files() -> None:
     # Strict Open XML is named.
     CASES.add("Strict Open XML", _edited(_strict), SCANNER, REFUSED, place="Strict", unmappable=NO_WORKBOOK)
 
-    ole = bytes.fromhex("d0cf11e0a1b11ae1")
-    for name, content in {
-        "an empty file": b"",
-        "a csv file": b"No.,x1,y1,z1,d,R,Ld,Td\n1,277,70.3,-70,2.3,75,50,10\n",
-        "SpreadsheetML 2003": b'<?xml version="1.0"?><Workbook xmlns="urn:schemas-microsoft-com:office:spreadsheet"/>',
-        "an old .xls": ole + bytes(600),
-        "a protected workbook": ole + bytes(600) + "EncryptedPackage".encode("utf-16-le"),
-        "zeros": bytes(5000),
-        "a Git LFS pointer": b"version https://git-lfs.github.com/spec/v1\noid sha256:00\nsize 25732\n",
-        "a zip's first bytes": b"PK\x03\x04" + bytes(50),
-        "an empty zip": zipped({}),
-        "a Word document": zipped({"[Content_Types].xml": b"<Types/>", "word/document.xml": b"<w/>"}),
-        "OpenDocument": zipped({"mimetype": b"application/vnd.oasis.opendocument.spreadsheet", "content.xml": b"<a/>"}),
-        "a binary .xlsb": zipped({"[Content_Types].xml": b"<Types/>", "xl/workbook.bin": b""}),
-        "a zip of the workbook": zipped({"scanner.xlsx": b"PK\x03\x04"}),
-    }.items():
-        CASES.add(f"no workbook: {name}", lambda path, content=content: path.write_bytes(content), None, REFUSED)
+    ole, none = bytes.fromhex("d0cf11e0a1b11ae1"), "not an .xlsx workbook"
+    spreadsheet_ml = b'<?xml version="1.0"?><Workbook xmlns="urn:schemas-microsoft-com:office:spreadsheet"/>'
+    for name, content, said in (
+        ("an empty file", b"", "an empty file"),
+        ("a csv file", b"No.,x1,y1,z1,d,R,Ld,Td\n1,277,70.3,-70,2.3,75,50,10\n", none),
+        ("SpreadsheetML 2003", spreadsheet_ml, none),
+        ("an old .xls", ole + bytes(600), "an old Excel .xls file"),
+        ("a protected workbook", ole + bytes(600) + "EncryptedPackage".encode("utf-16-le"), "protected by a password"),
+        ("zeros", bytes(5000), none),
+        ("a Git LFS pointer", b"version https://git-lfs.github.com/spec/v1\noid sha256:00\nsize 25732\n", none),
+        ("a zip's first bytes", b"PK\x03\x04" + bytes(50), none),
+        ("an empty zip", zipped({}), "not a whole .xlsx workbook"),
+        ("a Word document", zipped({"word/document.xml": b"<w/>"}), "not a whole .xlsx workbook"),
+        ("OpenDocument", zipped({"mimetype": b"", "content.xml": b"<a/>"}), "an OpenDocument file"),
+        ("a binary .xlsb", zipped({"xl/workbook.bin": b""}), "a binary .xlsb workbook"),
+        ("a zip of the workbook", zipped({"scanner.xlsx": b"PK\x03\x04"}), "not a whole .xlsx workbook"),
+    ):
+        CASES.add(
+            f"no workbook: {name}", lambda path, content=content: path.write_bytes(content), None, REFUSED, place=said
+        )
     for part in (0.02, 0.6, 0.99):
         cut = _bytes(lambda b, part=part: b[: int(len(b) * part)])
         CASES.add(f"cut off after {part:.0%}", cut, None, REFUSED)
-    CASES.add("a folder", lambda path: path.mkdir(), None, REFUSED)
+    CASES.add("a folder", lambda path: path.mkdir(), None, REFUSED, place="is a folder, expected an .xlsx workbook")
     lock, named = b"\x06Someone" + b" " * 100, {"place": "lock file", "file": "~$scanner.xlsx"}
     CASES.add("a lock file", lambda path: path.write_bytes(lock), None, REFUSED, **named)
-    CASES.add("no file", lambda path: None, None, REFUSED)
+    CASES.add("no file", lambda path: None, None, REFUSED, place="no such file")
     CASES.add("a flipped byte", _bytes(_flipped), None, REFUSED)
     for name, change in {
         "a sheet missing": _without(sheet),

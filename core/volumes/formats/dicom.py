@@ -290,7 +290,8 @@ def _pixels(slices: list[_Slice]) -> Iterator[tuple[_Slice, NDArray[Any]]]:
     """Each slice with its stored values (rows, columns). A multi-frame file is decoded once."""
     import pydicom
 
-    path, frames = None, np.empty(0)
+    path: Path | None = None
+    frames: NDArray[Any] = np.empty(0)
     for one in slices:
         if one.path != path:
             path = one.path

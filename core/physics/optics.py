@@ -92,6 +92,13 @@ class Optics:
             object.__setattr__(self, name, bool(getattr(self, name)))
         object.__setattr__(self, "library", namespace(*self.numbers.values()))
 
+    def __getstate__(self) -> dict[str, Any]:
+        """What is pickled and copied: a module cannot be."""
+        return {name: value for name, value in self.__dict__.items() if name != "library"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state, library=namespace(*state.values()))
+
     @classmethod
     def of(cls, system: PinholeSystem, lines: Sequence[tuple[float, float]] = (), **settings: Any) -> Self:
         """The optics of a system's modules for photons of these `lines`: energies, keV, and numbers per decay.

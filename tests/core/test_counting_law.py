@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import copy
+import pickle
+
 import numpy as np
 import pytest
 
@@ -209,3 +212,11 @@ def test_cameras_of_tensors_count_as_the_model_with_the_same_optics(system):
 def test_optics_that_cannot_be_are_refused(settings, why, system):
     with pytest.raises(mph.InputError, match=why):
         mph.sensitivity(system, [[0, 0, 0]], **settings)
+
+
+def test_optics_and_models_are_copied_and_pickled(system):
+    """As for other processes, and by packages that copy their physics."""
+    model = mph.Emission(system, isotope="Tc-99m", aperture_mu="tungsten", crystal_mu="NaI")
+    expected = mph.sensitivity(system, [CENTER], optics=model.optics)
+    for same in (copy.deepcopy(model), pickle.loads(pickle.dumps(model))):
+        np.testing.assert_array_equal(mph.sensitivity(system, [CENTER], optics=same.optics), expected)

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..errors import InputError
 from ..system_source import SystemSource
 from ..validation import freeze, one_of, real_array
-from .columns import ColumnTable, Values, vector
+from .columns import ColumnTable, Values
 from .module_parts import ModulePart
 from .views import Views
 
@@ -58,31 +58,24 @@ class Scanner(ABC):
             SCANNERS[cls.kind] = cls
 
     def __post_init__(self) -> None:
-        known = {f.name for f in fields(self)}  # type: ignore[arg-type]
-        more: dict[str, Any] = {}
+        own, more = {f.name for f in fields(self)}, dict[str, Any]()  # type: ignore[arg-type]
+        given = own | self.more.keys()
         n: int | None = None
         if unknown := self.more.keys() - self.columns.fields.keys():
             raise InputError(f"{sorted(unknown)[0]}: is no column of a {self.kind} scanner")
         for name, columns in self.columns.fields.items():
-            absent = (
-                columns[0].default(self.columns.needed_values(self)) if name not in known | self.more.keys() else None
-            )
-            given = getattr(self, name) if name in known else self.more.get(name, absent)
-            values = columns[0].checked(given, n) if columns[0].axis is None else vector(given, name, n)
-            n = len(values)
-            if name in known:
-                object.__setattr__(self, name, freeze(values))
-            else:
-                more[name] = freeze(values)
+            of = columns[0]
+            values = getattr(self, name) if name in given else of.default(self.columns.needed_values(self))
+            held = vars(self) if name in own else more
+            held[name] = freeze(of.checked(values, n))
+            n = len(held[name])
             if n == 0:
                 raise InputError(f"a {self.kind} system needs at least one module, got none")
-        object.__setattr__(self, "more", more)
-        numbers = (
-            np.arange(1, (n or 0) + 1) if self.numbers is None else real_array(self.numbers, "numbers", (n,), np.int64)
-        )
-        if self.numbers is not None and not np.array_equal(numbers, self.numbers):
+        wanted = np.arange(1, (n or 0) + 1) if self.numbers is None else self.numbers
+        numbers = freeze(real_array(wanted, "numbers", (n,), np.int64))
+        if not np.array_equal(numbers, wanted):
             raise InputError("numbers: expected whole numbers")
-        object.__setattr__(self, "numbers", freeze(numbers))
+        vars(self).update(more=more, numbers=numbers)
         for name, column in self.columns.scalars.items():
             if column.plausible[0] > 0:
                 unit = next(iter(column.units))

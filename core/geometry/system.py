@@ -23,7 +23,6 @@ from .views import Views
 
 LENGTHS = {name: column.help for name, column in PINHOLE_COLUMNS.scalars.items() if column.kind == "length"}
 """The modules' dimensions: fields of `PinholeSystem`, with what they are."""
-LATER_LENGTHS: tuple[str, ...] = ()
 
 # Pinholes that differ in z by less than this fraction of the crystal's side belong to one ring.
 _RING_GAP = 0.2

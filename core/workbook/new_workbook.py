@@ -96,9 +96,7 @@ def _content(column: Column, system: Scanner, places: dict[str, tuple[str, int]]
     if not column.formula:
         return [(value, "") for value in values]
     by_formula = column.follows_formula(system)
-    undefined = np.zeros(len(system), np.bool_)
-    if column.undefined is not None:
-        undefined = by_formula & column.undefined(system.columns.needed_values(system))
+    undefined = by_formula & column.undefined(system.columns.needed_values(system))
     quoted = {its: its if re.fullmatch(r"\w+", its) else f"'{its}'" for its, _ in places.values()}
     before = {name: "" if its == title else f"{quoted[its]}!" for name, (its, _) in places.items()}
     content = []

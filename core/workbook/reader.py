@@ -104,9 +104,8 @@ def read(book: Book, scanner: type[AnyScanner], columns: ColumnMap | None = None
     defaults = {name: declared[name].default(values) for name in declared.optional}
     values |= defaults
     for name in declared:  # causes before their effects
-        undefined = declared[name].undefined
         if name in cells and name in declared.derived:
-            given[name] = cells[name].values(True, None if undefined is None else undefined(values))
+            given[name] = cells[name].values(True, declared[name].undefined(values))
         elif name in cells and name in declared.optional:
             given[name] = cells[name].values(columns is None or declared[name].is_text)
             in_sheet = cells[name].in_code(given[name])

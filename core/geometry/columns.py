@@ -137,6 +137,10 @@ class Column:
         """Which modules (M,) have the value of a blank cell."""
         return self.same(self.default(scanner.columns.needed_values(scanner)), self.of(scanner))
 
+    def is_unused(self, scanner: Any) -> bool:
+        """Whether all its cells may be blank: it is optional, has no formula, and no module has another value."""
+        return self.has_constant_blank and bool(self.is_default(scanner).all())
+
     def follows_formula(self, scanner: Any) -> NDArray[np.bool_]:
         """Which modules (M,) have the value that its formula gives, if it has one."""
         return self.is_default(scanner) if self.derived is None else ~self.unlike_formula(scanner)

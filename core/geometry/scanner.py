@@ -23,7 +23,7 @@ from .views import Views
 
 Detector = Literal["virtual", "real"]
 
-Fault = tuple[str, NDArray[np.bool_], Callable[[int], str]]
+Fault = tuple[str, int, str]
 
 SCANNERS: dict[str, type[Scanner]] = {}
 """Name -> class, of the kinds of scanners; each enters itself when it is defined."""
@@ -129,25 +129,23 @@ class Scanner(ABC):
 
     def filled(self) -> dict[str, NDArray[Any]]:
         """The attributes that columns hold, without those in which all cells of a workbook could be blank."""
-        found = {}
-        for name, columns in self.columns.fields.items():
-            if not columns[0].has_constant_blank or not all(c.is_default(self).all() for c in columns):
-                found[name] = getattr(self, name)
-        return found
+        used = {
+            column.field for columns in self.columns.fields.values() for column in columns if not column.is_unused(self)
+        }
+        return {name: getattr(self, name) for name in self.columns.fields if name in used}
 
     @classmethod
     def faults(cls, values: Values, numbers: Sequence[int], place: Callable[[str, int], str]) -> Iterator[Fault]:
         """What no scanner of this kind has, of positive `values` of the needed columns of modules with these `numbers`.
 
         `place` gives the cell of a column and a module's index, for messages. Each fault is the column whose cell is at
-        fault, the modules (M,) for which it is, and a function that tells why it is that of a module, after the cell.
+        fault, the first module for which it is, and why it is, after the cell.
         """
         yield from ()
 
     def _refuse(self, bad: NDArray[np.bool_], message: str) -> None:
         """Refuse the first module that is `bad`; `message` is a template of its attributes."""
-        if bad.any():
-            i = int(np.argmax(bad))
+        for i in first(bad):
             own = {name: np.ravel(getattr(self, name))[i] for name in re.findall(r"{(\w+)", message)}
             raise InputError(f"module {self.numbers[i]}: {message.format(**own)}")
 
@@ -194,18 +192,24 @@ class Scanner(ABC):
         """Index (M,) of each module's group, from 0; all are one by default."""
         return np.zeros(len(self), dtype=np.int64)
 
-    def reach(self) -> float:
-        """Radius, mm, of a sphere around the isocentre with the modules' sources in it."""
-        return float(np.linalg.norm(self.poses()[:, :3, 3], axis=1).max())
-
     def region_radius(self) -> float:
         """Radius, mm, of the sphere around the isocentre that is looked at: by default to halfway to the nearest source."""
         return float(np.linalg.norm(self.poses()[:, :3, 3], axis=1).min()) / 2
+
+
+def first(bad: NDArray[np.bool_]) -> list[int]:
+    """The first index that is bad, if any."""
+    return np.flatnonzero(bad)[:1].tolist()
 
 
 def repeated(rows: NDArray[Any]) -> NDArray[np.bool_]:
     """Which rows (M,) of an array (M, ...) stand there before."""
     if len(rows) == 1:
         return np.zeros(1, bool)
-    _, first, inverse = np.unique(rows, axis=0, return_index=True, return_inverse=True)
-    return first[inverse.reshape(-1)] != np.arange(len(rows))
+    return first_equal(rows) != np.arange(len(rows))
+
+
+def first_equal(rows: NDArray[Any]) -> NDArray[np.intp]:
+    """The first row (M,) of an array (M, ...) that is equal to each."""
+    _, places, inverse = np.unique(rows, axis=0, return_index=True, return_inverse=True)
+    return places[inverse.reshape(-1)]

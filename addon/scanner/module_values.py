@@ -177,11 +177,21 @@ def _straightened(kind: Kind, poses: NDArray[np.float64], turned: NDArray[np.boo
     """Poses (M, 4, 4) without rounding where they are aimed, and with a proper rotation where they were turned."""
     left, _, right = np.linalg.svd(poses[turned, :3, :3])
     poses[turned, :3, :3] = left @ right
-    exact = kind.aimed(poses[:, :3, 3])
-    if exact is not None:
-        aimed = np.abs(poses - exact).max(axis=(1, 2)) <= _AIMED
-        poses[aimed] = exact[aimed]
+    exact, aimed = _aims(kind, poses)
+    poses[aimed] = exact[aimed]
     return poses
+
+
+def _aims(kind: Kind, poses: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """The poses (M, 4, 4) that look at the isocentre from the places of `poses` (M, 4, 4), and which of these do so.
+
+    Rolled ones do not. Of a kind that is not aimed, and at the isocentre itself, all are right.
+    """
+    found, aimed, away = poses.copy(), np.ones(len(poses), bool), np.any(poses[:, :3, 3], axis=1)
+    exact = kind.aimed(poses[away, :3, 3])
+    if exact is not None:
+        found[away], aimed[away] = exact, np.abs(poses[away] - exact).max(axis=(1, 2)) <= _AIMED
+    return found, aimed
 
 
 def _carry(
@@ -242,16 +252,10 @@ def changes(found: Sequence[bpy.types.Object]) -> tuple[list[bool], list[bool]]:
 def aim_of(kind: Kind, matrices: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """The world matrices (M, 4, 4) with which cameras look at the isocentre from where they stand, and which do so, upright.
 
-    `matrices` (M, 4, 4) are those that they have. Of a kind that is not aimed, and at the isocentre itself, all are right.
+    `matrices` (M, 4, 4) are those that they have; see `_aims`.
     """
-    poses, off_centre = cameras.poses_of(matrices), np.any(matrices[:, :3, 3], axis=1)
-    exact = kind.aimed(poses[off_centre, :3, 3])
-    if exact is None:
-        return matrices, np.ones(len(matrices), bool)
-    aimed, found = ~off_centre, matrices.copy()
-    found[off_centre] = cameras.matrices_of(exact)
-    aimed[off_centre] = np.abs(poses[off_centre] - exact)[:, :3, :3].max(axis=(1, 2)) <= _AIMED
-    return found, aimed
+    exact, aimed = _aims(kind, cameras.poses_of(matrices))
+    return cameras.matrices_of(exact), aimed
 
 
 def off_aim(collection: bpy.types.Collection, cameras_: Iterable[bpy.types.Object]) -> list[int]:

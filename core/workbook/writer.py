@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import InputError, warn
+from ..errors import InputError, several, warn
 from ..files import replacing, write_bytes
 from ..geometry.scanner import Scanner, first
 from ..recording import recorded_warnings
@@ -16,7 +16,7 @@ from ..validation import instance
 from .book import Book
 from .calculation import Recalculation
 from .column_map import ColumnMap, column_map
-from .edit import Edit, several
+from .edit import Edit
 from .new_workbook import new_sheets, new_workbook
 from .reader import read
 from .workbook_xml import KINDS, Place, WorkbookXml

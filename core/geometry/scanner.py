@@ -199,7 +199,7 @@ class Scanner(ABC):
 
 def first(bad: NDArray[np.bool_]) -> list[int]:
     """The first index that is bad, if any."""
-    return np.flatnonzero(bad)[:1].tolist()
+    return [int(bad.argmax())] if bad.any() else []
 
 
 def repeated(rows: NDArray[Any]) -> NDArray[np.bool_]:

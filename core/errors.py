@@ -1,7 +1,7 @@
 """Errors and warnings about the user's input, and the exception of cancelled work."""
 
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -66,3 +66,9 @@ def first_line(error: BaseException) -> str:
     """A library's error message, as one line."""
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     return lines[0] if lines else type(error).__name__
+
+
+def several(things: Iterable[object], shown: int = 3) -> str:
+    """The first few, and how many more."""
+    texts = [str(thing) for thing in things]
+    return ", ".join(texts[:shown]) + (f" and {len(texts) - shown} more" if len(texts) > shown else "")

@@ -151,6 +151,20 @@ def numbers(dataset: Any) -> NDArray[Any]:
     return np.asarray(dataset[()])
 
 
+def datasets(file: Any) -> dict[str, Any]:
+    """All datasets in an open file, by their names."""
+    import h5py
+
+    found: dict[str, Any] = {}
+    file.visititems(lambda name, item: found.update({name: item}) if isinstance(item, h5py.Dataset) else None)
+    return found
+
+
+def attributes(file: Any) -> dict[str, Any]:
+    """The attributes of an open file: texts, and numbers as Python's own."""
+    return {name: value.item() if isinstance(value, np.generic) else value for name, value in file.attrs.items()}
+
+
 class _Sealed(io.RawIOBase):
     """The text and the HDF5 of a sealed file, whose blocks are compared with the table when they are read."""
 

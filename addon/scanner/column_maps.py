@@ -11,7 +11,7 @@ import bpy
 from bpy.props import BoolProperty, CollectionProperty, EnumProperty, IntProperty, StringProperty
 
 from ...core.errors import InputError
-from ...core.geometry.columns import ANGLE_UNITS, LENGTH_UNITS, Column
+from ...core.geometry.columns import ANGLE_UNITS, LENGTH_UNITS
 from ...core.geometry.system import PinholeSystem
 from ...core.recording import recorded_warnings
 from ...core.workbook import ColumnMap, MappedColumn, MappedTable, draft_column_map, preview_workbook, read_system
@@ -229,7 +229,7 @@ def update(form: ColumnMapProperties) -> None:
 def _preview(workbook: Path, columns: ColumnMap) -> tuple[int, list[list[str]]]:
     """How many modules the workbook has; headings, then the numbers of the first modules and the last, mm."""
     system = read_system(workbook, columns)
-    columns_of = [c for c in system.columns.values() if c.name == "b" or not (c.derived or _is_blank(c, system))]
+    columns_of = [c for c in system.columns.values() if c.name == "b" or not (c.derived or c.is_unused(system))]
     values = zip(*(c.of(system).tolist() for c in columns_of), strict=True)
     rows = [
         [str(module), *(value if isinstance(value, str) else f"{value:.3f}" for value in row)]
@@ -238,11 +238,6 @@ def _preview(workbook: Path, columns: ColumnMap) -> tuple[int, list[list[str]]]:
     if len(rows) > _FIRST + 2:
         rows[_FIRST:-1] = [["..."] * len(rows[0])]
     return len(system), [["Module", *(c.name for c in columns_of)], *rows]
-
-
-def _is_blank(column: Column, system: PinholeSystem) -> bool:
-    """Whether a column that modules may have is one that none has."""
-    return column.role == "optional" and not column.formula and bool(column.is_default(system).all())
 
 
 def accept(form: ColumnMapProperties) -> ColumnMap:

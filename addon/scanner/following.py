@@ -11,11 +11,12 @@ import bpy
 import numpy as np
 
 from ...core.errors import InputError
+from ...core.geometry.module_parts import ModulePart
 from ...core.geometry.scanner import SCANNERS, Scanner
 from ..blender import objects
 from . import cameras, collimators, pinholes
 from .collimators import PARTS
-from .module_values import TYPED, Kind, aim_of, designed, kind_of, readings
+from .module_values import TYPED, Kind, aim_of, designed, kind_of, readings, together
 
 _KEY = "mphdrr_solid"  # custom property of a mesh: the values that it was built from
 _Parts = dict[bpy.types.Object, list[bpy.types.Object]]
@@ -184,26 +185,25 @@ def _rebuild(
 
 
 def _reshape(
-    found: Scanner, cameras_: Sequence[bpy.types.Object], old: Sequence[_Old], scanner: bpy.types.PropertyGroup
+    found: Scanner, cameras_: Sequence[bpy.types.Object], old: list[_Old], scanner: bpy.types.PropertyGroup
 ) -> None:
     """Reshape the `old` parts of modules."""
-    chosen = found[np.array([m for m, _, _ in old])] if len(old) < len(found) else found
-    try:
-        built = chosen.parts(pinholes.construction(scanner, type(found)))
-    except InputError as error:  # e.g. while d is typed before Ld: the last shape stays
-        if len(old) == 1:
-            cameras_[old[0][0]].mphdrr_module.problem = str(error)
-        else:
-            for one in old:
-                _reshape(found, cameras_, [one], scanner)
-        return
-    solids = {(part.number, part.kind.upper()): part.solid for part in built}
-    for m, text, items in old:
-        for item in items:
-            solid = solids.get((int(found.numbers[m]), item.mphdrr_module.part))
-            if solid is not None and not collimators.has_shape(item.data, solid):
-                collimators.reshape_mesh(item.data, solid)
-            item.data[_KEY] = text
+
+    def built(some: list[_Old]) -> Sequence[ModulePart]:
+        chosen = found[np.array([m for m, _, _ in some])] if len(some) < len(found) else found
+        return chosen.parts(pinholes.construction(scanner, type(found)))
+
+    for some, parts in together(old, built):
+        if isinstance(parts, InputError):  # e.g. while d is typed before Ld: the last shape stays
+            cameras_[some[0][0]].mphdrr_module.problem = str(parts)
+            continue
+        solids = {(part.number, part.kind.upper()): part.solid for part in parts}
+        for m, text, items in some:
+            for item in items:
+                solid = solids.get((int(found.numbers[m]), item.mphdrr_module.part))
+                if solid is not None and not collimators.has_shape(item.data, solid):
+                    collimators.reshape_mesh(item.data, solid)
+                item.data[_KEY] = text
 
 
 def reset_views(collection: bpy.types.Collection) -> list[int]:

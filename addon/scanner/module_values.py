@@ -5,11 +5,11 @@ valid as long as the visible one is its rounding. A number that the user has typ
 """
 
 import json
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from functools import lru_cache
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, TypeVar
 
 import bpy
 import numpy as np
@@ -28,6 +28,8 @@ FROM_ROI, TYPED = "FROM_ROI", "TYPED"  # `mphdrr_module.length_mode`
 _AIMED = 1e-4  # of a rotation's matrix, about rad
 _ROUNDING = 4e-6  # of a rotation's matrix: rotations kept as float32 angles agree to better than 1e-6
 
+Item = TypeVar("Item")
+Made = TypeVar("Made")
 Kind = type[Scanner]
 _Rows = dict[str, list[Any]]
 """Attribute of a scanner -> its values, module by module."""
@@ -118,19 +120,24 @@ def read_modules(
     return kind.of({name: np.array(row) for name, row in rows.items()} | {"source": source})
 
 
+def together(which: list[Item], make: Callable[[list[Item]], Made]) -> Iterator[tuple[list[Item], Made | InputError]]:
+    """Some things and what is made of them: of all together, but of one by one where that is refused."""
+    try:
+        yield which, make(which)
+    except InputError as error:
+        if len(which) == 1:
+            yield which, error
+            return
+        for one in which:
+            yield from together([one], make)
+
+
 def readings(
     kind: Kind, cameras_: Sequence[bpy.types.Object], matrices: NDArray[np.float64]
 ) -> Iterator[tuple[list[int], Scanner | InputError]]:
-    """Indices of modules and what is read of them: all together, but one by one where that is refused."""
-    try:
-        yield list(range(len(cameras_))), read_modules(kind, cameras_, matrices)
-    except InputError as error:
-        if len(cameras_) == 1:
-            yield [0], error
-            return
-        for m, camera in enumerate(cameras_):
-            for _, found in readings(kind, [camera], matrices[m : m + 1]):
-                yield [m], found
+    """Indices of modules and what is read of them, or why there are none."""
+    all_of_them = list(range(len(cameras_)))
+    return together(all_of_them, lambda which: read_modules(kind, [cameras_[m] for m in which], matrices[which]))
 
 
 def _shown(kind: Kind, cameras_: Sequence[bpy.types.Object], known: Sequence[dict[str, Any]]) -> _Rows:
@@ -170,31 +177,39 @@ def _straightened(kind: Kind, poses: NDArray[np.float64], turned: NDArray[np.boo
     """Poses (M, 4, 4) without rounding where they are aimed, and with a proper rotation where they were turned."""
     left, _, right = np.linalg.svd(poses[turned, :3, :3])
     poses[turned, :3, :3] = left @ right
-    exact = kind.aimed(poses[:, :3, 3])
-    if exact is not None:
-        aimed = np.abs(poses - exact).max(axis=(1, 2)) <= _AIMED
-        poses[aimed] = exact[aimed]
+    exact, aimed = _aims(kind, poses)
+    poses[aimed] = exact[aimed]
     return poses
 
 
+def _aims(kind: Kind, poses: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """The poses (M, 4, 4) that look at the isocentre from the places of `poses` (M, 4, 4), and which of these do so.
+
+    Rolled ones do not. Of a kind that is not aimed, and at the isocentre itself, all are right.
+    """
+    found, aimed, away = poses.copy(), np.ones(len(poses), bool), np.any(poses[:, :3, 3], axis=1)
+    exact = kind.aimed(poses[away, :3, 3])
+    if exact is not None:
+        found[away], aimed[away] = exact, np.abs(poses[away] - exact).max(axis=(1, 2)) <= _AIMED
+    return found, aimed
+
+
 def _carry(
-    kind: Kind, rows: _Rows, known: Sequence[dict[str, Any]], poses: NDArray[np.float64], which: Sequence[int]
+    kind: Kind, rows: _Rows, known: Sequence[dict[str, Any]], poses: NDArray[np.float64], which: list[int]
 ) -> None:
     """Write the attributes into `rows` that modules have at their poses; one by one where they cannot be together."""
-    names = kind.columns.fields
-    now = {name: np.array([rows[name][m] for m in which]) for name in ("numbers", *kind.columns.scalars)}
-    try:
+    names, own = kind.columns.fields, ("numbers", *kind.columns.scalars)
+
+    def carried(which: list[int]) -> Scanner:
         imported = kind.of({name: np.array([known[m].get(name, rows[name][m]) for m in which]) for name in names})
-        there = imported.at_poses(poses[which], **now)
-    except InputError:
-        if len(which) == 1:
-            raise
-        for m in which:
-            _carry(kind, rows, known, poses, [m])
-        return
-    for name in names.keys() - now.keys():
-        for m, value in zip(which, getattr(there, name).tolist(), strict=True):
-            rows[name][m] = value
+        return imported.at_poses(poses[which], **{name: np.array([rows[name][m] for m in which]) for name in own})
+
+    for some, there in together(which, carried):
+        if isinstance(there, InputError):
+            raise there
+        for name in names.keys() - set(own):
+            for m, value in zip(some, getattr(there, name).tolist(), strict=True):
+                rows[name][m] = value
 
 
 def _design(kind: Kind, rows: _Rows, cameras_: Sequence[bpy.types.Object], known: Sequence[dict[str, Any]]) -> None:
@@ -237,16 +252,10 @@ def changes(found: Sequence[bpy.types.Object]) -> tuple[list[bool], list[bool]]:
 def aim_of(kind: Kind, matrices: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """The world matrices (M, 4, 4) with which cameras look at the isocentre from where they stand, and which do so, upright.
 
-    `matrices` (M, 4, 4) are those that they have. Of a kind that is not aimed, and at the isocentre itself, all are right.
+    `matrices` (M, 4, 4) are those that they have; see `_aims`.
     """
-    poses, off_centre = cameras.poses_of(matrices), np.any(matrices[:, :3, 3], axis=1)
-    exact = kind.aimed(poses[off_centre, :3, 3])
-    if exact is None:
-        return matrices, np.ones(len(matrices), bool)
-    aimed, found = ~off_centre, matrices.copy()
-    found[off_centre] = cameras.matrices_of(exact)
-    aimed[off_centre] = np.abs(poses[off_centre] - exact)[:, :3, :3].max(axis=(1, 2)) <= _AIMED
-    return found, aimed
+    exact, aimed = _aims(kind, cameras.poses_of(matrices))
+    return cameras.matrices_of(exact), aimed
 
 
 def off_aim(collection: bpy.types.Collection, cameras_: Iterable[bpy.types.Object]) -> list[int]:

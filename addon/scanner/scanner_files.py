@@ -12,7 +12,7 @@ import numpy as np
 from ...core import workbook
 from ...core.errors import InputError, warn
 from ...core.exchange import FORMATS, write_geometry
-from ...core.geometry.scanner import Detector, Scanner
+from ...core.geometry.scanner import Detector, Scanner, first
 from ...core.progress import Progress, stages_of
 from ...core.recording import recorded_warnings
 from ..blender import jobs, storage
@@ -21,7 +21,6 @@ from . import pinholes, scanner
 from .module_values import kind_of
 
 WORKBOOK_SUFFIXES = (".xlsx", ".xlsm")
-_EQUAL = 1e-9  # mm, or share of a length above 1 mm
 
 
 def exporting_scanner(collection: bpy.types.Collection, path: Path, use_template: bool = True) -> jobs.Job:
@@ -107,8 +106,6 @@ def _difference(one: Scanner, other: Scanner) -> str:
     if not np.array_equal(one.numbers, other.numbers):
         return "the modules' numbers"
     for column in one.columns.values():
-        a, b = column.of(one), column.of(other)
-        wrong = a != b if column.is_text else np.abs(a - b) > _EQUAL * np.maximum(1.0, np.abs(a))
-        if column.role != "derived" and wrong.any():
-            return f"{column.title} of module {one.numbers[int(wrong.argmax())]}"
+        for i in first(~column.same(column.of(other), column.of(one))) if column.role != "derived" else ():
+            return f"{column.title} of module {one.numbers[i]}"
     return ""

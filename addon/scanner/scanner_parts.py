@@ -6,6 +6,7 @@ from typing import Any
 import bpy
 import numpy as np
 
+from ...core.errors import several
 from ...core.geometry.module_parts import ModulePart
 from ...core.geometry.scanner import Scanner
 from ..blender import ids, objects
@@ -110,7 +111,7 @@ def losses(collection: bpy.types.Collection) -> list[str]:
         lost.append(f"{gone} module{'s' * (gone > 1)} deleted or moved out")
     names = [o.name for o in others] + [c.name for c in _own_collections(collection)]
     if names:
-        lost.append(f"yours, which will move to the scene's collection: {_listed(names)}")
+        lost.append(f"yours, which will move to the scene's collection: {several(names, 6)}")
     return lost
 
 
@@ -176,9 +177,4 @@ def _own_collections(collection: bpy.types.Collection) -> list[bpy.types.Collect
 
 def modules_text(numbers: Sequence[int]) -> str:
     """ "module 7", or "modules 7, 12"."""
-    return f"module{'s' * (len(numbers) > 1)} {_listed([str(n) for n in numbers])}"
-
-
-def _listed(names: Sequence[str], most: int = 6) -> str:
-    rest = len(names) - most
-    return ", ".join(names[:most]) + (f" and {rest} more" if rest > 0 else "")
+    return f"module{'s' * (len(numbers) > 1)} {several(numbers, 6)}"

@@ -97,8 +97,7 @@ class Event:
     def attributes(self) -> dict[str, Any]:
         """The attributes of its file."""
         with self.opened() as file:
-            items = file.attrs.items()
-            return {name: value.item() if isinstance(value, np.generic) else value for name, value in items}
+            return hdf5.attributes(file)
 
     @property
     def name(self) -> str:

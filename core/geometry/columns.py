@@ -5,9 +5,8 @@ units, limits and help from here.
 """
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
@@ -44,9 +43,9 @@ class Column:
     kind: Kind = "length"
     derived: Callable[[Any], NDArray[np.float64]] | None = None
     """A function of the scanner that gives its values (M,), mm or rad, of a column that follows from the others."""
-    undefined: Callable[[Values], NDArray[np.bool_]] | None = None
+    undefined: Callable[[Values], NDArray[np.bool_]] = lambda needed: np.zeros(len(next(iter(needed.values()))), bool)
     """A function of the needed columns: where (M,) the formula divides by 0, and any value is right."""
-    unlike_formula: Callable[[Any], NDArray[np.bool_]] | None = None
+    unlike_formula: Callable[[Any], NDArray[np.bool_]] = lambda scanner: np.zeros(len(scanner), bool)
     """A function of the scanner: where (M,) the formula does not give the value of a derived column."""
     headings: tuple[str, ...] = ()
     """The texts that head it. Texts of one letter are case-sensitive, others are not."""
@@ -138,11 +137,13 @@ class Column:
         """Which modules (M,) have the value of a blank cell."""
         return self.same(self.default(scanner.columns.needed_values(scanner)), self.of(scanner))
 
+    def is_unused(self, scanner: Any) -> bool:
+        """Whether all its cells may be blank: it is optional, has no formula, and no module has another value."""
+        return self.has_constant_blank and bool(self.is_default(scanner).all())
+
     def follows_formula(self, scanner: Any) -> NDArray[np.bool_]:
-        """Which modules (M,) have the value that its formula gives."""
-        if self.derived is None:
-            return self.is_default(scanner) if self.formula else np.zeros(len(scanner), dtype=np.bool_)
-        return np.ones(len(scanner), dtype=np.bool_) if self.unlike_formula is None else ~self.unlike_formula(scanner)
+        """Which modules (M,) have the value that its formula gives, if it has one."""
+        return self.is_default(scanner) if self.derived is None else ~self.unlike_formula(scanner)
 
     def same(self, one: NDArray[Any], other: NDArray[Any], within: float = AGREEING) -> NDArray[np.bool_]:
         """Where values (M,) are equal: numbers to `within`, relative, texts letter by letter."""
@@ -160,7 +161,15 @@ class Column:
         return (symbol, description + stated) if description else (symbol + stated, "")
 
     def checked(self, values: Any, n: int | None) -> NDArray[Any]:
-        """`values`, one for each of `n` modules or one for all, as an array of its kind, or `InputError`."""
+        """`values`, one for each of `n` modules or one for all, as an array of its kind, or `InputError`.
+
+        Those of a coordinate are all three: (M, 3), or one triple for all.
+        """
+        if self.axis is not None:
+            vectors = real_array(values, self.field, None)
+            if n is not None and vectors.shape in ((), (3,)):
+                vectors = np.broadcast_to(vectors, (n, 3))
+            return real_array(vectors, self.field, (n, 3))
         if self.is_text:
             return self._texts(values, n or 1)
         if self.kind == "angle":
@@ -180,98 +189,48 @@ class Column:
         if texts.shape not in ((), (n,)):
             raise InputError(f"{self.field}: expected one text, or one for each of {n} modules, got {texts.size}")
         for text in map(str, texts.flat):
-            self.require_choice(text)
+            if self.word(text) != text:
+                raise InputError(f"{self.field} {text!r}: expected {self.expected}")
         return np.array(np.broadcast_to(texts, (n,)), np.str_)
 
-    def require_choice(self, text: str) -> None:
-        """Raise `InputError` unless a choice is one of its words, or "" if a cell may be blank."""
-        if self.kind == "choice" and text not in self.choices and text != self.blank:
-            raise InputError(f"{self.field} {text!r}: expected one of {', '.join(self.choices)}")
 
+class ColumnTable(dict[str, Column]):
+    """A kind of scanner's columns by name; causes stand before their effects, so that the cause of an error is refused.
 
-class ColumnTable(Mapping[str, Column]):
-    """A kind of scanner's columns by name; causes stand before their effects, so that the cause of an error is refused."""
+    `unread` are columns of a workbook that are known and written, but not read. By name there are
+
+    - ``needed``: what a workbook must have: ``position``, the coordinates x1, y1, z1 of pinholes, which stand in one table
+      that has a row for each module, and ``dimensions``, which may be given once for all modules;
+    - ``optional``: what has a value where its cells are blank;
+    - ``derived``: what follows from the others and is compared;
+    - ``typed``: what a scanner is made of, the needed, then the optional ones;
+    - ``leading``: the column whose table has a row for each module, the first coordinate, if there is any.
+
+    `fields` are attributes of the scanner with their columns, one or those of three coordinates; `scalars` those with one.
+    """
 
     def __init__(self, columns: Iterable[Column], unread: Iterable[Column] = ()) -> None:
-        self._columns = {column.name: column for column in columns}
+        super().__init__({column.name: column for column in columns})
         self.unread = tuple(unread)
-        """Columns of a workbook that are known and written, but not read."""
+        self.needed, self.optional, self.derived = (
+            tuple(column.name for column in self.values() if column.role == role)
+            for role in ("needed", "optional", "derived")
+        )
+        self.typed = (*self.needed, *self.optional)
+        self.position = tuple(name for name in self.needed if self[name].axis is not None)
+        self.dimensions = tuple(name for name in self.needed if self[name].axis is None)
+        self.leading = (*self.position, *self.needed)[0]
+        typed = [self[name] for name in self.typed]
+        self.fields = {c.field: tuple(other for other in typed if other.field == c.field) for c in typed}
+        self.scalars = {column.field: column for column in typed if column.axis is None}
 
-    def __getitem__(self, name: str) -> Column:
-        return self._columns[name]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._columns)
-
-    def __len__(self) -> int:
-        return len(self._columns)
-
-    __hash__ = object.__hash__
+    __hash__ = object.__hash__  # type: ignore[assignment]
     __eq__ = object.__eq__
 
     def with_columns(self, *columns: Column) -> "ColumnTable":
         """A table that has these, too."""
         return ColumnTable([*self.values(), *columns], self.unread)
 
-    def _names(self, *roles: str) -> tuple[str, ...]:
-        return tuple(column.name for column in self.values() if column.role in roles)
-
-    @cached_property
-    def needed(self) -> tuple[str, ...]:
-        """What a workbook must have."""
-        return self._names("needed")
-
-    @cached_property
-    def optional(self) -> tuple[str, ...]:
-        """What has a value where its cells are blank."""
-        return self._names("optional")
-
-    @cached_property
-    def derived(self) -> tuple[str, ...]:
-        """What follows from the others and is compared."""
-        return self._names("derived")
-
-    @cached_property
-    def typed(self) -> tuple[str, ...]:
-        """What a scanner is made of: the needed, then the optional ones."""
-        return (*self.needed, *self.optional)
-
-    @cached_property
-    def position(self) -> tuple[str, ...]:
-        """The needed coordinates, x1, y1, z1 of pinholes: they stand in one table, which has a row for each module."""
-        return tuple(name for name in self.needed if self[name].axis is not None)
-
-    @cached_property
-    def leading(self) -> str:
-        """The column whose table has a row for each module: the first coordinate, if there is any."""
-        return (*self.position, *self.needed)[0]
-
-    @cached_property
-    def dimensions(self) -> tuple[str, ...]:
-        """The other needed ones, which may be given once for all modules."""
-        return tuple(name for name in self.needed if self[name].axis is None)
-
-    @cached_property
-    def fields(self) -> dict[str, tuple[Column, ...]]:
-        """Attribute of the scanner -> its column, or those of its three coordinates."""
-        found: dict[str, tuple[Column, ...]] = {}
-        for name in self.typed:
-            found[self[name].field] = (*found.get(self[name].field, ()), self[name])
-        return found
-
-    @cached_property
-    def scalars(self) -> dict[str, Column]:
-        """Attribute of the scanner -> its column, of those that are no coordinates."""
-        return {name: columns[0] for name, columns in self.fields.items() if columns[0].axis is None}
-
     def needed_values(self, scanner: Any) -> Values:
         """The values of a scanner that a workbook must have."""
         return {name: self[name].of(scanner) for name in self.needed}
-
-
-def vector(values: Any, name: str, n: int | None) -> NDArray[np.float64]:
-    """`values` (M, 3), or one triple for all `n` modules, or `InputError`."""
-    array = real_array(values, name, None)
-    if n is not None and array.shape in ((), (3,)):
-        array = np.array(np.broadcast_to(array, (n, 3)))
-    return real_array(array, name, (n, 3))

@@ -61,12 +61,16 @@ def tilts(frames: NDArray[np.float64], turned: NDArray[np.float64]) -> NDArray[n
 
 def rotations(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
     """Rotation matrices (N, 3, 3) of rotation vectors (N, 3), rad, by Rodrigues' formula."""
-    angle = np.linalg.norm(vectors, axis=1)[:, None, None]
-    x, y, z = vectors.T
-    zero = np.zeros_like(x)
-    cross = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)
+    angle, cross = np.linalg.norm(vectors, axis=1)[:, None, None], cross_matrix(vectors)
     # sin(a)/a and (1 - cos(a))/a^2 by sinc, which is exact at 0; numpy's is sin(pi x)/(pi x).
     return np.eye(3) + np.sinc(angle / np.pi) * cross + 0.5 * np.sinc(angle / (2 * np.pi)) ** 2 * (cross @ cross)
+
+
+def cross_matrix(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Matrices (…, 3, 3) that multiply by `vectors` (…, 3) from the left: ``a x b``."""
+    x, y, z = np.moveaxis(vectors, -1, 0)
+    zero = np.zeros_like(x)
+    return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1).reshape(*x.shape, 3, 3)
 
 
 def rotation_vectors(matrices: NDArray[np.float64]) -> NDArray[np.float64]:

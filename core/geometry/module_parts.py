@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from ..validation import freeze
 from .collimator import Collimator
+from .frames import moved
 from .part_colors import PartKind
 
 Solid = tuple[NDArray[np.float64], NDArray[np.int32]]
@@ -44,16 +45,12 @@ class ModulePart:
     @property
     def vertices(self) -> NDArray[np.float64]:
         """(V, 3), world mm."""
-        return self.to_world(self.solid[0])
+        return moved(self.pose, self.solid[0])
 
     @property
     def triangles(self) -> NDArray[np.int32]:
         """(F, 3), counter-clockwise seen from outside."""
         return self.solid[1][:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3)
-
-    def to_world(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """World mm of points (N, 3) of camera space."""
-        return points @ self.pose[:3, :3].T + self.pose[:3, 3]
 
 
 def collimator_solid(collimator: Collimator) -> Solid:

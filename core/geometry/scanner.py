@@ -17,13 +17,13 @@ from numpy.typing import ArrayLike, NDArray
 from ..errors import InputError
 from ..system_source import SystemSource
 from ..validation import freeze, one_of, real_array
-from .columns import ColumnTable, Values, vector
+from .columns import ColumnTable, Values
 from .module_parts import ModulePart
 from .views import Views
 
 Detector = Literal["virtual", "real"]
 
-Fault = tuple[str, NDArray[np.bool_], Callable[[int], str]]
+Fault = tuple[str, int, str]
 
 SCANNERS: dict[str, type[Scanner]] = {}
 """Name -> class, of the kinds of scanners; each enters itself when it is defined."""
@@ -58,31 +58,24 @@ class Scanner(ABC):
             SCANNERS[cls.kind] = cls
 
     def __post_init__(self) -> None:
-        known = {f.name for f in fields(self)}  # type: ignore[arg-type]
-        more: dict[str, Any] = {}
+        own, more = {f.name for f in fields(self)}, dict[str, Any]()  # type: ignore[arg-type]
+        given = own | self.more.keys()
         n: int | None = None
         if unknown := self.more.keys() - self.columns.fields.keys():
             raise InputError(f"{sorted(unknown)[0]}: is no column of a {self.kind} scanner")
         for name, columns in self.columns.fields.items():
-            absent = (
-                columns[0].default(self.columns.needed_values(self)) if name not in known | self.more.keys() else None
-            )
-            given = getattr(self, name) if name in known else self.more.get(name, absent)
-            values = columns[0].checked(given, n) if columns[0].axis is None else vector(given, name, n)
-            n = len(values)
-            if name in known:
-                object.__setattr__(self, name, freeze(values))
-            else:
-                more[name] = freeze(values)
+            of = columns[0]
+            values = getattr(self, name) if name in given else of.default(self.columns.needed_values(self))
+            held = vars(self) if name in own else more
+            held[name] = freeze(of.checked(values, n))
+            n = len(held[name])
             if n == 0:
                 raise InputError(f"a {self.kind} system needs at least one module, got none")
-        object.__setattr__(self, "more", more)
-        numbers = (
-            np.arange(1, (n or 0) + 1) if self.numbers is None else real_array(self.numbers, "numbers", (n,), np.int64)
-        )
-        if self.numbers is not None and not np.array_equal(numbers, self.numbers):
+        wanted = np.arange(1, (n or 0) + 1) if self.numbers is None else self.numbers
+        numbers = freeze(real_array(wanted, "numbers", (n,), np.int64))
+        if not np.array_equal(numbers, wanted):
             raise InputError("numbers: expected whole numbers")
-        object.__setattr__(self, "numbers", freeze(numbers))
+        vars(self).update(more=more, numbers=numbers)
         for name, column in self.columns.scalars.items():
             if column.plausible[0] > 0:
                 unit = next(iter(column.units))
@@ -136,25 +129,23 @@ class Scanner(ABC):
 
     def filled(self) -> dict[str, NDArray[Any]]:
         """The attributes that columns hold, without those in which all cells of a workbook could be blank."""
-        found = {}
-        for name, columns in self.columns.fields.items():
-            if not columns[0].has_constant_blank or not all(c.is_default(self).all() for c in columns):
-                found[name] = getattr(self, name)
-        return found
+        used = {
+            column.field for columns in self.columns.fields.values() for column in columns if not column.is_unused(self)
+        }
+        return {name: getattr(self, name) for name in self.columns.fields if name in used}
 
     @classmethod
     def faults(cls, values: Values, numbers: Sequence[int], place: Callable[[str, int], str]) -> Iterator[Fault]:
         """What no scanner of this kind has, of positive `values` of the needed columns of modules with these `numbers`.
 
         `place` gives the cell of a column and a module's index, for messages. Each fault is the column whose cell is at
-        fault, the modules (M,) for which it is, and a function that tells why it is that of a module, after the cell.
+        fault, the first module for which it is, and why it is, after the cell.
         """
         yield from ()
 
     def _refuse(self, bad: NDArray[np.bool_], message: str) -> None:
         """Refuse the first module that is `bad`; `message` is a template of its attributes."""
-        if bad.any():
-            i = int(np.argmax(bad))
+        for i in first(bad):
             own = {name: np.ravel(getattr(self, name))[i] for name in re.findall(r"{(\w+)", message)}
             raise InputError(f"module {self.numbers[i]}: {message.format(**own)}")
 
@@ -201,18 +192,24 @@ class Scanner(ABC):
         """Index (M,) of each module's group, from 0; all are one by default."""
         return np.zeros(len(self), dtype=np.int64)
 
-    def reach(self) -> float:
-        """Radius, mm, of a sphere around the isocentre with the modules' sources in it."""
-        return float(np.linalg.norm(self.poses()[:, :3, 3], axis=1).max())
-
     def region_radius(self) -> float:
         """Radius, mm, of the sphere around the isocentre that is looked at: by default to halfway to the nearest source."""
         return float(np.linalg.norm(self.poses()[:, :3, 3], axis=1).min()) / 2
+
+
+def first(bad: NDArray[np.bool_]) -> list[int]:
+    """The first index that is bad, if any."""
+    return [int(bad.argmax())] if bad.any() else []
 
 
 def repeated(rows: NDArray[Any]) -> NDArray[np.bool_]:
     """Which rows (M,) of an array (M, ...) stand there before."""
     if len(rows) == 1:
         return np.zeros(1, bool)
-    _, first, inverse = np.unique(rows, axis=0, return_index=True, return_inverse=True)
-    return first[inverse.reshape(-1)] != np.arange(len(rows))
+    return first_equal(rows) != np.arange(len(rows))
+
+
+def first_equal(rows: NDArray[Any]) -> NDArray[np.intp]:
+    """The first row (M,) of an array (M, ...) that is equal to each."""
+    _, places, inverse = np.unique(rows, axis=0, return_index=True, return_inverse=True)
+    return places[inverse.reshape(-1)]

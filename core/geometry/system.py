@@ -18,12 +18,11 @@ from .design_formulas import roi_radius_seen
 from .frames import affine_matrix, module_frames, module_poses, tilted, tilts
 from .module_parts import ModulePart, collimator_solid, crystal_solid
 from .pinhole_columns import PINHOLE_COLUMNS
-from .scanner import Detector, Fault, Scanner, repeated
+from .scanner import Detector, Fault, Scanner, first, first_equal, repeated
 from .views import Views
 
 LENGTHS = {name: column.help for name, column in PINHOLE_COLUMNS.scalars.items() if column.kind == "length"}
 """The modules' dimensions: fields of `PinholeSystem`, with what they are."""
-LATER_LENGTHS: tuple[str, ...] = ()
 
 # Pinholes that differ in z by less than this fraction of the crystal's side belong to one ring.
 _RING_GAP = 0.2
@@ -78,23 +77,23 @@ class PinholeSystem(Scanner):
     def faults(cls, values: Values, numbers: Sequence[int], place: Callable[[str, int], str]) -> Iterator[Fault]:
         """Holes wider than the crystal, pinholes at the isocentre or inside the ROI, and two at one place."""
         d, side, roi = values["d"], values["Ld"], values["R"]
-        wide = "has d = {:g} mm, expected less than Ld = {:g} mm in {}"
-        yield "d", d >= side, lambda i: wide.format(d[i], side[i], place("Ld", i))
+        for i in first(d >= side):
+            yield "d", i, f"has d = {d[i]:g} mm, expected less than Ld = {side[i]:g} mm in {place('Ld', i)}"
         centers = np.stack([values[name] for name in ("x1", "y1", "z1")], axis=1)
-        puts = [f"and y1, z1 put the pinhole of module {number}" for number in numbers]
         with np.errstate(over="ignore"):
             b = np.linalg.norm(centers, axis=1)
-        yield "x1", b == 0, lambda i: f"{puts[i]} at the isocentre, expected outside the ROI"
-        yield "x1", np.isinf(b), lambda i: f"{puts[i]} too far away to compute, expected millimetres"
-        outside = "{} {:g} mm from the isocentre, expected outside the ROI of {:g} mm in {}"
-        yield "x1", b <= roi, lambda i: outside.format(puts[i], b[i], roi[i], place("R", i))
-        first, again = same_place(centers) or (0, len(centers))
-        twice = "{} at the place of module {} ({}), expected another place"
-        yield (
-            "x1",
-            np.arange(len(centers)) == again,
-            lambda i: twice.format(puts[i], numbers[first], place("x1", first)),
-        )
+        puts = "and y1, z1 put the pinhole of module"
+        for i in first(b == 0):
+            yield "x1", i, f"{puts} {numbers[i]} at the isocentre, expected outside the ROI"
+        for i in first(np.isinf(b)):
+            yield "x1", i, f"{puts} {numbers[i]} too far away to compute, expected millimetres"
+        for i in first(b <= roi):
+            outside = f"expected outside the ROI of {roi[i]:g} mm in {place('R', i)}"
+            yield "x1", i, f"{puts} {numbers[i]} {b[i]:g} mm from the isocentre, {outside}"
+        same = first_equal(np.round(centers / _SAME_PLACE))
+        for i in first(same < np.arange(len(same))):
+            at = f"at the place of module {numbers[same[i]]} ({place('x1', int(same[i]))})"
+            yield "x1", i, f"{puts} {numbers[i]} {at}, expected another place"
 
     @property
     def pinhole_distance(self) -> NDArray[np.float64]:
@@ -227,14 +226,6 @@ def warn_of_size(pixels: tuple[int, int], pitches: NDArray[np.float64], sides: N
     for m, axis in np.argwhere((covered < 0.45 * sides) | (covered > 1.1 * sides))[:1]:
         said = f"{pixels[axis]} pixels of {covered[m, axis] / pixels[axis]:g} mm are {covered[m, axis]:g} mm"
         warn(f"{said}, but the {name} is {sides[m, 0]:g} mm")
-
-
-def same_place(centers: NDArray[np.float64]) -> tuple[int, int] | None:
-    """The first module whose pinhole, of `centers` (M, 3), is that of an earlier one, after this one; None if none is."""
-    _, first, inverse = np.unique(np.round(centers / _SAME_PLACE), axis=0, return_index=True, return_inverse=True)
-    earlier = first[inverse.reshape(-1)]
-    later = np.flatnonzero(earlier < np.arange(len(centers)))
-    return (int(earlier[later[0]]), int(later[0])) if len(later) else None
 
 
 def chosen_modules(system: AnyScanner, text: str | None, name: str = "--modules") -> AnyScanner:

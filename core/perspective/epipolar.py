@@ -15,13 +15,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..errors import InputError
+from ..geometry.frames import cross_matrix
 from ..geometry.views import Views
 from ..validation import instance, real_array
 from .view_rays import (
     Floats,
     Indices,
     broadcast,
-    cross_matrix,
     lines_of_pixels,
     rays_by_depth,
     view_frames,

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InputError
+from ..geometry.frames import cross_matrix
 from ..geometry.views import Views
 from ..validation import instance, real_array
 
@@ -136,13 +137,6 @@ def lines_of_pixels(views: Views, m: NDArray[np.intp], origin: Floats) -> tuple[
     places = to_detector.copy()
     places[..., 2] += views.sources[m] - origin
     return directions, -cross_matrix(direction) @ places
-
-
-def cross_matrix(vectors: Floats) -> Floats:
-    """Matrices (…, 3, 3) that multiply by `vectors` (…, 3) from the left: ``a x b``."""
-    x, y, z = np.moveaxis(vectors, -1, 0)
-    zero = np.zeros_like(x)
-    return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1).reshape(*x.shape, 3, 3)
 
 
 def _to_detector(views: Views) -> Floats:

@@ -20,7 +20,7 @@ from ..geometry.grid import Grid
 from ..geometry.scanner import Scanner, scanner_kind
 from ..geometry.system import PinholeSystem
 from ..geometry.views import Views
-from ..hdf5 import numbers, opened, pack
+from ..hdf5 import attributes, datasets, numbers, opened, pack
 from ..volumes.formats import numpy_files
 from ..volumes.volume import Volume
 from .run import ProjectionRun
@@ -195,20 +195,8 @@ def _packed_hdf5(arrays: _Arrays, attributes: dict[str, Any]) -> memoryview:
 
 
 def _read_hdf5(path: Path) -> _Contents:
-    import h5py
-
-    arrays: dict[str, NDArray[Any]] = {}
-
-    def take(name: str, item: h5py.Dataset | h5py.Group) -> None:
-        if isinstance(item, h5py.Dataset):
-            arrays[name] = numbers(item)
-
     with opened(path, whole=True) as file:
-        file.visititems(take)
-        attributes = {
-            name: value.item() if isinstance(value, np.generic) else value for name, value in file.attrs.items()
-        }
-    return arrays, attributes
+        return {name: numbers(item) for name, item in datasets(file).items()}, attributes(file)
 
 
 def _packed_npz(described: _Arrays, attributes: dict[str, Any]) -> memoryview:

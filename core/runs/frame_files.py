@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError, reading
 from ..files import require_file
-from ..hdf5 import numbers, opened
+from ..hdf5 import datasets, numbers, opened
 from ..memory import require
 from ..progress import Progress, tell
 from ..recording import recorded_warnings
@@ -220,16 +220,10 @@ def _numpy(path: Path, layout: Layout) -> Counts:
 def _hdf5(path: Path, layout: Layout) -> Counts:
     import h5py
 
-    arrays: dict[str, Any] = {}
-
-    def take(name: str, item: Any) -> None:
-        if isinstance(item, h5py.Dataset):
-            arrays[name] = item
-
     with opened(path, whole=True) as file:
-        file.visititems(take)
-        if layout.dataset is not None and layout.dataset in file:  # of an array's names, the visit gives one
-            take(layout.dataset.strip("/"), file[layout.dataset])
+        arrays = datasets(file)
+        if layout.dataset is not None and isinstance(file.get(layout.dataset), h5py.Dataset):
+            arrays[layout.dataset.strip("/")] = file[layout.dataset]  # of an array's names, the visit gives one
         dataset = arrays[_chosen(arrays, layout)]
         _require_memory(dataset.shape, dataset.dtype.itemsize)
         return _counts(numbers(dataset))

@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..errors import InputError, warn
+from ..errors import InputError, several, warn
 from ..geometry.scanner import Scanner
 from .agreement import EXACT, agree, text_of
 from .book import module_number
@@ -348,9 +348,3 @@ class Edit:
                 if was_right and (j is None or not agree(right, number)):
                     self.expected[sheet.name, row, column.column] = number
                     self.unsettled.add((sheet.name, row, column.column))
-
-
-def several(things: Iterable[object], shown: int = 3) -> str:
-    """The first few, and how many more."""
-    texts = [str(thing) for thing in things]
-    return ", ".join(texts[:shown]) + (f" and {len(texts) - shown} more" if len(texts) > shown else "")

@@ -2,7 +2,7 @@
 
 import itertools
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from functools import cached_property
 from typing import Any
 
@@ -118,12 +118,6 @@ class ColumnCells:
     def in_cells(self, values: NDArray[Any]) -> NDArray[Any]:
         """Numbers in mm or rad in the cells' unit; texts as they are."""
         return values if self.declared.is_text else values / self.factor
-
-    def refuse(self, bad: NDArray[np.bool_], why: Callable[[int], str]) -> None:
-        """Raise `InputError` for the first module of `bad` (M,), if any."""
-        if bad.any():
-            i = int(np.argmax(bad))
-            raise InputError(f"{self.where(i)} {why(i)}")
 
 
 def absent(given: NDArray[Any]) -> NDArray[np.bool_]:

@@ -12,7 +12,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..geometry.columns import Column
-from ..geometry.scanner import Scanner
+from ..geometry.scanner import Scanner, first
 from .layout import MAX_MODULES
 from .sheet_xml import CellError, cell_name
 
@@ -65,7 +65,7 @@ def new_sheets(system: Scanner, styled: bool = True) -> tuple[dict[str, dict[int
     cells = {title: {1: _column(1, ("", "Definitions"), numbers, (heading, _NORMAL))} for title in titles}
     stored: dict[str, Any] = {}
     for column in (*declared.values(), *declared.unread):
-        if column.name in declared.optional and not column.formula and column.is_default(system).all():
+        if column.is_unused(system):
             continue
         (title, at), content = places[column.name], _content(column, system, places)
         style = _FOUR_DECIMALS if styled and title == main and not column.is_text else _NORMAL
@@ -96,9 +96,7 @@ def _content(column: Column, system: Scanner, places: dict[str, tuple[str, int]]
     if not column.formula:
         return [(value, "") for value in values]
     by_formula = column.follows_formula(system)
-    undefined = np.zeros(len(system), np.bool_)
-    if column.undefined is not None:
-        undefined = by_formula & column.undefined(system.columns.needed_values(system))
+    undefined = by_formula & column.undefined(system.columns.needed_values(system))
     quoted = {its: its if re.fullmatch(r"\w+", its) else f"'{its}'" for its, _ in places.values()}
     before = {name: "" if its == title else f"{quoted[its]}!" for name, (its, _) in places.items()}
     content = []
@@ -122,8 +120,7 @@ def refuse_unreadable(system: Scanner) -> None:
         held = {"number": numbers.astype(np.float64), **{name: column.of(system) for name, column in declared.items()}}
     for name, values in held.items():
         most = _LARGEST_NUMBER if name == "number" else np.finfo(np.float64).max
-        if values.dtype.kind == "f" and np.any(bad := ~(np.abs(values) <= most)):
-            i = int(np.argmax(bad))
+        for i in first(~(np.abs(values) <= most)) if values.dtype.kind == "f" else ():
             raise InputError(f"{cannot}: {name} of module {numbers[i]} is {values[i]:g}, expected at most {most:g}")
     places = _places(system)
 
@@ -131,10 +128,8 @@ def refuse_unreadable(system: Scanner) -> None:
         title, at = places[name]
         return f"{title}!{cell_name((_FIRST_ROW + i, at))}"
 
-    for name, faulty, why in system.faults(declared.needed_values(system), numbers.tolist(), place):
-        if faulty.any():
-            i = int(np.argmax(faulty))
-            raise InputError(f"{cannot}, with it: the new workbook: {place(name, i)} {why(i)}")
+    for name, i, why in system.faults(declared.needed_values(system), numbers.tolist(), place):
+        raise InputError(f"{cannot}, with it: the new workbook: {place(name, i)} {why}")
 
 
 def _column(at: int, titles: tuple[str, str], content: list[tuple[Any, str]], styles: tuple[int, int]) -> list[str]:

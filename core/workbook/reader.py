@@ -9,9 +9,9 @@ from typing import Any, Generic
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import naming, warn
+from ..errors import InputError, naming, warn
 from ..geometry.columns import Values
-from ..geometry.scanner import SCANNERS, Scanner, scanner_kind
+from ..geometry.scanner import SCANNERS, Scanner, first, scanner_kind
 from ..geometry.system import AnyScanner, PinholeSystem
 from ..system_source import QuantityCells, SystemSource
 from .agreement import tolerance
@@ -99,14 +99,13 @@ def read(book: Book, scanner: type[AnyScanner], columns: ColumnMap | None = None
     for name in declared.dimensions:
         _refuse_not_positive(cells[name], values[name])
     numbers = layout.modules.module_numbers
-    for name, bad, why in scanner.faults(values, numbers, lambda name, i: cells[name].place(i)):
-        cells[name].refuse(bad, why)
+    for name, i, why in scanner.faults(values, numbers, lambda name, i: cells[name].place(i)):
+        raise InputError(f"{cells[name].where(i)} {why}")
     defaults = {name: declared[name].default(values) for name in declared.optional}
     values |= defaults
     for name in declared:  # causes before their effects
-        undefined = declared[name].undefined
         if name in cells and name in declared.derived:
-            given[name] = cells[name].values(True, None if undefined is None else undefined(values))
+            given[name] = cells[name].values(True, declared[name].undefined(values))
         elif name in cells and name in declared.optional:
             given[name] = cells[name].values(columns is None or declared[name].is_text)
             in_sheet = cells[name].in_code(given[name])
@@ -171,9 +170,8 @@ def _source(book: Book, layout: Layout, columns: ColumnMap | None) -> SystemSour
 def _refuse_not_positive(column: ColumnCells, values: NDArray[np.float64]) -> None:
     """Raise `InputError` if a number (M,), mm or rad, is not positive but plausible ones are."""
     declared = column.declared
-    if declared.plausible[0] > 0:
-        why = "has {} = {}, expected more than 0"
-        column.refuse(values <= 0, lambda i: why.format(declared.name, declared.text_of(values[i])))
+    for i in first(values <= 0) if declared.plausible[0] > 0 else ():
+        raise InputError(f"{column.where(i)} has {declared.name} = {declared.text_of(values[i])}, expected more than 0")
 
 
 def _implausible(system: Scanner, cells: dict[str, ColumnCells]) -> Iterator[str]:

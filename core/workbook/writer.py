@@ -8,15 +8,15 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import InputError, warn
+from ..errors import InputError, several, warn
 from ..files import replacing, write_bytes
-from ..geometry.scanner import Scanner
+from ..geometry.scanner import Scanner, first
 from ..recording import recorded_warnings
 from ..validation import instance
 from .book import Book
 from .calculation import Recalculation
 from .column_map import ColumnMap, column_map
-from .edit import Edit, several
+from .edit import Edit
 from .new_workbook import new_sheets, new_workbook
 from .reader import read
 from .workbook_xml import KINDS, Place, WorkbookXml
@@ -152,9 +152,7 @@ def _refuse_other_system(path: Path, name: str, columns: ColumnMap | None, syste
         )
     for declared in [system.columns[typed] for typed in system.columns.typed]:
         wanted, got = declared.of(system), declared.of(back.system)
-        same = declared.same(got, wanted, _WITHIN)
-        if not same.all():
-            i = int(np.argmin(same))
+        for i in first(~declared.same(got, wanted, _WITHIN)):
             column = back.layout.columns.get(declared.name)
             why = f": {column.place(i)} is read for all modules" if column is not None and column.shared else ""
             raise InputError(

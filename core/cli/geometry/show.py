@@ -74,5 +74,5 @@ def _rows(system: PinholeSystem) -> list[dict[str, Any]]:
 def _shown(system: PinholeSystem) -> dict[str, list[str]]:
     """The texts of the columns that modules may have, and that some have: column -> a text for each module."""
     declared = system.columns
-    more = [declared[name] for name in declared.optional if name != "l" and not declared[name].is_default(system).all()]
+    more = [declared[name] for name in declared.optional if name != "l" and not declared[name].is_unused(system)]
     return {c.name: [c.number_of(value) for value in c.of(system).tolist()] for c in more}

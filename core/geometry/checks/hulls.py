@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ..frames import moved
 from ..module_parts import BOX_FACES, ModulePart
 from ..part_colors import PartKind
 
@@ -34,7 +35,7 @@ class Hulls:
     @classmethod
     def of(cls, parts: Sequence[ModulePart]) -> Hulls:
         """The hulls of `parts`."""
-        vertices = np.stack([part.to_world(_corners(part.solid[0])) for part in parts])
+        vertices = np.stack([moved(part.pose, _corners(part.solid[0])) for part in parts])
         a, b, _, d = (vertices[:, BOX_FACES[:, i]] for i in range(4))
         normals = _unit(np.cross(b - a, d - a))
         centers = vertices.mean(axis=1)

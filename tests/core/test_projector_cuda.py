@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 pytest.importorskip("warp", reason="warp-lang is not installed")
+pytest.importorskip("torch", reason="torch is not installed")
 
 import warp
 

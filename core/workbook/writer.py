@@ -1,6 +1,7 @@
 """`write_system`: a scanner into a new geometry workbook, or a copy of one in which nothing else changes."""
 
 import os
+import re
 from collections import defaultdict
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +14,7 @@ from ..files import replacing, write_bytes
 from ..geometry.scanner import Scanner, first
 from ..recording import recorded_warnings
 from ..validation import instance
-from .book import Book
+from .book import Book, shortened
 from .calculation import Recalculation
 from .column_map import ColumnMap, column_map
 from .edit import Edit
@@ -21,6 +22,9 @@ from .new_workbook import new_sheets, new_workbook
 from .reader import read
 from .workbook_xml import KINDS, Place, WorkbookXml
 
+_NOT_IN_CELLS = re.compile("[^\t\n\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
+_LONGEST = 32_767
+"""Characters of a text in Excel."""
 _WITHIN = 2e-9
 """Largest relative error of a number that is written and read back."""
 
@@ -74,6 +78,7 @@ def write_system(
         value, and of ranges that leave added modules out.
     """
     instance(system, Scanner, "write_system")
+    _refuse_texts(system)
     target = Path(path)
     suffix = target.suffix.lower()
     if suffix not in KINDS:
@@ -95,6 +100,17 @@ def write_system(
         else:
             written = _edited(system, book, read_by, target, temporary)
     return written
+
+
+def _refuse_texts(system: Scanner) -> None:
+    """Refuse texts that no cell gives back: spreadsheets cut them off, and XML has no control characters."""
+    for column in (column for column in system.columns.values() if column.is_text):
+        for number, text in zip(system.numbers, column.of(system).tolist(), strict=True):
+            if text != text.strip() or _NOT_IN_CELLS.search(text) or len(text) > _LONGEST:
+                raise InputError(
+                    f"module {number}: {column.title} {shortened(repr(text))}: no cell can hold it, expected at most "
+                    f"{_LONGEST} characters without blanks at the ends and control characters"
+                )
 
 
 def _refuse_other_suffix(workbook: WorkbookXml, target: Path) -> None:

@@ -73,8 +73,9 @@ def test_a_column_added_at_run_time_is_in_workbooks_maps_and_commands(kind, work
 
     # Commands.
     option = f"--{column.field.replace('_', '-')}"
-    out = str(tmp_path / "set.xlsx")
-    assert main(["geometry", "set", str(written.path), "--modules", "3", option, str(values[0]), "-o", out]) == 0
+    out, given = str(tmp_path / "set.xlsx"), str(values[0])
+    given = given.lower() if kind == "choice" else given
+    assert main(["geometry", "set", str(written.path), "--modules", "3", option, given, "-o", out]) == 0
     assert main(["geometry", "show", out, "--json"]) == 0
     shown = json.loads(capsys.readouterr().out.partition("\n")[2])["modules"]
     assert [row[column.name] for row in shown] == values[[0, 1, 0]].tolist()
@@ -82,6 +83,25 @@ def test_a_column_added_at_run_time_is_in_workbooks_maps_and_commands(kind, work
     assert column.name in capsys.readouterr().out.splitlines()[0]
     assert main(["geometry", "show", str(tmp_path / "without.xlsx")]) == 0
     assert column.name not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("text", [" NaI", "NaI ", " ", "a\x01b", "a\r\nb", "\ud800", "x" * 40_000])
+def test_a_text_that_no_cell_gives_back_is_refused(text, workbook, tmp_path):
+    system = mph.read_system(workbook)[:3].replace(crystal_material=["NaI", text, ""])
+    for template in (None, workbook):
+        with pytest.raises(
+            mph.InputError, match=r"module 2: crystal material .*: no cell can hold it, expected at most"
+        ):
+            mph.write_system(system, tmp_path / "new.xlsx", template)
+        assert not (tmp_path / "new.xlsx").exists()
+
+
+@pytest.mark.parametrize("text", ["a\nb", "5", "1e5", '<&">', "µ 😀", "=1+1", "TRUE", "007", "x" * 32_767])
+def test_other_texts_are_kept_letter_by_letter(text, workbook, tmp_path):
+    system = mph.read_system(workbook)[:3].replace(crystal_material=["NaI", text, ""])
+    for template in (None, workbook):
+        written = mph.write_system(system, tmp_path / "new.xlsx", template)
+        assert mph.read_system(written.path).crystal_material.tolist() == ["NaI", text, ""]
 
 
 BAD = {

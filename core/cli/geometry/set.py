@@ -20,7 +20,7 @@ _SHORT = {
     "detector_thickness": "thickness",
     "roi_radius": "roi",
 }
-_TYPES: dict[str, type] = {"whole": int, "text": str, "choice": str}
+_TYPES: dict[str, type] = {"whole": int, "text": str}
 _METAVARS = {"length": "MM", "angle": "DEG", "text": "TEXT"}
 
 
@@ -40,13 +40,13 @@ def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     for name, its in _options().items():
         column, many = its[0], its[0].axis is not None
         letters = tuple(c.name.rpartition("_")[2].upper() for c in its)
-        more: dict[str, Any] = {"nargs": len(its)} if many else {}
+        more: dict[str, Any] = {"type": _TYPES.get(column.kind, float)} | ({"nargs": len(its)} if many else {})
         if column.kind == "choice":
-            more["choices"] = column.choices
+            more |= {"choices": column.choices, "type": lambda text, column=column: column.word(text) or text}
         else:
             more["metavar"] = letters if many else _METAVARS.get(column.kind, "N")
         what = ", ".join(dict.fromkeys(c.help for c in its)) + "; degrees" * (column.kind == "angle")
-        add(f"--{_option(name)}", dest=name, type=_TYPES.get(column.kind, float), help=what, **more)
+        add(f"--{_option(name)}", dest=name, help=what, **more)
     length = (
         "l, collimator length, or 'design' for the design formula's; default: those that follow the formula go on "
         "following it, the others stay"

@@ -18,7 +18,7 @@ from ..errors import InputError
 from ..memory import readable_size
 
 MAX_PART_BYTES = 128 * 2**20
-"""Of a sheet and the like, unpacked: 100 000 rows of 20 columns take 80 MiB."""
+"""The largest part, unpacked: a sheet of 100 000 rows of 20 columns takes 80 MiB."""
 CONTENT_TYPES = "[Content_Types].xml"
 _START_TAG = re.compile(rb"""<(?:[^>"']|"[^"]*"|'[^']*')*>""")
 

@@ -234,28 +234,6 @@ def made(tmp_path, text: str) -> list[str]:
     return warned(lambda: events.make(recipe, tmp_path / "set", 1))
 
 
-def test_warnings_of_runs_reach_events(tmp_path):
-    usual = EVENT_RECIPE.replace("time = 600", "time = 600\npixel_points = 1\ntolerance = 1e9\nwithin_crystal = true")
-    assert made(tmp_path / "usual", usual) == []
-    values = np.full((6, 6, 6), 4.0)
-    values[:3] = -3
-    mph.write_volume(mph.Volume(values, mph.Grid.centered(6, 20.0)), tmp_path / "negative.npz")
-    kind = usual[usual.index('kind = "derenzo"') : usual.index("[phantoms.pose]")]
-    own = usual.replace(kind, f"file = '{tmp_path / 'negative.npz'}'\n").replace('turn = "uniform"', "")
-    (negative,) = made(tmp_path / "negative", own)
-    assert re.match(r"event 0: the activity is -\d.* kBq/mL: what is below 0 makes counts below 0", negative)
-    beside = made(tmp_path / "beside", usual.replace("spacing = 14", "spacing = 14\ncenter = [300, 0, 0]"))
-    assert any("the isocentre, at which the modules aim, lies outside" in text for text in beside)
-    wide = usual.replace("within_crystal = true", "").replace(
-        "columns = 12\n[truth]", "columns = 12\npitch = 90\n[truth]"
-    )
-    assert any("images are wider than the crystal" in text for text in made(tmp_path / "wide", wide))
-    close = usual.replace("columns = 12\n[truth]", "columns = 12\nmagnification = 2.5\n[truth]")
-    assert any("virtual detectors stand in front of" in text for text in made(tmp_path / "close", close))
-    metres = usual.replace("spacing = 14", "spacing = 0.014")
-    assert any("is it in metres?" in text for text in made(tmp_path / "metres", metres))
-
-
 def test_attenuation_at_another_energy_is_named_in_events_too(tmp_path):
     tmp_path.mkdir(exist_ok=True)
     (tmp_path / "a.toml").write_text(

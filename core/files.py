@@ -124,7 +124,12 @@ def is_leftover(path: Path) -> bool:
     if found is None or not found[1]:  # earlier versions named no process
         return found is not None
     if int(found[1], 16) == _HOST:
-        return not psutil.pid_exists(int(found[2], 16))
+        try:
+            return psutil.Process(int(found[2], 16)).status() == psutil.STATUS_ZOMBIE  # killed, and not yet waited for
+        except psutil.NoSuchProcess:
+            return True
+        except psutil.Error:  # it is another user's
+            return False
     with suppress(OSError):
         return time.time() - path.stat().st_mtime > _LEFT_AFTER
     return False

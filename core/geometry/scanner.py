@@ -1,6 +1,7 @@
 """What any scanner offers: a table of typed columns with a row for each module, its views, its solids, its source file.
 
-`PinholeSystem` is the first kind. A new kind is a class here derived from `Scanner`, its columns, and a row of `SCANNERS`.
+`PinholeSystem` is the first kind. A new kind is a class derived from `Scanner` with its columns, which enters itself in
+`SCANNERS`.
 """
 
 from __future__ import annotations

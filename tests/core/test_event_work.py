@@ -19,7 +19,9 @@ from mphdrr.addon.cli import main
 from mphdrr.core import events
 from mphdrr.core.progress import Cancelled
 
+from .conftest import WORKBOOK
 from .small_events import TEXT, small_recipe
+from .small_events import WORKBOOK as SMALL_WORKBOOK
 
 COUNT = 6
 
@@ -180,6 +182,7 @@ def test_a_killed_worker_costs_nothing_but_time(tmp_path, undisturbed):
 
 LONG = (
     TEXT.replace('modules = "1-4,21-24"', "")
+    .replace(str(SMALL_WORKBOOK), str(WORKBOOK))
     .replace("rows = 14\ncolumns = 16", "rows = 256\ncolumns = 256")
     .replace("voxels = 16\nspacing = 6.0", "voxels = 128\nspacing = 0.8")
     .replace('hole = "point"\npixel_points = 1', 'hole = "rays"\naperture_points = 37\npixel_points = 4')

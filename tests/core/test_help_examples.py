@@ -21,6 +21,7 @@ from mphdrr.core.cli import build_parser
 from .conftest import WORKBOOK
 from .dicom_files import write_series
 from .small_events import TEXT
+from .small_events import WORKBOOK as SMALL_WORKBOOK
 
 THORAX = WORKBOOK.parent / "phantoms" / "thorax.toml"
 
@@ -68,7 +69,8 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     np.save(folder / "counts.npy", np.ones((80, 16, 16)))
     (folder / "study.toml").write_text('[reconstruction]\nmethod = "osem"\niterations = 2\n')
     model = TEXT[TEXT.index("[models.emission]") : TEXT.index("[radon]")]
-    text = TEXT.replace("[radon]", model.replace("models.emission", "models.counts") + "[radon]")
+    text = TEXT.replace(str(SMALL_WORKBOOK), str(WORKBOOK))
+    text = text.replace("[radon]", model.replace("models.emission", "models.counts") + "[radon]")
     (folder / "derenzo.toml").write_text(
         text.replace('modules = "1-4,21-24"', "").replace("[6, 8]", "[96]\nrows = 14\ncolumns = 16")
     )

@@ -1,4 +1,4 @@
-"""A column is one row of its table; a kind of scanner is its class, its columns and its row; modules may be tilted."""
+"""A column is one row of its table; a kind of scanner is its class and its columns; modules may be tilted."""
 
 from __future__ import annotations
 

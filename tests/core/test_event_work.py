@@ -185,7 +185,7 @@ LONG = (
     .replace(str(SMALL_WORKBOOK), str(WORKBOOK))
     .replace("rows = 14\ncolumns = 16", "rows = 256\ncolumns = 256")
     .replace("voxels = 16\nspacing = 6.0", "voxels = 128\nspacing = 0.8")
-    .replace('hole = "point"\npixel_points = 1', 'hole = "rays"\naperture_points = 37\npixel_points = 4')
+    .replace('hole = "point"\npixel_points = 1', 'hole = "rays"\naperture_points = 127\npixel_points = 55')
 )
 """Events that take minutes."""
 

@@ -103,7 +103,7 @@ def steps():
     picture("map")
     seen["map"] = [place((0.0, 0.0, 0.0)), place((60.0, -60.0, 60.0))]
     left, bottom, width, height = color_bar.place()
-    seen["bar"] = [*on_screen(left, bottom + height), width, height]
+    seen["bar"] = [*on_screen(left, bottom + height - 1), width, height]
     space.show_region_ui = True
     bpy.context.view_layer.objects.active = bpy.data.objects["Sensitivity map"]
     look(600.0, (1.05, 0.0, 0.95))

@@ -21,7 +21,7 @@ from ..runs.run import ProjectionRun
 from ..runs.settings import SETTINGS
 from ..volumes.volume import Volume
 from ..volumes.volume_files import VOLUME_FORMATS, read_volume, write_volume
-from .options import add_command, output_path, progress_bar, say
+from .options import add_run, output_path, progress_bar, say
 from .recipe_options import add_entries, add_setting, typed_entries
 
 _OTHERS = ("attenuation.file", "attenuation.energy", "compute.backend", "compute.threads")
@@ -30,15 +30,7 @@ _OTHERS = ("attenuation.file", "attenuation.energy", "compute.backend", "compute
 
 def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     """Add the command."""
-    parser = add_command(
-        subparsers,
-        "reconstruct",
-        "reconstruct the volume that a run's images are of",
-        "mphdrr reconstruct run.h5 --iterations 20 --subsets 16 --voxels 64 --spacing 1.6 -o volume.nii.gz --picture "
-        "slices.png\n"
-        "example: mphdrr reconstruct run.h5 --recipe study.toml -o volume.nii.gz\n"
-        "example: mphdrr reconstruct run.h5 --set model.intrinsic_fwhm=3 -o volume.nii.gz",
-    )
+    parser = add_run(subparsers, "reconstruct", _run)
     parser.add_argument("file", metavar="RUN", help=f"a run of mphDRR: {', '.join(FORMATS)}")
     text = f"recipe (.toml) whose tables {', '.join(f'[{table}]' for table in TABLES)} say how; options override it"
     parser.add_argument("--recipe", metavar="FILE", help=text)
@@ -59,7 +51,6 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     parser.add_argument("--quiet", action="store_true", help="no line for each iteration on standard error")
     text = "write the recipe (.toml) of these options instead of reconstructing"
     parser.add_argument("--write-recipe", metavar="FILE", help=text)
-    parser.set_defaults(run=_run)
 
 
 def _chosen(arguments: argparse.Namespace, run: ProjectionRun) -> Recipe:
@@ -75,6 +66,12 @@ def _chosen(arguments: argparse.Namespace, run: ProjectionRun) -> Recipe:
 
 
 def _run(arguments: argparse.Namespace) -> None:
+    """Reconstruct the volume that a run's images are of.
+
+    mphdrr reconstruct run.h5 --iterations 20 --subsets 16 --voxels 64 --spacing 1.6 -o volume.nii.gz --picture slices.png
+    mphdrr reconstruct run.h5 --recipe study.toml -o volume.nii.gz
+    mphdrr reconstruct run.h5 --set model.intrinsic_fwhm=3 -o volume.nii.gz
+    """
     if arguments.write_recipe:
         recipe_path = output_path(arguments.write_recipe, (".toml",))
         write_recipe(_chosen(arguments, read_run(arguments.file)), recipe_path)

@@ -18,21 +18,19 @@ _TIMES, _SECONDS = 10, 0.5
 
 def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     """Add the action."""
-    parser = add_action(
-        actions,
-        "check",
-        _run,
-        "read every byte of a set and say what is wrong: events that are missing, cut, changed or of another recipe, and "
-        "foreign files",
-        "mphdrr events check set",
-        "mphdrr events check set --repair --workers 2",
-    )
+    parser = add_action(actions, "check", _run)
     text = "make missing and damaged events anew; foreign files move to the folder SET-foreign; the rest is not touched"
     parser.add_argument("--repair", action="store_true", help=text)
     parser.add_argument("--workers", type=int, default=1, metavar="N", help="processes that make events anew")
 
 
 def _run(arguments: argparse.Namespace) -> None:
+    """Read every byte of a set and say what is wrong: events that are missing, cut, changed or of another recipe, and
+    foreign files.
+
+    mphdrr events check set
+    mphdrr events check set --repair --workers 2
+    """
     folder = arguments.folder
     faults = check(folder, progress_bar("checking"))
     lines = [fault.text for fault in faults]

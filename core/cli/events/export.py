@@ -11,14 +11,7 @@ from .action import add_action
 
 def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     """Add the action."""
-    parser = add_action(
-        actions,
-        "export",
-        _run,
-        "write a set's events for another program",
-        "mphdrr events export set --to 3dunet --model counts --noise own -o unet",
-        "mphdrr events export set --to webdataset --split train -o shards",
-    )
+    parser = add_action(actions, "export", _run)
     add = parser.add_argument
     add("--to", required=True, choices=PROGRAMS, metavar="PROGRAM", help="see the list below")
     folder = "a new one, or one that holds the beginning of the same export, which is gone on with"
@@ -38,6 +31,11 @@ def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
 
 
 def _run(arguments: argparse.Namespace) -> None:
+    """Write a set's events for another program.
+
+    mphdrr events export set --to 3dunet --model counts --noise own -o unet
+    mphdrr events export set --to webdataset --split train -o shards
+    """
     events = EventSet(arguments.folder)
     if arguments.split is not None:
         events = events.split(arguments.split)

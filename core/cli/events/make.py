@@ -18,15 +18,7 @@ from .action import add_action
 
 def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     """Add the action."""
-    parser = add_action(
-        actions,
-        "make",
-        _run,
-        "make the events of a set that are missing",
-        "mphdrr events make set --recipe derenzo.toml -n 1000 --workers 2",
-        "mphdrr events make set",
-        "mphdrr events make set -n 100000 --shard 3/50",
-    )
+    parser = add_action(actions, "make", _run)
     add = parser.add_argument
     add("--recipe", metavar="FILE", help="recipe (.toml) of a new set, whose folder keeps a copy")
     add("-n", "--count", type=int, metavar="N", help="events; default: as many as were asked for before")
@@ -55,6 +47,12 @@ def chosen_recipe(folder: str, recipe: str | None) -> EventRecipe:
 
 
 def _run(arguments: argparse.Namespace) -> None:
+    """Make the events of a set that are missing.
+
+    mphdrr events make set --recipe derenzo.toml -n 1000 --workers 2
+    mphdrr events make set
+    mphdrr events make set -n 100000 --shard 3/50
+    """
     recipe = chosen_recipe(arguments.folder, arguments.recipe)
     work = making(
         recipe,

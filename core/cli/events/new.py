@@ -8,17 +8,12 @@ from ...errors import InputError
 from ...events.templates import TEMPLATES, template_text
 from ...example import EXAMPLE
 from ...files import replacing
-from ..options import add_command, output_path, print_answer
+from ..options import add_run, output_path, print_answer
 
 
 def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     """Add the action."""
-    parser = add_command(
-        actions,
-        "new",
-        "write a commented recipe to begin with",
-        "mphdrr events new --like derenzo --system scanner.xlsx -o derenzo.toml",
-    )
+    parser = add_run(actions, "new", _run)
     add = parser.add_argument
     add("--like", choices=tuple(TEMPLATES), default="derenzo", metavar="NAME", help="see the list below")
     add("--system", metavar="FILE", help="the scanner's geometry workbook; default: that of the examples")
@@ -26,10 +21,13 @@ def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     add("--json", action="store_true", help="print the recipe and its file as JSON")
     names = "\n".join(f"  {name:<13}{text}" for name, text in TEMPLATES.items())
     parser.epilog = f"recipes:\n{names}\n{parser.epilog}"
-    parser.set_defaults(run=_run)
 
 
 def _run(arguments: argparse.Namespace) -> None:
+    """Write a commented recipe to begin with.
+
+    mphdrr events new --like derenzo --system scanner.xlsx -o derenzo.toml
+    """
     workbook = Path(EXAMPLE if arguments.system is None else arguments.system)
     if not workbook.is_file():
         raise InputError(f"--system {workbook}: no such file; expected a geometry workbook (.xlsx, .xlsm)")

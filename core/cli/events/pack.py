@@ -11,14 +11,16 @@ from .action import add_action
 
 def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     """Add both actions."""
-    summary = "put the events of a set into shards, tar archives of many events"
-    pack = add_action(actions, "pack", _pack, summary, "mphdrr events pack set")
+    pack = add_action(actions, "pack", _pack)
     pack.add_argument("--gigabytes", type=float, default=SHARD_BYTES / 1e9, metavar="N", help="size of a shard, about")
-    summary = "give each event of a set's shards a file of its own again"
-    add_action(actions, "unpack", _unpack, summary, "mphdrr events unpack set")
+    add_action(actions, "unpack", _unpack)
 
 
 def _pack(arguments: argparse.Namespace) -> None:
+    """Put the events of a set into shards, tar archives of many events.
+
+    mphdrr events pack set
+    """
     store, size = _set(arguments).store, positive(arguments.gigabytes, "--gigabytes") * 1e9
     done = store.pack(progress_bar("packing"), int(size))
     shards = counted(len(store.shard_paths()), "shard")
@@ -26,6 +28,10 @@ def _pack(arguments: argparse.Namespace) -> None:
 
 
 def _unpack(arguments: argparse.Namespace) -> None:
+    """Give each event of a set's shards a file of its own again.
+
+    mphdrr events unpack set
+    """
     done = _set(arguments).store.unpack(progress_bar("unpacking"))
     print_answer(arguments, {"unpacked": done}, [f"{arguments.folder}: {done} events have files of their own again"])
 

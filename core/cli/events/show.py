@@ -19,14 +19,7 @@ _COLUMNS = ("x_mm", "y_mm", "z_mm", "phi_degrees", "theta_degrees", "psi_degrees
 
 def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     """Add the action."""
-    parser = add_action(
-        actions,
-        "show",
-        _run,
-        "draw events of a set: slices of the truth, all images, a Radon view and a sinogram; or list them",
-        "mphdrr events show set -o sheet.png",
-        "mphdrr events show set --events 0 7 12 --model emission -o some.svg",
-    )
+    parser = add_action(actions, "show", _run)
     add = parser.add_argument
     text = f"numbers of the events; default: the first {_ON_SHEET} for a sheet, all for a list"
     add("--events", type=int, nargs="+", metavar="I", help=text)
@@ -35,6 +28,11 @@ def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
 
 
 def _run(arguments: argparse.Namespace) -> None:
+    """Draw events of a set: slices of the truth, all images, a Radon view and a sinogram; or list them.
+
+    mphdrr events show set -o sheet.png
+    mphdrr events show set --events 0 7 12 --model emission -o some.svg
+    """
     path = None if arguments.output is None else output_path(arguments.output, SUFFIXES)
     if path is None and arguments.model is not None:
         raise InputError("--model says what is drawn: give -o FILE, too")

@@ -11,11 +11,14 @@ from .action import add_action
 
 def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     """Add the action."""
-    summary = "say how many events a set has, and which are missing"
-    add_action(actions, "status", _run, summary, "mphdrr events status set")
+    add_action(actions, "status", _run)
 
 
 def _run(arguments: argparse.Namespace) -> None:
+    """Say how many events a set has, and which are missing.
+
+    mphdrr events status set
+    """
     found = status(arguments.folder)
     lines = [f"{found.made} of {found.asked} events, {readable_size(found.size)}"]
     for name, counts in (("phantoms", found.phantoms), ("splits", found.splits)):

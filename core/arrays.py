@@ -10,6 +10,9 @@ from numpy.typing import NDArray
 from .errors import InputError
 from .validation import batch_shape, real_array, real_numbers, require_finite, shape_text
 
+Floats = NDArray[np.float64]
+Floats32 = NDArray[np.float32]
+Array = NDArray[Any]  # of any type
 ArrayOrTensor = Any  # a numpy array or a torch tensor; torch may not be installed
 
 
@@ -134,7 +137,7 @@ def cropped(*volumes: ArrayOrTensor) -> tuple[list[ArrayOrTensor], tuple[int, in
     return boxes, (ranges[0][0], ranges[1][0], ranges[2][0])
 
 
-def _filled_ranges(volumes: tuple[NDArray[Any], ...]) -> list[tuple[int, int]]:
+def _filled_ranges(volumes: tuple[Array, ...]) -> list[tuple[int, int]]:
     """First and last + 1 index of nonzero voxels along each axis. Reads the empty margins, not whole volumes."""
     ranges: list[tuple[int, int]] = []
     for axis in (0, 1):
@@ -165,7 +168,7 @@ def _filled_ranges_of_tensors(volumes: tuple[Any, ...]) -> list[tuple[int, int]]
     return ranges
 
 
-def table_rows(columns: dict[str, NDArray[Any]]) -> list[dict[str, Any]]:
+def table_rows(columns: dict[str, Array]) -> list[dict[str, Any]]:
     """The rows of a table given by its columns, in Python's numbers."""
     values = (column.tolist() for column in columns.values())
     return [dict(zip(columns, row, strict=True)) for row in zip(*values, strict=True)]

@@ -15,6 +15,8 @@ from pathlib import Path
 
 from .errors import InputError, refusing
 
+AnyPath = str | os.PathLike[str]
+
 _TEMPORARY = re.compile(r"\.(?:[0-9a-f]{8}|([0-9a-f]{4})([0-9a-f]{8})[0-9a-f]{8})-(.+)")
 """Names of files that are being written: by which host and process, so that what a killed one has left is known."""
 _LEFT_AFTER = 3600  # seconds: what other hosts have not touched since is not written any more
@@ -23,7 +25,7 @@ _HOST = zlib.crc32(platform.node().encode()) & 0xFFFF
 
 
 @contextmanager
-def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
+def replacing(path: AnyPath) -> Iterator[Path]:
     """Give a temporary path beside `path`; rename it to `path` on success, remove it on failure.
 
     Even if the program is killed or the power fails, there is either the old or the new file at `path`, whose folder must
@@ -53,7 +55,7 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
                 temporary.unlink()
 
 
-def write_bytes(path: str | os.PathLike[str], data: bytes | memoryview) -> None:
+def write_bytes(path: AnyPath, data: bytes | memoryview) -> None:
     """Write a file whole or not at all, also beside others that write it, or remove what they think was left."""
     for attempt in range(1, _ATTEMPTS + 1):
         try:
@@ -141,7 +143,7 @@ def remove_leftovers(folder: Path) -> None:
         path.unlink(missing_ok=True)
 
 
-def require_file(path: str | os.PathLike[str], expected: str = "a file") -> Path:
+def require_file(path: AnyPath, expected: str = "a file") -> Path:
     """A path, if it is that of a file that can be read; `InputError` of what is missing, a folder, device or pipe."""
     path = Path(path)
     if "\0" in str(path):
@@ -158,26 +160,26 @@ def require_file(path: str | os.PathLike[str], expected: str = "a file") -> Path
     return path
 
 
-def ending_of(path: str | os.PathLike[str], endings: Sequence[str]) -> str:
+def ending_of(path: AnyPath, endings: Sequence[str]) -> str:
     """Which of `endings` the name of a file has, or ""."""
     name = Path(path).name.lower()
     return next((ending for ending in endings if name.endswith(ending)), "")
 
 
-def require_ending(path: str | os.PathLike[str], endings: Sequence[str]) -> str:
+def require_ending(path: AnyPath, endings: Sequence[str]) -> str:
     """Which of `endings` the name of a file has, or `InputError`."""
     if ending := ending_of(path, endings):
         return ending
     raise InputError(f"{path}: expected a name ending in {', '.join(endings)}")
 
 
-def read_bytes(path: str | os.PathLike[str]) -> bytes:
+def read_bytes(path: AnyPath) -> bytes:
     """All of a file; `InputError` where `require_file` gives it, or it cannot be read."""
     with refusing(path, "cannot be read"):
         return require_file(path).read_bytes()
 
 
-def read_text(path: str | os.PathLike[str], expected: str = "a text in UTF-8") -> str:
+def read_text(path: AnyPath, expected: str = "a text in UTF-8") -> str:
     """The text of a file, every line's end as it is; `InputError` with what is `expected` where it is none in UTF-8."""
     try:
         return read_bytes(path).decode("utf-8-sig")
@@ -210,7 +212,7 @@ def _is_folder(path: Path) -> bool:
         return path.is_dir()
 
 
-def folder_path(path: str | os.PathLike[str]) -> Path:
+def folder_path(path: AnyPath) -> Path:
     """The absolute path of a folder, there or not; `InputError` where it cannot be one's name, such as an empty one."""
     if not os.fspath(path):
         raise InputError("expected the name of a folder, got an empty one (. is the current folder)")
@@ -219,7 +221,7 @@ def folder_path(path: str | os.PathLike[str]) -> Path:
     return folder
 
 
-def ensure_folder(path: str | os.PathLike[str]) -> Path:
+def ensure_folder(path: AnyPath) -> Path:
     """Make the folder `path` and its parents unless they exist; `InputError` if it cannot be made or written to."""
     folder = folder_path(path)
     probe = folder / f".{uuid.uuid4().hex[:8]}"

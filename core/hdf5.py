@@ -17,10 +17,10 @@ from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from .arrays import Array
 from .errors import InputError, reading, refusing
-from .files import require_file
+from .files import AnyPath, require_file
 from .memory import require
 
 HEADER = 512
@@ -105,7 +105,7 @@ def parse_seal(start: bytes) -> Seal | None:
     return Seal(kind.decode(), int(size), named, sha256.decode(), int(version))
 
 
-def verify(path: str | os.PathLike[str], offset: int = 0) -> None:
+def verify(path: AnyPath, offset: int = 0) -> None:
     """Raise `InputError` unless every byte of a sealed file, which begins at `offset`, is as it was written."""
     with refusing(path, "cannot be read"), open(path, "rb") as file:
         if (sealed := _sealed(file, offset)) is None:
@@ -114,7 +114,7 @@ def verify(path: str | os.PathLike[str], offset: int = 0) -> None:
 
 
 @contextmanager
-def opened(path: str | os.PathLike[str], offset: int = 0, *, whole: bool = False) -> Iterator[Any]:
+def opened(path: AnyPath, offset: int = 0, *, whole: bool = False) -> Iterator[Any]:
     """An HDF5 file, open for reading: an ``h5py.File`` whose bytes are checked as they are read, where it has a seal.
 
     With `whole`, all are checked before. Else HDF5 reads zeros for what was changed, and leaving the context raises.
@@ -144,7 +144,7 @@ def opened(path: str | os.PathLike[str], offset: int = 0, *, whole: bool = False
             raise sealed.wrong
 
 
-def numbers(dataset: Any) -> NDArray[Any]:
+def numbers(dataset: Any) -> Array:
     """All of a dataset, which has to fit into memory, as has each of its chunks."""
     count = max(math.prod(dataset.shape), math.prod(dataset.chunks or ()))
     require(count * dataset.dtype.itemsize, f"{dataset.name} of {' x '.join(map(str, dataset.shape))}")

@@ -1,21 +1,20 @@
 """TOML files: reading with one-line errors, and writing values."""
 
 import json
-import os
 import tomllib
 from collections.abc import Iterable
 from typing import Any
 
 from .errors import InputError
-from .files import read_text
+from .files import AnyPath, read_text
 
 
-def read_toml(path: str | os.PathLike[str]) -> dict[str, Any]:
+def read_toml(path: AnyPath) -> dict[str, Any]:
     """What a TOML file holds."""
     return parse_toml(toml_text(path), str(path))
 
 
-def toml_text(path: str | os.PathLike[str]) -> str:
+def toml_text(path: AnyPath) -> str:
     """The text of a TOML file, every line's end as it is."""
     return read_text(path, "TOML, a text in UTF-8")
 

@@ -8,9 +8,9 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ... import core as mph
+from ..arrays import Floats
 from ..phantoms.kinds import KINDS
 from ..phantoms.phantom import QUANTITIES
 from ..validation import seed_number, shape_text, whole_shape
@@ -137,7 +137,7 @@ def add_pose(parser: argparse.ArgumentParser, default: Any = (0, 0, 0)) -> None:
     add("--euler", type=float, nargs=3, default=default, metavar="DEG", help=euler)
 
 
-def read_pose(arguments: argparse.Namespace) -> NDArray[np.float64]:
+def read_pose(arguments: argparse.Namespace) -> Floats:
     """World-from-phantom (4, 4), mm, as `add_pose` asks for it."""
     phi, theta, psi = np.deg2rad(arguments.euler)
     return mph.euler_pose(phi, theta, psi, arguments.position)

@@ -4,10 +4,8 @@ import argparse
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
 from ... import core as mph
+from ..arrays import Floats
 from ..errors import naming
 from ..figures.page import SUFFIXES, Page
 from ..figures.scores import SIZE, draw
@@ -72,7 +70,7 @@ def _run(arguments: argparse.Namespace) -> None:
 
 def _truth(
     arguments: argparse.Namespace,
-) -> tuple[mph.Volume | mph.Phantom, NDArray[np.float64] | None, mph.ProjectionRun | None]:
+) -> tuple[mph.Volume | mph.Phantom, Floats | None, mph.ProjectionRun | None]:
     """The truth, the pose of a phantom, and the run that was simulated of it."""
     if arguments.make is not None:
         return arguments.make(arguments), read_pose(arguments), None

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..errors import InputError, refusing
-from ..files import ensure_folder, is_leftover, written_name
+from ..files import AnyPath, ensure_folder, is_leftover, written_name
 from ..memory import cores
 from ..progress import Progress, tell
 from .event_files import Place, header, verify
@@ -41,7 +41,7 @@ class Status:
     shards: int = 0  # files of many events
 
 
-def status(folder: str | os.PathLike[str]) -> Status:
+def status(folder: AnyPath) -> Status:
     """What is in a set; events count if their files have the length and recipe that they should (`check` reads all bytes).
 
     `InputError` where the folder is no event set.
@@ -65,7 +65,7 @@ def status(folder: str | os.PathLike[str]) -> Status:
     )
 
 
-def check(folder: str | os.PathLike[str], progress: Progress | None = None) -> list[Fault]:
+def check(folder: AnyPath, progress: Progress | None = None) -> list[Fault]:
     """All faults of a set: every byte of every file is read. Empty where there are none.
 
     Found are events that are missing, cut, changed, or of another recipe; files that do not belong to the set, and those
@@ -107,7 +107,7 @@ def check(folder: str | os.PathLike[str], progress: Progress | None = None) -> l
     return [*faults, *_foreign(target)]
 
 
-def repair(folder: str | os.PathLike[str], faults: list[Fault]) -> list[int]:
+def repair(folder: AnyPath, faults: list[Fault]) -> list[int]:
     """Mend what `check` found, and touch nothing else; the numbers of the events that are to be made again.
 
     Damaged events and those of another recipe are removed, leftovers of interrupted works too. Files that do not belong to
@@ -162,7 +162,7 @@ def _planned(target: SetFolder) -> list[int]:
     return sorted({*asked, *(n for n, place in places.items() if not asked or target.is_made(n, place))})
 
 
-def index_faults(folder: str | os.PathLike[str]) -> list[Fault]:
+def index_faults(folder: AnyPath) -> list[Fault]:
     """What is wrong with the index alone, as `check` says it."""
     target = SetFolder(folder)
     index, made = target.index, target.store.places()

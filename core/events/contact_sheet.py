@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arrays import Floats, Floats32
 from ..errors import InputError
 from ..figures.page import LARGEST, Page, box
 from ..figures.parts import number
@@ -38,12 +39,12 @@ class ShownEvent:
     title: str
     line: str  # beside it
     truth: Volume  # on a grid along the world's axes
-    middle: NDArray[np.float64]  # (3,), mm: where the slices meet
+    middle: Floats  # (3,), mm: where the slices meet
     model: str = ""
     unit: str = ""
-    images: NDArray[np.float32] | None = None  # (M, n_v, n_u); None for none
+    images: Floats32 | None = None  # (M, n_v, n_u); None for none
     rings: NDArray[np.int64] | None = None  # (M,), of the images
-    radon: NDArray[np.float32] | None = None  # (n, n_v, n_u); None for none
+    radon: Floats32 | None = None  # (n, n_v, n_u); None for none
     radon_degrees: float = 180.0
 
 
@@ -178,20 +179,20 @@ def _telling(event: ShownEvent) -> list[int]:
     return found
 
 
-def _middle(images: NDArray[np.float32], share: float) -> NDArray[np.float32]:
+def _middle(images: Floats32, share: float) -> Floats32:
     """The middle of images (M, n_v, n_u), a share of their sides."""
     off_v, off_u = (round(n * (1 - share) / 2) for n in images.shape[1:])
     return images[:, off_v : images.shape[1] - off_v, off_u : images.shape[2] - off_u]
 
 
-def _share(images: NDArray[np.float32]) -> float:
+def _share(images: Floats32) -> float:
     """The smallest of `_MIDDLES` that has nearly all there is."""
     total = float(np.abs(images).sum(dtype=float))
     parts = ((share, float(np.abs(_middle(images, share)).sum(dtype=float))) for share in _MIDDLES)
     return next((share for share, part in parts if part >= _NEARLY_ALL * total), 1.0)
 
 
-def _mosaic(event: ShownEvent, images: NDArray[np.float32], rings: NDArray[np.int64], share: float) -> _Panel:
+def _mosaic(event: ShownEvent, images: Floats32, rings: NDArray[np.int64], share: float) -> _Panel:
     """All images, ring by ring; a ring takes several rows where that suits the page."""
     whole = images.shape[1:]
     images = _middle(images, share)
@@ -226,7 +227,7 @@ def _mosaic(event: ShownEvent, images: NDArray[np.float32], rings: NDArray[np.in
     return _Panel(sheet, *size, above, below, frame=(size[0], _SIDE))
 
 
-def _radon(event: ShownEvent, radon: NDArray[np.float32]) -> list[_Panel]:
+def _radon(event: ShownEvent, radon: Floats32) -> list[_Panel]:
     """The view at the first angle, and the sinogram of the row with most in it."""
     count, n_v, n_u = radon.shape
     window = 0.0, _bright(radon)
@@ -268,7 +269,7 @@ def _draw(page: Page, panel: _Panel, left: int, top: int) -> None:
     page.text(panel.below, left, top + panel.frame[1] + 20, _TEXT, _FAINT)
 
 
-def _bright(values: NDArray[np.float32]) -> float:
+def _bright(values: Floats32) -> float:
     """The number that gets the last colour."""
     return max(float(np.quantile(values, _SHARE)) if values.size else 0.0, 1e-12)
 
@@ -279,5 +280,5 @@ def _range(window: tuple[float, float], unit: str) -> str:
     return f"0 to {largest} {shown}".rstrip()
 
 
-def _listed(values: NDArray[np.float64]) -> str:
+def _listed(values: Floats) -> str:
     return ", ".join(number(round(float(value), 1)) for value in values)

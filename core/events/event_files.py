@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import hdf5
+from ..arrays import Array, Floats32
 from ..errors import InputError, naming
 from ..geometry.grid import Grid
 from ..memory import cores
@@ -27,7 +28,6 @@ _COMPRESS_FROM = 1 << 13  # bytes: below, compressing costs more than it saves
 _BRICK = 32  # voxels along each axis of the truth's chunks, which are left out where they are empty
 _PIECE = 1 << 18  # numbers in a chunk of a list
 
-Floats = NDArray[np.float32]
 
 try:
     from zlib_ng.zlib_ng import decompress as inflate
@@ -143,14 +143,14 @@ def _write_truth(file: Any, truth: Volume, recipe: EventRecipe, pool: ThreadPool
 
 
 def _write_images(
-    file: Any, name: str, images: NDArray[np.float32], unit: str, recipe: EventRecipe, pool: ThreadPoolExecutor
+    file: Any, name: str, images: Floats32, unit: str, recipe: EventRecipe, pool: ThreadPoolExecutor
 ) -> None:
     """Images, each a chunk of its own, so that one reads alone."""
     _write(file, name, images, recipe["storage.images"], (1, *images.shape[1:]), pool, {"unit": unit})
 
 
 def _write(
-    file: Any, name: str, array: NDArray[Any], store: str, chunk: tuple[int, ...], pool: ThreadPoolExecutor,
+    file: Any, name: str, array: Array, store: str, chunk: tuple[int, ...], pool: ThreadPoolExecutor,
     attributes: dict[str, Any],
 ) -> None:  # fmt: skip
     """A dataset, compressed in threads as HDF5 itself would do it in one: shuffled bytes, deflated; no chunk of zeros."""
@@ -182,7 +182,7 @@ def _write(
     dataset.attrs.update(attributes)
 
 
-def _halved(array: NDArray[Any]) -> tuple[NDArray[np.float16], dict[str, float]]:
+def _halved(array: Array) -> tuple[NDArray[np.float16], dict[str, float]]:
     """An array in half precision, times a power of 2 that uses its range; the factor, and the largest error made."""
     largest = float(np.abs(array).max(initial=0.0))
     scale = 2.0 ** (int(np.frexp(largest)[1]) - 15) if largest else 1.0
@@ -191,7 +191,7 @@ def _halved(array: NDArray[Any]) -> tuple[NDArray[np.float16], dict[str, float]]
     return halved, {"scale": scale, "error": error}
 
 
-def read_array(file: Any, name: str, which: tuple[slice, ...] = (), out: Floats | None = None) -> Floats:
+def read_array(file: Any, name: str, which: tuple[slice, ...] = (), out: Floats32 | None = None) -> Floats32:
     """The numbers of a dataset in float32, or a part of them; into `out`, which holds zeros, where it is given.
 
     `which` are slices without steps, one for each axis or none.
@@ -218,7 +218,7 @@ def read_array(file: Any, name: str, which: tuple[slice, ...] = (), out: Floats 
     return out
 
 
-def _inflated(data: bytes, kind: np.dtype[Any]) -> NDArray[Any]:
+def _inflated(data: bytes, kind: np.dtype[Any]) -> Array:
     """The numbers of a chunk, as HDF5 itself would read them, in a fourth of the time."""
     planes = np.frombuffer(inflate(data), np.uint8).reshape(kind.itemsize, -1)
     words = planes[-1].astype(f"<u{kind.itemsize}")
@@ -237,7 +237,7 @@ def _places(
     return itertools.product(*axes)
 
 
-def read_truth(file: Any, grid: Grid, which: tuple[slice, ...] = (), out: Floats | None = None) -> Floats:
+def read_truth(file: Any, grid: Grid, which: tuple[slice, ...] = (), out: Floats32 | None = None) -> Floats32:
     """The truth (n_x, n_y, n_z) of an open event's file, or a part of it, as `read_array` does."""
     if "truth" in file:
         return read_array(file, "truth", which, out)

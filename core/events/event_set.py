@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import cached_property
@@ -11,10 +10,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .. import hdf5
+from ..arrays import Floats, Floats32
 from ..errors import InputError
+from ..files import AnyPath
 from ..geometry.scanner import Scanner
 from ..geometry.views import Views
 from ..physics.noise import draw_counts
@@ -30,8 +30,6 @@ from .index import column
 from .making import radon_views
 from .planning import PlannedEvent, plan
 from .recipe import EventRecipe
-
-Floats = NDArray[np.float64]
 
 COUNTED = ("counts", "photons")
 """Units of images that have Poisson noise."""
@@ -138,7 +136,7 @@ class Event:
         """The volume of which all images are."""
         return Volume(freeze(self.truth_part()), self.recipe.grid, self.recipe.quantity)
 
-    def truth_part(self, part: tuple[slice, ...] = (), out: NDArray[np.float32] | None = None) -> NDArray[np.float32]:
+    def truth_part(self, part: tuple[slice, ...] = (), out: Floats32 | None = None) -> Floats32:
         """The numbers of the truth, or of a part of it, of which alone the bytes are read; into `out`, zeros, if given."""
         grid = self.recipe.grid
         with self.opened() as file:
@@ -173,8 +171,8 @@ class Event:
         noise_seed: int | None = None,
         level: float = 1.0,
         modules: Any = slice(None),
-        out: NDArray[np.float32] | None = None,
-    ) -> NDArray[np.float32]:
+        out: Floats32 | None = None,
+    ) -> Floats32:
         """A model's images.
 
         Parameters
@@ -216,7 +214,7 @@ class Event:
             draw_counts(images, noise_seed, images)
         return images if part else images[modules]
 
-    def radon(self, count: int) -> NDArray[np.float32]:
+    def radon(self, count: int) -> Floats32:
         """The parallel projections (count, n_v, n_u) at so many angles, value x mm."""
         with self.opened() as file:
             shape = None if self.recipe.radon is None else (count, *self.recipe.radon.shape)
@@ -303,7 +301,7 @@ class EventSet:
     (256, 256, 256)
     """
 
-    def __init__(self, folder: str | os.PathLike[str]) -> None:
+    def __init__(self, folder: AnyPath) -> None:
         found = SetFolder(folder)
         _ = found.recipe  # which every set has
         self._events = [Event(found, number) for number in found.places]

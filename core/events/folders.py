@@ -8,7 +8,7 @@ from functools import cached_property
 from typing import Any
 
 from ..errors import InputError, warn
-from ..files import ensure_folder, folder_path, remove_leftovers, write_bytes
+from ..files import AnyPath, ensure_folder, folder_path, remove_leftovers, write_bytes
 from ..version import build
 from .event_files import Header, Place, header
 from .index import Index
@@ -25,7 +25,7 @@ _RANGE = re.compile(r"(\d+)-(\d+)")
 class SetFolder:
     """Where everything of an event set is; nothing is read before it is asked for."""
 
-    def __init__(self, path: str | os.PathLike[str]) -> None:
+    def __init__(self, path: AnyPath) -> None:
         self.path = folder_path(path)
         self.recipe_path, self.inputs, self.asked_path = self.path / RECIPE, self.path / INPUTS, self.path / ASKED
         self.store = Store(self.path)

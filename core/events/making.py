@@ -4,11 +4,10 @@ import math
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array, Floats, Floats32
 from ..errors import InputError, naming
 from ..geometry.grid import Grid
 from ..geometry.parallel_views import parallel_views
@@ -39,10 +38,10 @@ class EventArrays:
 
     planned: PlannedEvent
     truth: Volume
-    images: dict[str, NDArray[np.float32]]  # by model, (M, n_v, n_u): expected means, background included
+    images: dict[str, Floats32]  # by model, (M, n_v, n_u): expected means, background included
     units: dict[str, str]  # by model
-    radon: dict[int, NDArray[np.float32]]  # by number of angles, (n, n_v, n_u), value x mm
-    gains: NDArray[np.float64]  # (M,)
+    radon: dict[int, Floats32]  # by number of angles, (n, n_v, n_u), value x mm
+    gains: Floats  # (M,)
     warnings: tuple[str, ...] = ()  # those of a run of the same settings
 
 
@@ -145,9 +144,7 @@ class EventMaker:
             self._volumes[file] = remembered(self.recipe.input(file).volume)
         return self._volumes[file].again()
 
-    def _images(
-        self, name: str, planned: PlannedEvent, truth: Volume, gains: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float32], str]:
+    def _images(self, name: str, planned: PlannedEvent, truth: Volume, gains: Floats) -> tuple[Floats32, str]:
         """A model's images, and their unit."""
         recipe, imaging, mu = self.recipe.models[name], self._imaging[name].again(), None
         if recipe["attenuation.of_phantom"]:
@@ -200,7 +197,7 @@ def radon_views(recipe: EventRecipe, count: int) -> Views:
     return parallel_views(angles, recipe.radon.shape, recipe.radon.pitch, center=recipe.grid.center)
 
 
-def _placed(volume: Volume, placement: NDArray[Any], grid: Grid) -> Volume:
+def _placed(volume: Volume, placement: Array, grid: Grid) -> Volume:
     """A file's volume, moved by a placement, on a grid: interpolated, or where the voxels are coarser, their means."""
     moved = Volume(volume.array, Grid(volume.grid.shape, placement @ volume.grid.affine), volume.quantity)
     coarser = bool(np.any(grid.spacing > 1.5 * moved.grid.spacing.max()))

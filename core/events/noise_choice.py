@@ -4,8 +4,8 @@ from collections.abc import Collection
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Floats32
 from ..errors import InputError
 from ..validation import seed_number
 from .event_set import COUNTED, Event, EventSet
@@ -33,9 +33,7 @@ def mixed_seed(own: int, *others: int) -> int:
     return int(np.random.SeedSequence((own, *others)).generate_state(1, np.uint64)[0])
 
 
-def noisy_images(
-    event: Event, model: str, seed: int | None, level: float, out: NDArray[np.float32] | None = None
-) -> NDArray[np.float32]:
+def noisy_images(event: Event, model: str, seed: int | None, level: float, out: Floats32 | None = None) -> Floats32:
     """A model's images (M, n_v, n_u): of counts and photons with noise of a seed and a level, others as they are."""
     if event.unit(model) not in COUNTED:
         return event.images(model, out=out)

@@ -5,8 +5,8 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Floats
 from ..errors import InputError, naming
 from ..geometry.frames import euler_pose
 from ..phantoms.language import read_phantom
@@ -73,16 +73,16 @@ class PlannedEvent:
         return self.entry.name
 
     @property
-    def pose(self) -> NDArray[np.float64]:
+    def pose(self) -> Floats:
         """World-from-phantom pose (4, 4), mm: rotation and translation."""
         phi, theta, psi = map(math.radians, self.euler_degrees)
         return euler_pose(phi, theta, psi, self.position)
 
     @property
-    def placement(self) -> NDArray[np.float64]:
+    def placement(self) -> Floats:
         """The pose after mirroring and the factor of size: what the phantom's own frame is placed by, (4, 4), mm."""
         scale = np.diag([-self.size if self.mirror else self.size, self.size, self.size, 1.0])
-        placement: NDArray[np.float64] = self.pose @ scale
+        placement: Floats = self.pose @ scale
         return placement
 
     @property
@@ -121,7 +121,7 @@ class PlannedEvent:
             return {"kind": self.entry.kind.name, **as_settings(self.phantom, self.entry.kind)}
         return {"file": self.file} | ({} if self.mu_file is None else {"mu_file": self.mu_file})
 
-    def gains(self, count: int) -> NDArray[np.float64]:
+    def gains(self, count: int) -> Floats:
         """Factors (count,) of the modules' sensitivities."""
         deviation, dice = self.recipe["augmentation.module_gain"], Dice(self.recipe.seed, self.number)
         return np.array([math.exp(deviation * dice.normal(f"module gain {m}")) for m in range(count)])

@@ -4,7 +4,6 @@ import copy
 import hashlib
 import json
 import math
-import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -14,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputError, naming
+from ..files import AnyPath
 from ..geometry.grid import Grid
 from ..runs.recipe import Recipe
 from ..runs.settings import Setting, named
@@ -286,7 +286,7 @@ def _what(quantity: str, energy: Any) -> str:
     return quantity if energy is None or quantity != "mu" else f"mu at {energy}"
 
 
-def read_recipe(path: str | os.PathLike[str], inputs: Mapping[str, Input] | None = None) -> EventRecipe:
+def read_recipe(path: AnyPath, inputs: Mapping[str, Input] | None = None) -> EventRecipe:
     """The recipe of an event set in a TOML file; paths in it are relative to its folder. `InputError` names the entry.
 
     `inputs` as for `EventRecipe`.

@@ -1,11 +1,11 @@
 """Recipes to begin with: commented files that users copy and change."""
 
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
 
 from ..example import EXAMPLE
+from ..files import AnyPath
 from ..toml import toml_value
 from ..validation import one_of
 
@@ -20,7 +20,7 @@ TEMPLATES: Mapping[str, str] = MappingProxyType({
 """What each template is, by name."""
 
 
-def template_text(name: str, workbook: str | os.PathLike[str] = EXAMPLE) -> str:
+def template_text(name: str, workbook: AnyPath = EXAMPLE) -> str:
     """The text of a template (TOML), with a workbook's path as the recipe's folder sees it; `InputError` for another name.
 
     >>> Path("derenzo.toml").write_text(template_text("derenzo", "scanner.xlsx"))

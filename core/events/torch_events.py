@@ -7,10 +7,10 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch.utils.data import Dataset, default_collate, get_worker_info
 from torch.utils.data._utils.collate import default_collate_fn_map
 
+from ..arrays import Floats32
 from ..errors import InputError, warn
 from .event_set import Event, EventSet
 from .exports.slots import Slots
@@ -110,7 +110,7 @@ class TorchEvents(Dataset):
         return item
 
     def _fill(
-        self, out: NDArray[np.float32], event: Event, epoch: int, level: float, name: str, part: tuple[slice, ...],
+        self, out: Floats32, event: Event, epoch: int, level: float, name: str, part: tuple[slice, ...],
         truth: tuple[slice, ...],
     ) -> None:  # fmt: skip
         """Read a field, or a part of it, into zeros."""

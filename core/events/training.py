@@ -1,10 +1,10 @@
 """Event sets for training with torch."""
 
-import os
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Literal
 
 from ..errors import InputError
+from ..files import AnyPath
 from ..validation import instance, one_of, positive, seed_number, strict_whole
 from .event_set import EventSet
 from .exports.slots import read_slots, row_slots
@@ -31,7 +31,7 @@ def torch_dataset(
     noise: Literal["own", "epoch"] | None = None,
     levels: float | Sequence[float] | None = None,
     seed: int = 0,
-    slots: str | os.PathLike[str] | None = None,
+    slots: AnyPath | None = None,
     skip_damaged: bool = False,
 ) -> "Dataset[dict[str, Any]]":
     """The events as a torch `Dataset` of dicts of float32 tensors, for a `DataLoader` with any number of workers.

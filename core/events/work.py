@@ -1,6 +1,5 @@
 """Making the events of a set: which are missing, one after the other, each written whole."""
 
-import os
 import re
 import time
 from collections.abc import Iterator, Sequence
@@ -9,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..errors import InputError, warn
-from ..files import Locked, ensure_folder, remove_leftovers
+from ..files import AnyPath, Locked, ensure_folder, remove_leftovers
 from ..memory import readable_size
 from ..progress import Progress, tell
 from ..validation import seed_number, whole_number
@@ -101,7 +100,7 @@ def _pack(store: Store) -> None:
 
 def making(
     recipe: EventRecipe,
-    folder: str | os.PathLike[str],
+    folder: AnyPath,
     count: int | None = None,
     first: int = 0,
     workers: int = 1,
@@ -173,7 +172,7 @@ def _in_turn(target: SetFolder, missing: Sequence[int], progress: Progress | Non
 
 def make(
     recipe: EventRecipe,
-    folder: str | os.PathLike[str],
+    folder: AnyPath,
     count: int,
     first: int = 0,
     workers: int = 1,

@@ -4,7 +4,7 @@ import os
 import time
 from typing import Any, NamedTuple
 
-from ..files import write_bytes
+from ..files import AnyPath, write_bytes
 from ..progress import Progress
 from ..recording import recorded_warnings
 from .event_files import Place, packed
@@ -27,7 +27,7 @@ class EventWriter:
     `threads` is how many an event takes, by default one per core.
     """
 
-    def __init__(self, folder: str | os.PathLike[str], threads: int | None = None) -> None:
+    def __init__(self, folder: AnyPath, threads: int | None = None) -> None:
         self.folder = SetFolder(folder)
         self.maker = EventMaker(self.folder.recipe, threads)
         self._indexed = set(self.folder.index.read())

@@ -4,12 +4,11 @@ To add a program, write its `Format` in a module here, and list it below. The co
 `docs/geometry-export.md`, which refers to the command's help, take it from the list.
 """
 
-import os
 from pathlib import Path
 from typing import Any
 
 from ..errors import InputError
-from ..files import new_folder, replacing, require_ending
+from ..files import AnyPath, new_folder, replacing, require_ending
 from ..geometry.system import PinholeSystem
 from ..geometry.views import Views
 from ..validation import instance, one_of
@@ -32,7 +31,7 @@ FORMAT_NUMBERS: dict[str, int] = {format.name: number for number, format in enum
 
 
 def write_geometry(
-    system: PinholeSystem, path: str | os.PathLike[str], format: str, *, views: Views | None = None, **options: Any
+    system: PinholeSystem, path: AnyPath, format: str, *, views: Views | None = None, **options: Any
 ) -> None:
     """Write the scanner's geometry for another program.
 

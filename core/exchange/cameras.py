@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Floats
 from ..errors import InputError
 from ..geometry.frames import affine_matrix
 from ..geometry.grid import Grid
@@ -164,7 +164,7 @@ def _rtk(system: PinholeSystem, views: Views, temporary: Path) -> None:
     temporary.write_text("\n".join(lines) + "\n", encoding="ascii")
 
 
-def _euler_angles(rotation: NDArray[np.float64]) -> tuple[float, float, float]:
+def _euler_angles(rotation: Floats) -> tuple[float, float, float]:
     """Gantry, out-of-plane and in-plane angle, rad, of R = Rz(-in) Rx(-out) Ry(-gantry).
 
     The in-plane angle is what remains after the other two, so R is exact at out = 90 degrees too, where gantry and in-plane
@@ -212,7 +212,7 @@ def _nerf(system: PinholeSystem, views: Views, temporary: Path, *, pictures: str
     temporary.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
 
 
-def _camera_matrices(views: Views, format: str, mirrored: bool = True) -> tuple[NDArray[np.float64], ...]:
+def _camera_matrices(views: Views, format: str, mirrored: bool = True) -> tuple[Floats, ...]:
     """Camera matrices K (M, 3, 3), rotations R (M, 3, 3) and translations t (M, 3), mm, of `views`, exactly.
 
     World point X is seen where ``K @ (R @ X + t)`` is a multiple of (column, row, 1); 0 is the centre of pixel 0. R is a
@@ -241,7 +241,7 @@ def _camera_matrices(views: Views, format: str, mirrored: bool = True) -> tuple[
     return matrices, rotations, -np.einsum("mij,mj->mi", rotations, views.sources)
 
 
-def _pixel_axes(views: Views, format: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _pixel_axes(views: Views, format: str) -> tuple[Floats, Floats]:
     """Pixel pitches (M, 2), mm, and unit vectors (2, M, 3) along columns' and rows' index.
 
     The second vectors are made exactly perpendicular to the first; the message names the first view where they are not.
@@ -262,7 +262,7 @@ def _pixel_axes(views: Views, format: str) -> tuple[NDArray[np.float64], NDArray
     return pitches, np.stack([x, y / np.linalg.norm(y, axis=1, keepdims=True)])
 
 
-def _with_common_pitch(views: Views, format: str) -> tuple[Views, tuple[float, float], NDArray[np.float64]]:
+def _with_common_pitch(views: Views, format: str) -> tuple[Views, tuple[float, float], Floats]:
     """The same rays with one pixel size (pitch_u, pitch_v), mm, for all detectors; that size; and the `_pixel_axes`.
 
     Detectors with smaller pixels are moved away from their sources until their pixels are as large as the largest.

@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Floats
 from ..geometry.system import PinholeSystem
 from ..geometry.views import Views
 from .format import Format
@@ -121,7 +121,7 @@ class _Folder:
         return self.write(f"placements/{part.name}.placements", "\n".join(lines) + "\n")
 
 
-def angle_and_axis(rotation: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
+def angle_and_axis(rotation: Floats) -> tuple[float, Floats]:
     """Angle, 0 to pi, and unit axis of a rotation matrix (3, 3); the axis is z where it does not turn."""
     from nibabel.quaternions import mat2quat
 
@@ -219,7 +219,7 @@ def _source(folder: _Folder, setup: Setup, simulation: Simulation) -> list[str]:
     pose = simulation.world_from_phantom
     photons_per_decay = sum(photons for _, photons in simulation.nuclide.lines)
 
-    def source(name: str, activity: float, center: NDArray[np.float64], *shape: str) -> list[str]:
+    def source(name: str, activity: float, center: Floats, *shape: str) -> list[str]:
         settings = [
             *("gps/particle gamma", "gps/ene/type UserSpectrum", f"gps/setSpectrumFile {spectrum}"),
             *(f"setActivity {_n(activity * photons_per_decay)} becquerel", "setForcedUnstableFlag true"),

@@ -14,6 +14,7 @@ from typing import Any, Literal, NamedTuple, get_args, get_type_hints
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arrays import Floats
 from ..errors import InputError
 from ..geometry.collimator import Collimator, Construction, EdgePlace, angle_from_degrees
 from ..geometry.frames import checked_affine, euler_pose
@@ -72,7 +73,7 @@ class Simulation:
     height: float = 40.0  # the rods' length, mm
     position: tuple[float, ...] = (0.0, 0.0, 0.0)  # middle of the point or phantom, mm
     euler_degrees: tuple[float, ...] = (0.0, 0.0, 0.0)  # the phantom's phi, theta, psi of `euler_pose`
-    pose: NDArray[np.float64] | None = None  # world from phantom (4, 4), rigid, instead of both
+    pose: Floats | None = None  # world from phantom (4, 4), rigid, instead of both
     isotope: str | Isotope = "Tc-99m"  # its photons are emitted, each on its own
     activity: float | None = None  # total at the start, MBq; None: 1, or that of a `DerenzoPhantom`
     time: float = 1.0  # s
@@ -128,7 +129,7 @@ class Simulation:
         return self.phantom.total_activity * 1e3 if isinstance(self.phantom, DerenzoPhantom) else 1e6
 
     @cached_property
-    def world_from_phantom(self) -> NDArray[np.float64]:
+    def world_from_phantom(self) -> Floats:
         """(4, 4), from `pose` or from `position` and `euler_degrees`."""
         if self.pose is None:
             phi, theta, psi = np.radians(real_array(self.euler_degrees, "euler_degrees", (3,)))
@@ -165,8 +166,8 @@ class Placed(NamedTuple):
     shape: Literal["box", "trd", "cone", "cylinder"]
     size: tuple[float, ...]
     material: str
-    centers: NDArray[np.float64]  # (N, 3), in the mother's frame
-    rotations: NDArray[np.float64]  # (N, 3, 3), the solid's axes in that frame as columns
+    centers: Floats  # (N, 3), in the mother's frame
+    rotations: Floats  # (N, 3, 3), the solid's axes in that frame as columns
 
 
 class Setup(NamedTuple):
@@ -213,19 +214,19 @@ def build_setup(system: PinholeSystem, simulation: Simulation) -> Setup:
     return Setup(collimators, crystals, phantom, rods, math.ceil(2 * (reach + _SPACE)))
 
 
-def _alike(*lengths: NDArray[np.float64]) -> list[NDArray[np.intp]]:
+def _alike(*lengths: Floats) -> list[NDArray[np.intp]]:
     """Indices of the modules with equal lengths, kind by kind, from the shortest."""
     _, kind = np.unique(np.round(np.stack(lengths, axis=1) / _SAME), axis=0, return_inverse=True)
     kind = kind.reshape(-1)
     return [np.flatnonzero(kind == i) for i in range(kind.max() + 1)]
 
 
-def _behind_pinholes(poses: NDArray[np.float64], depths: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _behind_pinholes(poses: Floats, depths: Any) -> tuple[Floats, Floats]:
     """Centres and rotations of solids that lie `depths` (M,) or one depth, mm, behind their pinholes."""
     return poses[:, :3, 3] - np.reshape(depths, (-1, 1)) * poses[:, :3, 2], poses[:, :3, :3]
 
 
-def _collimator(name: str, poses: NDArray[np.float64], body: Collimator, material: str) -> list[Placed]:
+def _collimator(name: str, poses: Floats, body: Collimator, material: str) -> list[Placed]:
     """The solids of one kind, and the pieces of air in each, front to back."""
     built, l, half_side = body.construction, body.length, body.detector_side / 2
     middle = (l + built.front) / 2  # depth of the solid's centre

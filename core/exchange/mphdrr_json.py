@@ -1,13 +1,12 @@
 """mphDRR's own JSON file of a geometry. It holds every digit and can be read back."""
 
 import json
-import os
 from pathlib import Path
 from typing import Any
 
 from ..arrays import table_rows
 from ..errors import InputError
-from ..files import read_bytes
+from ..files import AnyPath, read_bytes
 from ..geometry.scanner import Scanner, scanner_kind
 from ..geometry.system import PinholeSystem
 from ..geometry.views import Views
@@ -45,7 +44,7 @@ def _write(system: Scanner, views: Views, temporary: Path) -> None:
     temporary.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
 
 
-def read_geometry(path: str | os.PathLike[str]) -> tuple[Scanner, Views]:
+def read_geometry(path: AnyPath) -> tuple[Scanner, Views]:
     """Read what `write_geometry` wrote in the format ``"mphdrr"``, bit for bit; `InputError` for any other file."""
     content = read_bytes(path)
     try:

@@ -1,7 +1,6 @@
 """A page on which figures are drawn, once as pixels and once as SVG: pictures, lines, areas and text."""
 
 import base64
-import os
 from collections.abc import Iterator, Sequence
 from html import escape
 from itertools import pairwise
@@ -10,8 +9,9 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..arrays import Floats, Floats32
 from ..errors import InputError
-from ..files import require_ending, write_bytes
+from ..files import AnyPath, require_ending, write_bytes
 from ..runs import letters
 from ..runs.mosaic import png, write_png
 from ..runs.resizing import resized
@@ -107,7 +107,7 @@ class Page:
             f"{escape(text)}</text>"
         )
 
-    def write(self, path: str | os.PathLike[str]) -> None:
+    def write(self, path: AnyPath) -> None:
         """Write the page in the format that its name says, .png or .svg."""
         if require_ending(path, SUFFIXES) == ".png":
             write_png(self.picture, path)
@@ -116,7 +116,7 @@ class Page:
         head = f'<svg xmlns="http://www.w3.org/2000/svg" {size} font-family="{_FONTS}" xml:space="preserve">'
         write_bytes(path, "\n".join([head, *self._marks, "</svg>\n"]).encode())
 
-    def _around(self, points: NDArray[np.float64], margin: float) -> tuple[int, int, NDArray, NDArray]:
+    def _around(self, points: Floats, margin: float) -> tuple[int, int, NDArray, NDArray]:
         """The part of the page that holds points: its first row and column, and its pixels' x and y."""
         low = np.maximum(np.floor(points.min(axis=0) - margin), 0).astype(int)
         high = np.minimum(np.ceil(points.max(axis=0) + margin), [self.width, self.height]).astype(int)
@@ -166,7 +166,7 @@ def _dashes(points: Sequence[Point], dash: float) -> Iterator[list[Point]]:
         yield [(float(np.interp(a, at, corners[:, 0])), float(np.interp(a, at, corners[:, 1]))) for a in places]
 
 
-def _rgb(color: str) -> NDArray[np.float32]:
+def _rgb(color: str) -> Floats32:
     return np.array(list(bytes.fromhex(color.removeprefix("#"))), np.float32)
 
 

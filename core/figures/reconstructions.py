@@ -4,8 +4,9 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ..arrays import Floats32
 from ..geometry.grid import Grid
 from ..runs.display import Display
 from ..volumes.resampling import resample
@@ -100,7 +101,7 @@ def draw_objective(
         page.area([(x - r, y), (x, y - r), (x + r, y), (x, y + r)], color)
 
 
-def _slice(volume: Volume, grid: Grid, axis: int) -> NDArray[np.float32]:
+def _slice(volume: Volume, grid: Grid, axis: int) -> Floats32:
     """The middle slice of a grid across one of its axes, of a volume on any grid."""
     index = grid.shape[axis] // 2
     shape = [*grid.shape]

@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Floats, Floats32
 from ..geometry.frames import moved
 from ..reconstruction.scores.derenzo import DerenzoSector
 from ..reconstruction.scores.summary import VolumeScore
@@ -25,8 +25,6 @@ _PLANES = ((0, 1), (0, 2), (1, 2))  # axes to the right and upward
 _MARGIN = 1.1  # of a phantom's box, that slices show
 _COARSE, _NEARLY = 65, 0.9  # points along an axis, and the share of the most, to choose where slices lie
 _MOST = 512  # pixels along the sides of a slice
-
-Floats = NDArray[np.float64]
 
 
 class _Curve(NamedTuple):
@@ -111,9 +109,7 @@ def _shown(score: VolumeScore) -> tuple[Floats, Floats]:
     return low, high
 
 
-def _slice(
-    volume: Volume, pose: Floats, plane: tuple[int, int], low: Floats, high: Floats, middle: Floats
-) -> NDArray[np.float32]:
+def _slice(volume: Volume, pose: Floats, plane: tuple[int, int], low: Floats, high: Floats, middle: Floats) -> Floats32:
     """Values (across, up) of the voxels in a plane through `middle`."""
     counts = np.clip(np.rint((high - low) / volume.grid.spacing.min()), 1, _MOST).astype(int)
     at = [low[a] + (np.arange(counts[a]) + 0.5) * (high[a] - low[a]) / counts[a] for a in range(3)]

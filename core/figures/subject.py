@@ -3,9 +3,7 @@
 from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, field
 
-import numpy as np
-from numpy.typing import NDArray
-
+from ..arrays import Floats
 from ..errors import InputError
 from ..geometry.collimator import Construction
 from ..geometry.system import AnyScanner, PinholeSystem, chosen_modules
@@ -35,7 +33,7 @@ class Subject:
     run: ProjectionRun | None = None
     name: str = ""
     """What the volume is called."""
-    pose: NDArray[np.float64] | None = None
+    pose: Floats | None = None
     """World-from-phantom (4, 4), mm, where the volume is a phantom."""
     display: Display = field(default_factory=Display)
     """How projections are shown."""

@@ -3,6 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arrays import Floats, Floats32
 from ..projector.tracing import trace_rays
 from ..runs.display import Display
 from ..runs.run_recipe import euler_degrees
@@ -18,7 +19,7 @@ _NAMES = "xyz"
 _Frame = tuple[int, int, int, int]  # left, top, width, height
 
 
-def orthogonal_sum(volume: Volume, axis: int) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
+def orthogonal_sum(volume: Volume, axis: int) -> tuple[Floats32, Floats]:
     """Line integrals of a volume along world x, y or z (`axis` 0, 1, 2), value x mm, and the box (2, 3) around it, mm.
 
     The array's indices go along the other two axes, in their order. Its pixels are about as large as the smallest voxel: on
@@ -81,7 +82,7 @@ def _numbers(values: object) -> str:
     return ", ".join(number(round(float(value), 3) + 0.0) for value in np.asarray(values))
 
 
-def _panel(page: Page, panel: int, picture: NDArray[np.uint8], box: NDArray[np.float64], frame: _Frame) -> None:
+def _panel(page: Page, panel: int, picture: NDArray[np.uint8], box: Floats, frame: _Frame) -> None:
     """One sum with its title and axes."""
     em, (left, top, width, height) = page.em, frame
     axis, right, up = _PANELS[panel]

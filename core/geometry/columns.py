@@ -12,6 +12,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arrays import Array, Floats
 from ..errors import InputError
 from ..validation import one_for_all, radians, real_array
 
@@ -26,7 +27,7 @@ AGREEING = 1e-9
 """Relative: a formula's result nearer to a number than this gives that number."""
 
 Kind = Literal["length", "angle", "number", "whole", "choice", "text"]
-Values = Mapping[str, NDArray[Any]]
+Values = Mapping[str, Array]
 """Column -> its values (M,), lengths in mm and angles in rad."""
 
 
@@ -41,7 +42,7 @@ class Column:
     axis: int | None = None
     """Which coordinate of a vector it is."""
     kind: Kind = "length"
-    derived: Callable[[Any], NDArray[np.float64]] | None = None
+    derived: Callable[[Any], Floats] | None = None
     """A function of the scanner that gives its values (M,), mm or rad, of a column that follows from the others."""
     undefined: Callable[[Values], NDArray[np.bool_]] = lambda needed: np.zeros(len(next(iter(needed.values()))), bool)
     """A function of the needed columns: where (M,) the formula divides by 0, and any value is right."""
@@ -61,7 +62,7 @@ class Column:
     """Words that suggest this column in a heading that is not understood."""
     plausible: tuple[float, float] = (-math.inf, math.inf)
     """mm or rad; a warning is given of numbers outside. If all of them are above 0, a typed one that is not is refused."""
-    blank: float | str | Callable[[Values], NDArray[np.float64]] | None = None
+    blank: float | str | Callable[[Values], Floats] | None = None
     """The value of a blank cell, or a function of the needed columns that gives it (M,); None: each must be given."""
     choices: tuple[str, ...] = ()
     """The words that a choice may be."""
@@ -122,14 +123,14 @@ class Column:
         shown = self.number_of(value, digits)
         return repr(shown) if self.is_text else f"{shown} {next(iter(self.units))}".rstrip()
 
-    def of(self, scanner: Any) -> NDArray[Any]:
+    def of(self, scanner: Any) -> Array:
         """Its values (M,) in a scanner, mm or rad."""
         if self.derived is not None:
             return self.derived(scanner)
         values = getattr(scanner, self.field)
         return values if self.axis is None else values[:, self.axis]
 
-    def default(self, needed: Values) -> NDArray[Any]:
+    def default(self, needed: Values) -> Array:
         """The values (M,) of an optional one where its cells are blank, by the `needed` ones, mm."""
         return self.blank(needed) if callable(self.blank) else np.full(len(next(iter(needed.values()))), self.blank)
 
@@ -145,7 +146,7 @@ class Column:
         """Which modules (M,) have the value that its formula gives, if it has one."""
         return self.is_default(scanner) if self.derived is None else ~self.unlike_formula(scanner)
 
-    def same(self, one: NDArray[Any], other: NDArray[Any], within: float = AGREEING) -> NDArray[np.bool_]:
+    def same(self, one: Array, other: Array, within: float = AGREEING) -> NDArray[np.bool_]:
         """Where values (M,) are equal: numbers to `within`, relative, texts letter by letter."""
         if self.is_text:
             return np.asarray(one, np.str_) == other
@@ -160,7 +161,7 @@ class Column:
         stated = f" ({unit or usual})"
         return (symbol, description + stated) if description else (symbol + stated, "")
 
-    def checked(self, values: Any, n: int | None) -> NDArray[Any]:
+    def checked(self, values: Any, n: int | None) -> Array:
         """`values`, one for each of `n` modules or one for all, as an array of its kind, or `InputError`.
 
         Those of a coordinate are all three: (M, 3), or one triple for all.

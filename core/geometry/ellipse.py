@@ -4,9 +4,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from ..arrays import Floats
 
 _ITERATIONS = 100
 # An ellipse has five parameters, so five points or fewer say nothing about how well it fits.
@@ -17,12 +16,12 @@ _FEWEST_POINTS = 6
 class Ellipse:
     """An ellipse: semi-axes (2,) and center (2,), mm, and the angle from x to the first axis, rad."""
 
-    semi_axes: Array
-    center: Array
+    semi_axes: Floats
+    center: Floats
     rotation: float
 
     @property
-    def axes(self) -> Array:
+    def axes(self) -> Floats:
         """Unit vectors (2, 2) along its axes, as columns."""
         cosine, sine = math.cos(self.rotation), math.sin(self.rotation)
         return np.array([[cosine, -sine], [sine, cosine]])
@@ -32,7 +31,7 @@ class Ellipse:
         """Whether the isocentre is inside."""
         return bool(np.linalg.norm(self.center @ self.axes / self.semi_axes) < 1)
 
-    def at(self, azimuths: Array) -> Array:
+    def at(self, azimuths: Floats) -> Floats:
         """The points (..., 2), mm, where rays from the isocentre at `azimuths` cross it."""
         rays = np.stack([np.cos(azimuths), np.sin(azimuths)], axis=-1)
         # In units of the semi-axes it is a circle: |r ray - center| = 1.
@@ -41,7 +40,7 @@ class Ellipse:
         distance = (along + np.sqrt(along**2 + squared * (1 - center @ center))) / squared
         return distance[..., None] * rays
 
-    def distances(self, points: Array) -> tuple[Array, Array, Array]:
+    def distances(self, points: Floats) -> tuple[Floats, Floats, Floats]:
         """Signed distances (N,), mm, of points from it; normals (N, 2) and eccentric angles (N,) of the nearest points."""
         local = (points - self.center) @ self.axes
         a, b = self.semi_axes
@@ -60,7 +59,7 @@ class Ellipse:
         return ((local - closest) * normals).sum(axis=1), normals @ self.axes.T, angle
 
 
-def fit_ellipse(points: Array) -> Ellipse | None:
+def fit_ellipse(points: Floats) -> Ellipse | None:
     """The ellipse with the least squared distances from `points` (N, 2), by Gauss and Newton's method.
 
     It starts from the direct fit of R. Halir and J. Flusser, "Numerically stable direct least squares fitting of ellipses",
@@ -89,7 +88,7 @@ def fit_ellipse(points: Array) -> Ellipse | None:
     return ellipse if ellipse.holds_isocentre else None
 
 
-def _direct_fit(points: Array) -> Ellipse | None:
+def _direct_fit(points: Floats) -> Ellipse | None:
     """Halir and Flusser's fit: the least algebraic distance among the conics that are ellipses."""
     middle = points.mean(axis=0)
     size = float(np.abs(points - middle).max())

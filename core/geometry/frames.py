@@ -5,6 +5,7 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..arrays import Floats
 from ..errors import InputError
 from ..validation import radians, real_array
 
@@ -13,7 +14,7 @@ _PARALLEL = 1e-9
 _ROUNDING = 1e-14  # rad
 
 
-def principal_rays(centers: ArrayLike) -> NDArray[np.float64]:
+def principal_rays(centers: ArrayLike) -> Floats:
     """Unit vectors (M, 3) from pinhole `centers` (M, 3), mm, to the isocentre at the origin."""
     centers = real_array(centers, "pinhole centres", (None, 3))
     distance = np.linalg.norm(centers, axis=1)
@@ -22,7 +23,7 @@ def principal_rays(centers: ArrayLike) -> NDArray[np.float64]:
     return -centers / distance[:, None]
 
 
-def module_frames(centers: ArrayLike) -> NDArray[np.float64]:
+def module_frames(centers: ArrayLike) -> Floats:
     """Module frames (M, 3, 3), rows u, v, k, of pinholes at `centers` (M, 3), mm.
 
     k points from the pinhole to the isocentre, ``u = normalize(z_hat x k)`` (x_hat where z_hat is parallel to k)
@@ -36,13 +37,13 @@ def module_frames(centers: ArrayLike) -> NDArray[np.float64]:
     return np.stack([u, _cross(k, u), k], axis=1)
 
 
-def _cross(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+def _cross(a: Floats, b: Floats) -> Floats:
     """numpy.cross of (..., 3) to the same digits; of a few vectors, four times as fast."""
     (ax, ay, az), (bx, by, bz) = np.moveaxis(a, -1, 0), np.moveaxis(b, -1, 0)
     return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=-1)
 
 
-def tilted(frames: NDArray[np.float64], tilt: NDArray[np.float64]) -> NDArray[np.float64]:
+def tilted(frames: Floats, tilt: Floats) -> Floats:
     """Frames (M, 3, 3), rows u, v, k, turned by rotation vectors `tilt` (M, 3), rad, about their own u, v and k."""
     turned = np.any(tilt, axis=1)
     if not turned.any():  # to the last digit
@@ -53,27 +54,27 @@ def tilted(frames: NDArray[np.float64], tilt: NDArray[np.float64]) -> NDArray[np
     return found
 
 
-def tilts(frames: NDArray[np.float64], turned: NDArray[np.float64]) -> NDArray[np.float64]:
+def tilts(frames: Floats, turned: Floats) -> Floats:
     """Rotation vectors (M, 3), rad, about u, v and k of `frames` (M, 3, 3) that make them `turned`; 0 within rounding."""
     found = rotation_vectors((turned @ frames.transpose(0, 2, 1)).transpose(0, 2, 1))
     return np.where(np.abs(found).max(axis=1, keepdims=True) > _ROUNDING, found, 0.0)
 
 
-def rotations(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+def rotations(vectors: Floats) -> Floats:
     """Rotation matrices (N, 3, 3) of rotation vectors (N, 3), rad, by Rodrigues' formula."""
     angle, cross = np.linalg.norm(vectors, axis=1)[:, None, None], cross_matrix(vectors)
     # sin(a)/a and (1 - cos(a))/a^2 by sinc, which is exact at 0; numpy's is sin(pi x)/(pi x).
     return np.eye(3) + np.sinc(angle / np.pi) * cross + 0.5 * np.sinc(angle / (2 * np.pi)) ** 2 * (cross @ cross)
 
 
-def cross_matrix(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+def cross_matrix(vectors: Floats) -> Floats:
     """Matrices (…, 3, 3) that multiply by `vectors` (…, 3) from the left: ``a x b``."""
     x, y, z = np.moveaxis(vectors, -1, 0)
     zero = np.zeros_like(x)
     return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1).reshape(*x.shape, 3, 3)
 
 
-def rotation_vectors(matrices: NDArray[np.float64]) -> NDArray[np.float64]:
+def rotation_vectors(matrices: Floats) -> Floats:
     """Rotation vectors (N, 3), rad, of rotation matrices (N, 3, 3); of half a turn, either of the two.
 
     By unit quaternions: the candidate with the largest divisor, so that no angle loses digits.
@@ -97,26 +98,26 @@ def rotation_vectors(matrices: NDArray[np.float64]) -> NDArray[np.float64]:
     return q[:, 1:] * np.where(sine > 0, angle / np.where(sine > 0, sine, 1.0), 2.0)
 
 
-def module_poses(centers: ArrayLike) -> NDArray[np.float64]:
+def module_poses(centers: ArrayLike) -> Floats:
     """World-from-module poses (M, 4, 4) of pinholes at `centers` (M, 3), mm: columns u, v, k and the centre."""
     return affine_matrix(module_frames(centers).transpose(0, 2, 1), centers)
 
 
-def affine_matrix(linear: NDArray[np.float64], translation: ArrayLike) -> NDArray[np.float64]:
+def affine_matrix(linear: Floats, translation: ArrayLike) -> Floats:
     """Matrices (..., 4, 4) on column vectors, of their linear part (..., 3, 3) and their translation (..., 3)."""
     matrix = np.zeros((*linear.shape[:-2], 4, 4))
     matrix[..., :3, :3], matrix[..., :3, 3], matrix[..., 3, 3] = linear, translation, 1.0
     return matrix
 
 
-def moved(affine: NDArray[np.float64], points: NDArray[np.floating | np.integer]) -> NDArray[np.float64]:
+def moved(affine: Floats, points: NDArray[np.floating | np.integer]) -> Floats:
     """Points (..., 3) after an affine (4, 4)."""
     return points @ affine[:3, :3].T + affine[:3, 3]
 
 
 def euler_pose(
     phi: float = 0.0, theta: float = 0.0, psi: float = 0.0, translation: ArrayLike = (0.0, 0.0, 0.0)
-) -> NDArray[np.float64]:
+) -> Floats:
     """World-from-object pose (4, 4): a rotation by three Euler angles, rad, then a translation, mm.
 
     The object is turned by psi about its z axis, then by theta about world y, then by phi about world z.
@@ -133,7 +134,7 @@ def euler_pose(
     return affine_matrix(rotation, real_array(translation, "translation", (3,)))
 
 
-def checked_affine(affine: ArrayLike, name: str) -> NDArray[np.float64]:
+def checked_affine(affine: ArrayLike, name: str) -> Floats:
     """`affine` as an invertible (4, 4) float64 matrix acting on column vectors, or `InputError`."""
     matrix = real_array(affine, name, (4, 4))
     if not np.array_equal(matrix[3], [0.0, 0.0, 0.0, 1.0]):

@@ -10,10 +10,11 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..arrays import Floats
 from ..errors import InputError
 from ..validation import lengths, positive, radians, real_array, whole_number
 from .design_formulas import collimator_length as designed_length
-from .ellipse import Array, Ellipse
+from .ellipse import Ellipse
 from .system import PinholeSystem
 
 Spacing = Literal["angle", "arc"]
@@ -120,7 +121,7 @@ def plate_rings(
     return _rings(places, z, mirrored, collimator_length, *sizes)
 
 
-def regular_polygon(sides: int, apothem: float, rotation: float = 0.0) -> Array:
+def regular_polygon(sides: int, apothem: float, rotation: float = 0.0) -> Floats:
     """Vertices (sides, 2), mm, of a regular polygon around the isocentre, for `plate_rings`.
 
     The plates are `apothem` mm from the isocentre; the middle of the first has the azimuth `rotation`, rad.
@@ -133,7 +134,7 @@ def regular_polygon(sides: int, apothem: float, rotation: float = 0.0) -> Array:
     return radius * np.stack([np.cos(angles), np.sin(angles)], axis=1)
 
 
-def even_azimuths(ellipse: Ellipse, modules: Any, start: float, end: float, spacing: str) -> Array:
+def even_azimuths(ellipse: Ellipse, modules: Any, start: float, end: float, spacing: str) -> Floats:
     """Azimuths (M,), rad, of evenly spaced modules on an ellipse. Parameters as in `ellipse_rings`."""
     count = whole_number(modules, "modules")
     if count > _MOST_MODULES:
@@ -155,7 +156,7 @@ def even_azimuths(ellipse: Ellipse, modules: Any, start: float, end: float, spac
 
 
 def _rings(
-    places: Array, z: ArrayLike, mirrored: bool, collimator_length: ArrayLike | None, *sizes: ArrayLike
+    places: Floats, z: ArrayLike, mirrored: bool, collimator_length: ArrayLike | None, *sizes: ArrayLike
 ) -> PinholeSystem:
     """Modules at `places` ((rings,) M, 2), mm, in rings at `z`; `sizes` are d, Ld, Td and R."""
     heights = np.atleast_1d(real_array(z, "z", (None,) * min(np.ndim(z), 2)))

@@ -6,8 +6,9 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ..arrays import Floats
 from ..validation import freeze, lengths, real_array, whole_shape
 from .frames import affine_matrix, checked_affine
 
@@ -21,7 +22,7 @@ class Grid:
     """
 
     shape: tuple[int, int, int]
-    affine: NDArray[np.float64]
+    affine: Floats
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "shape", whole_shape(self.shape, "grid shape", 3))
@@ -45,7 +46,7 @@ class Grid:
         return Grid(shape, affine)  # type: ignore[arg-type]
 
     @property
-    def spacing(self) -> NDArray[np.float64]:
+    def spacing(self) -> Floats:
         """Voxel size (3,), mm, along each index axis."""
         return np.linalg.norm(self.affine[:3, :3], axis=0)
 
@@ -60,16 +61,16 @@ class Grid:
         return int(np.prod(self.shape, dtype=object))
 
     @cached_property  # needed for every part of every image
-    def index_from_world(self) -> NDArray[np.float64]:
+    def index_from_world(self) -> Floats:
         """Matrix (4, 4) from world mm to index, on column vectors."""
         return freeze(np.linalg.inv(self.affine))
 
     @property
-    def center(self) -> NDArray[np.float64]:
+    def center(self) -> Floats:
         """World point (3,), mm, of the grid's middle."""
         return (self.affine @ [*((np.array(self.shape) - 1) / 2), 1.0])[:3]
 
-    def corners(self) -> NDArray[np.float64]:
+    def corners(self) -> Floats:
         """World points (8, 3), mm, of the box's outer corners (voxel faces, not centres)."""
         unit = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), axis=-1).reshape(8, 3)
         index = unit * np.array(self.shape) - 0.5
@@ -84,7 +85,7 @@ class Grid:
         return hash((self.shape, self.affine.tobytes()))
 
 
-def grid_around(points: NDArray[np.float64], spacing: float) -> Grid:
+def grid_around(points: Floats, spacing: float) -> Grid:
     """The axis-aligned grid of cubes that holds world `points` (n, 3), mm, with at least half a voxel around them."""
     low, high = points.min(axis=0), points.max(axis=0)
     return Grid.centered(np.ceil((high - low) / spacing) + 2, spacing, (low + high) / 2)

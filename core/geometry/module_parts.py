@@ -10,13 +10,14 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arrays import Floats
 from ..errors import InputError
 from ..validation import freeze
 from .collimator import Collimator
 from .frames import moved
 from .part_colors import PartKind
 
-Solid = tuple[NDArray[np.float64], NDArray[np.int32]]
+Solid = tuple[Floats, NDArray[np.int32]]
 """Vertices (V, 3), mm, and quads (F, 4), counter-clockwise seen from outside."""
 
 # Points on a ring: a multiple of 8, so that squares have points at their corners. The polygon is inscribed in the hole's
@@ -40,10 +41,10 @@ class ModulePart:
     kind: PartKind
     name: str  # such as "Module 07 collimator"; names sort like the modules' numbers
     solid: Solid  # in the module's camera space
-    pose: NDArray[np.float64]  # (4, 4), world from camera space, mm
+    pose: Floats  # (4, 4), world from camera space, mm
 
     @property
-    def vertices(self) -> NDArray[np.float64]:
+    def vertices(self) -> Floats:
         """(V, 3), world mm."""
         return moved(self.pose, self.solid[0])
 

@@ -7,8 +7,8 @@ from operator import attrgetter
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Floats
 from .columns import Column, ColumnTable, Values
 from .design_formulas import collimator_length
 from .frames import principal_rays
@@ -22,7 +22,7 @@ def _coordinate(axis: str, places: str) -> dict[str, Any]:
     return {"name": axis, "headings": (axis, *headings), "hints": hints}
 
 
-def _designed(needed: Values) -> NDArray[np.float64]:
+def _designed(needed: Values) -> Floats:
     """The collimator length (M,), mm, of the design formula."""
     b = np.sqrt(sum(needed[name] ** 2 for name in ("x1", "y1", "z1")))
     return collimator_length(b, needed["d"], needed["Ld"], needed["R"])
@@ -31,12 +31,12 @@ def _designed(needed: Values) -> NDArray[np.float64]:
 _HOLES = "center of hole, centre of hole, center of pinhole, centre of pinhole, pinhole"
 
 
-def _detector_back(system: Any) -> NDArray[np.float64]:
+def _detector_back(system: Any) -> Floats:
     """Distance (M,) from the isocentre to the crystal's back, mm."""
     return system.pinhole_distance + system.collimator_length + system.detector_thickness
 
 
-def _detector_end(system: Any) -> NDArray[np.float64]:
+def _detector_end(system: Any) -> Floats:
     """Middle (M, 3) of the crystal's back, mm."""
     aimed = system.centers * (_detector_back(system) / system.pinhole_distance)[:, None]
     if not system.tilt.any():  # as the workbook's formula has it, to the last digit
@@ -45,12 +45,12 @@ def _detector_end(system: Any) -> NDArray[np.float64]:
     return aimed - off * (system.collimator_length + system.detector_thickness)[:, None]
 
 
-def _planar_range(system: Any) -> NDArray[np.float64]:
+def _planar_range(system: Any) -> Floats:
     """Distance (M,) from the pinhole to the z axis, mm."""
     return np.hypot(system.centers[:, 0], system.centers[:, 1])
 
 
-def _slope(system: Any) -> NDArray[np.float64]:
+def _slope(system: Any) -> Floats:
     """The users' "3D slope" (M,): the distance to the isocentre, in units of x1."""
     with np.errstate(divide="ignore", over="ignore"):
         return system.pinhole_distance / system.centers[:, 0]

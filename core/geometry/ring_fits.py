@@ -7,9 +7,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arrays import Floats
 from ..errors import InputError
 from ..validation import instance
-from .ellipse import Array, Ellipse, fit_ellipse
+from .ellipse import Ellipse, fit_ellipse
 from .generators import FULL_TURN, Spacing, even_azimuths
 from .system import PinholeSystem
 
@@ -26,11 +27,11 @@ class RingFit:
     """
 
     numbers: NDArray[np.int64]  # (M,), in their order along the ring; an open ring begins at one end
-    semi_axes: Array
-    center: Array
+    semi_axes: Floats
+    center: Floats
     rotation: float  # at most 45 degrees either way
-    azimuths: Array  # (M,), monotonic, without jumps
-    z: Array  # (M,)
+    azimuths: Floats  # (M,), monotonic, without jumps
+    z: Floats  # (M,)
     spacing: Spacing  # whichever even spacing from the first to the last azimuth comes closer
     curve_deviation: float  # largest distance of a pinhole from the ellipse at its own z
     even_deviation: float  # largest distance of a pinhole from its place in an evenly spaced ring at the mean z
@@ -106,7 +107,7 @@ def _run_clockwise(system: PinholeSystem, rings: Sequence[NDArray[np.intp]]) -> 
     return bool(2 * falls > sum(len(order) for order in orders))
 
 
-def _in_order(system: PinholeSystem, which: NDArray[np.intp], clockwise: bool) -> tuple[Array, NDArray[np.intp]]:
+def _in_order(system: PinholeSystem, which: NDArray[np.intp], clockwise: bool) -> tuple[Floats, NDArray[np.intp]]:
     """Azimuths without jumps of the modules `which`, and these modules, in their order along the ring."""
     azimuths = np.arctan2(*system.centers[which, 1::-1].T)
     order = np.argsort(azimuths, kind="stable")

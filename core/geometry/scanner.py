@@ -15,6 +15,7 @@ from typing import Any, ClassVar, Literal, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..arrays import Array, Floats
 from ..errors import InputError
 from ..system_source import SystemSource
 from ..validation import freeze, one_of, real_array
@@ -91,7 +92,7 @@ class Scanner(ABC):
     def __len__(self) -> int:
         return len(self.numbers)
 
-    def __getitem__(self, which: int | slice | NDArray[Any]) -> Self:
+    def __getitem__(self, which: int | slice | Array) -> Self:
         """The modules `which` (an index from 0, a slice, or an array of indices or booleans) as a scanner."""
         index = np.atleast_1d(np.arange(len(self))[which])
         if len(index) == 0:
@@ -124,11 +125,11 @@ class Scanner(ABC):
                 given[name] = np.stack([own.get(column.name, absent) for column in columns], axis=1)
         return cls.of(given)
 
-    def values(self) -> dict[str, NDArray[Any]]:
+    def values(self) -> dict[str, Array]:
         """The values (M,) of the typed columns by name, mm, rad or texts."""
         return {name: self.columns[name].of(self) for name in self.columns.typed}
 
-    def filled(self) -> dict[str, NDArray[Any]]:
+    def filled(self) -> dict[str, Array]:
         """The attributes that columns hold, without those in which all cells of a workbook could be blank."""
         used = {
             column.field for columns in self.columns.fields.values() for column in columns if not column.is_unused(self)
@@ -151,19 +152,19 @@ class Scanner(ABC):
             raise InputError(f"module {self.numbers[i]}: {message.format(**own)}")
 
     @abstractmethod
-    def poses(self) -> NDArray[np.float64]:
+    def poses(self) -> Floats:
         """World-from-module poses (M, 4, 4): columns u, v, k, at right angles to its image, and the source's place, mm."""
 
-    def frames(self) -> NDArray[np.float64]:
+    def frames(self) -> Floats:
         """Module frames (M, 3, 3), rows u, v, k."""
         return self.poses()[:, :3, :3].transpose(0, 2, 1)
 
     @abstractmethod
-    def at_poses(self, poses: NDArray[np.float64], **changes: Any) -> Self:
+    def at_poses(self, poses: Floats, **changes: Any) -> Self:
         """The scanner with its modules moved and turned as rigid bodies to these poses (M, 4, 4), and other `changes`."""
 
     @classmethod
-    def aimed(cls, places: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    def aimed(cls, places: Floats) -> Floats | None:
         """The poses (M, 4, 4) in which modules at `places` (M, 3), mm, look at the isocentre; None if the kind has none."""
         return None
 
@@ -178,7 +179,7 @@ class Scanner(ABC):
     ) -> Views:
         """The modules' images, of n_v rows and n_u columns, as the settings of a run ask for them."""
 
-    def fields(self) -> NDArray[np.float64]:
+    def fields(self) -> Floats:
         """What each module's camera sees, (M, 5), mm: `Views.fields` of its image."""
         return self.views((1, 1)).fields(self.poses())
 
@@ -203,14 +204,14 @@ def first(bad: NDArray[np.bool_]) -> list[int]:
     return [int(bad.argmax())] if bad.any() else []
 
 
-def repeated(rows: NDArray[Any]) -> NDArray[np.bool_]:
+def repeated(rows: Array) -> NDArray[np.bool_]:
     """Which rows (M,) of an array (M, ...) stand there before."""
     if len(rows) == 1:
         return np.zeros(1, bool)
     return first_equal(rows) != np.arange(len(rows))
 
 
-def first_equal(rows: NDArray[Any]) -> NDArray[np.intp]:
+def first_equal(rows: Array) -> NDArray[np.intp]:
     """The first row (M,) of an array (M, ...) that is equal to each."""
     _, places, inverse = np.unique(rows, axis=0, return_index=True, return_inverse=True)
     return places[inverse.reshape(-1)]

@@ -9,6 +9,7 @@ from typing import Any, ClassVar, Self, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..arrays import Floats
 from ..errors import InputError, naming, warn
 from ..system_source import SystemSource
 from ..validation import lengths, positive, real_array, whole_shape
@@ -48,15 +49,15 @@ class PinholeSystem(Scanner):
     kind: ClassVar[str] = "pinhole"
     columns: ClassVar[ColumnTable] = PINHOLE_COLUMNS
 
-    centers: NDArray[np.float64]
-    pinhole_diameter: NDArray[np.float64]  # d
-    collimator_length: NDArray[np.float64]  # l
-    detector_side: NDArray[np.float64]  # Ld
-    detector_thickness: NDArray[np.float64]  # Td
-    roi_radius: NDArray[np.float64]  # R
+    centers: Floats
+    pinhole_diameter: Floats  # d
+    collimator_length: Floats  # l
+    detector_side: Floats  # Ld
+    detector_thickness: Floats  # Td
+    roi_radius: Floats  # R
     numbers: NDArray[np.int64] = None  # type: ignore[assignment]  # always an array once made
     source: SystemSource | None = None
-    tilt: NDArray[np.float64] = 0.0  # type: ignore[assignment]  # likewise
+    tilt: Floats = 0.0  # type: ignore[assignment]  # likewise
     crystal_material: NDArray[np.str_] = ""  # type: ignore[assignment]
     more: Mapping[str, Any] = field(default_factory=dict)
 
@@ -96,48 +97,48 @@ class PinholeSystem(Scanner):
             yield "x1", i, f"{puts} {numbers[i]} {at}, expected another place"
 
     @property
-    def pinhole_distance(self) -> NDArray[np.float64]:
+    def pinhole_distance(self) -> Floats:
         """b (M,), mm: pinhole centre to isocentre."""
         return np.linalg.norm(self.centers, axis=1)
 
     @property
-    def principal_rays(self) -> NDArray[np.float64]:
+    def principal_rays(self) -> Floats:
         """k (M, 3): the modules' axes, unit vectors from pinhole to isocentre where there is no tilt."""
         return self.frames()[:, 2]
 
-    def frames(self) -> NDArray[np.float64]:
+    def frames(self) -> Floats:
         """Module frames (M, 3, 3), rows u, v, k: those of `core.geometry.frames.module_frames`, tilted."""
         return tilted(module_frames(self.centers), self.tilt)
 
-    def isocentres(self) -> NDArray[np.float64]:
+    def isocentres(self) -> Floats:
         """The isocentre in each module's frame (M, 3), mm from its pinhole along u, v and k: (0, 0, b) without tilt."""
         turned = np.any(self.tilt, axis=1)[:, None]
         aimed = self.pinhole_distance[:, None] * [0.0, 0.0, 1.0]
         return np.where(turned, -np.einsum("mij,mj->mi", self.frames(), self.centers), aimed)
 
-    def roi_radius_seen(self) -> NDArray[np.float64]:
+    def roi_radius_seen(self) -> Floats:
         """Radius (M,), mm, of the largest sphere at the isocentre that each module's field of view holds, or 0."""
         u, v, height = self.isocentres().T
         sizes = self.pinhole_diameter, self.detector_side, self.collimator_length
         seen = roi_radius_seen(np.where(height > 0, height, 1.0), *sizes, aside=np.maximum(abs(u), abs(v)))
         return np.where(height > 0, seen, 0.0)
 
-    def poses(self) -> NDArray[np.float64]:
+    def poses(self) -> Floats:
         """World-from-module poses (M, 4, 4): columns u, v, k and the pinhole centre, mm."""
         return affine_matrix(self.frames().transpose(0, 2, 1), self.centers)
 
-    def at_poses(self, poses: NDArray[np.float64], **changes: Any) -> Self:
+    def at_poses(self, poses: Floats, **changes: Any) -> Self:
         """The system with its pinholes, and their modules turned with them, at these poses (M, 4, 4)."""
         centers = poses[:, :3, 3]
         tilt = tilts(module_frames(centers), poses[:, :3, :3].transpose(0, 2, 1))
         return self.replace(centers=centers, tilt=tilt, **changes)
 
     @classmethod
-    def aimed(cls, places: NDArray[np.float64]) -> NDArray[np.float64]:
+    def aimed(cls, places: Floats) -> Floats:
         """The poses (M, 4, 4) without tilt of modules whose pinholes are at `places` (M, 3), mm."""
         return module_poses(places)
 
-    def fields(self) -> NDArray[np.float64]:
+    def fields(self) -> Floats:
         """The crystal's side in front of the pinhole, as far as the crystal is behind it: (M, 5), mm."""
         none, side = np.zeros(len(self)), self.detector_side
         return np.stack([none, none, self.collimator_length, side, side], axis=1)
@@ -217,7 +218,7 @@ class PinholeSystem(Scanner):
         return Views(self.centers, middles, pitch_u * u, pitch_v * v, (n_v, n_u))
 
 
-def warn_of_size(pixels: tuple[int, int], pitches: NDArray[np.float64], sides: NDArray[np.float64], name: str) -> None:
+def warn_of_size(pixels: tuple[int, int], pitches: Floats, sides: Floats, name: str) -> None:
     """Warn where pixels of these pitches (2,) or (M, 2), mm, cover more than the `sides` (M, 1), mm, or less than half.
 
     Half of a side is covered on purpose, as "FOV", a little more than all of it by round numbers.

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arrays import Floats
 from ..errors import InputError
 from ..validation import freeze, real_array, whole_shape
 
@@ -24,10 +25,10 @@ class Views:
     direction from ``sources[m]`` to ``detector_centers[m]``. How far these two are apart does not matter.
     """
 
-    sources: NDArray[np.float64]  # pinholes, or X-ray sources
-    detector_centers: NDArray[np.float64]
-    u_steps: NDArray[np.float64]  # from one pixel to the next along a row (column index + 1)
-    v_steps: NDArray[np.float64]  # along a column (row index + 1)
+    sources: Floats  # pinholes, or X-ray sources
+    detector_centers: Floats
+    u_steps: Floats  # from one pixel to the next along a row (column index + 1)
+    v_steps: Floats  # along a column (row index + 1)
     shape: tuple[int, int]  # pixels (n_v, n_u): rows, columns
     parallel: bool = False  # whether the sources are at infinity; of all views or of none
 
@@ -61,7 +62,7 @@ class Views:
         )
         return Views(sources, centers, u_steps, v_steps, self.shape, self.parallel)
 
-    def rays(self, m: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def rays(self, m: int) -> tuple[Floats, Floats]:
         """Ends of view m's rays: sources and targets, each (n_v * n_u, 3) in mm, row by row.
 
         All sources are the same point (a read-only view). Parallel rays begin in the plane through ``sources[m]`` that is
@@ -76,7 +77,7 @@ class Views:
             return targets + (self.sources[m] - self.detector_centers[m]), targets
         return np.broadcast_to(self.sources[m], (n_v * n_u, 3)), targets
 
-    def fields(self, poses: NDArray[np.float64]) -> NDArray[np.float64]:
+    def fields(self, poses: Floats) -> Floats:
         """Where the images stand in front of cameras at `poses` (M, 4, 4), whose columns are u, v and k: (M, 5), mm.
 
         They are x, y and distance of each image's middle, and its width and height, in camera space: X = -u, Y = v, Z = -k.
@@ -89,7 +90,7 @@ class Views:
         places = [-np.sum(to_middle * u, axis=1), np.sum(to_middle * v, axis=1), np.sum(to_middle * k, axis=1)]
         return np.stack([*places, width, height], axis=1)
 
-    def projection_matrices(self) -> NDArray[np.float64]:
+    def projection_matrices(self) -> Floats:
         """Matrices (M, 3, 4) from homogeneous world points, mm, to ``(column, row, 1)`` times a factor.
 
         Columns and rows are in pixels, 0 at the centre of pixel 0. The factor is the depth in units of the distance from
@@ -108,7 +109,7 @@ class Views:
             offset += from_detector[:, 2]
         return np.concatenate([linear, offset[:, :, None]], axis=2)
 
-    def perspective_matrices(self) -> NDArray[np.float64]:
+    def perspective_matrices(self) -> Floats:
         """Transforms (M, 4, 4) from homogeneous world points, mm, to ``(column, row, k, 1)`` times a factor.
 
         Columns, rows and the factor are those of `projection_matrices`. ``k = D / depth`` is the magnification: D is the
@@ -124,6 +125,6 @@ class Views:
         if self.parallel:
             raise InputError(f"{name}: expected views with a source each; parallel views have theirs at infinity")
 
-    def _axes(self) -> NDArray[np.float64]:
+    def _axes(self) -> Floats:
         """(M, 3, 3) with columns u_step, v_step and source-to-detector."""
         return np.stack([self.u_steps, self.v_steps, self.detector_centers - self.sources], axis=2)

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..arrays import ArrayOrTensor, checked, is_tensor, to_numpy
+from ..arrays import ArrayOrTensor, Floats, Floats32, checked, is_tensor, to_numpy
 from ..errors import InputError
 from ..geometry.grid import Grid
 from ..geometry.views import Views
@@ -24,9 +24,7 @@ _NEUTRAL = {SUM: 0.0, PRODUCT: 1.0, LEAST: np.inf}
 _PARTS = 8  # of a volume, one after the other
 _SAME = 1e-6  # mm: between places of the same view
 
-Array = NDArray[np.float32]
 Counts = NDArray[np.int32]
-Floats = NDArray[np.float64]
 Depth = Callable[[int], tuple[PerspectiveGrid, ArrayOrTensor]] | Sequence[tuple[PerspectiveGrid, ArrayOrTensor]]
 """A depth distribution for each view: its perspective grid and an array (n_u, n_v, n_k) on it, or what gives them."""
 
@@ -38,7 +36,7 @@ def backproject(
     how: str = "sum",
     depth: Depth | None = None,
     progress: Progress | None = None,
-) -> Volume | Array:
+) -> Volume | Floats32:
     """What the views say of each voxel: the images' values at its place, summed, multiplied, or the least of them.
 
     It is no reconstruction: a value is that of whole rays, not of the voxel. The sum is large wherever many rays cross
@@ -96,7 +94,7 @@ def backproject(
     besides = 2 if kind == PRODUCT and depth is not None else 0
     require(4.0 * (1 + besides) * float(np.prod(grid.shape)), "a back-projection to {} x {} x {}".format(*grid.shape))
     points = np.empty(grid.shape, np.float32)
-    taken: Iterable[tuple[Array, Floats]]
+    taken: Iterable[tuple[Floats32, Floats]]
     if depth is None:
         matrices = _pixel_rows(views) @ lattice.to_world
         size = -(-len(points) // _PARTS)
@@ -113,7 +111,7 @@ def backproject(
     return lattice.finished(points, "backprojection")
 
 
-def views_that_see(views: Views, grid: Grid | PerspectiveGrid, progress: Progress | None = None) -> Volume | Array:
+def views_that_see(views: Views, grid: Grid | PerspectiveGrid, progress: Progress | None = None) -> Volume | Floats32:
     """How many views see each voxel: its centre is in front of their source and within their image.
 
     Parameters
@@ -157,7 +155,7 @@ class _Lattice:
         self.to_world = grid.affine if isinstance(grid, Grid) else grid.inverse
         self.planes: Floats = index if isinstance(grid, Grid) else grid.planes_at(index)
 
-    def finished(self, points: Array, quantity: str) -> Volume | Array:
+    def finished(self, points: Floats32, quantity: str) -> Volume | Floats32:
         if isinstance(self.grid, Grid):
             return Volume(freeze(points), self.grid, quantity)
         return points
@@ -169,7 +167,7 @@ def _pixel_rows(views: Views) -> Floats:
     return np.stack([row, column, np.zeros_like(row), factor, factor], axis=1)
 
 
-def _plain(values: Any, name: str, shape: tuple[int, ...]) -> Array:
+def _plain(values: Any, name: str, shape: tuple[int, ...]) -> Floats32:
     """`values`, an array or tensor without a gradient, as float32; not copied without need."""
     if is_tensor(values):
         if values.requires_grad:
@@ -180,14 +178,14 @@ def _plain(values: Any, name: str, shape: tuple[int, ...]) -> Array:
     return np.require(checked(values, name, shape, False), requirements=["C", "A"])
 
 
-def _require_no_negative(values: Array, name: str, what: str, axes: tuple[str, ...]) -> None:
+def _require_no_negative(values: Floats32, name: str, what: str, axes: tuple[str, ...]) -> None:
     if values.min(initial=0.0) < 0:
         index = np.unravel_index(int(values.argmin()), values.shape)
         place = ", ".join(f"{axis} {i}" for axis, i in zip(axes, index, strict=True))
         raise InputError(f"{name}: expected 0 or more for a {what}, got {values[index]:g} at {place}")
 
 
-def _distributions(depth: Depth, views: Views) -> Iterator[tuple[PerspectiveGrid, Array]]:
+def _distributions(depth: Depth, views: Views) -> Iterator[tuple[PerspectiveGrid, Floats32]]:
     """Each view's perspective grid and distribution, checked."""
     if not callable(depth):
         if not isinstance(depth, Sequence):
@@ -217,10 +215,10 @@ def _is_view(g: PerspectiveGrid, views: Views, m: int) -> bool:
 
 
 def _fill(
-    points: Array,
+    points: Floats32,
     kind: int,
     planes: Floats,
-    taken: Iterable[tuple[Array, Floats]],
+    taken: Iterable[tuple[Floats32, Floats]],
     n: int,
     progress: Progress | None,
     flat: bool = False,
@@ -238,7 +236,7 @@ def _fill(
         _take_roots(points, **counts)
 
 
-def _take_roots(points: Array, seen: Counts, exponents: Counts) -> None:
+def _take_roots(points: Floats32, seen: Counts, exponents: Counts) -> None:
     """Make products, times 2 to the `exponents`, geometric means of as many numbers as were `seen`; in place."""
     for plane, count, exponent in zip(points, seen, exponents, strict=True):  # in little memory
         with np.errstate(divide="ignore"):

@@ -1,11 +1,10 @@
 """Points and lines under homogeneous transforms, such as those of `Views.perspective_matrices`."""
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ..arrays import Floats
 from ..validation import real_array
-
-Floats = NDArray[np.float64]
 
 
 def transform_points(matrix: ArrayLike, points: ArrayLike) -> Floats:

@@ -14,12 +14,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..arrays import Floats
 from ..errors import InputError
 from ..memory import require
 from ..progress import Progress, tell
 from ..validation import instance, real_array, whole_number
 from .perspective_grid import PerspectiveGrid
-from .view_rays import Floats, Indices, pixels_of, points_at_depths, rays_by_depth, view_indices
+from .view_rays import Indices, pixels_of, points_at_depths, rays_by_depth, view_indices
 
 # Of an image's range: what varies less is of one value, stored as float32.
 _ROUNDING = 1e-6

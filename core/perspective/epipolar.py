@@ -14,19 +14,12 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..arrays import Floats
 from ..errors import InputError
 from ..geometry.frames import cross_matrix
 from ..geometry.views import Views
 from ..validation import instance, real_array
-from .view_rays import (
-    Floats,
-    Indices,
-    broadcast,
-    lines_of_pixels,
-    rays_by_depth,
-    view_frames,
-    view_indices,
-)
+from .view_rays import Indices, broadcast, lines_of_pixels, rays_by_depth, view_frames, view_indices
 
 # What is less than this share of what it is the difference of, is rounding.
 _ROUNDING = 1e-12

@@ -7,17 +7,15 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from ..arrays import ArrayOrTensor, cast_like, checked
+from ..arrays import ArrayOrTensor, Floats, cast_like, checked
 from ..errors import InputError
 from ..geometry.grid import Grid
 from ..geometry.views import Views
 from ..validation import freeze, instance, one_for_all, one_of, real_array, whole_number
 from .coordinates import transform_points
 from .view_rays import view_frames
-
-Floats = NDArray[np.float64]
 
 UNIFORM = ("k", "depth")
 """What the planes of a perspective grid may be evenly spaced in."""

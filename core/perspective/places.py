@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arrays import Array, Floats
 from ..progress import Progress, tell
 from ..projector.parallel import in_order, thread_count
 
@@ -18,7 +19,6 @@ try:
 except (ImportError, OSError):  # no kernels for this platform
     _gather_kernel = _scatter_kernel = None  # type: ignore[assignment]
 
-Array = NDArray[np.floating[Any]]
 
 SUM, LEAST, PRODUCT = 0, 1, 2
 """In which way a point's number is combined with those at its places."""
@@ -28,9 +28,9 @@ _SLABS = 4  # of points or of an array's planes, for each thread: none waits lon
 
 def gather(
     points: Array,
-    planes: NDArray[np.float64],
+    planes: Floats,
     arrays: Array,
-    matrices: NDArray[np.float64],
+    matrices: Floats,
     *,
     how: int = SUM,
     flat: bool = False,
@@ -84,9 +84,9 @@ def gather(
 
 def scatter(
     points: Array,
-    planes: NDArray[np.float64],
+    planes: Floats,
     array: Array,
-    matrix: NDArray[np.float64],
+    matrix: Floats,
     progress: Progress | None = None,
 ) -> None:
     """Add to `array` (m_x, m_y, m_z) the points' numbers, shared out at their places: the adjoint of `gather`'s sum.
@@ -106,7 +106,7 @@ def see_through(parts: Iterator[None], size: int, total: int, progress: Progress
         tell(progress, min(done * size, total), total)
 
 
-def shifted(matrices: NDArray[np.float64], first: int) -> NDArray[np.float64]:
+def shifted(matrices: Floats, first: int) -> Floats:
     """Matrices for points whose first index is counted from `first`."""
     shifted = matrices.copy()
     shifted[..., 3] += first * shifted[..., 0]
@@ -144,7 +144,7 @@ def _gather_in_numpy(
     points: Array,
     planes: Array,
     arrays: Array,
-    matrices: NDArray[np.float64],
+    matrices: Floats,
     how: int,
     seen: Any,
     exponents: Any,
@@ -173,7 +173,7 @@ def _gather_in_numpy(
                 seen[i] += inside
 
 
-def _scatter_in_numpy(points: Array, planes: Array, array: Array, matrix: NDArray[np.float64], slab: slice) -> None:
+def _scatter_in_numpy(points: Array, planes: Array, array: Array, matrix: Floats, slab: slice) -> None:
     part = array[slab]
     first = slab.indices(len(array))[0]
     for i in range(len(points)):

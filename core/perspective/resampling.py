@@ -5,9 +5,8 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..arrays import ArrayOrTensor, is_double, to_caller, to_numpy
+from ..arrays import Array, ArrayOrTensor, Floats, is_double, to_caller, to_numpy
 from ..errors import InputError, warn
 from ..geometry.grid import Grid
 from ..memory import require
@@ -34,8 +33,6 @@ _LOOKED_AT = 9  # cells along each axis, to find how many points one needs
 _GAP = 1.5  # voxels from ray to ray
 
 Lattice = Grid | PerspectiveGrid
-Array = NDArray[np.floating[Any]]
-Floats = NDArray[np.float64]
 
 
 def to_perspective(

@@ -15,10 +15,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..arrays import Floats
 from ..errors import InputError
 from ..geometry.views import Views
 from ..validation import freeze, real_array
-from .view_rays import Floats, Indices, rays_by_depth, view_indices
+from .view_rays import Indices, rays_by_depth, view_indices
 
 _STEPS = 200
 _HALVINGS = 40

@@ -6,12 +6,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..arrays import Array, Floats
 from ..errors import InputError
 from ..geometry.frames import cross_matrix
 from ..geometry.views import Views
 from ..validation import instance, real_array
 
-Floats = NDArray[np.float64]
 Indices = int | Sequence[int] | NDArray[np.integer[Any]]
 
 
@@ -28,7 +28,7 @@ def view_indices(views: Views, which: Indices, name: str) -> NDArray[np.intp]:
     return index % len(views)
 
 
-def broadcast(first: NDArray[Any], second: NDArray[Any], expected: str) -> tuple[NDArray[Any], NDArray[Any]]:
+def broadcast(first: Array, second: Array, expected: str) -> tuple[Array, Array]:
     """Two arrays made of one shape, or `InputError` with what is `expected`."""
     try:
         one, other = np.broadcast_arrays(first, second)

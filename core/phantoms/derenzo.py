@@ -7,8 +7,8 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Floats
 from ..errors import InputError, warn
 from ..physics.materials import WATER_MU
 from ..validation import at_least_0, freeze, positive, real_array
@@ -68,7 +68,7 @@ class DerenzoRods(Shape):
         self._set_size((outermost, outermost, half), math.hypot(outermost, half), volume)
 
     @cached_property
-    def rods(self) -> NDArray[np.float64]:
+    def rods(self) -> Floats:
         """Every rod as (sector, x, y, diameter), array (n_rods, 4), mm."""
         table = []
         for sector, (w, (margin, rows)) in enumerate(zip(self.rod_diameters, self._rows, strict=True)):
@@ -103,7 +103,7 @@ class DerenzoRods(Shape):
         return table
 
     @cached_property
-    def _axes(self) -> NDArray[np.float64]:
+    def _axes(self) -> Floats:
         """Unit vectors along each sector (away from the axis) and across it, (S, 2, 2)."""
         angle = np.deg2rad(-90.0 + 360.0 / self.sectors * np.arange(self.sectors))
         return np.stack([np.cos(angle), np.sin(angle), -np.sin(angle), np.cos(angle)], axis=1).reshape(-1, 2, 2)
@@ -207,13 +207,13 @@ class DerenzoPhantom(Phantom):
         return (Cylinder(radius=self.cylinder_radius, height=self._water_height, **content), self._rods)
 
     @property
-    def box(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def box(self) -> tuple[Floats, Floats]:
         """Opposite corners, mm, of the phantom's box, in which the rods take their whole `radius`."""
         half = max(self.radius, self.cylinder_radius, self._rods.half_box[0])  # very thin rods reach beyond the rim
         corner = np.array([half, half, max(self.height, self.cylinder_height) / 2])
         return -corner, corner
 
-    def rods(self) -> NDArray[np.float64]:
+    def rods(self) -> Floats:
         """Every rod as (sector, x, y, diameter), array (n_rods, 4), mm."""
         return self._rods.rods
 

@@ -5,10 +5,11 @@ misses.
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
-Real = NDArray[np.floating]
-Points = NDArray[np.float64]
+from ..arrays import Array, Floats
+
+Real = Array
+Points = Floats
 Interval = tuple[Points, Points]
 
 

@@ -24,14 +24,13 @@ Keys are the attributes of the shapes; angles are degrees, ``euler_degrees = [ph
 
 import dataclasses
 import math
-import os
 from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
 
 from ..errors import InputError, naming
-from ..files import require_ending, write_bytes
+from ..files import AnyPath, require_ending, write_bytes
 from ..toml import parse_toml, read_toml, toml_value
 from ..validation import instance
 from .derenzo import DerenzoRods
@@ -46,7 +45,7 @@ SHAPES: dict[str, type[Shape]] = {
 _EULER = "euler_degrees"
 
 
-def read_phantom(path: str | os.PathLike[str]) -> ShapePhantom:
+def read_phantom(path: AnyPath) -> ShapePhantom:
     """The phantom that a TOML file describes, see `core.phantoms.language`; messages name file, shape and key."""
     return _phantom(read_toml(path), str(path))
 
@@ -56,7 +55,7 @@ def parse_phantom(text: str, name: str = "phantom") -> ShapePhantom:
     return _phantom(parse_toml(text, name), name)
 
 
-def write_phantom(phantom: Phantom, path: str | os.PathLike[str]) -> None:
+def write_phantom(phantom: Phantom, path: AnyPath) -> None:
     """Write the shapes of any phantom as a .toml file; `read_phantom` gives the same shapes back."""
     instance(phantom, Phantom, "write_phantom")
     require_ending(path, (".toml",))

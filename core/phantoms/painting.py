@@ -15,13 +15,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arrays import Array, Floats, Floats32
 from ..geometry.grid import Grid
 from ..memory import cores, require
 from ..progress import Progress, tell
 from .shapes import Shape
 
-Points = NDArray[np.float64]
-Floats = NDArray[np.float32]
+Points = Floats
 Indices = NDArray[np.int64]
 
 # Points of one call of a shape's `distance`: few enough that its temporaries stay in the processor's cache.
@@ -67,7 +67,7 @@ class Layer:
         """Which of the world `points` (3, N), mm, lie inside."""
         return self.shape.distance(_moved(self.from_world, points)) < 0
 
-    def over(self, values: NDArray[Any]) -> NDArray[Any]:
+    def over(self, values: Array) -> Array:
         """The values after painting this layer over `values`."""
         value = values.dtype.type(self.value)
         return values + value if self.adds else np.full_like(values, value)
@@ -157,7 +157,7 @@ def _seen_beneath(layers: Sequence[Layer]) -> list[list[Layer]]:
 
 def paint_voxels(
     grid: Grid, layers: Sequence[Layer], changes: Sequence[float], progress: Progress | None = None
-) -> Floats:
+) -> Floats32:
     """The mean of the painting over each voxel, float32 array of the grid's shape.
 
     A voxel farther from a surface than its own half diagonal lies inside or outside as a whole. Of the others, the share
@@ -235,7 +235,7 @@ class _Stroke:
             samples = max(samples, (7500 * float(np.sqrt(ratio / (self.in_voxels * n_cells)))) ** 1.5)
         self.n_samples = int(min(samples, _MAX_SAMPLES))
 
-    def paint_points(self, box: Floats, pool: ThreadPoolExecutor) -> Iterator[None]:
+    def paint_points(self, box: Floats32, pool: ThreadPoolExecutor) -> Iterator[None]:
         """Points of the shape, each with an equal share of its volume, are added to the voxels that they fall into."""
         total, hits = np.zeros(box.shape), 0
         index_from_shape = np.linalg.inv(self.grid.affine) @ self.layer.pose
@@ -253,13 +253,13 @@ class _Stroke:
             yield
         box += total * (self.in_voxels / max(hits, 1))
 
-    def paint_cells(self, box: Floats, pool: ThreadPoolExecutor) -> Iterator[None]:
+    def paint_cells(self, box: Floats32, pool: ThreadPoolExecutor) -> Iterator[None]:
         """Voxels inside the shape are filled; those that its surface cuts are sampled."""
         stretches = max(1, _SEQUENCE // self.n_samples)
         offsets = (_r3_sequence(stretches * self.n_samples) - 0.5).reshape(3, stretches, self.n_samples)
         layers = [_Sampled(layer, self.grid, self.levels, offsets) for layer in (self.layer, *self.beneath)]
 
-        def fill(first: int) -> tuple[Indices, Floats]:
+        def fill(first: int) -> tuple[Indices, Floats32]:
             number = np.arange(first, min(first + self.blocks.step, box.size))
             place = np.stack(np.unravel_index(number, box.shape))
             index = place + self.start[:, None]
@@ -309,7 +309,7 @@ class _Sampled:
         points = self._centers(index, -1)[:, :, None] + self._offsets[:, stretch]
         return (self.layer.shape.distance(points.reshape(3, -1)) < 0).reshape(points.shape[1:])
 
-    def paint(self, values: Floats, index: Indices, level: int) -> None:
+    def paint(self, values: Floats32, index: Indices, level: int) -> None:
         """Paint the layer over the `values` (n, points) of cells; its surface may cut those of the last level only."""
         side = self.sort(index, level)
         whole, cut = side > 0, np.flatnonzero(side == 0)
@@ -317,12 +317,12 @@ class _Sampled:
         if len(cut):
             values[cut] = np.where(self.inside(index[:, cut]), self.layer.over(values[cut]), values[cut])
 
-    def _centers(self, index: Indices, level: int) -> Floats:
+    def _centers(self, index: Indices, level: int) -> Floats32:
         edges, first = self._cells[level]
         return (edges @ index + first).astype(np.float32)
 
 
-def _add_changes(changes: Floats, voxel: Indices, index: Indices, level: int, layers: Sequence[_Sampled]) -> None:
+def _add_changes(changes: Floats32, voxel: Indices, index: Indices, level: int, layers: Sequence[_Sampled]) -> None:
     """Add what painting the first layer over the others changes in cells (3, n) of a level that their surfaces may cut.
 
     `voxel` (n,) are the columns of `changes` to add to: the change of the voxel's mean, and how much of it is uncertain.

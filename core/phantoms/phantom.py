@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..arrays import Floats, Floats32
 from ..errors import InputError, naming, warn
 from ..geometry.frames import checked_affine, moved
 from ..geometry.grid import Grid
@@ -31,7 +32,7 @@ class PhantomMesh(NamedTuple):
     """One shape of a phantom as a closed mesh."""
 
     name: str
-    vertices: NDArray[np.float64]  # (V, 3), mm, in the phantom's frame
+    vertices: Floats  # (V, 3), mm, in the phantom's frame
     faces: NDArray[np.int32]  # triangles (F, 3), counter-clockwise as seen from outside
     activity: float | None  # kBq/mL
     mu: float | None  # 1/mm
@@ -75,7 +76,7 @@ class Phantom:
         return 2 * max(math.hypot(*shape.position) + shape.ball_radius for shape in self.shapes)
 
     @cached_property
-    def box(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def box(self) -> tuple[Floats, Floats]:
         """Opposite corners, mm, of a box along the axes of the phantom's own frame that contains it."""
         low, high = np.full(3, np.inf), np.full(3, -np.inf)
         for shape in self.shapes:
@@ -102,7 +103,7 @@ class Phantom:
 
     def line_integrals(
         self, sources: ArrayLike, targets: ArrayLike, pose: ArrayLike | None = None, quantity: str = "activity"
-    ) -> NDArray[np.float64]:
+    ) -> Floats:
         """Integrals (N,) along lines, value x mm, exact (closed form).
 
         `sources` and `targets` are the ends of the lines, (N, 3) each, or (3,) for one that all lines share; world mm.
@@ -117,7 +118,7 @@ class Phantom:
         starts, ends = np.broadcast_arrays(starts, ends)
         return line_integrals(layers, starts, ends)
 
-    def project(self, views: Views, pose: ArrayLike | None = None, quantity: str = "activity") -> NDArray[np.float32]:
+    def project(self, views: Views, pose: ArrayLike | None = None, quantity: str = "activity") -> Floats32:
         """Exact line integrals to the pixels' centres of all views: images (M, n_v, n_u), value x mm.
 
         `Projector` with `Transmission` converges to them as voxels get smaller.
@@ -129,9 +130,7 @@ class Phantom:
             image[...] = self.line_integrals(*views.rays(m), pose, quantity).reshape(views.shape)
         return images
 
-    def values(
-        self, points: ArrayLike, pose: ArrayLike | None = None, quantity: str = "activity"
-    ) -> NDArray[np.float64]:
+    def values(self, points: ArrayLike, pose: ArrayLike | None = None, quantity: str = "activity") -> Floats:
         """Values (N,) at world `points` (N, 3), mm."""
         return values_at(self._layers(quantity, pose), real_array(points, "points", (None, 3)).T)
 

@@ -1,8 +1,9 @@
 """Random poses, for training sets."""
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ..arrays import Floats
 from ..errors import InputError
 from ..geometry.frames import euler_pose
 from ..validation import real_array, seed_number
@@ -10,7 +11,7 @@ from ..validation import real_array, seed_number
 
 def random_pose(
     seed: int | np.random.Generator, box: ArrayLike = (0.0, 0.0, 0.0), center: ArrayLike = (0.0, 0.0, 0.0)
-) -> NDArray[np.float64]:
+) -> Floats:
     """A random pose: the middle uniform in a box, each Euler angle of `euler_pose` uniform between 0 and 360 degrees.
 
     This is not the uniform distribution of rotations, for which cos(theta) would be uniform: a phantom's axis points along

@@ -3,11 +3,13 @@
 import numpy as np
 from numpy.typing import NDArray
 
-Surface = tuple[NDArray[np.float64], NDArray[np.int32]]
+from ..arrays import Floats
+
+Surface = tuple[Floats, NDArray[np.int32]]
 """Vertices (V, 3), mm, and triangles (F, 3), counter-clockwise as seen from outside."""
 
 
-def lathe(radii: NDArray[np.float64], heights: NDArray[np.float64], a: float, b: float, n_sides: int = 64) -> Surface:
+def lathe(radii: Floats, heights: Floats, a: float, b: float, n_sides: int = 64) -> Surface:
     """A profile turned about z in `n_sides` sides, stretched by `a` along x and by `b` along y.
 
     The profile's `radii` and `heights` (n,) run from bottom to top and begin and end on the axis.
@@ -25,7 +27,7 @@ def lathe(radii: NDArray[np.float64], heights: NDArray[np.float64], a: float, b:
     return vertices, faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)].astype(np.int32)
 
 
-def clipped(surface: Surface, normal: NDArray[np.float64], offset: float) -> Surface:
+def clipped(surface: Surface, normal: Floats, offset: float) -> Surface:
     """The part of a closed convex `surface` at ``normal . x <= offset``, closed by a fan around the middle of the cut."""
     vertices, faces = surface
     height = vertices @ normal - offset

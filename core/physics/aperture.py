@@ -11,12 +11,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..arrays import ArrayOrTensor
+from ..arrays import ArrayOrTensor, Floats
 from ..errors import InputError
-
-Array = NDArray[np.float64]
 
 _GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
 
@@ -33,7 +30,7 @@ _EDGE_RINGS = ((2 - _ROOT, (2 + _ROOT) / 4), (2 + _ROOT, (2 - _ROOT) / 4))
 _FEWEST_EDGE_ANGLES = 7
 
 
-def disk_points(n: int) -> Array:
+def disk_points(n: int) -> Floats:
     """n points (n, 2) of equal weight in the unit disk: Vogel's spiral (Mathematical Biosciences 44 (1979) 179-189).
 
     The points are shifted and stretched slightly to have the disk's mean, 0, and its variance, 1/4 in every direction,
@@ -74,12 +71,12 @@ def points_needed(tolerance: float, shadow: float, pitch: tuple[float, float], b
     return n
 
 
-def _point_images(points: Array, shadow: float, pitch: tuple[float, float], blur: tuple[float, float]) -> Array:
+def _point_images(points: Floats, shadow: float, pitch: tuple[float, float], blur: tuple[float, float]) -> Floats:
     """Image of a point source through equally weighted `points` of the unit disk, as fractions of its counts.
 
     Its shape is (n_v, places, n_u, places), for evenly spaced positions of the pixels' edges along v and u.
     """
-    along: list[Array] = []
+    along: list[Floats] = []
     counts: list[int] = []
     for middles, size, width in zip(points.T * (shadow / 2), pitch, blur, strict=True):
         extent = 1.2 * shadow + width  # of the image

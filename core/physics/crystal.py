@@ -8,9 +8,8 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..arrays import ArrayOrTensor
+from ..arrays import ArrayOrTensor, Floats
 
 
 def absorbed_share(
@@ -48,7 +47,7 @@ def share_inside(middle: ArrayOrTensor, size: ArrayOrTensor, side: ArrayOrTensor
     return (last - first).clip(min=0) / size
 
 
-def gaussian_blur(n: int, sigma: float) -> NDArray[np.float64]:
+def gaussian_blur(n: int, sigma: float) -> Floats:
     """Matrix (n, n) that blurs n pixels with a Gaussian of `sigma` pixels, integrated over each receiving pixel."""
     with np.errstate(divide="ignore"):  # no blur, of some modules: 1 on the diagonal
         edges = (np.arange(n + 1) - 0.5) / (sigma * math.sqrt(2))

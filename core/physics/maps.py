@@ -5,8 +5,8 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Floats
 from ..geometry.grid import Grid
 from ..geometry.system import PinholeSystem
 from ..memory import require
@@ -16,8 +16,6 @@ from ..volumes.volume import Volume
 from .optics import Optics, chosen_optics
 from .performance import resolution, seen, sensitivity
 from .sampling import TOLERANCE, sampling_gaps
-
-Array = NDArray[np.float64]
 
 # Points times modules in one block, whose temporaries stay in the processor's cache.
 _BLOCK = 1 << 17
@@ -59,7 +57,7 @@ def resolution_map(
     """
     optics = chosen_optics(optics, settings)
 
-    def combined(points: Array) -> Array:
+    def combined(points: Floats) -> Floats:
         fwhm, counts = (of(system, points, optics=optics) for of in (resolution, sensitivity))
         total = counts.sum(axis=1)
         return np.sqrt((counts * np.nan_to_num(fwhm) ** 2).sum(axis=1) / np.where(total > 0, total, 1))
@@ -76,7 +74,7 @@ def completeness_map(
     module sees the voxel. `tolerance` is that of the gap, rad.
     """
 
-    def share(points: Array) -> Array:
+    def share(points: Floats) -> Floats:
         return 1 - sampling_gaps(system, points, tolerance=tolerance) / (math.pi / 2)
 
     return _map(system, grid, "completeness", share, progress)
@@ -93,7 +91,7 @@ def within_roi(volume: Volume, system: PinholeSystem) -> Volume:
 
 
 def _map(
-    system: PinholeSystem, grid: Grid, quantity: str, value: Callable[[Array], Array], progress: Progress | None
+    system: PinholeSystem, grid: Grid, quantity: str, value: Callable[[Floats], Floats], progress: Progress | None
 ) -> Volume:
     """The volume of `value`, a function of points (P, 3), block by block."""
     instance(system, PinholeSystem, "system")

@@ -8,9 +8,8 @@ from dataclasses import dataclass
 from functools import lru_cache, partial
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..arrays import is_tensor
+from ..arrays import Floats, is_tensor
 from ..errors import InputError, naming, warn
 from ..geometry.collimator import edge_slope
 from ..geometry.system import PinholeSystem
@@ -63,11 +62,11 @@ def attenuation(material: str, energy: float) -> float:
 
 def module_coefficients(
     aperture: str | float | None,
-    crystal: str | float | NDArray[np.float64] | None,
+    crystal: str | float | Floats | None,
     lines: Sequence[tuple[float, float]],
     system: PinholeSystem,
     opening_angle: float,
-) -> tuple[float | None, float | NDArray[np.float64] | None]:
+) -> tuple[float | None, float | Floats | None]:
     """Attenuation coefficients, 1/mm, of the apertures and of the crystals, effective over all photon energies.
 
     With these coefficients as many photons along the axis pass the mean hole, by Paix's
@@ -115,7 +114,7 @@ def _known(material: str) -> Material:
     return MATERIALS[name]
 
 
-def _at_lines(material: str, lines: Sequence[tuple[float, float]], name: str) -> NDArray[np.float64]:
+def _at_lines(material: str, lines: Sequence[tuple[float, float]], name: str) -> Floats:
     with naming(name):
         _known(material)  # refuses an unknown material even without lines
         coefficients = [attenuation(material, energy) for energy, _ in lines]

@@ -1,10 +1,9 @@
 """Poisson noise of counts."""
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..arrays import Array
 from ..errors import InputError
 from ..validation import real_array, seed_number
 
@@ -26,7 +25,7 @@ def sample_counts(mean: ArrayLike, seed: int) -> NDArray[np.int64]:
     return counts
 
 
-def draw_counts(mean: NDArray[Any], seed: int, out: NDArray[Any]) -> None:
+def draw_counts(mean: Array, seed: int, out: Array) -> None:
     """`sample_counts` of an array of numbers into another of the same shape, which may be `mean` itself."""
     seed = seed_number(seed)
     if mean.size and not 0 <= mean.min() <= mean.max() <= _LARGEST_MEAN:

@@ -18,12 +18,11 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..arrays import Floats
 from ..errors import InputError
 from ..geometry.system import PinholeSystem
 from ..validation import positive, real_array
 from .performance import seen
-
-Array = NDArray[np.float64]
 
 TOLERANCE = math.radians(0.1)
 """Default accuracy of a gap, rad: it may be this much below the true angle."""
@@ -38,7 +37,7 @@ _NUMBERS = 1 << 15
 _QUARTERS = np.array([[-0.5, -0.5], [-0.5, 0.5], [0.5, -0.5], [0.5, 0.5]])
 
 
-def sampling_gaps(system: PinholeSystem, points: ArrayLike, *, tolerance: float = TOLERANCE) -> Array:
+def sampling_gaps(system: PinholeSystem, points: ArrayLike, *, tolerance: float = TOLERANCE) -> Floats:
     """The largest angle (P,), rad, by which a plane through each point misses every pinhole that sees the point.
 
     With unit vectors n normal to the plane and d_k from the point to the pinholes it is
@@ -63,7 +62,7 @@ def sampling_gaps(system: PinholeSystem, points: ArrayLike, *, tolerance: float 
     return gaps
 
 
-def _gaps(towards: Array, tolerance: float) -> Array:
+def _gaps(towards: Floats, tolerance: float) -> Floats:
     """The largest gap (P,), rad, for unit vectors `towards` (P, 3, K), by branch and bound over the normals n.
 
     When n turns by an angle, the gap changes by at most that angle. So no normal in a patch around n has a gap larger
@@ -87,7 +86,7 @@ def _gaps(towards: Array, tolerance: float) -> Array:
 
 
 @functools.cache
-def _patches() -> Array:
+def _patches() -> Floats:
     """Patches (1, N, 3, 3) of a cube's surface, each a middle and two half sides, that cover the normals of all planes.
 
     As n and -n describe the same plane, three faces are enough. Seen from the cube's centre, patches are about equal.
@@ -100,7 +99,7 @@ def _patches() -> Array:
     return np.concatenate([np.roll(face, axis, axis=2) for axis in range(3)])[None]
 
 
-def _bounds(patches: Array, towards: Array, point: NDArray[np.intp], best: Array) -> Array:
+def _bounds(patches: Floats, towards: Floats, point: NDArray[np.intp], best: Floats) -> Floats:
     """Upper bounds (A, N) of the gaps in patches (A or 1, N, 3, 3) of points; raises `best` (P,) to the middles' gaps."""
     middles, sines = patches[:, :, 0], np.empty((len(point), patches.shape[1]))
     size = max(1, _NUMBERS // (patches.shape[1] * towards.shape[2]))
@@ -115,5 +114,5 @@ def _bounds(patches: Array, towards: Array, point: NDArray[np.intp], best: Array
     return angles + radius / np.maximum(1, distance - radius)
 
 
-def _lengths(vectors: Array) -> Array:
+def _lengths(vectors: Floats) -> Floats:
     return np.sqrt(np.einsum("...i,...i", vectors, vectors))

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from ..arrays import ArrayOrTensor, cast_like, is_tensor
+from ..arrays import ArrayOrTensor, Floats, cast_like, is_tensor
 from ..geometry.grid import Grid
 from .lattices import Lattices
-from .rays import Array, Attenuation, Ends, Fan, Rays
+from .rays import Attenuation, Ends, Fan, Rays
 
 KEPT_BYTES = 2**27
 """What a projector keeps of its rays and their weights from call to call takes at most this much memory."""
@@ -24,7 +24,7 @@ class Beam:
     rays: Fan  # from the rays' source to the pixels: n_v rows of n_u rays
     # weights of the integrals: of slices of rows, columns and shifts, an array (shifts, rows, columns), with 1 row or
     # column where all are the same. None: 1 everywhere.
-    weigh: Callable[[slice, slice, slice], Array] | None = None
+    weigh: Callable[[slice, slice, slice], Floats] | None = None
 
     def transposed(self) -> Beam:
         """The same rays with rows and columns exchanged."""
@@ -75,12 +75,12 @@ class Part:
 
     # numbers of the images to which the fans belong, and how many fans of each follow one another
     images: list[tuple[int, int]]
-    rays: Array | Ends  # (F, 4, 3), the fans' vectors (`Fan.vectors`); or rays from point to point
+    rays: Floats | Ends  # (F, 4, 3), the fans' vectors (`Fan.vectors`); or rays from point to point
     rows: slice  # the part of an image that each fan covers, of the transposed image if `transposed`
     columns: slice
     transposed: bool = False
     # (F, rows, columns), weights of the integrals, with 1 row or column where all are the same; None: 1 everywhere
-    weights: Array | None = None
+    weights: Floats | None = None
     parallel: float = 0.0  # that of `Fan`; fans of one part are all alike in this
 
     @property

@@ -3,8 +3,8 @@
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Floats32
 from ..geometry.grid import Grid
 from ..geometry.views import Views
 from ..physics.materials import APERTURES, attenuation
@@ -38,7 +38,7 @@ def doubts(grid: Grid, views: Views, model: Model) -> Iterator[str]:
         yield from doubts_of_mu(model.mu.array, model)
 
 
-def doubts_of_mu(mu: NDArray[np.float32], model: Emission) -> Iterator[str]:
+def doubts_of_mu(mu: Floats32, model: Emission) -> Iterator[str]:
     """Of what attenuates, 1/mm."""
     bone = _largest(model, "bone")
     if (high := mu[mu > _ABOVE_BONE * bone]).sum(dtype=float) > 0.5 * mu.sum(dtype=float):

@@ -10,7 +10,7 @@ from typing import Any, Literal, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import ArrayOrTensor, is_tensor
+from ..arrays import ArrayOrTensor, Floats, is_tensor
 from ..errors import InputError, naming
 from ..geometry.collimator import OPENING_ANGLE
 from ..geometry.grid import Grid
@@ -25,7 +25,7 @@ from ..validation import instance, positive, real_array, strict_whole
 from ..volumes.volume import Volume, require_quantity
 from .bundles import Beam
 from .hole_response import WholeHoles
-from .models import Array, Model, checked_background
+from .models import Model, checked_background
 from .pixel_points import TOLERANCE, expected_error, lattices, offsets, points_needed, require_points, shadow_edges
 from .rays import Fan, view_rays
 
@@ -155,7 +155,7 @@ class Emission(Model):
     within_cone: bool = False
     pixel_points: int | None = None
     tolerance: float = TOLERANCE
-    background: float | Array = 0.0  # type: ignore[assignment]  # no class of mutable values: checked, and frozen
+    background: float | Floats = 0.0  # type: ignore[assignment]  # no class of mutable values: checked, and frozen
     hole: Hole = "auto"
 
     name = "emission"
@@ -290,7 +290,7 @@ class Emission(Model):
         return Optics(**{f.name: getattr(self, f.name) for f in fields(Optics)})
 
     @property
-    def effective_diameter(self) -> Array:
+    def effective_diameter(self) -> Floats:
         """d_e (M,), mm: the opaque hole that lets as many photons pass along the axis."""
         return self.optics.effective_diameter(self.system.pinhole_diameter)
 
@@ -311,7 +311,7 @@ class Emission(Model):
         holes = self.openings(m, n_hole)
         n = self._pixel_points(views, m, grid)
 
-        def weigh(places: Array, opening: Opening, layer: int, rows: slice, columns: slice, which: slice) -> Array:
+        def weigh(places: Floats, opening: Opening, layer: int, rows: slice, columns: slice, which: slice) -> Floats:
             u_places, v_places = places[which].T[:, :, None, None]
             along, across = along_u[:, columns] + u_places, along_v[rows] + v_places
             return self.pixel_weights(m, along, across, (pitch_u, pitch_v), l, opening, layer, n * len(holes)) / n
@@ -367,7 +367,7 @@ class Emission(Model):
         optics, *along, length = self._optics_of(m).promoted(along_u, along_v, length)
         return self.effective_time * optics.pixel_weights(along, pitch, length, side, thickness, opening, layer, cells)
 
-    def response(self, views: Views, m: int) -> tuple[Array, Array] | None:
+    def response(self, views: Views, m: int) -> tuple[Floats, Floats] | None:
         """The intrinsic blur of view m: matrices (n_v, n_v) along v and (n_u, n_u) along u."""
         if not np.any(self.intrinsic_fwhm):
             return None
@@ -384,7 +384,7 @@ class Emission(Model):
         sides = self.system.detector_side if within else np.full(len(self.system), np.inf)
         everywhere = replace(self, within_crystal=False, within_walls=False)
 
-        def weigh(m: int, u: Array, v: Array) -> Array:
+        def weigh(m: int, u: Floats, v: Floats) -> Floats:
             (opening,) = everywhere.openings(m, 1)
             return everywhere.pixel_weights(m, u, v, (1.0, 1.0), float(self.system.collimator_length[m]), opening)
 

@@ -6,14 +6,14 @@ from typing import Any
 
 import numpy as np
 
-from ..arrays import ArrayOrTensor, cast_like, to_caller, zeros
+from ..arrays import ArrayOrTensor, Floats, cast_like, to_caller, zeros
 from ..geometry.grid import Grid
 from ..memory import available
 from .backends import Backend
 from .bundles import Bundles, Part
 from .lattices import Lattices, filled_lattices
 from .parallel import in_order, run_all, sum_of
-from .rays import Array, Attenuation, Rays, window
+from .rays import Attenuation, Rays, window
 
 # Rays of a task: with fewer, starting it takes longer than tracing them.
 _FEWEST_RAYS = 2**12
@@ -84,12 +84,12 @@ class Execution:
 
     def derivatives(
         self, volume: ArrayOrTensor, bundles: Bundles, mu: ArrayOrTensor = None
-    ) -> list[tuple[Part, Array]]:
+    ) -> list[tuple[Part, Floats]]:
         """The backend's derivatives, part by part, (7 or 14, rays)."""
         lattices = self._lattices(volume, mu, bundles)
         derivatives = self.backend.functions.derivatives
 
-        def run(task: _Task) -> list[tuple[Part, Array]]:
+        def run(task: _Task) -> list[tuple[Part, Floats]]:
             return [
                 (part, to_caller(derivatives(lattices.volume, *part.in_index_space(lattices)), np.empty(0)).T)
                 for part in self._parts(task, bundles)

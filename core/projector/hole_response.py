@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import cropped
+from ..arrays import Array, Floats32, cropped
 from ..errors import InputError
 from ..geometry.grid import Grid
 from ..geometry.system import PinholeSystem
@@ -38,7 +38,6 @@ from .parallel import in_order, run_all
 from .rays import view_rays
 from .transmittance import mean_transmittance
 
-Array = NDArray[Any]
 VoxelBox = tuple[tuple[slice, ...], NDArray[np.bool_]]
 """A box of a grid, and which of its voxels."""
 Weigh = Callable[[int, Array, Array], Array]
@@ -232,7 +231,7 @@ class WholeHoles:
         close = (depths > 0) & (depths <= near)
         return (tuple(map(slice, low.tolist(), high.tolist())), close) if close.any() else None
 
-    def transmittance(self, m: int, mu: Volume, part: Grid) -> NDArray[np.float32]:
+    def transmittance(self, m: int, mu: Volume, part: Grid) -> Floats32:
         """What `mu` leaves of the photons from each voxel of a part of the grid, on their way to view m's pinhole."""
         _, frame, l, d = self._module(m)
         margin = d / 2 * (1 / l + 1 / self._limits(m)[1])

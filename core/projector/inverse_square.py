@@ -7,13 +7,14 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arrays import Floats
 from ..geometry.grid import Grid
 from ..geometry.system import PinholeSystem
 from ..geometry.views import Views
 from ..validation import instance
 from .bundles import Beam
 from .emission import Emission
-from .models import Array, Model
+from .models import Model
 from .rays import view_rays
 
 
@@ -54,7 +55,7 @@ class InverseSquareSum(Model):
         weights = self.system.pinhole_diameter[m] ** 2 / 16 * sine**3
         yield Beam(rays, lambda rows, columns, shifts: weights[None, rows, columns])
 
-    def voxel_weights(self, views: Views, m: int, grid: Grid) -> Array:
+    def voxel_weights(self, views: Views, m: int, grid: Grid) -> Floats:
         """``1 / h^2`` at the voxels' centres, 1/mm^2."""
         k = self.system.frames()[m, 2]
         along = [k @ grid.affine[:3, axis] * np.arange(n) for axis, n in enumerate(grid.shape)]

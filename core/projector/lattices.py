@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from ..arrays import ArrayOrTensor, cropped
+from ..arrays import ArrayOrTensor, Floats, cropped
 from ..errors import InputError
 from ..geometry.grid import Grid
-from .rays import Array, Attenuation, Ends, IndexFans, IndexRays, Rays, index_fans, index_rays
+from .rays import Attenuation, Ends, IndexFans, IndexRays, Rays, index_fans, index_rays
 
 Index = tuple[int, int, int]
 
@@ -28,7 +28,7 @@ class Lattices:
     mu_origin: Index = (0, 0, 0)
 
     def fans(
-        self, vectors: Array, shape: tuple[int, int], parallel: float = 0.0
+        self, vectors: Floats, shape: tuple[int, int], parallel: float = 0.0
     ) -> tuple[IndexFans, Attenuation | None]:
         """Fans (F, 4, 3), vectors of `Fan.vectors`, of one shape in index space, and what attenuates them."""
         return self._mapped(index_fans, vectors, shape, parallel)
@@ -44,7 +44,7 @@ class Lattices:
             attenuation = Attenuation(self.mu, mu_rays)
         return index(self.grid, *rays, self.origin), attenuation
 
-    def corners(self) -> Array:
+    def corners(self) -> Floats:
         """Corners (8, 3), world mm, of the part of the grid that is traced."""
         grid = self.grid if self.volume is None else self.grid.box(self.origin, self.volume.shape)
         return grid.corners()

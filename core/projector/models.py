@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..arrays import ArrayOrTensor, is_tensor, namespace
+from ..arrays import ArrayOrTensor, Floats, is_tensor, namespace
 from ..errors import InputError
 from ..geometry.grid import Grid
 from ..geometry.views import Views
@@ -20,8 +20,6 @@ from .bundles import Beam
 from .hole_response import WholeHoles
 from .pixel_points import TOLERANCE, offsets, points_needed, require_points, shadow_edges
 from .rays import view_rays
-
-Array = NDArray[np.float64]
 
 
 class Model(ABC):
@@ -39,7 +37,7 @@ class Model(ABC):
     takes: tuple[str, ...] = LINE_INTEGRALS
     """Quantities of volumes that can be projected; arrays and tensors have none and are not checked."""
 
-    background: float | Array = 0.0
+    background: float | Floats = 0.0
     """What each pixel measures besides the volume: a number, one for each view (M,), or images (M, n_v, n_u)."""
 
     weights_voxels: bool = False
@@ -72,7 +70,7 @@ class Model(ABC):
     def beams(self, views: Views, m: int, grid: Grid) -> Iterator[Beam]:
         """The rays of view m through `grid`, from the detector's side."""
 
-    def voxel_weights(self, views: Views, m: int, grid: Grid) -> Array:
+    def voxel_weights(self, views: Views, m: int, grid: Grid) -> Floats:
         """Factors of the voxels in view m, ``grid.shape``; used if `weights_voxels`."""
         return np.ones(grid.shape)
 
@@ -84,7 +82,7 @@ class Model(ABC):
         """The model for what can only be done with rays; `InputError` where it is not to take any."""
         return self
 
-    def response(self, views: Views, m: int) -> tuple[Array, Array] | None:
+    def response(self, views: Views, m: int) -> tuple[Floats, Floats] | None:
         """The detector's response in view m: matrices (n_v, n_v) along v and (n_u, n_u) along u, None if ideal."""
         return None
 
@@ -145,9 +143,7 @@ def intensity(line_integrals: ArrayOrTensor, photons: float) -> ArrayOrTensor:
     return positive(photons, "photons") * namespace(line_integrals).exp(-line_integrals)
 
 
-def checked_background(
-    value: ArrayLike, name: str, n: int, pixels: tuple[int, int] | None = None
-) -> float | NDArray[np.float64]:
+def checked_background(value: ArrayLike, name: str, n: int, pixels: tuple[int, int] | None = None) -> float | Floats:
     """Counts besides a volume's: a number, or read-only those of `n` views (M,), or their images (M, n_v, n_u).
 
     Parameters

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import ArrayOrTensor, cast_like, checked, is_double, is_tensor, promote, to_caller, to_numpy, zeros
+from ..arrays import Array, ArrayOrTensor, cast_like, checked, is_double, is_tensor, promote, to_caller, to_numpy, zeros
 from ..errors import InputError, warn
 from ..geometry.grid import Grid
 from ..geometry.views import Views
@@ -291,7 +291,7 @@ class Projector(LinearOperator):
         return (len(self.views), *self.views.shape)
 
     @property
-    def background(self) -> NDArray[np.floating[Any]]:
+    def background(self) -> Array:
         """What the model expects besides the volume's images, (M, n_v, n_u), read-only: ``A(x) + A.background``."""
         values = np.asarray(self.model.background)
         return np.broadcast_to(values[:, None, None] if values.ndim == 1 else values, self.shape_out)

@@ -15,13 +15,11 @@ import functools
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Floats
 from ..errors import InputError
 from ..geometry.grid import Grid
 from ..geometry.views import Views
-
-Array = NDArray[np.float64]
 
 TOLERANCE = 0.02
 """By default the total counts of a single voxel are right to this share of them."""
@@ -42,7 +40,7 @@ _DUAL_NEAR, _DUAL_FAR = 6, 3
 
 
 @functools.lru_cache(maxsize=256)
-def lattice(n: int) -> Array:
+def lattice(n: int) -> Floats:
     """n points (n, 2) of the unit square around 0, (column, row): a rank-1 lattice, which also fills either side evenly.
 
     The one whose shortest dual vectors keep farthest from the axes, since voxels' shadows often have their edges along
@@ -67,13 +65,13 @@ def _generator(n: int) -> int:
     return max((g for g in range(1, n // 2 + 1) if math.gcd(g, n) == 1), key=merit)
 
 
-def lattices(n: int, n_all: int) -> Array:
+def lattices(n: int, n_all: int) -> Floats:
     """Where in the pixel those lattices begin (n_all, 2) that belong to n points of a hole, and to the rest, of its edge."""
     return np.concatenate([lattice(k) for k in (n, n_all - n) if k])
 
 
 @functools.lru_cache(maxsize=256)
-def _dual(n: int) -> Array:
+def _dual(n: int) -> Floats:
     """Vectors (N, 2) of the dual of `lattice(n)`, one of each pair k, -k, without 0: k . x is whole for every point x.
 
     Those that count for boxes, whose transform falls as 1 / (k_u k_v): near the axes the far ones, too.
@@ -85,7 +83,7 @@ def _dual(n: int) -> Array:
     return np.stack([column[chosen], row[chosen]], axis=1).astype(np.float64)
 
 
-def expected_error(edges: Array, n: int, hole_points: int = 1) -> float:
+def expected_error(edges: Floats, n: int, hole_points: int = 1) -> float:
     """Largest error of a single voxel's total counts, as a share of them, wherever it lies between the rays.
 
     Parameters
@@ -101,7 +99,7 @@ def expected_error(edges: Array, n: int, hole_points: int = 1) -> float:
     return _LARGEST_ERROR * float(np.sqrt(2 * (waves**2).sum(axis=1).max(initial=0.0) / hole_points))
 
 
-def points_needed(edges: Array, tolerance: float, hole_points: int = 1) -> int:
+def points_needed(edges: Floats, tolerance: float, hole_points: int = 1) -> int:
     """The fewest points of the pixel (a Fibonacci number) with which `expected_error` is at most `tolerance`.
 
     At most `MOST_POINTS`, be that enough or not. Arguments as in `expected_error`.
@@ -123,7 +121,7 @@ def _points_needed(edges: bytes, n_voxels: int, tolerance: float, hole_points: i
     return _FIBONACCI[enough]
 
 
-def shadow_edges(views: Views, m: int, grid: Grid) -> Array:
+def shadow_edges(views: Views, m: int, grid: Grid) -> Floats:
     """Edges (D, 3, 2) of the shadows of some voxels on view m's detector, pixels: those that ask for most points.
 
     They are among the voxels in front of the source and within the image; where none is, among those in front of it.
@@ -157,6 +155,6 @@ def require_points(value: object, name: str) -> int | None:
     return int(value)
 
 
-def offsets(n: int, shift: Array | None = None) -> Array:
+def offsets(n: int, shift: Floats | None = None) -> Floats:
     """`lattice(n)` moved by `shift` (2,) round the pixel: (n, 2), from -1/2 to 1/2 of a pixel along columns and rows."""
     return lattice(n) if shift is None else (lattice(n) + shift + 0.5) % 1 - 0.5

@@ -5,17 +5,20 @@ An integral is length x mean. The mean moves with the planes of either grid, and
 
 import numpy as np
 
+from ..arrays import Floats
 from ..geometry.grid import Grid
 from .bundles import Part
-from .rays import Array, Ends
+from .rays import Ends
 
 
-def integrals(part: Part, derivatives: Array) -> Array:
+def integrals(part: Part, derivatives: Floats) -> Floats:
     """Line integrals (rays,) of a part, value x mm."""
     return np.concatenate([length for _, length in _rays(part)]) * derivatives[0]
 
 
-def by_geometry(part: Part, gradient: Array, derivatives: Array, grid: Grid, mu_grid: Grid) -> list[tuple[int, Array]]:
+def by_geometry(
+    part: Part, gradient: Floats, derivatives: Floats, grid: Grid, mu_grid: Grid
+) -> list[tuple[int, Floats]]:
     """The gradient by the geometry of each image of a part, with the image's number.
 
     Parameters
@@ -45,8 +48,8 @@ def by_geometry(part: Part, gradient: Array, derivatives: Array, grid: Grid, mu_
 
 
 def _by_ends(
-    part: Part, values: Array, derivatives: Array, along: Array, lengths: Array, grid: Grid, mu_grid: Grid
-) -> Array:
+    part: Part, values: Floats, derivatives: Floats, along: Floats, lengths: Floats, grid: Grid, mu_grid: Grid
+) -> Floats:
     """The gradient (2, n, 3) by start and end of the rays."""
     weights = values * lengths
     result = np.empty((2, len(values), 3))
@@ -61,8 +64,8 @@ def _by_ends(
 
 
 def _by_fan(
-    part: Part, values: Array, derivatives: Array, along: Array, lengths: Array, grid: Grid, mu_grid: Grid
-) -> Array:
+    part: Part, values: Floats, derivatives: Floats, along: Floats, lengths: Floats, grid: Grid, mu_grid: Grid
+) -> Floats:
     """The gradient (4, 3) by source, corner, row step and column step."""
     numbers = _numbers(part)
     # Sums over the rays first, times their numbers where a step moves their ends as often.
@@ -80,13 +83,13 @@ def _by_fan(
     return result[[0, 1, 3, 2]] if part.transposed else result
 
 
-def _by_length(values: Array, lengths: Array, derivatives: Array) -> Array:
+def _by_length(values: Floats, lengths: Floats, derivatives: Floats) -> Floats:
     """The gradient (n,) by the rays' lengths at constant ends on the lattices, divided by the lengths."""
     by_length = derivatives[0] if len(derivatives) == 7 else derivatives[0] + lengths * derivatives[13]
     return values * by_length / np.where(lengths > 0, lengths, 1.0)
 
 
-def _rays(part: Part) -> list[tuple[Array, Array]]:
+def _rays(part: Part) -> list[tuple[Floats, Floats]]:
     """Source to target of the rays of every fan, (3, n), and their lengths (n,), world mm."""
     if isinstance(part.rays, Ends):
         each = [(part.rays.ends - part.rays.starts).T]
@@ -99,7 +102,7 @@ def _rays(part: Part) -> list[tuple[Array, Array]]:
     return [(along, np.sqrt(np.einsum("in,in->n", along, along))) for along in each]
 
 
-def _numbers(part: Part) -> Array:
+def _numbers(part: Part) -> Floats:
     """For each ray of a fan: 1, the row's number and the column's, (3, n), counted from the part's corner."""
     rows, columns = part.shape
     numbers = np.ones((3, rows, columns))
@@ -107,5 +110,5 @@ def _numbers(part: Part) -> Array:
     return numbers.reshape(3, -1)
 
 
-def _linear(grid: Grid) -> Array:
+def _linear(grid: Grid) -> Floats:
     return grid.index_from_world[:3, :3]

@@ -7,12 +7,10 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Floats
 from ..geometry.grid import Grid
 from ..geometry.views import Views
-
-Array = NDArray[np.float64]
 
 # Rounding moves a coordinate by about 1e-12 voxels (a rotated grid, a source thousands of voxels away). A ray
 # that stays this close to a plane of voxel faces lies in the plane; one this steady along an axis is
@@ -33,12 +31,12 @@ class Fan:
     columns: more points of every pixel.
     """
 
-    source: Array  # (3,), mm
-    corner: Array  # (3,), mm
-    row_step: Array  # (3,), mm
-    column_step: Array  # (3,), mm
+    source: Floats  # (3,), mm
+    corner: Floats  # (3,), mm
+    row_step: Floats  # (3,), mm
+    column_step: Floats  # (3,), mm
     shape: tuple[int, int]  # rows and columns
-    shifts: Array = field(default_factory=lambda: _UNSHIFTED)  # (S, 2), in rows and columns
+    shifts: Floats = field(default_factory=lambda: _UNSHIFTED)  # (S, 2), in rows and columns
     parallel: float = 0.0  # 0: one source; 1: parallel rays
 
     def part(self, rows: slice, columns: slice, shifts: slice = _ALL) -> Fan:
@@ -64,7 +62,7 @@ class Fan:
         contiguous = grid.index_from_world[2, :3]
         return bool(abs(contiguous @ self.row_step) > abs(contiguous @ self.column_step))
 
-    def vectors(self) -> Array:
+    def vectors(self) -> Floats:
         """Source, corner, row step and column step of the S lattices, (S, 4, 3)."""
         vectors = np.empty((len(self.shifts), 4, 3))
         vectors[:] = self.source, self.corner, self.row_step, self.column_step
@@ -74,7 +72,7 @@ class Fan:
             vectors[:, 1] += moved
         return vectors
 
-    def targets(self) -> Array:
+    def targets(self) -> Floats:
         """Ends of the rays (S * rows * columns, 3), shift by shift, row by row."""
         return _targets(self.vectors(), self.shape)
 
@@ -104,8 +102,8 @@ def view_rays(views: Views, m: int, grid: Grid | None = None) -> Fan:
 class Ends:
     """Rays from point to point: N rows of one ray."""
 
-    starts: Array  # (N, 3): World mm
-    ends: Array  # (N, 3): World mm
+    starts: Floats  # (N, 3): World mm
+    ends: Floats  # (N, 3): World mm
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -113,14 +111,14 @@ class Ends:
         return len(self.ends), 1
 
 
-def _targets(vectors: Array, shape: tuple[int, int]) -> Array:
+def _targets(vectors: Floats, shape: tuple[int, int]) -> Floats:
     """Ends of the rays of fans (F, 4, 3), one after the other, (F * rows * columns, 3)."""
     row, column = (np.arange(n, dtype=np.float64) for n in shape)
     corner, row_step, column_step = vectors[:, 1:, None, None].swapaxes(0, 1)
     return (corner + row[:, None, None] * row_step + column[:, None] * column_step).reshape(-1, 3)
 
 
-def window(fans: Sequence[Fan], points: Array) -> tuple[slice, slice]:
+def window(fans: Sequence[Fan], points: Floats) -> tuple[slice, slice]:
     """The rows and columns outside of which no ray of any of `fans` meets the convex hull of `points`.
 
     Parameters
@@ -159,9 +157,9 @@ class IndexRays:
     A point of ray r is ``starts[r] + alpha * directions[r]``, alpha from 0 (source) to 1 (target).
     """
 
-    starts: Array  # (N, 3): Sources, voxels
-    directions: Array  # (N, 3): Source to target, voxels; a component is either exactly 0 or larger than 1e-9 in size
-    lengths: Array  # (N,): Source to target, mm: ``lengths[r] * (alpha_2 - alpha_1)`` is the length of a segment
+    starts: Floats  # (N, 3): Sources, voxels
+    directions: Floats  # (N, 3): Source to target, voxels; a component is either exactly 0 or larger than 1e-9 in size
+    lengths: Floats  # (N,): Source to target, mm: ``lengths[r] * (alpha_2 - alpha_1)`` is the length of a segment
 
     def __len__(self) -> int:
         return len(self.lengths)
@@ -177,7 +175,7 @@ class IndexFans:
 
     # (F, 8, 3): Source, corner, row step and column step of each in index space, where nothing is snapped yet; the
     # same in world mm
-    table: Array
+    table: Floats
     shape: tuple[int, int]  # rows and columns
     # How far the sources move along with the points: 0 if there is one source, 1 where rays are parallel. Between are rays
     # of one source that begin in a plane on their way; the backend cuda takes none of those.
@@ -193,7 +191,7 @@ class IndexFans:
         mm = _targets(self.table[:, 4:], self.shape) - sources
         return _snapped(starts, ends, np.linalg.norm(mm, axis=1))
 
-    def _of_sources(self, first: int) -> Array:
+    def _of_sources(self, first: int) -> Floats:
         """The fans (F, 4, 3) whose points are the sources, in index space (`first` 0) or in world mm (4)."""
         vectors = self.table[:, first : first + 4].copy()
         vectors[:, 1] = vectors[:, 0]
@@ -213,7 +211,7 @@ class Attenuation:
 
 
 def index_fans(
-    grid: Grid, vectors: Array, shape: tuple[int, int], parallel: float = 0.0, origin: tuple[int, int, int] = (0, 0, 0)
+    grid: Grid, vectors: Floats, shape: tuple[int, int], parallel: float = 0.0, origin: tuple[int, int, int] = (0, 0, 0)
 ) -> IndexFans:
     """Fans (F, 4, 3) in world mm, vectors of `Fan.vectors`, parallel or not, in `grid`'s index space; see `index_rays`."""
     affine = _index_from_world(grid, origin)
@@ -224,7 +222,7 @@ def index_fans(
     return IndexFans(table, shape, parallel)
 
 
-def index_rays(grid: Grid, sources: Array, targets: Array, origin: tuple[int, int, int] = (0, 0, 0)) -> IndexRays:
+def index_rays(grid: Grid, sources: Floats, targets: Floats, origin: tuple[int, int, int] = (0, 0, 0)) -> IndexRays:
     """Rays from `sources` to `targets`, both (N, 3) in world mm, in `grid`'s index space.
 
     A ray that lies in a plane of voxel faces belongs to the voxels above it (half-open voxels), in every
@@ -244,7 +242,7 @@ def index_rays(grid: Grid, sources: Array, targets: Array, origin: tuple[int, in
     return _snapped(starts, ends, np.linalg.norm(targets - sources, axis=1))
 
 
-def _index_from_world(grid: Grid, origin: tuple[int, int, int]) -> Array:
+def _index_from_world(grid: Grid, origin: tuple[int, int, int]) -> Floats:
     """World mm to the index space of `IndexRays`, (4, 4)."""
     affine = grid.index_from_world.copy()
     # An integer index is a voxel's centre in `grid`, and its lower face here.
@@ -252,7 +250,7 @@ def _index_from_world(grid: Grid, origin: tuple[int, int, int]) -> Array:
     return affine
 
 
-def _snapped(starts: Array, ends: Array, lengths: Array) -> IndexRays:
+def _snapped(starts: Floats, ends: Floats, lengths: Floats) -> IndexRays:
     planes = np.rint(starts)
     in_plane = (np.abs(starts - planes) <= SNAP) & (np.abs(ends - planes) <= SNAP)
     starts = np.where(in_plane, planes, starts)

@@ -3,6 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arrays import Floats
 from ..errors import InputError
 from ..geometry.views import Views
 from ..validation import whole_number
@@ -46,7 +47,7 @@ def ordered_subsets(views: Views, n: int) -> list[tuple[int, NDArray[np.int64]]]
     return [(s, subsets[s]) for s in access_order(len(subsets))]
 
 
-def _rings(z: NDArray[np.float64], gap: float) -> NDArray[np.int64]:
+def _rings(z: Floats, gap: float) -> NDArray[np.int64]:
     """Index of each source's ring along z: sources at about the same z form one."""
     order = np.argsort(z, kind="stable")
     rings = np.empty(len(z), np.int64)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..arrays import ArrayOrTensor, checked, is_double, is_tensor, namespace, promote, to_caller
+from ..arrays import ArrayOrTensor, Floats, checked, is_double, is_tensor, namespace, promote, to_caller
 from ..errors import InputError
 from ..geometry.grid import Grid
 from ..validation import instance, shape_text, whole_shape
@@ -19,7 +19,7 @@ from .bundles import Beam, Bundle, Bundles, Part
 from .execution import Execution
 from .lattices import require_no_negative
 from .parallel import in_order, thread_count
-from .rays import Array, Ends, Fan
+from .rays import Ends, Fan
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -123,7 +123,7 @@ def trace_fans(
     array, mu, execution = _execution(volume, backend, grid, mu, mu_grid, (vectors,))
     numbers = _numbers(vectors, "vectors", (4, 3), is_tensor(array) or is_tensor(vectors))
 
-    def bundles(vectors: Array) -> Bundles:
+    def bundles(vectors: Floats) -> Bundles:
         each = vectors.reshape(-1, 4, 3)
 
         def bundle(number: int) -> Bundle:
@@ -194,13 +194,13 @@ def _points(value: Any, name: str, in_torch: bool) -> Any:
 
 
 def _traced(
-    volume: Any, mu: Any, geometry: Any, bundles_of: Callable[[Array], Bundles], execution: Execution
+    volume: Any, mu: Any, geometry: Any, bundles_of: Callable[[Floats], Bundles], execution: Execution
 ) -> ArrayOrTensor:
     """Line integrals (images, rows, columns) of the rays that ``bundles_of(geometry)`` makes, a step of torch's graph if
     the geometry is a tensor; float32, or float64 of the reference and in torch.
     """
 
-    def images(bundles: Bundles, volume: Any, mu: Any) -> list[Array]:
+    def images(bundles: Bundles, volume: Any, mu: Any) -> list[Floats]:
         return [to_caller(image, np.empty(0)) for image in execution.images(volume, bundles, mu)]
 
     if not is_tensor(geometry):
@@ -214,7 +214,7 @@ def _traced(
     volume_data, mu_data = (x.detach() if is_tensor(x) else x for x in (volume, mu))
 
     def run(needs: Any) -> Any:
-        parts: list[tuple[Part, Array]] = []
+        parts: list[tuple[Part, Floats]] = []
         if needs[2]:
             parts = execution.derivatives(volume_data, bundles, mu_data)
             integrals = np.zeros((len(bundles), *bundles.image_shape))
@@ -241,7 +241,7 @@ def _traced(
     return autograd.step(run, volume, mu, geometry)
 
 
-def _by_geometry(gradient: Array, parts: list[tuple[Part, Array]], bundles: Bundles, execution: Execution) -> Array:
+def _by_geometry(gradient: Floats, parts: list[tuple[Part, Floats]], bundles: Bundles, execution: Execution) -> Floats:
     """The gradient by fans (images, 4, 3), or by starts and ends (2, rays, 3)."""
     mu_grid = execution.mu_grid or execution.grid
     results = in_order(

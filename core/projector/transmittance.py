@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Floats, Floats32
 from ..geometry.grid import Grid
 from ..geometry.views import Views
 from ..volumes.volume import Volume
@@ -14,8 +14,6 @@ from . import backends
 from .bundles import Beam, Bundle, Bundles
 from .execution import Execution
 from .rays import Fan
-
-Array = NDArray[np.float64]
 
 # Rays across a voxel, where that is farthest and looks narrowest. Across a voxel of mu there are not fewer than its edges
 # need, nor more than they show.
@@ -25,8 +23,8 @@ _SLOPE = (math.sqrt(5) - 1) / 2
 
 
 def mean_transmittance(
-    mu: Volume, grid: Grid, part: Grid, views: Views, m: int, frame: Array, margin: float
-) -> NDArray[np.float32]:
+    mu: Volume, grid: Grid, part: Grid, views: Views, m: int, frame: Floats, margin: float
+) -> Floats32:
     """The mean over each voxel of a `part` of `grid` of ``exp(-integral of mu)`` from there to the pinhole, ``part.shape``.
 
     The mean over the chord of every ray through a voxel is exact; that over the voxel is the mean over the rays that meet

@@ -5,6 +5,7 @@ from typing import Any, Unpack
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..arrays import Array
 from ..memory import require
 from ..progress import Progress, tell
 from ..projector import Projector
@@ -13,7 +14,7 @@ from ..validation import at_least_0
 from .counts import LEAST, CountLoop
 from .loop import IterativeOptions, waiting
 from .priors import Prior
-from .result import Array, Reconstruction
+from .result import Reconstruction
 
 _LEAST_SHARE = np.float32(0.1)
 """An update leaves at least this share of a voxel's value, so that one bad step can be mended."""

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..arrays import Array
 from ..errors import InputError, warn
 from ..geometry.frames import affine_matrix
 from ..geometry.grid import Grid
@@ -17,7 +18,6 @@ from ..projector.subsets import balanced_subsets
 from ..validation import instance, real_array, shape_text
 from .loop import Loop, plain
 from .priors import Prior, penalty_of
-from .result import Array
 
 # Less is nothing: float32 could not hold what it would be divided into.
 LEAST = np.float32(1e-30)

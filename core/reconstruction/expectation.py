@@ -5,6 +5,7 @@ from typing import Any, Unpack
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..arrays import Array
 from ..errors import warn
 from ..progress import Progress, tell
 from ..projector import Projector
@@ -12,7 +13,7 @@ from ..projector.subsets import access_order
 from .counts import LEAST, CountLoop
 from .loop import IterativeOptions, waiting
 from .priors import Prior
-from .result import Array, Reconstruction
+from .result import Reconstruction
 
 _LEAST_SHARE = 0.1
 """A prior leaves at least this share of the sensitivity everywhere."""

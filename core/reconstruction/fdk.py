@@ -1,19 +1,17 @@
 """Filtered backprojection of cone-beam views from an arc or a circle."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ..arrays import Array
 from ..errors import InputError, warn
 from ..geometry.grid import Grid
 from ..geometry.views import Views
 from ..progress import Progress
 from ..volumes.volume import Volume
 from .filtered import angular_weights, checked_images, filtered_backprojection, rows_across
-
-Array = NDArray[np.floating[Any]]
 
 _OFF_CIRCLE = 0.1
 """Sources may be so far from their circle, as a share of its radius."""

@@ -1,14 +1,13 @@
 """Reconstructions in files, from which they can be resumed."""
 
 import json
-import os
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ..errors import InputError, reading
-from ..files import write_bytes
+from ..files import AnyPath, write_bytes
 from ..hdf5 import numbers, opened, pack
 from ..validation import instance, require_finite
 from ..volumes.formats import hdf5
@@ -20,7 +19,7 @@ _GROUP = "reconstruction"
 _ENDINGS = (".h5", ".hdf5")
 
 
-def write_reconstruction(result: Reconstruction, path: str | os.PathLike[str]) -> None:
+def write_reconstruction(result: Reconstruction, path: AnyPath) -> None:
     """Write a reconstruction as HDF5 (.h5, .hdf5), with all that is needed to resume it.
 
     `read_volume` reads the volume of such a file. Raises InputError for another ending, or where it cannot be written: an
@@ -40,7 +39,7 @@ def write_reconstruction(result: Reconstruction, path: str | os.PathLike[str]) -
     write_bytes(path, pack("mphDRR reconstruction", {}, fill))
 
 
-def read_reconstruction(path: str | os.PathLike[str]) -> Reconstruction:
+def read_reconstruction(path: AnyPath) -> Reconstruction:
     """Read a file of `write_reconstruction`; InputError where there is none, or no whole reconstruction in it."""
     import h5py
 
@@ -61,7 +60,7 @@ def read_reconstruction(path: str | os.PathLike[str]) -> Reconstruction:
         return Reconstruction(volume, objective, json.loads(group.attrs["settings"]), state)
 
 
-def _named(path: str | os.PathLike[str]) -> Path:
+def _named(path: AnyPath) -> Path:
     path = Path(path)
     if path.suffix.lower() not in _ENDINGS:
         raise InputError(f"{path}: expected a name ending in {' or '.join(_ENDINGS)}")

@@ -2,11 +2,11 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ..arrays import Array
 from ..errors import InputError, warn
 from ..geometry.grid import Grid
 from ..geometry.views import Views
@@ -17,8 +17,6 @@ from ..projector.parallel import run_all, thread_count
 from ..validation import instance, real_array
 from .loop import plain
 from .ramp import ramp_matrix
-
-Array = NDArray[np.floating[Any]]
 
 _BYTES_AT_ONCE = 2**26
 """Filtered images that are held at once."""

@@ -5,12 +5,13 @@ from typing import Any, Unpack
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..arrays import Array
 from ..errors import InputError, warn
 from ..progress import Progress, tell
 from ..projector import Projector
 from ..validation import instance, positive, real_array
 from .loop import IterativeOptions, Loop, plain, waiting
-from .result import Array, Reconstruction
+from .result import Reconstruction
 
 _LEAN = 0.05
 """Cosine between a gradient of CGLS and its first, 0 in exact numbers: below it volumes are within 1e-3 of theirs."""

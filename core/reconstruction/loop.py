@@ -8,13 +8,13 @@ from typing import Any, TypedDict
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..arrays import is_tensor, to_numpy
+from ..arrays import Array, is_tensor, to_numpy
 from ..errors import InputError, naming, warn
 from ..progress import Cancelled, Progress, part_of
 from ..projector import Projector
 from ..validation import freeze, instance, real_array, whole_number
 from ..volumes.volume import Volume
-from .result import Array, Callback, Reconstruction
+from .result import Callback, Reconstruction
 from .stopping import StoppingRule, StopWhen, inside
 
 Start = Volume | Reconstruction | ArrayLike | None

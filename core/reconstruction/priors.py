@@ -8,6 +8,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arrays import Array
 from ..errors import InputError
 from ..geometry.grid import Grid
 from ..memory import require
@@ -15,7 +16,6 @@ from ..projector.lattices import same_lattice
 from ..projector.parallel import run_all, thread_count
 from ..validation import at_least_0, instance, one_of, positive, whole_number
 from ..volumes.volume import Volume
-from .result import Array
 
 # Voxels that are worked on at once: their numbers and some arrays as large stay in a core's cache.
 _SLAB_VOXELS = 2**14

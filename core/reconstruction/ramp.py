@@ -2,14 +2,11 @@
 
 import math
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array
 from ..validation import one_of
-
-Array = NDArray[np.floating[Any]]
 
 WINDOWS: dict[str, Callable[[Array], Array]] = {
     "ramp": np.ones_like,

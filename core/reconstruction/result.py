@@ -4,12 +4,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
+from ..arrays import Array, Floats
 from ..volumes.volume import Volume
-
-Array = NDArray[np.floating[Any]]
 
 Callback = Callable[[int, Array], bool | None]
 """Called as ``callback(iteration, values)`` after each iteration, counted from 1, with the volume's values, which cannot be
@@ -21,7 +17,7 @@ class Reconstruction:
     """A reconstructed volume, and how it came about; as ``start=`` of the same algorithm it goes on where it ended."""
 
     volume: Volume
-    objective: NDArray[np.float64]
+    objective: Floats
     """What the method makes as large, or as small, as it can, after each iteration (n,); (0,) of a method without one."""
     settings: Mapping[str, Any] = field(default_factory=dict)
     """The method's name ("method"), its arguments, and why it ended ("stopped"): anything JSON can hold."""

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..arrays import Array
 from ..errors import InputError, warn
 from ..validation import positive, real_numbers
-from .result import Array
 
 
 class StoppingRule:

@@ -5,6 +5,7 @@ from typing import Any, Unpack
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..arrays import Array
 from ..geometry.grid import Grid
 from ..memory import require
 from ..progress import Progress, tell
@@ -12,7 +13,7 @@ from ..projector import Projector
 from ..validation import positive
 from .least_squares import LeastSquaresLoop, inverse
 from .loop import IterativeOptions, waiting
-from .result import Array, Reconstruction
+from .result import Reconstruction
 
 
 def tv(

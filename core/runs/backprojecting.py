@@ -4,8 +4,8 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Floats, Floats32
 from ..errors import InputError
 from ..geometry.grid import Grid
 from ..perspective.backprojection import HOW, backproject
@@ -17,8 +17,6 @@ from .recipe import Recipe
 from .reconstructing import line_integrals, recipe_of, reconstruction_grid
 from .run import ProjectionRun
 from .run_recipe import recipe_model
-
-Array = NDArray[np.float32]
 
 
 def backproject_run(
@@ -66,7 +64,7 @@ def backprojection_grid(run: ProjectionRun, recipe: Recipe | None = None) -> Gri
     return reconstruction_grid(run, recipe_of(run, recipe))
 
 
-def run_line_integrals(run: ProjectionRun) -> Array:
+def run_line_integrals(run: ProjectionRun) -> Floats32:
     """The images of a run as line integrals along the pixels' rays, comparable from module to module.
 
     Counts, less the expected background, are divided by what each pixel counts of a line integral of 1 through the middle
@@ -101,7 +99,7 @@ def run_line_integrals(run: ProjectionRun) -> Array:
     return np.divide(counts, weights, out=np.zeros(counts.shape), where=weights > 0).astype(np.float32)
 
 
-def _pixel_weights(run: ProjectionRun) -> NDArray[np.float64]:
+def _pixel_weights(run: ProjectionRun) -> Floats:
     """What pixels (M, n_v, n_u) count of a line integral of 1 along their rays through the middle of the hole."""
     model: Any = recipe_model(run.recipe, run.system)
     assert isinstance(model, Emission)

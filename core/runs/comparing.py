@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Floats32
 from ..errors import InputError
 from .display import DIVERGING, Display
 from .mosaic import Sheet, sheet
@@ -15,7 +15,7 @@ from .run import ProjectionRun
 class Difference:
     """What one run has more than another."""
 
-    images: NDArray[np.float32]  # (M, n_v, n_u)
+    images: Floats32  # (M, n_v, n_u)
     unit: str
     maximum: float  # the largest of all pixels, without its sign
     rms: float  # root mean square of all pixels

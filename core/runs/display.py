@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..arrays import Floats32
 from ..errors import InputError
 from ..validation import one_of
 
@@ -55,7 +56,7 @@ class Display:
         if self.scale == "log" and self.low is not None and self.low <= 0:
             raise InputError(f"low = {self.low:g}: expected more than 0 on the logarithmic scale")
 
-    def part(self, images: NDArray[np.float32]) -> NDArray[np.float32]:
+    def part(self, images: Floats32) -> Floats32:
         """What of images (..., n_v, n_u) is shown."""
         n_v, n_u = images.shape[-2:]
         return images[..., n_v // 4 : n_v - n_v // 4, n_u // 4 : n_u - n_u // 4] if self.half else images
@@ -73,7 +74,7 @@ class Display:
             low = min(0.0, float(np.min(values, initial=0.0, where=np.isfinite(values))))
         return low, high
 
-    def shares(self, values: ArrayLike, window: tuple[float, float]) -> NDArray[np.float32]:
+    def shares(self, values: ArrayLike, window: tuple[float, float]) -> Floats32:
         """Where `values` stand between the first colour, 0, and the last, 1; numbers outside the window are clipped."""
         low, high = window
         numbers = np.asarray(values, np.float32)

@@ -6,16 +6,15 @@ Whatever the format, a file holds arrays by name (``"geometry/center"``) with un
 import hashlib
 import io
 import json
-import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array
 from ..errors import InputError, reading
-from ..files import require_file, write_bytes
+from ..files import AnyPath, require_file, write_bytes
 from ..geometry.grid import Grid
 from ..geometry.scanner import Scanner, scanner_kind
 from ..geometry.system import PinholeSystem
@@ -49,7 +48,7 @@ _KIND, _TEXTS = "scanner", "texts"
 """Attributes: the kind of scanner where it is another, and the texts of its columns, as JSON."""
 
 
-def _geometry(scanner: Scanner) -> dict[str, tuple[str, NDArray[Any]]]:
+def _geometry(scanner: Scanner) -> dict[str, tuple[str, Array]]:
     """Unit and contents of the arrays of a scanner, by name."""
     found = {"number": ("", scanner.numbers), "ring": ("", scanner.rings()), "pose": ("mm", scanner.poses())}
     if isinstance(scanner, PinholeSystem):
@@ -67,7 +66,7 @@ def _texts(scanner: Scanner) -> dict[str, list[str]]:
     return {name: values.tolist() for name, values in filled if scanner.columns.fields[name][0].is_text}
 
 
-def _scanner(arrays: dict[str, NDArray[Any]], attributes: dict[str, Any]) -> Scanner:
+def _scanner(arrays: dict[str, Array], attributes: dict[str, Any]) -> Scanner:
     """The scanner that a file holds."""
     kind = scanner_kind(attributes.get(_KIND, _PINHOLE))
     given = {"numbers": arrays["geometry/number"], **json.loads(attributes.get(_TEXTS, "{}"))}
@@ -86,13 +85,13 @@ _BACKGROUND = "background"  # in the unit of the projections; where there is non
 _ATTRIBUTES, _SHA256 = "attributes", "sha256"
 _COMPRESS_FROM = 1 << 16  # bytes: below, compressing costs more than it saves
 
-_Arrays = dict[str, tuple[str, NDArray[Any]]]
+_Arrays = dict[str, tuple[str, Array]]
 """Unit and contents of arrays by name."""
-_Contents = tuple[dict[str, NDArray[Any]], dict[str, Any]]
+_Contents = tuple[dict[str, Array], dict[str, Any]]
 """Arrays and attributes by name."""
 
 
-def write_run(run: ProjectionRun, path: str | os.PathLike[str]) -> None:
+def write_run(run: ProjectionRun, path: AnyPath) -> None:
     """Write a run as HDF5 (.h5, .hdf5), numpy archive (.npz) or torch file (.pt), by the path's suffix.
 
     `InputError` for another suffix, where torch is missing for .pt, or the file cannot be written: the old one then stays.
@@ -128,14 +127,14 @@ def _arrays(run: ProjectionRun) -> _Arrays:
     return found
 
 
-def read_run(path: str | os.PathLike[str]) -> ProjectionRun:
+def read_run(path: AnyPath) -> ProjectionRun:
     """Read a run written by `write_run`; `InputError` where there is no such file, or no whole run in it."""
     _, read = _format(Path(path))
     with reading(require_file(path), "a projection run"):
         return _run_of(*read(Path(path)))
 
 
-def _run_of(arrays: dict[str, NDArray[Any]], attributes: dict[str, Any]) -> ProjectionRun:
+def _run_of(arrays: dict[str, Array], attributes: dict[str, Any]) -> ProjectionRun:
     if attributes.get("format") != _FORMAT:
         raise InputError(f"expected a file marked {_FORMAT!r}, found {attributes.get('format', 'no mark')!r}")
     if int(attributes["format_version"]) > _FORMAT_VERSION:
@@ -170,7 +169,7 @@ def _run_of(arrays: dict[str, NDArray[Any]], attributes: dict[str, Any]) -> Proj
     )
 
 
-def _sha256(arrays: dict[str, NDArray[Any]], attributes: dict[str, Any]) -> str:
+def _sha256(arrays: dict[str, Array], attributes: dict[str, Any]) -> str:
     """Of all that a run's file holds."""
     digest = hashlib.sha256(json.dumps(attributes, sort_keys=True).encode())
     for name, array in sorted(arrays.items()):

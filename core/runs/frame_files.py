@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array, Floats
 from ..errors import InputError, reading
-from ..files import require_file
+from ..files import AnyPath, require_file
 from ..hdf5 import datasets, numbers, opened
 from ..memory import require
 from ..progress import Progress, tell
@@ -50,7 +50,7 @@ class Counts(np.ndarray[Any, Any]):
         Of the files.
     """
 
-    about: NDArray[np.float64]
+    about: Floats
 
     def __array_finalize__(self, source: Any) -> None:
         self.kind, self.name = getattr(source, "kind", ""), getattr(source, "name", "counts")
@@ -64,7 +64,7 @@ class Counts(np.ndarray[Any, Any]):
             found.about = about if about.shape == found.about.shape else found.about
         return found
 
-    def __array_wrap__(self, array: NDArray[Any], *_: Any) -> Any:  # type: ignore[override]
+    def __array_wrap__(self, array: Array, *_: Any) -> Any:  # type: ignore[override]
         return np.asarray(array)[()]
 
     def exposures(self, which: Any = slice(None)) -> list[float]:
@@ -88,7 +88,7 @@ class Layout:
 
 
 def read_counts(
-    path: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
+    path: AnyPath | Sequence[AnyPath],
     *,
     dataset: str | None = None,
     shape: tuple[int, int, int] | None = None,
@@ -117,7 +117,7 @@ def read_counts(
 
 
 def read_frames(
-    path: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
+    path: AnyPath | Sequence[AnyPath],
     layout: Layout = Layout(),
     progress: Progress | None = None,
 ) -> Counts:
@@ -166,7 +166,7 @@ def _reader(path: Path, ending: str) -> Callable[[Path, Layout], Counts]:
     )
 
 
-def _counts(array: NDArray[Any], kind: str = "", **known: Sequence[float]) -> Counts:
+def _counts(array: Array, kind: str = "", **known: Sequence[float]) -> Counts:
     """Checked frames, with an axis of frames also where there is only one, and what is `known` about them from the file.
 
     That is their `time` (s), `pixel` (along a row and down the columns, mm) and energy `window` (number). Of these, fewer
@@ -190,7 +190,7 @@ def _require_memory(shape: Sequence[int], itemsize: int) -> None:
     require((itemsize + 9.0) * math.prod(map(int, shape)), f"counts of {shape_text(tuple(shape))}")
 
 
-def _raw(path: Path, layout: Layout) -> NDArray[Any]:
+def _raw(path: Path, layout: Layout) -> Array:
     if layout.shape is None or layout.type is None:
         missing = (
             "shape (--raw-shape FRAMES ROWS COLUMNS)" if layout.shape is None else "type (--raw-type, uint16 or so)"
@@ -201,7 +201,7 @@ def _raw(path: Path, layout: Layout) -> NDArray[Any]:
     return _numbers(path, kind, whole_shape(layout.shape, "raw shape (--raw-shape)", 3))
 
 
-def _numbers(path: Path, kind: np.dtype[Any], shape: tuple[int, ...], skip: int = 0) -> NDArray[Any]:
+def _numbers(path: Path, kind: np.dtype[Any], shape: tuple[int, ...], skip: int = 0) -> Array:
     """All numbers of a file behind its first `skip` bytes."""
     needed, size = skip + kind.itemsize * math.prod(shape), path.stat().st_size
     if needed != size:

@@ -6,8 +6,8 @@ import zlib
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Floats32
 from .resizing import resized
 
 _CHARACTERS = "".join(map(chr, range(32, 127))) + "µ²³·×°±−–αβθφψΣ∫"
@@ -18,7 +18,7 @@ _EM, _ROWS, _BASELINE = 48, 51, 39
 _BITS = Path(__file__).with_name("letters.txt")
 
 
-def lettered(text: str, size: float) -> tuple[NDArray[np.float32], float]:
+def lettered(text: str, size: float) -> tuple[Floats32, float]:
     """A line of text, `size` pixels to the em: how much ink is where (rows, columns), 0 to 1, and the baseline's row.
 
     A character that is not known is "?".
@@ -37,7 +37,7 @@ def width(text: str, size: float) -> float:
 
 
 @functools.cache
-def _letters() -> dict[str, NDArray[np.float32]]:
+def _letters() -> dict[str, Floats32]:
     """Each character's ink (rows, its width)."""
     stored = np.frombuffer(zlib.decompress(base64.b85decode(_BITS.read_bytes().strip())), np.uint8)
     widths, bits = stored[: len(_CHARACTERS)].astype(int), np.unpackbits(stored[len(_CHARACTERS) :])

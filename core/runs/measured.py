@@ -10,8 +10,9 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ..arrays import Array
 from ..errors import InputError, naming, warn
 from ..files import read_text
 from ..geometry.scanner import Detector, Scanner
@@ -199,7 +200,7 @@ def _words(orientation: Any, count: int) -> list[str]:
     return words
 
 
-def _require_counts(array: NDArray[Any], expected: bool) -> None:
+def _require_counts(array: Array, expected: bool) -> None:
     """Refuse numbers that are no counts; the message names frame, row and column, from 1."""
     if array.dtype.kind == "f":
         require_finite(array, "counts")
@@ -244,7 +245,7 @@ def _warn_of_others(found: Counts, used: list[int], words: list[str], run: Proje
             return
 
 
-def _warn_of_frames(array: NDArray[Any], used: list[int], numbers: list[int | None], name: str) -> None:
+def _warn_of_frames(array: Array, used: list[int], numbers: list[int | None], name: str) -> None:
     """Warn of frames that hardly are what modules have counted: empty ones, equal ones, single bright pixels."""
     called = [f"frame {k + 1} (module {number})" for k, number in enumerate(numbers)]
     sums = {k: float(array[k].sum(dtype=float)) for k in used}

@@ -1,7 +1,6 @@
 """Pictures of projections: upright, as seen from the pinhole, alone or all in one with numbers and a colour bar."""
 
 import math
-import os
 import struct
 import zlib
 from dataclasses import dataclass
@@ -9,8 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..arrays import Floats, Floats32
 from ..errors import InputError
-from ..files import write_bytes
+from ..files import AnyPath, write_bytes
 from ..validation import real_numbers
 from . import letters
 from .display import Display
@@ -67,9 +67,9 @@ class Sheet:
     """The numbers at the colour bar's lower and upper end."""
     summed: str
     """What the numbers in the images' corners are, "sum" or "mean"; see `totals`."""
-    totals: NDArray[np.float64]
+    totals: Floats
     """These numbers (M,)."""
-    maxima: NDArray[np.float32]
+    maxima: Floats32
     """The largest numbers that are shown of each image (M,)."""
     half: bool
     """Whether the images' middle halves are shown."""
@@ -77,14 +77,14 @@ class Sheet:
     """What is shown of the images' width and height."""
 
 
-def totals(projections: NDArray[np.float32], unit: str) -> tuple[str, NDArray[np.float64]]:
+def totals(projections: Floats32, unit: str) -> tuple[str, Floats]:
     """What sums up each of the images (M, n_v, n_u): "sum" of counts and photons, "mean" of line integrals; and it (M,)."""
     name = "sum" if unit in ("counts", "photons") else "mean"
     return name, getattr(np, name)(projections, axis=(1, 2), dtype=np.float64)
 
 
 def sheet(
-    projections: NDArray[np.float32],
+    projections: Floats32,
     numbers: ArrayLike,
     rings: ArrayLike,
     unit: str,
@@ -124,7 +124,7 @@ def sheet(
     return Sheet(whole, corners, (n_v, n_u), window, word, values, shown.max(axis=(1, 2)), display.half, share)
 
 
-def write_sheet(run: ProjectionRun, path: str | os.PathLike[str], display: Display | None = None) -> None:
+def write_sheet(run: ProjectionRun, path: AnyPath, display: Display | None = None) -> None:
     """Write all images of a run in one picture, a PNG; see `sheet`."""
     drawn = sheet(run.projections, labels(run), run.system.rings(), run.unit, display)
     write_png(_captioned(drawn.picture, caption(run)), path)
@@ -158,7 +158,7 @@ def _captioned(picture: NDArray[np.uint8], text: str) -> NDArray[np.uint8]:
     return np.concatenate([picture, strip])
 
 
-def smaller(images: NDArray[np.float32], pixels: float) -> NDArray[np.float32]:
+def smaller(images: Floats32, pixels: float) -> Floats32:
     """Images (M, n_v, n_u) of about so many `pixels` together: means over blocks, where blocks of a size fill an image."""
     needed = math.sqrt(images.size / pixels)
     common = math.gcd(*images.shape[1:])
@@ -166,7 +166,7 @@ def smaller(images: NDArray[np.float32], pixels: float) -> NDArray[np.float32]:
     return _means(images, side) if needed > 1 and side > 1 else images
 
 
-def sized(images: NDArray[np.float32], pixels: float) -> NDArray[np.float32]:
+def sized(images: Floats32, pixels: float) -> Floats32:
     """Images (M, n_v, n_u) with so many pixels that they can be looked at: up to about `pixels` together, not too few."""
     _, n_v, n_u = images.shape
     factor = min(int(np.ceil(np.sqrt(images.size / pixels))), n_v, n_u)
@@ -176,7 +176,7 @@ def sized(images: NDArray[np.float32], pixels: float) -> NDArray[np.float32]:
     return images.repeat(factor, axis=1).repeat(factor, axis=2) if factor > 1 else images
 
 
-def _means(images: NDArray[np.float32], side: int) -> NDArray[np.float32]:
+def _means(images: Floats32, side: int) -> Floats32:
     """Means over blocks of `side` pixels a side; pixels beyond the last block are left out."""
     count, n_v, n_u = images.shape
     rows, columns = n_v // side, n_u // side
@@ -221,7 +221,7 @@ def _write(picture: NDArray[np.uint8], text: str, row: int, column: int, size: f
     place[:] = np.rint(255 * ink + (1 - ink) * shade * place)
 
 
-def write_png(picture: ArrayLike, path: str | os.PathLike[str]) -> None:
+def write_png(picture: ArrayLike, path: AnyPath) -> None:
     """Write a picture (`png`) to a file."""
     write_bytes(path, png(picture))
 

@@ -5,8 +5,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ..arrays import Floats32
 from ..errors import InputError, warn
 from ..geometry.scanner import Detector, Scanner
 from ..geometry.system import PinholeSystem
@@ -34,9 +35,7 @@ class Imaging:
         """What a pixel measures."""
         return self.projector.model
 
-    def images(
-        self, volume: Volume, mu: NDArray[np.float32] | None = None, progress: Progress | None = None
-    ) -> NDArray[np.float32]:
+    def images(self, volume: Volume, mu: Floats32 | None = None, progress: Progress | None = None) -> Floats32:
         """The expected images (M, n_v, n_u) of a volume, the background included.
 
         `mu`, 1/mm, attenuates in place of the model's, on whose grid it is. `progress` is called after every view.

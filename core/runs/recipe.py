@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import InputError, naming
-from ..files import write_bytes
+from ..files import AnyPath, write_bytes
 from ..phantoms.settings import setting_names
 from ..toml import read_toml, toml_value
 from .settings import SAMPLING, SETTINGS, TABLES, Setting, settings_with
@@ -141,7 +141,7 @@ def recipe_of_tables(tables: Mapping[str, Any], recorded: bool = False) -> Recip
     return fitting_recipe(values, given)
 
 
-def read_recipe(path: str | os.PathLike[str]) -> Recipe:
+def read_recipe(path: AnyPath) -> Recipe:
     """The recipe in a TOML file, whose paths are relative to its folder; `InputError` names file and key."""
     folder = Path(path).parent
     tables = read_toml(path)
@@ -149,7 +149,7 @@ def read_recipe(path: str | os.PathLike[str]) -> Recipe:
         return _with_paths(recipe_of_tables(tables), lambda name: os.path.normpath(folder / name))
 
 
-def write_recipe(recipe: Recipe, path: str | os.PathLike[str]) -> None:
+def write_recipe(recipe: Recipe, path: AnyPath) -> None:
     """Write a recipe as TOML: what is given, and every other setting as a comment with its default.
 
     `InputError` where the name does not end in .toml, or the file cannot be written.

@@ -6,8 +6,8 @@ from inspect import Parameter
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array, Floats32
 from ..errors import InputError, warn
 from ..geometry.grid import Grid
 from ..memory import require
@@ -24,7 +24,7 @@ from .run import ProjectionRun
 from .run_recipe import projector_of_run, recipe_model
 from .settings import SAMPLING, SETTINGS
 
-Watch = Callable[[int, NDArray[Any], Sequence[float]], bool | None]
+Watch = Callable[[int, Array, Sequence[float]], bool | None]
 """Called as ``watch(iteration, values, objective)`` after each iteration, with the volume's values and the objective after
 all iterations so far; what is true ends the reconstruction there."""
 
@@ -128,7 +128,7 @@ class _Watched(StoppingRule):
         if self._rules is not None:
             self._rules.check(shape)
 
-    def reason(self, objective: Sequence[float], values: NDArray[Any], seconds: float) -> str | None:
+    def reason(self, objective: Sequence[float], values: Array, seconds: float) -> str | None:
         if self._watch(len(objective), values, objective):
             return "watch"
         return None if self._rules is None else self._rules.reason(objective, values, seconds)
@@ -257,7 +257,7 @@ def _by_depth(recipe: Recipe) -> bool:
     return why is None
 
 
-def line_integrals(run: ProjectionRun, recipe: Recipe) -> NDArray[np.float32]:
+def line_integrals(run: ProjectionRun, recipe: Recipe) -> Floats32:
     """What a run's pixels say of its volume linearly: counts as they are, of photons that pass the line integrals.
 
     Where no photon has passed, half a photon is taken for it.

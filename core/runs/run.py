@@ -8,9 +8,8 @@ from importlib import metadata
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..arrays import checked
+from ..arrays import Floats, Floats32, checked
 from ..errors import InputError
 from ..geometry.scanner import Scanner
 from ..geometry.views import Views
@@ -40,7 +39,7 @@ class ProjectionRun:
     A measured run (`counts_run`) has no volume: nobody knows what was in the scanner.
     """
 
-    projections: NDArray[np.float32]  # (M, n_v, n_u), column index along +u, row index along +v
+    projections: Floats32  # (M, n_v, n_u), column index along +u, row index along +v
     system: Scanner  # the M modules
     views: Views  # the M images' rays
     volume: Volume | None = None  # what was projected; None where the images were measured
@@ -50,7 +49,7 @@ class ProjectionRun:
     workbook: str = ""  # name of the geometry workbook, and its SHA-256; empty where there is none
     workbook_sha256: str = ""
     versions: Mapping[str, str] = field(default_factory=versions)  # of mphDRR and what it ran on
-    background: float | NDArray[np.float64] = 0.0  # besides the volume, as in `Emission`: (), (M,) or images
+    background: float | Floats = 0.0  # besides the volume, as in `Emission`: (), (M,) or images
 
     def __post_init__(self) -> None:
         self.views.require_pinholes("run")
@@ -83,7 +82,7 @@ class ProjectionRun:
             raise InputError("the run holds no recipe: give its model, as by --set model.kind=emission or --recipe")
         return recipe_of_tables(self.settings["recipe"], recorded=True)
 
-    def intrinsics(self) -> NDArray[np.float64]:
+    def intrinsics(self) -> Floats:
         """Camera matrices K (M, 3, 3), pixels: ``K @ (x_u, x_v, x_k)`` is a multiple of ``(column, row, 1)``.
 
         (x_u, x_v, x_k) is a point in the module's frame, mm from the pinhole.

@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Floats
 from ..errors import InputError
 from ..geometry.frames import euler_pose
 from ..geometry.grid import Grid
@@ -291,7 +291,7 @@ def recipe_phantom(recipe: Recipe) -> Phantom:
     return kind.phantom(**{**kind.usual, **recipe.fields("phantom", kind.phantom)})
 
 
-def truth_of_run(run: ProjectionRun) -> tuple[Volume | Phantom, NDArray[np.float64] | None]:
+def truth_of_run(run: ProjectionRun) -> tuple[Volume | Phantom, Floats | None]:
     """What a simulated run's images are of: the phantom that its recipe describes and its pose, else its volume and None.
 
     `InputError` of a measured run.
@@ -304,7 +304,7 @@ def truth_of_run(run: ProjectionRun) -> tuple[Volume | Phantom, NDArray[np.float
     return recipe_phantom(recipe), phantom_pose(recipe)
 
 
-def _mu_of_phantom(phantom: Phantom, pose: NDArray[np.float64], grid: Grid, model: Model, stages: Stages) -> Volume:
+def _mu_of_phantom(phantom: Phantom, pose: Floats, grid: Grid, model: Model, stages: Stages) -> Volume:
     """What the phantom attenuates, on a grid."""
     require_mu(phantom, model)
     return phantom.voxelize(grid, pose, stages("voxelizing"), "mu")
@@ -317,7 +317,7 @@ def require_mu(phantom: Phantom, model: Model) -> None:
     warn_of_energy(model, phantom.mu_energy, f"the {phantom.title}")
 
 
-def phantom_pose(recipe: Recipe) -> NDArray[np.float64]:
+def phantom_pose(recipe: Recipe) -> Floats:
     """World-from-phantom pose (4, 4), mm; `InputError` where matrix and position with angles are given and disagree."""
     phi, theta, psi = np.deg2rad(recipe["phantom.euler_degrees"])
     pose = euler_pose(phi, theta, psi, recipe["phantom.position"])
@@ -330,7 +330,7 @@ def phantom_pose(recipe: Recipe) -> NDArray[np.float64]:
     return matrix
 
 
-def with_phantom(recipe: Recipe, phantom: Phantom, pose: NDArray[np.float64]) -> Recipe:
+def with_phantom(recipe: Recipe, phantom: Phantom, pose: Floats) -> Recipe:
     """The recipe with all that describes the phantom: the numbers of its kind, and its pose as matrix and angles."""
     values: dict[str, Any] = {"matrix": pose.tolist(), "voxels": recipe["phantom.voxels"]}
     angles = euler_degrees(pose)
@@ -344,7 +344,7 @@ def with_phantom(recipe: Recipe, phantom: Phantom, pose: NDArray[np.float64]) ->
     return recipe.updated({f"phantom.{name}": value for name, value in values.items()})
 
 
-def euler_degrees(pose: NDArray[np.float64]) -> list[float] | None:
+def euler_degrees(pose: Floats) -> list[float] | None:
     """Angles phi, theta, psi with which `euler_pose` turns as `pose` does; None where it does more than turn and move."""
     turn = pose[:3, :3]
     if not np.allclose(turn @ turn.T, np.eye(3), rtol=0, atol=1e-6) or np.linalg.det(turn) < 0:

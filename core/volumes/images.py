@@ -3,7 +3,8 @@
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+
+from ..arrays import Array
 
 
 class Images(np.ndarray):  # type: ignore[type-arg]
@@ -13,7 +14,7 @@ class Images(np.ndarray):  # type: ignore[type-arg]
     """
 
     @classmethod
-    def of(cls, array: NDArray[Any], quantity: str) -> "Images":
+    def of(cls, array: Array, quantity: str) -> "Images":
         """The same numbers, of a volume's quantity."""
         images = array.view(cls)
         images.quantity = quantity

@@ -3,6 +3,7 @@
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..arrays import Floats32
 from ..errors import InputError
 from ..geometry.frames import moved
 from ..geometry.grid import Grid
@@ -111,6 +112,6 @@ def _indices(value: ArrayLike, name: str) -> NDArray[np.int64]:
     return numbers.astype(np.int64)
 
 
-def _part(volume: Volume, array: NDArray[np.float32], start: NDArray[np.int64]) -> Volume:
+def _part(volume: Volume, array: Floats32, start: NDArray[np.int64]) -> Volume:
     """`array` as a volume whose first voxel has the index `start` in `volume`."""
     return Volume(array, volume.grid.box(start, array.shape), volume.quantity)

@@ -5,6 +5,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arrays import Floats, Floats32
 from ..errors import InputError
 from ..geometry.grid import Grid
 from ..memory import require
@@ -12,9 +13,8 @@ from ..progress import Progress
 from ..validation import freeze, instance, real_array
 from .volume import Volume, outside_value
 
-Floats = NDArray[np.float32]
 # For n voxels of the new grid along an axis: indices of the old grid and their weights, (n, taps) each.
-_Taps = tuple[NDArray[np.int64], NDArray[np.float32]]
+_Taps = tuple[NDArray[np.int64], Floats32]
 
 _PARALLEL = 1e-9  # voxels per voxel: axes that deviate by less are parallel
 _SLAB = 1 << 20  # samples at once
@@ -57,15 +57,13 @@ def resample(
     return Volume(freeze(result), grid, volume.quantity)
 
 
-def values_at(volume: Volume, points: NDArray[np.float64], method: str = "linear") -> Floats:
+def values_at(volume: Volume, points: Floats, method: str = "linear") -> Floats32:
     """Values (N,) at world `points` (N, 3), mm, by the `method` "linear" or "nearest" of `resample`; 0 outside the grid."""
     index = volume.grid.index_from_world
     return _samples(volume.array, index[:3, :3] @ points.T + index[:3, 3:], _TAPS[method])
 
 
-def _along_axes(
-    array: Floats, index_from_index: NDArray[np.float64], method: str, result: Floats, progress: Progress
-) -> None:
+def _along_axes(array: Floats32, index_from_index: Floats, method: str, result: Floats32, progress: Progress) -> None:
     """Fill `result`, one axis after the other."""
     old_axes = np.abs(index_from_index[:3, :3]).argmax(axis=0)  # the old axis of each new one
     taps = []
@@ -86,13 +84,13 @@ def _along_axes(
         progress(min(first + slab, result.shape[0]), result.shape[0])
 
 
-def _nearest_taps(at: NDArray[np.float64], step: float, n: int) -> _Taps:
+def _nearest_taps(at: Floats, step: float, n: int) -> _Taps:
     index = np.floor(at + 0.5).astype(np.int64)
     inside = (index >= 0) & (index < n)
     return index.clip(0, n - 1)[:, None], inside.astype(np.float32)[:, None]
 
 
-def _linear_taps(at: NDArray[np.float64], step: float, n: int) -> _Taps:
+def _linear_taps(at: Floats, step: float, n: int) -> _Taps:
     inside = (at >= -0.5) & (at <= n - 0.5)
     at = at.clip(0, n - 1)
     low = np.floor(at).astype(np.int64)
@@ -101,7 +99,7 @@ def _linear_taps(at: NDArray[np.float64], step: float, n: int) -> _Taps:
     return np.stack([low, np.minimum(low + 1, n - 1)], axis=1), weight.astype(np.float32)
 
 
-def _mean_taps(at: NDArray[np.float64], step: float, n: int) -> _Taps:
+def _mean_taps(at: Floats, step: float, n: int) -> _Taps:
     """Fractions of the new voxel, from ``at - step/2`` to ``at + step/2``, that lie in each old voxel."""
     low, high = at - step / 2 + 0.5, at + step / 2 + 0.5  # voxel i reaches from i to i + 1
     index = np.floor(low).astype(np.int64)[:, None] + np.arange(int(np.ceil(step)) + 1)
@@ -113,9 +111,7 @@ def _mean_taps(at: NDArray[np.float64], step: float, n: int) -> _Taps:
 _TAPS = {"nearest": _nearest_taps, "linear": _linear_taps, "mean": _mean_taps}
 
 
-def _at_points(
-    array: Floats, index_from_index: NDArray[np.float64], method: str, result: Floats, progress: Progress
-) -> None:
+def _at_points(array: Floats32, index_from_index: Floats, method: str, result: Floats32, progress: Progress) -> None:
     """Fill `result` from sample points: its voxels' centres, or several points in each voxel for means."""
     linear, origin = index_from_index[:3, :3], index_from_index[:3, 3]
     counts = [1, 1, 1]
@@ -138,7 +134,7 @@ def _at_points(
         progress(i + 1, len(result))
 
 
-def _samples(array: Floats, points: NDArray[np.float64], taps: Callable[..., _Taps]) -> Floats:
+def _samples(array: Floats32, points: Floats, taps: Callable[..., _Taps]) -> Floats32:
     """The array at index coordinates `points` (3, N), from the voxels and weights of `taps`; 0 outside."""
     (x, x_weight), (y, y_weight), (z, z_weight) = (
         [part.T.copy() for part in taps(at, 1.0, n)] for at, n in zip(points, array.shape, strict=True)

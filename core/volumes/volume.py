@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Floats32
 from ..errors import InputError
 from ..geometry.grid import Grid
 from ..validation import freeze, instance, one_of, real_array, real_numbers, require_finite
@@ -44,7 +44,7 @@ class Volume:
     `UNITS`.
     """
 
-    array: NDArray[np.float32]
+    array: Floats32
     grid: Grid
     quantity: str = "activity"
 

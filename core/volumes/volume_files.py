@@ -1,13 +1,12 @@
 """Volumes in files: the formats by their endings, and one clear line for every file that cannot be read."""
 
-import os
 from dataclasses import replace
 from pathlib import Path
 
 from numpy.typing import ArrayLike
 
 from ..errors import InputError, naming, reading, refusing
-from ..files import ending_of, replacing, require_ending, require_file
+from ..files import AnyPath, ending_of, replacing, require_ending, require_file
 from ..progress import Progress
 from ..validation import instance, real_array
 from .formats import dicom, hdf5, metaimage, nifti, nrrd, numpy_files
@@ -34,7 +33,7 @@ READ_FORMATS = (*_READERS, ".dcm")
 
 
 def read_volume(
-    path: str | os.PathLike[str],
+    path: AnyPath,
     quantity: str | None = None,
     *,
     affine: ArrayLike | None = None,
@@ -70,7 +69,7 @@ def read_volume(
 
 
 def read_volume_of(
-    path: str | os.PathLike[str],
+    path: AnyPath,
     quantity: str,
     advice: str = "",
     *,
@@ -89,7 +88,7 @@ def read_volume_of(
         return contents.volume(quantity)
 
 
-def write_volume(volume: Volume, path: str | os.PathLike[str]) -> None:
+def write_volume(volume: Volume, path: AnyPath) -> None:
     """Write a volume as NIfTI (.nii, .nii.gz; its affine is rounded to float32), .npz, .nrrd or .h5 (exact)."""
     path = Path(path)
     write = _WRITERS[require_ending(path, VOLUME_FORMATS)]

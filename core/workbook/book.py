@@ -2,14 +2,13 @@
 
 import hashlib
 import io
-import os
 import zipfile
 from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from ..errors import InputError
-from ..files import read_bytes, require_file
+from ..files import AnyPath, read_bytes, require_file
 from .calculation import Calculation, Uncomputed
 from .sheet_xml import At, Cell, CellError, Reference, Unreadable
 from .workbook_xml import Place, WorkbookXml
@@ -37,7 +36,7 @@ class Outdated(NamedTuple):
 class Book:
     """An .xlsx or .xlsm file; `InputError` if it is missing, unreadable, too large or not a workbook."""
 
-    def __init__(self, path: str | os.PathLike[str]) -> None:
+    def __init__(self, path: AnyPath) -> None:
         self.path = Path(path)
         content = _read(self.path)
         self.sha256 = hashlib.sha256(content).hexdigest()

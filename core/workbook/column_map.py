@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -10,7 +9,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 from ..errors import InputError
-from ..files import write_bytes
+from ..files import AnyPath, write_bytes
 from ..geometry.columns import ColumnTable
 from ..geometry.scanner import Scanner, scanner_kind
 from ..toml import parse_toml, read_toml, toml_value
@@ -127,7 +126,7 @@ class ColumnMap:
         return cls._of_values(parse_toml(text, name), name)
 
     @classmethod
-    def read(cls, path: str | os.PathLike[str]) -> ColumnMap:
+    def read(cls, path: AnyPath) -> ColumnMap:
         """The map in a TOML file; `InputError` if it cannot be read."""
         return cls._of_values(read_toml(path), str(path))
 
@@ -139,15 +138,13 @@ class ColumnMap:
             raise InputError(f"{name}: expected [[tables]] ({_HELP})")
         return cls(tuple(_table(table, f"{name}: {_of(i)}") for i, table in enumerate(tables)))
 
-    def write(self, path: str | os.PathLike[str], comment: str = "") -> None:
+    def write(self, path: AnyPath, comment: str = "") -> None:
         """Write the map to a .toml file, below the lines of a comment."""
         lines = "".join(f"# {line}\n" for line in comment.splitlines())
         write_bytes(path, (lines + self.to_toml()).encode())
 
 
-def column_map(
-    columns: ColumnMap | str | os.PathLike[str] | None, workbook: str | os.PathLike[str], scanner: type[Scanner]
-) -> ColumnMap | None:
+def column_map(columns: ColumnMap | AnyPath | None, workbook: AnyPath, scanner: type[Scanner]) -> ColumnMap | None:
     """The column map of `workbook` for a kind of scanner, given as such or by its file; `InputError` if incomplete."""
     if columns is None:
         return None

@@ -1,10 +1,10 @@
 """A first column map for a person to check, and what the cells of a workbook show."""
 
-import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 from ..errors import InputError
+from ..files import AnyPath
 from ..geometry.columns import ColumnTable
 from ..geometry.scanner import scanner_kind
 from ..recording import recorded_warnings
@@ -25,13 +25,13 @@ class ColumnMapDraft:
     questions: tuple[str, ...]
     """What is uncertain or missing, a line each; empty if the headings are understood."""
 
-    def write(self, path: str | os.PathLike[str]) -> None:
+    def write(self, path: AnyPath) -> None:
         """Write the map as TOML, with the questions as comments above it."""
         lines = ["A draft of what the workbook's cells hold. Check every line.", *self.questions]
         self.columns.write(path, "\n".join(lines))
 
 
-def draft_column_map(path: str | os.PathLike[str], kind: str = "pinhole") -> ColumnMapDraft:
+def draft_column_map(path: AnyPath, kind: str = "pinhole") -> ColumnMapDraft:
     """A best guess at a workbook's column map for a kind of scanner, for a person to check.
 
     For a workbook that `read_scanner` understands, it is the map that says the same.
@@ -137,9 +137,7 @@ def _guesses(sheet: Sheet, declared: ColumnTable, name: str) -> Iterator[MappedT
                 yield _mapped_table(sheet, rows, columns, row, next(iter(numbers)) if len(numbers) == 1 else None)
 
 
-def preview_workbook(
-    path: str | os.PathLike[str], rows: int = 20, columns: int = 26
-) -> dict[str, tuple[tuple[str, ...], ...]]:
+def preview_workbook(path: AnyPath, rows: int = 20, columns: int = 26) -> dict[str, tuple[tuple[str, ...], ...]]:
     """What the first `rows` and `columns` of each sheet show: sheet -> rows of short texts.
 
     They begin with row 1 and column A; a blank cell is an empty text, and a smaller sheet gives what it has.

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arrays import Array
 from ..errors import InputError, warn
 from ..geometry.columns import ColumnTable
 from .agreement import text_of
@@ -81,7 +82,7 @@ class ColumnCells:
         """Sheet and cell of module index `i`."""
         return self.table.sheet.place(self.rows[i], self.column)
 
-    def values(self, optional: bool = False, ignored: NDArray[np.bool_] | None = None) -> NDArray[Any]:
+    def values(self, optional: bool = False, ignored: NDArray[np.bool_] | None = None) -> Array:
         """What the cells hold (M,), numbers in their unit; `InputError` if one holds something else.
 
         NaN, or "" for a text, where they are `ignored`, or where a cell is blank, or its formula cannot be computed here but
@@ -111,16 +112,16 @@ class ColumnCells:
         number = value if type(value) is float and math.isfinite(value) else None
         return None if number is None or (self.declared.kind == "whole" and number % 1) else number
 
-    def in_code(self, given: NDArray[Any]) -> NDArray[Any]:
+    def in_code(self, given: Array) -> Array:
         """Numbers in the cells' unit as mm or rad, texts as the scanner has them."""
         return np.array([self.declared.word(text) for text in given]) if self.declared.is_text else given * self.factor
 
-    def in_cells(self, values: NDArray[Any]) -> NDArray[Any]:
+    def in_cells(self, values: Array) -> Array:
         """Numbers in mm or rad in the cells' unit; texts as they are."""
         return values if self.declared.is_text else values / self.factor
 
 
-def absent(given: NDArray[Any]) -> NDArray[np.bool_]:
+def absent(given: Array) -> NDArray[np.bool_]:
     """Where (M,) a column's cells hold nothing."""
     return given == "" if given.dtype.kind == "U" else np.isnan(given)
 

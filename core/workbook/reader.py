@@ -1,15 +1,15 @@
 """`read_system` and `read_scanner`: a geometry workbook as a scanner, and whether its numbers are possible and plausible."""
 
 import math
-import os
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, Generic
+from typing import Generic
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array, Floats
 from ..errors import InputError, naming, warn
+from ..files import AnyPath
 from ..geometry.columns import Values
 from ..geometry.scanner import SCANNERS, Scanner, first, scanner_kind
 from ..geometry.system import AnyScanner, PinholeSystem
@@ -25,9 +25,7 @@ _SHOWN = 5
 """Warnings of one column; the last one counts the rest."""
 
 
-def read_system(
-    path: str | os.PathLike[str], columns: ColumnMap | str | os.PathLike[str] | None = None
-) -> PinholeSystem:
+def read_system(path: AnyPath, columns: ColumnMap | AnyPath | None = None) -> PinholeSystem:
     """The pinhole scanner in a geometry workbook; `source` names the workbook and the cell of every number.
 
     Tables are found by their headings, listed in `core.geometry.pinhole_columns`, with their units. What could be mistaken
@@ -55,14 +53,12 @@ def read_system(
     return _read(path, PinholeSystem, columns)
 
 
-def read_scanner(
-    path: str | os.PathLike[str], kind: str, columns: ColumnMap | str | os.PathLike[str] | None = None
-) -> Scanner:
+def read_scanner(path: AnyPath, kind: str, columns: ColumnMap | AnyPath | None = None) -> Scanner:
     """The scanner of a kind, such as "pinhole", in a geometry workbook that may hold others too; see `read_system`."""
     return _read(path, scanner_kind(kind), columns)
 
 
-def kinds_in(path: str | os.PathLike[str]) -> tuple[str, ...]:
+def kinds_in(path: AnyPath) -> tuple[str, ...]:
     """The kinds of scanners in a workbook: those whose own sheet it has, or whose headings are in its other sheets."""
     book = Book(path)
     own = {name: kind for name, kind in SCANNERS.items() if kind.sheet}
@@ -73,9 +69,7 @@ def kinds_in(path: str | os.PathLike[str]) -> tuple[str, ...]:
     return tuple(name for name in SCANNERS if name in found)
 
 
-def _read(
-    path: str | os.PathLike[str], scanner: type[AnyScanner], columns: ColumnMap | str | os.PathLike[str] | None
-) -> AnyScanner:
+def _read(path: AnyPath, scanner: type[AnyScanner], columns: ColumnMap | AnyPath | None) -> AnyScanner:
     columns = column_map(columns, path, scanner)  # before the file, which may be large
     return read(Book(path), scanner, columns).system
 
@@ -85,7 +79,7 @@ class Reading(Generic[AnyScanner]):
     """What is read from a workbook; `given` is what the cells hold, numbers in their units, NaN or "" for nothing."""
 
     layout: Layout
-    given: dict[str, NDArray[Any]]
+    given: dict[str, Array]
     system: AnyScanner
 
 
@@ -139,7 +133,7 @@ def _doubtful(
         )
 
 
-def _rounding(column: ColumnCells, values: NDArray[np.float64]) -> NDArray[np.float64]:
+def _rounding(column: ColumnCells, values: Floats) -> Floats:
     """By how much (M,) the numbers in a column's cells may be rounded, mm or rad."""
     return column.factor * np.array([tolerance(x, x, column.unit) for x in values / column.factor])
 
@@ -167,7 +161,7 @@ def _source(book: Book, layout: Layout, columns: ColumnMap | None) -> SystemSour
     )
 
 
-def _refuse_not_positive(column: ColumnCells, values: NDArray[np.float64]) -> None:
+def _refuse_not_positive(column: ColumnCells, values: Floats) -> None:
     """Raise `InputError` if a number (M,), mm or rad, is not positive but plausible ones are."""
     declared = column.declared
     for i in first(values <= 0) if declared.plausible[0] > 0 else ():
@@ -195,10 +189,10 @@ def _implausible(system: Scanner, cells: dict[str, ColumnCells]) -> Iterator[str
 
 def _differences(
     column: ColumnCells,
-    given: NDArray[np.float64],
-    expected: NDArray[np.float64],
+    given: Floats,
+    expected: Floats,
     used: str,
-    slack: NDArray[np.float64] | float = 0.0,
+    slack: Floats | float = 0.0,
 ) -> Iterator[str]:
     """The first modules whose number `given` (M,) in the sheet, in its unit, is not as `expected` (M,), mm or rad.
 

@@ -1,6 +1,5 @@
 """`write_system`: a scanner into a new geometry workbook, or a copy of one in which nothing else changes."""
 
-import os
 import re
 from collections import defaultdict
 from dataclasses import dataclass
@@ -10,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputError, several, warn
-from ..files import replacing, write_bytes
+from ..files import AnyPath, replacing, write_bytes
 from ..geometry.scanner import Scanner, first
 from ..recording import recorded_warnings
 from ..validation import instance
@@ -46,9 +45,9 @@ class WrittenWorkbook:
 
 def write_system(
     system: Scanner,
-    path: str | os.PathLike[str],
-    template: str | os.PathLike[str] | None = None,
-    columns: ColumnMap | str | os.PathLike[str] | None = None,
+    path: AnyPath,
+    template: AnyPath | None = None,
+    columns: ColumnMap | AnyPath | None = None,
 ) -> WrittenWorkbook:
     """Write a scanner's geometry workbook: pinholes, or a scanner of another kind.
 

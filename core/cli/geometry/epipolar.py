@@ -5,9 +5,8 @@ import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ...arrays import table_rows
+from ...arrays import Array, table_rows
 from ...errors import InputError
 from ...geometry.system import PinholeSystem
 from ...geometry.views import Views
@@ -152,7 +151,7 @@ def _depths(given: list[float] | None, system: PinholeSystem, m: int) -> tuple[f
     return near, far
 
 
-def _listed(values: NDArray[Any]) -> list[float] | None:
+def _listed(values: Array) -> list[float] | None:
     """Numbers for JSON, which has no NaN."""
     return None if np.isnan(values).any() else values.tolist()
 

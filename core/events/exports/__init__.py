@@ -4,13 +4,12 @@ To add a program, write its `Layout` in a module here, and list it below; `mphdr
 """
 
 import inspect
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from ...errors import InputError
-from ...files import folder_path
+from ...files import AnyPath, folder_path
 from ...progress import Progress
 from ...validation import instance, one_of, positive
 from ..event_set import EventSet
@@ -54,7 +53,7 @@ PROGRAMS: dict[str, Program] = {program.name: program for program in _PROGRAMS}
 
 def planned_export(
     events: EventSet,
-    folder: str | os.PathLike[str],
+    folder: AnyPath,
     program: str,
     *,
     models: str | Sequence[str] | None = None,
@@ -88,7 +87,7 @@ def planned_export(
 
 def export_events(
     events: EventSet,
-    folder: str | os.PathLike[str],
+    folder: AnyPath,
     program: str,
     *,
     models: str | Sequence[str] | None = None,

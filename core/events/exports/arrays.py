@@ -5,19 +5,19 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...arrays import Array
 from ...errors import InputError
 
 
-def npy(array: NDArray[Any]) -> bytes:
+def npy(array: Array) -> bytes:
     """An array as an .npy file."""
     buffer = io.BytesIO()
     np.save(buffer, array, allow_pickle=False)
     return buffer.getvalue()
 
 
-def pt(array: NDArray[Any]) -> bytes:
+def pt(array: Array) -> bytes:
     """An array as a .pt file: one tensor, which ``torch.load(path, weights_only=True)`` gives."""
     try:
         import torch
@@ -28,7 +28,7 @@ def pt(array: NDArray[Any]) -> bytes:
     return buffer.getvalue()
 
 
-def hdf5(arrays: Mapping[str, NDArray[Any]], attributes: Mapping[str, Any]) -> bytes:
+def hdf5(arrays: Mapping[str, Array], attributes: Mapping[str, Any]) -> bytes:
     """Arrays as an HDF5 file, compressed, a chunk for each of their last two axes' pictures."""
     import h5py
 

@@ -6,16 +6,13 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
+from ...arrays import Floats32
 from ...errors import InputError
 from ...files import write_bytes
 from ..event_set import Event, EventSet
 from ..fields import Shapes, field_shapes, float32_bytes
 from ..noise_choice import NoiseChoice, chosen_seed, noisy_images
 
-Images = NDArray[np.float32]
 Row = dict[str, Any]
 """A row of events.csv: i, the export's running number from 0; the event's number, split and name, what places its phantom
 besides the pose; the noise's seed, or ""."""
@@ -37,11 +34,11 @@ class Chosen:
         """The seed of the event's noise; None: there is none."""
         return chosen_seed(event.noise_seed, self.noise)
 
-    def images(self, event: Event, model: str) -> Images:
+    def images(self, event: Event, model: str) -> Floats32:
         """A model's images (M, n_v, n_u): with the noise, where they are counts."""
         return noisy_images(event, model, self.seed(event), self.level)
 
-    def arrays(self, event: Event) -> Iterator[tuple[str, Images]]:
+    def arrays(self, event: Event) -> Iterator[tuple[str, Floats32]]:
         """The event's arrays by their names in `shapes`: truth, images of the models, Radon images."""
         yield "truth", event.truth_part()
         for model in self.models:

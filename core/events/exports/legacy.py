@@ -12,12 +12,12 @@ slots.csv                           which module each slot shows, and whether mi
 Rows of images go along +v and columns along +u, as everywhere in mphDRR.
 """
 
-import os
 from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 
+from ...files import AnyPath
 from ..event_set import Event
 from ..fields import float32_bytes
 from .arrays import npy, pt
@@ -30,7 +30,7 @@ _ANGLES = ("phi", "theta", "psi")
 class Legacy(Layout):
     """`slots`: a table of them instead of a row of images and its mirrored ones (`slots.read_slots`)."""
 
-    def __init__(self, chosen: Chosen, *, slots: str | os.PathLike[str] | None = None) -> None:
+    def __init__(self, chosen: Chosen, *, slots: AnyPath | None = None) -> None:
         super().__init__(chosen)
         self.model = only_model(chosen, "legacy")
         system = chosen.events.system

@@ -8,13 +8,14 @@ the image of column 19 - j, flipped left to right. Whoever means other ones give
 
 import csv
 import io
-import os
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ...arrays import Floats32
 from ...errors import InputError
+from ...files import AnyPath
 from ...geometry.scanner import Scanner
 
 MIRRORED = 4
@@ -37,7 +38,7 @@ class Slots:
     def __len__(self) -> int:
         return len(self.modules)
 
-    def arranged(self, images: NDArray[np.float32]) -> NDArray[np.float32]:
+    def arranged(self, images: Floats32) -> Floats32:
         """The modules' images (M, n_v, n_u) as the slots' (S, n_v, n_u); "left to right" is along u."""
         taken = images[self.modules]
         taken[self.mirrored] = taken[self.mirrored][..., ::-1]
@@ -76,7 +77,7 @@ def row_slots(system: Scanner) -> Slots:
     return Slots(modules, np.arange(len(modules)) % columns >= sizes[0], columns)
 
 
-def read_slots(path: str | os.PathLike[str], system: Scanner) -> Slots:
+def read_slots(path: AnyPath, system: Scanner) -> Slots:
     """Slots from a table such as `Slots.table` writes: a CSV file with the columns slot, module and mirrored.
 
     Slots are counted from 0, modules are named by their numbers, and a column "column" says how many are in a row; others

@@ -10,15 +10,15 @@ Files are in a folder for each split, ``train/000012.h5``, which the loaders' ``
 =============== ======================================================================================================
 """
 
-import os
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...arrays import Array
 from ...errors import InputError
+from ...files import AnyPath
 from ...perspective.backprojection import backproject
 from ...runs.backprojecting import run_line_integrals
 from ...validation import one_of
@@ -36,7 +36,7 @@ class Unet3d(Layout):
 
     packed = True
 
-    def __init__(self, chosen: Chosen, *, raw: Raw = "slots", slots: str | os.PathLike[str] | None = None) -> None:
+    def __init__(self, chosen: Chosen, *, raw: Raw = "slots", slots: AnyPath | None = None) -> None:
         super().__init__(chosen)
         one_of(raw, RAW, "raw")
         self.model, self.raw = only_model(chosen, "3dunet"), raw
@@ -87,7 +87,7 @@ class Unet3d(Layout):
             run = replace(event.run(self.model), projections=images)
             volume: Any = backproject(run_line_integrals(run), run.views, run.volume.grid)  # type: ignore[union-attr]
             raw, label = volume.array.T, run.volume.array.T  # type: ignore[union-attr]
-        arrays: dict[str, NDArray[Any]] = {"raw": np.ascontiguousarray(raw), "label": np.ascontiguousarray(label)}
+        arrays: dict[str, Array] = {"raw": np.ascontiguousarray(raw), "label": np.ascontiguousarray(label)}
         arrays = {name: array.astype(np.float32, copy=False) for name, array in arrays.items()}
         yield self.files(row)[0], hdf5(arrays, {"event": row["event"]})
 

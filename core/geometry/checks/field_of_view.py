@@ -13,12 +13,11 @@ more than the parts do: a ray that enters a collimator through its hole ends in 
 import numpy as np
 from numpy.typing import NDArray
 
+from ...arrays import Floats
 from ..frames import module_frames
 from ..system import PinholeSystem
 from .hulls import TOUCH, Hulls
 from .report import Blocked, Uncovered
-
-Array = NDArray[np.float64]
 
 SLACK = 0.01
 """Shortfall of the field of view, mm of radius, that is accepted: l may be rounded to 0.01 mm."""
@@ -40,7 +39,7 @@ def find_uncovered(system: PinholeSystem) -> tuple[Uncovered, ...]:
     )  # fmt: skip
 
 
-def unseen_share(middle: Array, d: float, slope: float, radius: float) -> float:
+def unseen_share(middle: Floats, d: float, slope: float, radius: float) -> float:
     """Fraction of the volume of a sphere of `radius`, mm, that is outside the field of view.
 
     Its `middle` (3,) is in the module's frame, mm. The volume is integrated over planes across the axis: in each, the field
@@ -69,7 +68,7 @@ def unseen_share(middle: Array, d: float, slope: float, radius: float) -> float:
     return float((weight * (np.pi * disc**2 - seen)).sum() / (4 / 3 * np.pi * radius**3))
 
 
-def _disc_below(radius: Array, a: Array, b: Array) -> Array:
+def _disc_below(radius: Floats, a: Floats, b: Floats) -> Floats:
     """Area of the part of discs around 0 in which one coordinate is below `a` and the other below `b`."""
     a, b = np.clip(a, -radius, radius), np.clip(b, -radius, radius)
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -103,7 +102,7 @@ def find_blocked(system: PinholeSystem, hulls: Hulls) -> tuple[Blocked, ...]:
     return tuple(found)
 
 
-def cone_directions(n: int, cosine: float) -> Array:
+def cone_directions(n: int, cosine: float) -> Floats:
     """`n` unit vectors (n, 3), spread evenly over the cone around z whose half-angle has the given cosine."""
     index = np.arange(n)
     z = 1 - (1 - cosine) * (index + 0.5) / n
@@ -112,7 +111,7 @@ def cone_directions(n: int, cosine: float) -> Array:
     return np.stack([across * np.cos(angle), across * np.sin(angle), z], axis=1)
 
 
-def hits(hulls: Hulls, p: int, origin: Array, directions: Array, lengths: Array) -> NDArray[np.bool_]:
+def hits(hulls: Hulls, p: int, origin: Floats, directions: Floats, lengths: Floats) -> NDArray[np.bool_]:
     """Which rays (N,) from `origin` along unit `directions` (N, 3), with `lengths` (N,), pass through hull `p`."""
     towards = hulls.normals[p] @ directions.T
     towards[towards == 0] = -np.finfo(np.float64).tiny  # parallel to a face
@@ -125,7 +124,7 @@ def hits(hulls: Hulls, p: int, origin: Array, directions: Array, lengths: Array)
     return leaves - enters > TOUCH
 
 
-def _candidates(hulls: Hulls, pinhole: Array, axis: Array, b: float, radius: float) -> NDArray[np.intp]:
+def _candidates(hulls: Hulls, pinhole: Floats, axis: Floats, b: float, radius: float) -> NDArray[np.intp]:
     """Parts with a corner in front of the pinhole, whose bounding sphere meets the cone of the ROI."""
     in_front = ((hulls.vertices - pinhole) @ axis).max(axis=1) > 0
     to = hulls.centers - pinhole

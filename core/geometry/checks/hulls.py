@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ...arrays import Floats
 from ..frames import moved
 from ..module_parts import BOX_FACES, ModulePart
 from ..part_colors import PartKind
@@ -25,12 +26,12 @@ class Hulls:
 
     numbers: NDArray[np.int64]  # (P,), the modules'
     kinds: tuple[PartKind, ...]
-    vertices: NDArray[np.float64]  # (P, 8, 3)
-    normals: NDArray[np.float64]  # (P, 6, 3)
-    offsets: NDArray[np.float64]  # (P, 6)
-    edges: NDArray[np.float64]  # (P, 6, 3), unit vectors
-    centers: NDArray[np.float64]  # (P, 3), of the bounding spheres
-    radii: NDArray[np.float64]  # (P,)
+    vertices: Floats  # (P, 8, 3)
+    normals: Floats  # (P, 6, 3)
+    offsets: Floats  # (P, 6)
+    edges: Floats  # (P, 6, 3), unit vectors
+    centers: Floats  # (P, 3), of the bounding spheres
+    radii: Floats  # (P,)
 
     @classmethod
     def of(cls, parts: Sequence[ModulePart]) -> Hulls:
@@ -54,7 +55,7 @@ class Hulls:
         return len(self.numbers)
 
 
-def _corners(vertices: NDArray[np.float64]) -> NDArray[np.float64]:
+def _corners(vertices: Floats) -> Floats:
     """Corners (8, 3) of the hull: both ends of a solid are squares around Z, of which the outermost count."""
     corners = []
     for z in (vertices[:, 2].min(), vertices[:, 2].max()):
@@ -63,5 +64,5 @@ def _corners(vertices: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.concatenate(corners)
 
 
-def _unit(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+def _unit(vectors: Floats) -> Floats:
     return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)

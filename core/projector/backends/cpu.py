@@ -14,13 +14,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...arrays import Array, Floats
 from ...errors import InputError
 from ..depth_response import DepthResponse
 from ..rays import Attenuation, IndexFans, IndexRays, Rays
-
-Array = NDArray[Any]  # of float32 or float64
 
 LEVEL_VARIABLE = "MPHDRR_CPU_LEVEL"
 """Environment variable that names a lower level of processor, `levels`, than this one's."""
@@ -156,9 +154,9 @@ def mu_gradient(gradient: Array, volume: Array, values: Array, rays: Rays, atten
 
 def gather(
     points: Array,
-    planes: NDArray[np.float64],
+    planes: Floats,
     arrays: Array,
-    matrices: NDArray[np.float64],
+    matrices: Floats,
     how: int,
     seen: Array | None,
     exponents: Array | None,
@@ -175,7 +173,7 @@ def gather(
     _run_places(_library.take_at, points, planes, arrays, matrices, [points, *counts], **others)
 
 
-def scatter(points: Array, planes: NDArray[np.float64], array: Array, matrix: NDArray[np.float64], slab: slice) -> None:
+def scatter(points: Array, planes: Floats, array: Array, matrix: Floats, slab: slice) -> None:
     """Add to the `slab` of `array` along its first axis, in place, what the adjoint of `gather` gives."""
     first, last, _ = slab.indices(len(array))
     _run_places(_library.give_at, points, planes, array[None], matrix[None], [array], first=first, last=last)
@@ -184,9 +182,9 @@ def scatter(points: Array, planes: NDArray[np.float64], array: Array, matrix: ND
 def _run_places(
     kernel: Any,
     points: Array,
-    planes: NDArray[np.float64],
+    planes: Floats,
     arrays: Array,
-    matrices: NDArray[np.float64],
+    matrices: Floats,
     written: list[Array],
     **others: Any,
 ) -> None:

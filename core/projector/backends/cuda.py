@@ -29,11 +29,10 @@ from typing import Any
 
 import numpy as np
 import warp as wp
-from numpy.typing import NDArray
 from torch import Tensor
 
 from ... import cache
-from ...arrays import ArrayOrTensor, is_tensor, to_caller, to_numpy, to_tensor
+from ...arrays import ArrayOrTensor, Floats, is_tensor, to_caller, to_numpy, to_tensor
 from ...errors import InputError
 from ...memory import readable_size
 from ..rays import Attenuation, IndexRays, Rays
@@ -199,7 +198,7 @@ def _array(volume: Tensor) -> Any:
     return wp.from_torch(volume)
 
 
-def _table(rays: Rays) -> tuple[NDArray[np.float64], int, int]:
+def _table(rays: Rays) -> tuple[Floats, int, int]:
     """Rays as the kernels take them: fans (F, 9, 3), their rows and columns. A single ray is a fan, too."""
     table = np.zeros((len(rays) if isinstance(rays, IndexRays) else len(rays.table), 9, 3))
     if isinstance(rays, IndexRays):

@@ -3,14 +3,11 @@
 import itertools
 import math
 from collections.abc import Iterator
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...arrays import Array
 from ..depth_response import DepthResponse
-
-Array = NDArray[Any]
 
 
 def voxels_to_cells(volume: Array, of: DepthResponse, passes: Array | None = None) -> Array:

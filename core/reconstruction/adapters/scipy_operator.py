@@ -1,14 +1,10 @@
 """scipy's linear operators."""
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse.linalg import LinearOperator as ScipyLinearOperator
 
+from ...arrays import Array
 from ...projector.operator import LinearOperator
-
-Array = NDArray[Any]
 
 
 class ScipyOperator(ScipyLinearOperator):

@@ -6,6 +6,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ...arrays import Floats
 from ...errors import InputError
 from ...geometry.frames import checked_affine
 from ...phantoms.derenzo import DerenzoRods
@@ -15,8 +16,6 @@ from ...validation import freeze, instance
 from ...volumes.resampling import values_at
 from ...volumes.volume import Volume, require_quantity
 from .rows import Rows, column
-
-Floats = NDArray[np.float64]
 
 RESOLVED_BELOW = 0.735
 """Valley-to-peak of two points that are just resolved, by Rayleigh's criterion."""

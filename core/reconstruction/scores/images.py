@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ...arrays import Floats
 from ...errors import InputError
 from ...geometry.grid import Grid
 from ...memory import require
@@ -14,7 +15,6 @@ from ...validation import instance, positive, real_array, shape_text
 from ...volumes.volume import Volume
 from ..stopping import inside
 
-Floats = NDArray[np.float64]
 Values = Volume | ArrayLike
 
 _SIGMA, _RADIUS = 1.5, 5  # of the window of Wang et al., voxels

@@ -4,8 +4,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ...arrays import Floats
 from ...errors import InputError
 from ...geometry.frames import checked_affine
 from ...phantoms.nema import NemaBody, room, sphere_places
@@ -13,8 +14,6 @@ from ...validation import freeze, instance
 from ...volumes.resampling import values_at
 from ...volumes.volume import Volume, require_quantity
 from .rows import Rows, column
-
-Floats = NDArray[np.float64]
 
 _SLICES = (-20.0, -10.0, 0.0, 10.0, 20.0)  # of the background regions, mm from the spheres' centres
 _IN_SLICE = 12  # background regions

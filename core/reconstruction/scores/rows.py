@@ -5,7 +5,8 @@ from dataclasses import dataclass
 from typing import Any, Generic, TypeVar, overload
 
 import numpy as np
-from numpy.typing import NDArray
+
+from ...arrays import Floats
 
 Row = TypeVar("Row")
 
@@ -16,7 +17,7 @@ class Rows(Sequence[Row], Generic[Row]):
 
     rows: tuple[Row, ...]
 
-    def column(self, name: str) -> NDArray[np.float64]:
+    def column(self, name: str) -> Floats:
         """An attribute of all rows."""
         return np.array([getattr(row, name) for row in self.rows], np.float64)
 

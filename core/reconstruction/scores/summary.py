@@ -6,8 +6,9 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ...arrays import Floats
 from ...errors import InputError
 from ...geometry.frames import checked_affine
 from ...phantoms.derenzo import DerenzoRods
@@ -39,7 +40,7 @@ class VolumeScore:
     """If the truth is a NEMA body phantom."""
     phantom: Phantom | None = None
     """The truth, if it is a phantom."""
-    pose: NDArray[np.float64] = field(default_factory=lambda: np.eye(4))
+    pose: Floats = field(default_factory=lambda: np.eye(4))
     """World-from-phantom (4, 4), mm."""
     notes: tuple[str, ...] = ()
     """What the scores were made with, and why some are missing: a sentence each."""

@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ... import errors
+from ...arrays import Array, Floats
 from ...errors import InputError
 from ...geometry.grid import Grid
 from ...memory import require
@@ -28,8 +28,8 @@ RAS_FROM_LPS = np.diag([-1.0, -1.0, 1.0, 1.0])
 class Contents:
     """A file's voxels: values (n_x, n_y, n_z) of any real type, and what the file says about them, or None."""
 
-    array: NDArray[Any]
-    affine: NDArray[np.float64] | None  # index to world mm, (4, 4)
+    array: Array
+    affine: Floats | None  # index to world mm, (4, 4)
     quantity: str | None = None
     unit: str | None = None
 

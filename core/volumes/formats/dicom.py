@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...arrays import Array, Floats
 from ...errors import InputError, first_line, naming, reading, warn
 from ...files import require_file
 from ...geometry.frames import affine_matrix
@@ -51,8 +51,8 @@ class _Slice:
     frame: int
     shape: tuple[int, int]  # rows, columns
     spacing: tuple[float, float]  # between rows, between columns, mm
-    orientation: NDArray[np.float64]  # (2, 3): along a row, down the rows
-    position: NDArray[np.float64]  # (3,), mm
+    orientation: Floats  # (2, 3): along a row, down the rows
+    position: Floats  # (3,), mm
     slope: float
     intercept: float
     thickness: float
@@ -234,7 +234,7 @@ def _frames(header: Any) -> list[Any]:
     return frames
 
 
-def _ordered(slices: list[_Slice]) -> tuple[list[_Slice], NDArray[np.float64]]:
+def _ordered(slices: list[_Slice]) -> tuple[list[_Slice], Floats]:
     """The slices sorted by place, and the step (3,), mm, from one to the next."""
     first = slices[0]
     for one in slices:
@@ -286,12 +286,12 @@ def _ordered(slices: list[_Slice]) -> tuple[list[_Slice], NDArray[np.float64]]:
     return slices, step
 
 
-def _pixels(slices: list[_Slice]) -> Iterator[tuple[_Slice, NDArray[Any]]]:
+def _pixels(slices: list[_Slice]) -> Iterator[tuple[_Slice, Array]]:
     """Each slice with its stored values (rows, columns). A multi-frame file is decoded once."""
     import pydicom
 
     path: Path | None = None
-    frames: NDArray[Any] = np.empty(0)
+    frames: Array = np.empty(0)
     for one in slices:
         if one.path != path:
             path = one.path
@@ -300,7 +300,7 @@ def _pixels(slices: list[_Slice]) -> Iterator[tuple[_Slice, NDArray[Any]]]:
         yield one, frames[one.frame]
 
 
-def decoded(data: Any) -> NDArray[Any]:
+def decoded(data: Any) -> Array:
     """The stored values of a file that is read whole."""
     try:
         return np.asarray(data.pixel_array)
@@ -386,7 +386,7 @@ def _in_becquerels(header: Any) -> dict[str, Any]:
     return {}
 
 
-def _numbers(header: Any, name: str, length: int, default: float | None = None) -> NDArray[np.float64]:
+def _numbers(header: Any, name: str, length: int, default: float | None = None) -> Floats:
     """The `length` finite numbers of the tag `name`, or `default` if it is missing or empty."""
     given = header.get(name)
     value = default if given is None or given == "" else given
@@ -398,7 +398,7 @@ def _numbers(header: Any, name: str, length: int, default: float | None = None) 
     return array
 
 
-def _directions(header: Any) -> NDArray[np.float64]:
+def _directions(header: Any) -> Floats:
     """ImageOrientationPatient as two orthonormal rows (2, 3): along a row of pixels, and down the rows."""
     rows = _numbers(header, "ImageOrientationPatient", 6).reshape(2, 3)
     if not np.allclose(rows @ rows.T, np.eye(2), atol=1e-3):

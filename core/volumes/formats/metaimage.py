@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...arrays import Floats
 from ...errors import InputError
 from ...files import require_file
 from ...geometry.frames import affine_matrix
@@ -97,7 +97,7 @@ def _unpacked(header: dict[str, str], file: BinaryIO, size: int, name: str) -> b
     return data
 
 
-def _affine(header: dict[str, str], path: Path) -> NDArray[np.float64]:
+def _affine(header: dict[str, str], path: Path) -> Floats:
     """Index to world mm, with a warning of what the header does not say."""
     spacing, offset = ("ElementSpacing", "ElementSize"), ("Offset", "Position", "Origin")
     turned = ("TransformMatrix", "Rotation", "Orientation")
@@ -116,7 +116,7 @@ def _affine(header: dict[str, str], path: Path) -> NDArray[np.float64]:
     return RAS_FROM_LPS @ affine_matrix(axes * _MILLIMETRES[unit], origin * _MILLIMETRES[unit])
 
 
-def _numbers(header: dict[str, str], keys: tuple[str, ...], default: NDArray[np.float64] | None) -> NDArray[np.float64]:
+def _numbers(header: dict[str, str], keys: tuple[str, ...], default: Floats | None) -> Floats:
     """The numbers of the first of `keys` in the header, as many as `default` has."""
     text = next((header[key] for key in keys if key in header), None)
     if text is None:

@@ -5,8 +5,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...arrays import Array
 from ...errors import InputError
 from ..volume import Volume
 from .contents import Contents
@@ -37,7 +37,7 @@ def packed(arrays: dict[str, Any]) -> memoryview:
     return memory.getbuffer()
 
 
-def load(path: Path, wanted: set[str] | None = None) -> dict[str, NDArray[Any]]:
+def load(path: Path, wanted: set[str] | None = None) -> dict[str, Array]:
     """The arrays of an .npz by name, or those that are `wanted`; of an .npy its array, with the name "".
 
     Each member of an .npz is read to its end, where its checksum is.

@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ...arrays import Floats
 from ...errors import InputError, reading
-from ...files import replacing, require_ending, require_file
+from ...files import AnyPath, replacing, require_ending, require_file
 from ...validation import freeze, one_of, real_array
 
 MESH_FORMATS = (".stl", ".obj", ".ply", ".glb")
@@ -28,7 +29,7 @@ class Mesh:
     Corners run counter-clockwise as seen from outside.
     """
 
-    vertices: NDArray[np.float64]
+    vertices: Floats
     faces: NDArray[np.int64]
 
     def __post_init__(self) -> None:
@@ -52,7 +53,7 @@ class Mesh:
         return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6)
 
 
-def read_mesh(path: str | os.PathLike[str], unit: str | None = None) -> Mesh:
+def read_mesh(path: AnyPath, unit: str | None = None) -> Mesh:
     """Read the triangles of a mesh file, all its objects as one: .stl, .obj, .ply or .glb.
 
     `unit` is that of the file's lengths, one of `MILLIMETRES`. Default: mm; of .glb m, as its standard says.
@@ -66,7 +67,7 @@ def read_mesh(path: str | os.PathLike[str], unit: str | None = None) -> Mesh:
         return Mesh(np.asarray(mesh.vertices) * factor, np.asarray(mesh.faces))
 
 
-def write_mesh(mesh: Mesh, path: str | os.PathLike[str], unit: str | None = None) -> None:
+def write_mesh(mesh: Mesh, path: AnyPath, unit: str | None = None) -> None:
     """Write a mesh as .stl, .obj, .ply or .glb; `unit` as for `read_mesh`."""
     import trimesh
 

@@ -10,6 +10,7 @@ from itertools import permutations
 import numpy as np
 from numpy.typing import NDArray
 
+from ...arrays import Floats, Floats32
 from ...errors import InputError
 from ...geometry.frames import moved
 from ...memory import require
@@ -60,7 +61,7 @@ def volume_to_mesh(volume: Volume, level: float | None = None, progress: Progres
     return Mesh(moved(volume.grid.affine, index), faces.reshape(-1, 3)[:, :: -1 if mirrored else 1])
 
 
-def _plane(array: NDArray[np.float32], i: int, outside: float) -> NDArray[np.float64]:
+def _plane(array: Floats32, i: int, outside: float) -> Floats:
     """The values of one plane of voxels with a margin of one voxel."""
     if 0 <= i < len(array):
         return np.pad(array[i].astype(np.float64), 1, constant_values=outside)
@@ -68,8 +69,8 @@ def _plane(array: NDArray[np.float32], i: int, outside: float) -> NDArray[np.flo
 
 
 def _triangles(
-    below: NDArray[np.float64], above: NDArray[np.float64], level: float, first: int, strides: NDArray[np.int64]
-) -> list[tuple[NDArray[np.int64], NDArray[np.float64]]]:
+    below: Floats, above: Floats, level: float, first: int, strides: NDArray[np.int64]
+) -> list[tuple[NDArray[np.int64], Floats]]:
     """Triangles between two planes: the edges (N, 3) on which their corners lie, and where on them (N, 3), 0 to 1.
 
     An edge is 8 times the flat index of its lower corner plus the corner of the cube that it points to.

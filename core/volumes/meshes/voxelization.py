@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ...arrays import Floats, Floats32
 from ...errors import InputError
 from ...geometry.frames import moved
 from ...geometry.grid import Grid
@@ -72,7 +73,7 @@ def voxelize_mesh(
     return Volume(freeze(array), grid, quantity)
 
 
-def mesh_coverage(mesh: Mesh, grid: Grid, progress: Progress | None = None) -> NDArray[np.float32]:
+def mesh_coverage(mesh: Mesh, grid: Grid, progress: Progress | None = None) -> Floats32:
     """Share of each voxel that lies inside a closed mesh, 0 to 1, float32 array of the grid's shape.
 
     Where the mesh intersects itself, everything that any part of it encloses is inside; there the shares are approximate,
@@ -114,8 +115,8 @@ def mesh_coverage(mesh: Mesh, grid: Grid, progress: Progress | None = None) -> N
 
 
 def _along_rays(
-    surface: NDArray[np.float64], shape: tuple[int, int, int], step: tuple[float, float]
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    surface: Floats, shape: tuple[int, int, int], step: tuple[float, float]
+) -> tuple[Floats, NDArray[np.bool_]]:
     """The shares of voxels inside the surface of polygons (N, V, 3), from rays along z, `step` voxels apart in x and y.
 
     Also the columns of voxels (n_x, n_y) in which there are winding numbers other than 0 and 1, or 0 and -1.
@@ -154,8 +155,8 @@ def _along_rays(
 
 
 def _crossings(
-    triangles: NDArray[np.float64], seen: NDArray[np.float64], size: NDArray[np.int64]
-) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.int64]]:
+    triangles: Floats, seen: Floats, size: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], Floats, NDArray[np.int64]]:
     """Where rays along z meet `triangles` (N, 3, 3): the ray's number, z, and 1 or -1 for the side of the triangle.
 
     The rays form a lattice of `size` (2,); `seen` (N, 3, 2) are the corners in lattice coordinates.
@@ -180,7 +181,7 @@ def _crossings(
     return ray, z, side
 
 
-def _winding(surface: NDArray[np.float64], shape: tuple[int, int, int]) -> NDArray[np.float64]:
+def _winding(surface: Floats, shape: tuple[int, int, int]) -> Floats:
     """Mean winding number of each voxel with respect to a surface of polygons (N, V, 3)."""
     n_x, n_y, n_z = shape
     steps = np.zeros(n_x * n_y * (n_z + 1))  # in the winding number, from each voxel to the next
@@ -204,9 +205,7 @@ def _winding(surface: NDArray[np.float64], shape: tuple[int, int, int]) -> NDArr
     return np.cumsum(steps.reshape(n_x, n_y, n_z + 1), axis=2)[:, :, :n_z]
 
 
-def _split(
-    pieces: NDArray[np.float64], cells: NDArray[np.int64], axis: int, n: int
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def _split(pieces: Floats, cells: NDArray[np.int64], axis: int, n: int) -> tuple[Floats, NDArray[np.int64]]:
     """The `pieces` (N, V, 3) cut at the whole numbers along `axis`, and `cells` (N, 3) with their index along it."""
     low = np.floor(pieces[:, :, axis].min(axis=1)).astype(np.int64).clip(0, n - 1)
     high = np.ceil(pieces[:, :, axis].max(axis=1)).astype(np.int64).clip(low + 1, n)
@@ -221,23 +220,23 @@ def _split(
     return _joined([pieces[whole], parts]), cells
 
 
-def _joined(pieces: list[NDArray[np.float64]]) -> NDArray[np.float64]:
+def _joined(pieces: list[Floats]) -> Floats:
     """Pieces with different numbers of corners in one array; the last corner is repeated."""
     corners = max(part.shape[1] for part in pieces)
     return np.concatenate([part[:, np.minimum(np.arange(corners), part.shape[1] - 1)] for part in pieces])
 
 
-def _slab(pieces: NDArray[np.float64], axis: int, low: ArrayLike, high: ArrayLike) -> NDArray[np.float64]:
+def _slab(pieces: Floats, axis: int, low: ArrayLike, high: ArrayLike) -> Floats:
     """The parts of `pieces` between two planes each."""
     return _clip(_clip(pieces, axis, low, 1), axis, high, -1)
 
 
-def _seen(pieces: NDArray[np.float64]) -> NDArray[np.float64]:
+def _seen(pieces: Floats) -> Floats:
     """Those `pieces` that have an area as seen along z; the others cover nothing."""
     return pieces[(np.ptp(pieces[:, :, :2], axis=1) > 0).all(axis=1)]
 
 
-def _clip(pieces: NDArray[np.float64], axis: int, plane: ArrayLike, side: int) -> NDArray[np.float64]:
+def _clip(pieces: Floats, axis: int, plane: ArrayLike, side: int) -> Floats:
     """The parts of convex `pieces` (N, V, 3) above (`side` 1) or below (-1) each one's `plane`: (N, W, 3).
 
     I. Sutherland, G. Hodgman, "Reentrant polygon clipping", CACM 17 (1974). Spare corners repeat the last one; a piece that

@@ -81,6 +81,7 @@ from .runs.recipe import Recipe, read_recipe, write_recipe
 from .runs.reconstructing import reconstruct_run
 from .runs.run import ProjectionRun
 from .runs.run_recipe import projector_of_run, run_recipe
+from .system_source import SystemSource
 from .volumes.meshes.mesh import Mesh, read_mesh, write_mesh
 from .volumes.meshes.surface import volume_to_mesh
 from .volumes.meshes.voxelization import voxelize_mesh
@@ -88,20 +89,10 @@ from .volumes.rearranging import canonical, centered, crop, crop_to_box, pad, sp
 from .volumes.resampling import resample
 from .volumes.volume import Volume
 from .volumes.volume_files import read_volume, write_volume
-from .workbook import (
-    ColumnMap,
-    ColumnMapDraft,
-    MappedColumn,
-    MappedTable,
-    SystemSource,
-    WrittenWorkbook,
-    draft_column_map,
-    kinds_in,
-    preview_workbook,
-    read_scanner,
-    read_system,
-    write_system,
-)
+from .workbook.column_map import ColumnMap, MappedColumn, MappedTable
+from .workbook.draft import ColumnMapDraft, draft_column_map, preview_workbook
+from .workbook.reader import kinds_in, read_scanner, read_system
+from .workbook.writer import WrittenWorkbook, write_system
 
 __all__ = [
     name for name, value in globals().items() if not (name.startswith("_") or isinstance(value, types.ModuleType))

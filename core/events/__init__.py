@@ -5,6 +5,8 @@
 >>> events[0].truth, events[0].images("emission", noise_seed=1), events[0].radon(96)
 """
 
+import types
+
 from .checking import Fault, Status, check, repair, status
 from .event_set import Event, EventSet
 from .exports import export_events
@@ -15,22 +17,5 @@ from .training import torch_dataset
 from .work import Made, make, making
 
 __all__ = [
-    "Event",
-    "EventArrays",
-    "EventMaker",
-    "EventRecipe",
-    "EventSet",
-    "Fault",
-    "Made",
-    "PlannedEvent",
-    "Status",
-    "check",
-    "export_events",
-    "make",
-    "making",
-    "plan",
-    "read_recipe",
-    "repair",
-    "status",
-    "torch_dataset",
+    name for name, value in globals().items() if not (name.startswith("_") or isinstance(value, types.ModuleType))
 ]

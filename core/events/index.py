@@ -4,17 +4,15 @@ It only says sooner what the recipe says: rows that are missing, such as those o
 for. So works that write it at once need not wait for each other; the last one that ends finds what is missing.
 """
 
-import csv
-import io
 import json
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 from ..errors import InputError, refusing
 from ..files import write_bytes
-from .cells import escaped, unescaped
+from .cells import csv_line, csv_lines, escaped, unescaped
 from .planning import FIXED_COLUMNS, plan
 from .recipe import EventRecipe
 
@@ -54,7 +52,7 @@ class Index:
         found = {int(first): line for line in lines if (first := line.partition(",")[0]).isdigit() and _CUT not in line}
         if names != self.columns:  # of an earlier version: the columns of what was drawn
             rows = {n: dict(zip(names, _cells(line), strict=False)) for n, line in found.items()}
-            found = {n: _csv([row.get(name, "") for name in self.columns]) for n, row in rows.items()}
+            found = {n: csv_line([row.get(name, "") for name in self.columns]) for n, row in rows.items()}
         return found
 
     def is_current(self) -> bool:
@@ -65,7 +63,7 @@ class Index:
         """The row of an event, as the recipe says."""
         row = plan(self._recipe, number).row()
         values = (row.get(name, "") for name in self.columns)
-        return _csv([escaped(value) if isinstance(value, str) else json.dumps(value) for value in values])
+        return csv_line([escaped(value) if isinstance(value, str) else json.dumps(value) for value in values])
 
     def values(self, line: str) -> dict[str, Any]:
         """What a row says, by column; None where it is empty."""
@@ -73,7 +71,7 @@ class Index:
 
     def text(self, lines: Mapping[int, str]) -> bytes:
         """The file with these rows, in order."""
-        return "".join(f"{line}\n" for line in (_csv(self.columns), *(lines[n] for n in sorted(lines)))).encode()
+        return "".join(f"{line}\n" for line in (csv_line(self.columns), *(lines[n] for n in sorted(lines)))).encode()
 
     def add(self, number: int) -> None:
         """Add the row of an event that was made, at the end of the file."""
@@ -118,14 +116,7 @@ def column(line: str, place: int) -> str:
 
 
 def _cells(line: str) -> list[str]:
-    return next(csv.reader(io.StringIO(line, newline="")), [])
-
-
-def _csv(cells: Iterable[str]) -> str:
-    """A line of the table."""
-    text = io.StringIO()
-    csv.writer(text, lineterminator="").writerow(cells)
-    return text.getvalue()
+    return next(csv_lines(line), [])
 
 
 def _value(name: str, text: str) -> Any:

@@ -85,6 +85,11 @@ class Grid:
         return hash((self.shape, self.affine.tobytes()))
 
 
+def same_grid(one: Grid, other: Grid) -> bool:
+    """Whether two grids have the same voxels, up to a thousandth of a voxel, which files may round away."""
+    return one.shape == other.shape and bool(np.abs(one.corners() - other.corners()).max() <= 1e-3 * one.spacing.min())
+
+
 def grid_around(points: Floats, spacing: float) -> Grid:
     """The axis-aligned grid of cubes that holds world `points` (n, 3), mm, with at least half a voxel around them."""
     low, high = points.min(axis=0), points.max(axis=0)

@@ -11,14 +11,3 @@ from .inverse_square import InverseSquareSum
 from .models import Model, Transmission, intensity
 from .operator import Adjoint, Projector
 from .tracing import trace_rays
-
-__all__ = [
-    "Adjoint",
-    "Emission",
-    "InverseSquareSum",
-    "Model",
-    "Projector",
-    "Transmission",
-    "intensity",
-    "trace_rays",
-]

@@ -14,7 +14,7 @@ import numpy as np
 
 from ..arrays import Array
 from ..errors import InputError, reading
-from ..files import AnyPath, require_file, write_bytes
+from ..files import AnyPath, require_ending, require_file, write_bytes
 from ..geometry.grid import Grid
 from ..geometry.scanner import Scanner, scanner_kind
 from ..geometry.system import PinholeSystem
@@ -96,7 +96,7 @@ def write_run(run: ProjectionRun, path: AnyPath) -> None:
 
     `InputError` for another suffix, where torch is missing for .pt, or the file cannot be written: the old one then stays.
     """
-    packed, _ = _format(Path(path))
+    packed, _ = _FORMATS[require_ending(path, FORMATS)]
     of_volume, of_scanner = {}, {}
     if run.volume is not None:
         of_volume = {"volume_quantity": run.volume.quantity, "volume_unit": run.volume.unit}
@@ -129,7 +129,7 @@ def _arrays(run: ProjectionRun) -> _Arrays:
 
 def read_run(path: AnyPath) -> ProjectionRun:
     """Read a run written by `write_run`; `InputError` where there is no such file, or no whole run in it."""
-    _, read = _format(Path(path))
+    _, read = _FORMATS[require_ending(path, FORMATS)]
     with reading(require_file(path), "a projection run"):
         return _run_of(*read(Path(path)))
 
@@ -241,10 +241,3 @@ _FORMATS: dict[str, _Format] = {
     ".pt": (_packed_pt, _read_pt),
 }
 FORMATS = tuple(_FORMATS)
-
-
-def _format(path: Path) -> _Format:
-    try:
-        return _FORMATS[path.suffix.lower()]
-    except KeyError:
-        raise InputError(f"{path}: expected a name ending in {', '.join(FORMATS)}") from None

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import InputError, naming
-from ..files import AnyPath, write_bytes
+from ..files import AnyPath, require_ending, write_bytes
 from ..phantoms.settings import setting_names
 from ..toml import read_toml, toml_value
 from .settings import SAMPLING, SETTINGS, TABLES, Setting, settings_with
@@ -155,8 +155,7 @@ def write_recipe(recipe: Recipe, path: AnyPath) -> None:
     `InputError` where the name does not end in .toml, or the file cannot be written.
     """
     path = Path(path)
-    if path.suffix.lower() != ".toml":
-        raise InputError(f"{path}: expected a name ending in .toml")
+    require_ending(path, (".toml",))
 
     def relative(name: str) -> str:
         try:

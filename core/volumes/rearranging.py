@@ -6,7 +6,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..arrays import Floats32
 from ..errors import InputError
 from ..geometry.frames import moved
-from ..geometry.grid import Grid
+from ..geometry.grid import Grid, same_grid
 from ..memory import require
 from ..validation import freeze, instance, one_for_all, real_array, real_numbers
 from .volume import Volume, outside_value
@@ -84,10 +84,7 @@ def split_labels(volume: Volume, labels: Volume | NDArray) -> dict[int, Volume]:
     """
     instance(volume, Volume, "split_labels")
     if isinstance(labels, Volume):
-        same = labels.grid.shape == volume.grid.shape and np.allclose(
-            labels.grid.affine, volume.grid.affine, rtol=0, atol=1e-3 * volume.grid.spacing.min()
-        )
-        if not same:
+        if not same_grid(labels.grid, volume.grid):
             raise InputError("labels: expected the volume's own grid; resample them onto it, method 'nearest'")
         labels = labels.array
     array = real_numbers(labels, "labels")

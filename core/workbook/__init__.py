@@ -14,19 +14,3 @@ from .column_map import ColumnMap, MappedColumn, MappedTable
 from .draft import ColumnMapDraft, draft_column_map, preview_workbook
 from .reader import kinds_in, read_scanner, read_system
 from .writer import WrittenWorkbook, write_system
-
-__all__ = [
-    "ColumnMap",
-    "ColumnMapDraft",
-    "MappedColumn",
-    "MappedTable",
-    "QuantityCells",
-    "SystemSource",
-    "WrittenWorkbook",
-    "draft_column_map",
-    "kinds_in",
-    "preview_workbook",
-    "read_scanner",
-    "read_system",
-    "write_system",
-]

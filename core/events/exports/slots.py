@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ...arrays import Floats32
 from ...errors import InputError
-from ...files import AnyPath
+from ...files import AnyPath, read_text
 from ...geometry.scanner import Scanner
 
 MIRRORED = 4
@@ -83,12 +83,7 @@ def read_slots(path: AnyPath, system: Scanner) -> Slots:
     Slots are counted from 0, modules are named by their numbers, and a column "column" says how many are in a row; others
     are not looked at. `InputError`, with the line, where something is missing or no module has the number.
     """
-    try:
-        with open(path, encoding="utf-8-sig", newline="") as file:
-            text = file.read()
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot be read as a table of slots ({error})") from error
-    lines = csv.DictReader(io.StringIO(text))
+    lines = csv.DictReader(io.StringIO(read_text(path, "a table of slots")))
     for name in ("slot", "module", "mirrored"):
         if name not in (lines.fieldnames or ()):
             raise InputError(f"{path}: no column {name!r}; expected slot, module and mirrored")

@@ -4,8 +4,6 @@
 gone on with: files that are there stay, those of more events are added. Any other folder with something in it is refused.
 """
 
-import csv
-import io
 import json
 import shutil
 from dataclasses import dataclass
@@ -16,7 +14,7 @@ from ...errors import InputError
 from ...files import ensure_folder, is_leftover, write_bytes, written_name
 from ...memory import readable_size
 from ...progress import Progress, tell
-from ..cells import escaped, unescaped
+from ..cells import csv_line, csv_lines, escaped, unescaped
 from ..noise_choice import chosen_seed
 from .layout import Chosen, Layout, Part, Row
 
@@ -150,13 +148,10 @@ def _require_same(folder: Path, request: dict[str, Any], rows: list[Row]) -> int
 
 def table(rows: list[Row]) -> bytes:
     """The events as CSV."""
-    text = io.StringIO()
-    lines = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
-    lines.writeheader()
-    lines.writerows({key: escaped(value) for key, value in row.items()} for row in rows)
-    return text.getvalue().encode()
+    lines = [rows[0], *(map(escaped, row.values()) for row in rows)]
+    return "".join(f"{csv_line(line)}\n" for line in lines).encode()
 
 
 def _cells(text: str) -> list[list[str]]:
     """What the cells of a table say, without its heading."""
-    return [[unescaped(cell) for cell in line] for line in csv.reader(io.StringIO(text, newline=""))][1:]
+    return [[unescaped(cell) for cell in line] for line in csv_lines(text)][1:]

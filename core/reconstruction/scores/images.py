@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ...arrays import Floats
 from ...errors import InputError
-from ...geometry.grid import Grid
+from ...geometry.grid import same_grid
 from ...memory import require
 from ...progress import Progress, in_threads
 from ...validation import instance, positive, real_array, shape_text
@@ -171,11 +171,6 @@ def bias_and_deviation(volumes: Iterable[Volume], truth: Volume) -> BiasAndDevia
         raise InputError(f"bias_and_deviation: expected two volumes or more, got {count}")
     found = (mean - truth.array, np.sqrt(squares / (count - 1)))
     return BiasAndDeviation(*(Volume(values.astype(np.float32), truth.grid, truth.quantity) for values in found))
-
-
-def same_grid(one: Grid, other: Grid) -> bool:
-    """Whether two grids have the same voxels, up to a thousandth of a voxel, which files may round away."""
-    return one.shape == other.shape and bool(np.abs(one.corners() - other.corners()).max() <= 1e-3 * one.spacing.min())
 
 
 def _pair(volume: Values, truth: Values, name: str, mask: ArrayLike | None = None) -> tuple[Floats, Floats]:

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 from ...arrays import Floats
 from ...errors import InputError
 from ...geometry.frames import checked_affine
+from ...geometry.grid import same_grid
 from ...phantoms.derenzo import DerenzoRods
 from ...phantoms.nema import NemaBody
 from ...phantoms.phantom import QUANTITIES, Phantom
@@ -19,7 +20,7 @@ from ...validation import instance
 from ...volumes.resampling import resample
 from ...volumes.volume import Volume, require_quantity
 from .derenzo import DerenzoScore, derenzo_score
-from .images import nrmse, psnr, same_grid, ssim
+from .images import nrmse, psnr, ssim
 from .nema import NemaScore, NemaSphere, nema_score
 
 

@@ -1,7 +1,5 @@
 """The scanner: all pinhole modules and their common isocentre."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, Self, TypeVar

@@ -7,8 +7,6 @@ References
 R. T. Collins, "A space-sweep approach to true multi-image matching", Proc. IEEE CVPR (1996) 358-363.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The lattice of one view's own coordinates: a cell for each pixel and plane of depth."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any

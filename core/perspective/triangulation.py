@@ -7,8 +7,6 @@ R. Hartley, A. Zisserman, "Multiple View Geometry in Computer Vision", 2nd ed., 
 R. D. Cook, S. Weisberg, "Residuals and Influence in Regression", Chapman and Hall (1982), section 2.2.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Shares of photons that reach a pinhole from every voxel of a grid, for models without rays."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

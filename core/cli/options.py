@@ -154,8 +154,7 @@ def counted(number: int, word: str) -> str:
 def say(text: str) -> None:
     """Write a line on standard error; on a terminal in the place of a bar that is not at its end."""
     over = "\r\x1b[K" if sys.stderr.isatty() else ""
-    sys.stderr.write(f"{over}mphdrr: {text}\n")
-    sys.stderr.flush()
+    print(f"{over}mphdrr: {text}", file=sys.stderr, flush=True)
 
 
 def progress_bar(label: str, more: Callable[[], str] | None = None) -> Progress:
@@ -172,7 +171,6 @@ def progress_bar(label: str, more: Callable[[], str] | None = None) -> Progress:
         words = f"{time.monotonic() - started:.1f} s" if more is None else more()
         end = "\n" if done >= total else ""
         bar = f"[{'#' * filled}{'.' * (width - filled)}]"
-        sys.stderr.write(f"\r{label} {bar} {done}/{total}  {words}\x1b[K{end}")
-        sys.stderr.flush()
+        print(f"\r{label} {bar} {done}/{total}  {words}\x1b[K", end=end, file=sys.stderr, flush=True)
 
     return show

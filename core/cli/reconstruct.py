@@ -151,5 +151,4 @@ class _Log:
         if not self.quiet:
             seconds = time.monotonic() - self.begun
             line = f"{self.name} {objective[-1]:.8g}, largest {float(values.max()):.4g}, {seconds:.1f} s"
-            sys.stderr.write(f"iteration {iteration} of {self.total}: {line}\n")
-            sys.stderr.flush()
+            print(f"iteration {iteration} of {self.total}: {line}", file=sys.stderr, flush=True)

@@ -79,13 +79,9 @@ class EventMaker:
         what = f"an event of {readable_size(self.raw_bytes)}" if workers == 1 else f"{workers} workers"
         require(workers * (2.5 * self.raw_bytes + (workers > 1) * _WORKER), what)
 
-    def plan(self, number: int) -> PlannedEvent:
-        """What an event is."""
-        return plan(self.recipe, number)
-
     def make(self, number: int, progress: Progress | None = None) -> EventArrays:
         """Compute an event; `progress` is called as ``progress(steps done, steps)`` and may raise `Cancelled`."""
-        planned, recipe = self.plan(number), self.recipe
+        planned, recipe = plan(self.recipe, number), self.recipe
         self.require_memory()
         done, steps = 0, 1 + len(recipe.models) + (0 if recipe.radon is None else len(recipe.radon.counts))
 

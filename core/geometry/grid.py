@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from ..arrays import Floats
 from ..validation import freeze, lengths, real_array, whole_shape
-from .frames import affine_matrix, checked_affine
+from .frames import affine_matrix, checked_affine, moved
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,8 +73,7 @@ class Grid:
     def corners(self) -> Floats:
         """World points (8, 3), mm, of the box's outer corners (voxel faces, not centres)."""
         unit = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), axis=-1).reshape(8, 3)
-        index = unit * np.array(self.shape) - 0.5
-        return index @ self.affine[:3, :3].T + self.affine[:3, 3]
+        return moved(self.affine, unit * np.array(self.shape) - 0.5)
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Grid):

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from ..arrays import Floats
+from ..geometry.frames import moved
 from ..geometry.grid import Grid
 from ..geometry.system import PinholeSystem
 from ..memory import require
@@ -103,7 +104,7 @@ def _map(
     def fill(first: int) -> None:
         voxels = np.arange(first, min(first + size, grid.n_voxels))
         index = np.stack(np.unravel_index(voxels, grid.shape), axis=1)
-        values[voxels] = value(index @ grid.affine[:3, :3].T + grid.affine[:3, 3])
+        values[voxels] = value(moved(grid.affine, index))
 
     in_threads(fill, range(0, grid.n_voxels, size), progress)
     return Volume(freeze(values.reshape(grid.shape)), grid, quantity)

@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 
 from ..arrays import Array, Floats32, cropped
 from ..errors import InputError
+from ..geometry.frames import moved
 from ..geometry.grid import Grid
 from ..geometry.system import PinholeSystem
 from ..geometry.views import Views
@@ -223,7 +224,7 @@ class WholeHoles:
         rays = views.detector_centers[m] - pinhole + signs @ [views.u_steps[m] * n_u / 2, views.v_steps[m] * n_v / 2]
         hole = d * (1 + near / l) * signs @ frame[:2]
         corners = pinhole + np.concatenate([hole, hole + near * rays / (rays @ frame[2])[:, None]])
-        index = corners @ self.grid.index_from_world[:3, :3].T + self.grid.index_from_world[:3, 3]
+        index = moved(self.grid.index_from_world, corners)
         low = np.clip(np.floor(index.min(axis=0)), 0, self.grid.shape).astype(int)
         high = np.clip(np.ceil(index.max(axis=0)) + 1, low, self.grid.shape).astype(int)
         row, places = self.depths(m), np.indices((high - low).tolist()) + low[:, None, None, None]

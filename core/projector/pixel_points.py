@@ -18,6 +18,7 @@ import numpy as np
 
 from ..arrays import Floats
 from ..errors import InputError
+from ..geometry.frames import moved
 from ..geometry.grid import Grid
 from ..geometry.views import Views
 
@@ -128,7 +129,7 @@ def shadow_edges(views: Views, m: int, grid: Grid) -> Floats:
     """
     ticks = [np.unique(np.linspace(0, n - 1, min(n, _VOXELS_ALONG)).round()) for n in grid.shape]
     index = np.stack(np.meshgrid(*ticks, indexing="ij"), axis=-1).reshape(-1, 3)
-    centers = index @ grid.affine[:3, :3].T + grid.affine[:3, 3]
+    centers = moved(grid.affine, index)
     matrix = views[m].projection_matrices()[0]
     column, row, factor = matrix[:, :3] @ centers.T + matrix[:, 3:]
     nearest = 1e-6 * np.abs(factor).max()  # a voxel at the source has no shadow to speak of

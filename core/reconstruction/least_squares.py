@@ -190,9 +190,8 @@ class LeastSquaresLoop(Loop):
             method, A, iterations, *options, **named, default=0.0, negative=not nonnegative, quantity=quantity
         )
         self._nonnegative = nonnegative
-        self.images: Array = real_array(plain(images), "images", A.shape_out, np.float32) - A.background.astype(
-            np.float32
-        )
+        background = A.background.astype(np.float32)
+        self.images: Array = real_array(plain(images), "images", A.shape_out, np.float32) - background
         self.weights: Array = self.mask.astype(np.float32)
 
     def record(self) -> dict[str, Any]:

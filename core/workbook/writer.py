@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputError, several, warn
-from ..files import AnyPath, replacing, require_ending, write_bytes
+from ..files import AnyPath, replacing, write_bytes
 from ..geometry.scanner import Scanner, first
 from ..recording import recorded_warnings
 from ..validation import instance
@@ -79,7 +79,9 @@ def write_system(
     instance(system, Scanner, "write_system")
     _refuse_texts(system)
     target = Path(path)
-    suffix = require_ending(target, tuple(KINDS))
+    suffix = target.suffix.lower()
+    if suffix not in KINDS:
+        raise InputError(f"{target}: expected a name ending in {' or '.join(KINDS)}")
     if template is None:
         if suffix != ".xlsx":
             raise InputError(f"{target}: a workbook without a template has no macros, expected a name ending in .xlsx")

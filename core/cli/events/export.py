@@ -39,10 +39,8 @@ def _run(arguments: argparse.Namespace) -> None:
     events = EventSet(arguments.folder)
     if arguments.split is not None:
         events = events.split(arguments.split)
-    options = {
-        name: getattr(arguments, name)
-        for name in ("noise", "level", "slots", "raw", "events_per_shard", "uncompressed")
-    }
+    names = ("noise", "level", "slots", "raw", "events_per_shard", "uncompressed")
+    options = {name: getattr(arguments, name) for name in names}
     plan = planned_export(events, arguments.output, arguments.to, models=arguments.model, **options)
     say(plan.says())
     plan.write(progress_bar("exporting"))

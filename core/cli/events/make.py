@@ -54,16 +54,8 @@ def _run(arguments: argparse.Namespace) -> None:
     mphdrr events make set -n 100000 --shard 3/50
     """
     recipe = chosen_recipe(arguments.folder, arguments.recipe)
-    work = making(
-        recipe,
-        arguments.folder,
-        arguments.count,
-        arguments.first,
-        arguments.workers,
-        arguments.shard,
-        dask=arguments.dask,
-        pack=arguments.pack,
-    )
+    options = {name: getattr(arguments, name) for name in ("count", "first", "workers", "shard", "dask", "pack")}
+    work = making(recipe, arguments.folder, **options)
     done, folder = watched(work, arguments.quiet), work.folder
     there, asked = len(folder.store.places()), sum(map(len, folder.asked))
     record = {"folder": arguments.folder, "asked": asked, "events": there, "made": done}

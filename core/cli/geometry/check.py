@@ -11,7 +11,7 @@ from ...geometry.collimator import EdgePlace
 from ...geometry.system import PinholeSystem
 from ...physics.isotopes import ISOTOPES
 from ...recording import recorded_warnings
-from ..options import print_answer, read_workbook, refuse
+from ..options import counted, print_answer, read_workbook, refuse
 from .arguments import add_action, add_edge, optics_of
 
 
@@ -42,9 +42,7 @@ def _run(arguments: argparse.Namespace) -> None:
     optics = optics_of(arguments, system)
     report = check_geometry(system, **parts, aperture_mu=optics.aperture_mu, opening_angle=optics.opening_angle)
     findings = report.messages()
-    warnings, found = (
-        f"{len(x)} {name}{'s' * (len(x) != 1)}" for x, name in ((messages, "warning"), (findings, "finding"))
-    )
+    warnings, found = counted(len(messages), "warning"), counted(len(findings), "finding")
     total = f"{warnings} of the workbook, {found} in the geometry"
     summary = _summary(system)
     answer = {"summary": summary, "warnings": messages, "findings": findings, "geometry": report.as_dict()}

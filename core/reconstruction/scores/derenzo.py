@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ...arrays import Floats
 from ...errors import InputError
-from ...geometry.frames import checked_affine
+from ...geometry.frames import checked_affine, moved
 from ...phantoms.derenzo import DerenzoRods
 from ...phantoms.phantom import QUANTITIES, Phantom
 from ...progress import Progress, tell
@@ -214,7 +214,7 @@ class _Sector:
     @cached_property
     def _span(self) -> tuple[float, float, str]:
         """The part of the rods' length, from and to in mm along z, that profiles are means over, or why there is none."""
-        index = self._centers @ self._index_from_rods[:3, :3].T + self._index_from_rods[:3, 3]
+        index = moved(self._index_from_rods, self._centers)
         along = self._index_from_rods[:3, 2]
         ends = np.stack([-0.5 - index, np.array(self.volume.grid.shape) - 0.5 - index])
         ends /= np.where(np.abs(along) < 1e-9, 1e-9, along)
@@ -258,11 +258,8 @@ class _Sector:
         low, high, _ = self._span
         along = (_middles(9) * (high - low) + (low + high) / 2)[:, None, None] * [0, 0, 1]
         places = [points + along for points in (np.concatenate([starts, ends]), (starts + ends) / 2)]
-        own = self.rods.pose
-        rods, between = (
-            self.phantom.values(p.reshape(-1, 3) @ own[:3, :3].T + own[:3, 3], quantity=self.volume.quantity).mean()
-            for p in places
-        )
+        placed = (moved(self.rods.pose, points.reshape(-1, 3)) for points in places)
+        rods, between = (self.phantom.values(points, quantity=self.volume.quantity).mean() for points in placed)
         return float(rods), float(between)
 
     def _profiles(self, diameter: float, is_hot: bool) -> list[RodProfile]:
@@ -281,9 +278,9 @@ class _Sector:
         for first in range(0, len(lines), step):
             part = slice(first, first + step)
             points = lines[part, :, None, None] + offsets[part, None]
-            samples = values_at(self.volume, points.reshape(-1, 3) @ world[:3, :3].T + world[:3, 3])
+            samples = values_at(self.volume, moved(world, points.reshape(-1, 3)))
             values[part] = samples.reshape(points.shape[:-1]).mean(axis=(2, 3), dtype=np.float64)
-        lines = lines @ world[:3, :3].T + world[:3, 3]
+        lines = moved(world, lines)
         return [RodProfile(freeze(p), freeze(v), is_hot) for p, v in zip(lines, values, strict=True)]
 
 

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 
 from ...arrays import Floats
 from ...errors import InputError
-from ...geometry.frames import checked_affine
+from ...geometry.frames import checked_affine, moved
 from ...phantoms.nema import NemaBody, room, sphere_places
 from ...validation import freeze, instance
 from ...volumes.resampling import values_at
@@ -117,7 +117,7 @@ def nema_score(volume: Volume, phantom: NemaBody, pose: ArrayLike | None = None)
         middles = np.array([(0.0, 0.0, z) for z in _SLICES])
         lung = _means(volume, world, middles, _LUNG * phantom.lung_diameter, "regions of the lung insert")
         residual = 100 * float(lung.mean()) / _level(_means(volume, world, around, _LARGEST, "background regions"))
-    return NemaScore(tuple(rows), residual, freeze(around @ world[:3, :3].T + world[:3, 3]))
+    return NemaScore(tuple(rows), residual, freeze(moved(world, around)))
 
 
 def _level(background: Floats) -> float:
@@ -135,8 +135,8 @@ def _means(volume: Volume, world: Floats, centers: Floats, diameter: float, name
     number = np.arange(count)
     radius, angle = diameter / 2 * np.sqrt((number + 0.5) / count), number * math.pi * (3 - math.sqrt(5))
     circle = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.zeros(count)], axis=1)
-    points = (centers[:, None] + circle) @ world[:3, :3].T + world[:3, 3]
-    index = points @ grid.index_from_world[:3, :3].T + grid.index_from_world[:3, 3]
+    points = moved(world, centers[:, None] + circle)
+    index = moved(grid.index_from_world, points)
     outside = ((index < -0.5) | (index > np.array(grid.shape) - 0.5)).any(axis=(1, 2))
     if outside.any():
         raise InputError(f"nema_score: {outside.sum()} of {len(centers)} {name} lie outside the volume")

@@ -7,13 +7,14 @@ from typing import Any
 import numpy as np
 
 from ..arrays import Floats
-from ..errors import InputError, naming
+from ..errors import naming
 from ..geometry.frames import euler_pose
 from ..phantoms.language import read_phantom
 from ..phantoms.phantom import Phantom
 from ..phantoms.settings import setting_names
 from ..phantoms.torso import CardiacTorso
 from ..recording import Remembered, remembered
+from ..validation import seed_number
 from .draws import Dice, options
 from .entries import as_settings
 from .recipe import EventRecipe
@@ -141,9 +142,7 @@ class PlannedEvent:
 
 def plan(recipe: EventRecipe, number: int) -> PlannedEvent:
     """What event `number`, from 0, of a recipe is: the same on every machine, whatever is made before or beside it."""
-    if isinstance(number, bool) or not isinstance(number, int | np.integer) or number < 0:
-        raise InputError(f"event: expected a whole number of at least 0, got {number!r}")
-    return PlannedEvent(recipe, int(number))
+    return PlannedEvent(recipe, seed_number(number, "event"))
 
 
 def _split(recipe: EventRecipe, number: int) -> str | None:

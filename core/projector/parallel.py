@@ -7,11 +7,9 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from typing import TypeVar
 
-import numpy as np
-
 from ..arrays import ArrayOrTensor
-from ..errors import InputError
 from ..memory import cores
+from ..validation import strict_whole
 
 In = TypeVar("In")
 Out = TypeVar("Out")
@@ -86,6 +84,4 @@ def thread_count(threads: int | None) -> int:
         return _usual
     if threads is None:
         return cores()
-    if isinstance(threads, bool) or not isinstance(threads, int | np.integer) or threads < 1:
-        raise InputError(f"threads: expected a whole number of at least 1, got {threads!r}")
-    return int(threads)
+    return strict_whole(threads, "threads", "a whole number of at least 1")

@@ -86,7 +86,7 @@ def backproject(
     """
     instance(views, Views, "backproject: views")
     one_of(how, HOW, "how")
-    lattice = _Lattice(grid, "backproject: grid")
+    to_world, planes = _placed(grid, "backproject: grid")
     kind = HOW[how]
     images = _plain(images, "backproject: images", (len(views), *views.shape))
     if kind == PRODUCT:
@@ -96,19 +96,19 @@ def backproject(
     points = np.empty(grid.shape, np.float32)
     taken: Iterable[tuple[Floats32, Floats]]
     if depth is None:
-        matrices = _pixel_rows(views) @ lattice.to_world
+        matrices = _pixel_rows(views) @ to_world
         size = -(-len(points) // _PARTS)
         parts = range(0, len(points), size)  # so that what a product needs besides is small
         for number, first in enumerate(parts):
             taken, part = [(images[..., None], shifted(matrices, first))], part_of(progress, number, len(parts))
-            _fill(points[first : first + size], kind, lattice.planes, taken, 1, part, flat=True)
+            _fill(points[first : first + size], kind, planes, taken, 1, part, flat=True)
     else:
         taken = (
-            (np.multiply(images[m].T[None, ..., None], array, order="C"), (g.index_matrix @ lattice.to_world)[None])
+            (np.multiply(images[m].T[None, ..., None], array, order="C"), (g.index_matrix @ to_world)[None])
             for m, (g, array) in enumerate(_distributions(depth, views))
         )
-        _fill(points, kind, lattice.planes, taken, len(views), progress)
-    return lattice.finished(points, "backprojection")
+        _fill(points, kind, planes, taken, len(views), progress)
+    return _finished(points, grid, "backprojection")
 
 
 def views_that_see(views: Views, grid: Grid | PerspectiveGrid, progress: Progress | None = None) -> Volume | Floats32:
@@ -133,32 +133,26 @@ def views_that_see(views: Views, grid: Grid | PerspectiveGrid, progress: Progres
         More memory is needed than there is.
     """
     instance(views, Views, "views_that_see: views")
-    lattice = _Lattice(grid, "views_that_see: grid")
+    to_world, planes = _placed(grid, "views_that_see: grid")
     require(8.0 * float(np.prod(grid.shape)), "numbers of views at {} x {} x {} places".format(*grid.shape))
     seen = np.zeros(grid.shape, np.int32)
     points, image = np.zeros(grid.shape, np.float32), np.zeros((1, *views.shape, 1), np.float32)
-    for m, matrix in enumerate(_pixel_rows(views) @ lattice.to_world):
+    for m, matrix in enumerate(_pixel_rows(views) @ to_world):
         part = part_of(progress, m, len(views))
-        gather(points, lattice.planes, image, matrix[None], flat=True, seen=seen, progress=part)
+        gather(points, planes, image, matrix[None], flat=True, seen=seen, progress=part)
     points[...] = seen
-    return lattice.finished(points, "modules")
+    return _finished(points, grid, "modules")
 
 
-class _Lattice:
-    """Where the points of a grid or perspective grid lie, as `gather` needs it."""
+def _placed(grid: Grid | PerspectiveGrid, name: str) -> tuple[Floats, Floats]:
+    """Where the points of a grid lie, as `gather` needs it: the matrix to the world, and the third coordinate of planes."""
+    if not isinstance(grid, Grid | PerspectiveGrid):
+        raise InputError(f"{name}: expected a Grid or a PerspectiveGrid, got {type(grid).__name__}")
+    return (grid.affine, np.arange(float(grid.shape[2]))) if isinstance(grid, Grid) else (grid.inverse, grid.planes)
 
-    def __init__(self, grid: Grid | PerspectiveGrid, name: str) -> None:
-        if not isinstance(grid, Grid | PerspectiveGrid):
-            raise InputError(f"{name}: expected a Grid or a PerspectiveGrid, got {type(grid).__name__}")
-        self.grid = grid
-        index = np.arange(float(grid.shape[2]))
-        self.to_world = grid.affine if isinstance(grid, Grid) else grid.inverse
-        self.planes: Floats = index if isinstance(grid, Grid) else grid.planes_at(index)
 
-    def finished(self, points: Floats32, quantity: str) -> Volume | Floats32:
-        if isinstance(self.grid, Grid):
-            return Volume(freeze(points), self.grid, quantity)
-        return points
+def _finished(points: Floats32, grid: Grid | PerspectiveGrid, quantity: str) -> Volume | Floats32:
+    return Volume(freeze(points), grid, quantity) if isinstance(grid, Grid) else points
 
 
 def _pixel_rows(views: Views) -> Floats:

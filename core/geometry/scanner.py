@@ -215,3 +215,11 @@ def first_equal(rows: Array) -> NDArray[np.intp]:
     """The first row (M,) of an array (M, ...) that is equal to each."""
     _, places, inverse = np.unique(rows, axis=0, return_index=True, return_inverse=True)
     return places[inverse.reshape(-1)]
+
+
+def rings_along_z(z: Floats, gaps: ArrayLike) -> NDArray[np.int64]:
+    """Index (M,) of each one's ring, from 0 along +z: those that differ less in z than the gap, one or (M,), form a ring."""
+    order = np.argsort(z, kind="stable")
+    rings = np.empty(len(z), np.int64)
+    rings[order] = np.cumsum(np.diff(z[order], prepend=z[order[0]]) > np.broadcast_to(gaps, len(z))[order])
+    return rings

@@ -17,7 +17,7 @@ from .design_formulas import roi_radius_seen
 from .frames import affine_matrix, module_frames, module_poses, tilted, tilts
 from .module_parts import ModulePart, collimator_solid, crystal_solid
 from .pinhole_columns import PINHOLE_COLUMNS
-from .scanner import Detector, Fault, Scanner, first, first_equal, repeated
+from .scanner import Detector, Fault, Scanner, first, first_equal, repeated, rings_along_z
 from .views import Views
 
 LENGTHS = {name: column.help for name, column in PINHOLE_COLUMNS.scalars.items() if column.kind == "length"}
@@ -171,12 +171,7 @@ class PinholeSystem(Scanner):
 
     def rings(self) -> NDArray[np.int64]:
         """Index (M,) of each module's ring, from 0 along +z. Pinholes at about the same z form a ring."""
-        z = self.centers[:, 2]
-        order = np.argsort(z, kind="stable")
-        starts = np.diff(z[order], prepend=z[order[0]]) > _RING_GAP * self.detector_side[order]
-        rings = np.empty(len(self), dtype=np.int64)
-        rings[order] = np.cumsum(starts)
-        return rings
+        return rings_along_z(self.centers[:, 2], _RING_GAP * self.detector_side)
 
     def views(
         self,

@@ -3,8 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import Floats
 from ..errors import InputError
+from ..geometry.scanner import rings_along_z
 from ..geometry.views import Views
 from ..validation import whole_number
 
@@ -21,7 +21,7 @@ def balanced_subsets(views: Views, n: int) -> list[NDArray[np.int64]]:
     if n > len(views):
         raise InputError(f"subsets: expected at most the {len(views)} views, got {n}")
     x, y, z = views.sources.T
-    ring = _rings(z, _RING_GAP * float(np.linalg.norm(views.sources, axis=1).mean()))
+    ring = rings_along_z(z, _RING_GAP * float(np.linalg.norm(views.sources, axis=1).mean()))
     dealt = []
     for r in range(n_rings := int(ring.max()) + 1):
         members = np.flatnonzero(ring == r)
@@ -45,11 +45,3 @@ def ordered_subsets(views: Views, n: int) -> list[tuple[int, NDArray[np.int64]]]
     """The subsets of `balanced_subsets` with their indices there, in the order in which they are used."""
     subsets = balanced_subsets(views, n)
     return [(s, subsets[s]) for s in access_order(len(subsets))]
-
-
-def _rings(z: Floats, gap: float) -> NDArray[np.int64]:
-    """Index of each source's ring along z: sources at about the same z form one."""
-    order = np.argsort(z, kind="stable")
-    rings = np.empty(len(z), np.int64)
-    rings[order] = np.cumsum(np.diff(z[order], prepend=z[order[0]]) > gap)
-    return rings

@@ -46,21 +46,21 @@ CLASSES: tuple[Any, ...] = (
 # Entries in Blender's own menus: operators with their texts.
 ENTRIES = {
     bpy.types.TOPBAR_MT_file_import: {
-        ids.IMPORT_GEOMETRY: "Pinhole Geometry (.xlsx)",
-        ids.IMPORT_VOLUME: "Volume for Projection (.nii, DICOM, .nrrd, .vdb, ...)",
-        ids.IMPORT_VOLUME_SEQUENCE: "Volume Sequence (.nii, .nrrd, .vdb, ...)",
-        ids.IMPORT_COUNTS: "Measured Counts (.npy, .h5, DICOM, .mhd, .hdr, ...)",
+        "mphdrr.import_geometry": "Pinhole Geometry (.xlsx)",
+        "mphdrr.import_volume": "Volume for Projection (.nii, DICOM, .nrrd, .vdb, ...)",
+        "mphdrr.import_volume_sequence": "Volume Sequence (.nii, .nrrd, .vdb, ...)",
+        "mphdrr.import_counts": "Measured Counts (.npy, .h5, DICOM, .mhd, .hdr, ...)",
     },
     bpy.types.TOPBAR_MT_file_export: {
-        ids.EXPORT_GEOMETRY: "Pinhole Geometry (.xlsx)",
-        ids.EXPORT_FOR_PROGRAM: "Pinhole Geometry for Programs",
-        ids.EXPORT_VOLUME: "Volume (.vdb, .nii, .nrrd, ...)",
-        ids.EXPORT_DATASET: "mphDRR Dataset (.h5/.npz/.pt)",
-        ids.EXPORT_FIGURE: "mphDRR Figure (.png/.svg)",
+        "mphdrr.export_geometry": "Pinhole Geometry (.xlsx)",
+        "mphdrr.export_for_program": "Pinhole Geometry for Programs",
+        "mphdrr.export_volume": "Volume (.vdb, .nii, .nrrd, ...)",
+        "mphdrr.export_dataset": "mphDRR Dataset (.h5/.npz/.pt)",
+        "mphdrr.export_figure": "mphDRR Figure (.png/.svg)",
     },
     bpy.types.VIEW3D_MT_object_convert: {
-        ids.VOXELIZE_OBJECTS: "Voxelize Meshes",
-        ids.MESH_FROM_VOLUME: "Mesh from Volume",
+        "mphdrr.voxelize_objects": "Voxelize Meshes",
+        "mphdrr.mesh_from_volume": "Mesh from Volume",
     },
 }
 
@@ -88,7 +88,7 @@ def _draw_submenu(name: str, text: str, icon: str) -> Callable[..., None]:
 
 def _draw_splash(menu: bpy.types.Menu, context: bpy.types.Context) -> None:
     """An extension cannot bring an application template: Blender looks for these in its own folders only."""
-    invoking(menu.layout).operator(ids.LOAD_EXAMPLE, text="mphDRR Example", icon="PLAY")
+    invoking(menu.layout).operator("mphdrr.load_example", text="mphDRR Example", icon="PLAY")
     menu.layout.separator()
 
 
@@ -188,7 +188,7 @@ def register(command: Callable[..., int] | None = None) -> None:
                 _registered.callback(space.draw_handler_remove, drawing, "WINDOW")
             for name in ("Image", "Image Editor Tool: Sample"):  # the editor's usual tool takes clicks first
                 keymap = bpy.context.window_manager.keyconfigs.addon.keymaps.new(name, space_type="IMAGE_EDITOR")
-                click = keymap.keymap_items.new(ids.PICK_MODULE, "LEFTMOUSE", "PRESS")
+                click = keymap.keymap_items.new("mphdrr.pick_module", "LEFTMOUSE", "PRESS")
                 _registered.callback(keymap.keymap_items.remove, click)
         if command is not None:
             _registered.callback(bpy.utils.unregister_cli_command, bpy.utils.register_cli_command(ids.PREFIX, command))

@@ -6,7 +6,6 @@ from typing import Literal
 import bpy
 from bpy.props import BoolProperty, FloatProperty, IntVectorProperty, StringProperty
 
-from ..addon.blender import ids
 from ..addon.blender.layouts import labelled
 from ..addon.blender.reports import run_reported, warnings_reported
 from ..addon.figures import studio
@@ -127,7 +126,7 @@ class MPHDRR_OT_import_geometry(bpy.types.Operator):
                 column.label(text=line[:1].upper() + line[1:], icon="DOT")
             return
         if context.space_data.type == "FILE_BROWSER":  # not in the panel of the last operation
-            layout.operator(ids.BROWSE_EXAMPLE, icon="FILE_FOLDER")
+            layout.operator("mphdrr.browse_example", icon="FILE_FOLDER")
         labelled(layout)
         for name in ("name", "plate_thickness", "wall_thickness", "image_size", "columns", "choose_columns"):
             layout.prop(self, name)

@@ -7,7 +7,7 @@ import bpy
 import numpy as np
 from bpy.app.translations import pgettext_iface as iface
 
-from ..addon.blender import ids, jobs
+from ..addon.blender import jobs
 from ..addon.blender.layouts import invoking, labelled
 from ..addon.scanner import columns, following, pinholes, scanner, selection
 from ..addon.scanner.module_values import Column, Kind, designed, kind_of
@@ -29,26 +29,26 @@ class MPHDRR_PT_design(ScannerPanel, bpy.types.Panel):
         if properties.untidy:
             box = layout.box().column(align=True)
             box.label(text=properties.untidy.capitalize(), icon="ERROR")
-            box.operator(ids.TIDY_MODULES, icon="BRUSH_DATA")
+            box.operator("mphdrr.tidy_modules", icon="BRUSH_DATA")
         edited = sum(not following.shows_its_field(camera) for camera in scanner.modules(collection))
         if edited:
             box = layout.box().column(align=True)
             draw_text(
                 box, f"Lens or sensor edited of {edited} camera{'s' * (edited > 1)}: not what the projections show"
             )
-            box.operator(ids.RESET_CAMERAS, icon="CAMERA_DATA")
+            box.operator("mphdrr.reset_cameras", icon="CAMERA_DATA")
         camera = selection.active_module(context)
         if camera is None:
             layout.label(text="Select a module's camera", icon="INFO")
         else:
             _draw_module(layout, camera, kind_of(collection))
         row = invoking(layout.row(align=True))
-        row.operator(ids.DUPLICATE_MODULES, text="Duplicate", icon="DUPLICATE")
-        row.operator(ids.REMOVE_MODULES, text="Remove", icon="TRASH")
+        row.operator("mphdrr.duplicate_modules", text="Duplicate", icon="DUPLICATE")
+        row.operator("mphdrr.remove_modules", text="Remove", icon="TRASH")
         if kind_of(collection).aimed(_ANYWHERE) is not None:
             row = layout.row(align=True)
             row.prop(properties, "keep_aimed", toggle=True, icon="CON_TRACKTO")
-            row.operator(ids.AIM_MODULES)
+            row.operator("mphdrr.aim_modules")
 
 
 class MPHDRR_PT_scanner_design(ScannerPanel, bpy.types.Panel):
@@ -63,9 +63,9 @@ class MPHDRR_PT_scanner_design(ScannerPanel, bpy.types.Panel):
         column = _draw_values(layout, properties, kind, properties.mixed.split())
         if pinholes.has_pinholes(kind):
             _draw_pinholes(layout, column, properties)
-        layout.operator_menu_enum(ids.RENUMBER_MODULES, "order", text="Renumber", icon="LINENUMBERS_ON")
+        layout.operator_menu_enum("mphdrr.renumber_modules", "order", text="Renumber", icon="LINENUMBERS_ON")
         if pinholes.has_pinholes(kind):
-            layout.operator(ids.CHECK_GEOMETRY, icon="CHECKMARK")
+            layout.operator("mphdrr.check_geometry", icon="CHECKMARK")
         if properties.findings:
             findings = json.loads(properties.findings)
             if not findings:
@@ -77,13 +77,13 @@ class MPHDRR_PT_scanner_design(ScannerPanel, bpy.types.Panel):
                 layout.label(text=more, icon="BLANK1")
         column = invoking(layout.column(align=True))
         if pinholes.has_pinholes(kind):
-            column.operator_menu_enum(ids.ADD_MAP, "quantity", text="Add Map", icon="OUTLINER_DATA_VOLUME")
+            column.operator_menu_enum("mphdrr.add_map", "quantity", text="Add Map", icon="OUTLINER_DATA_VOLUME")
         jobs.draw_job(column)
         column = invoking(layout.column(align=True))
-        column.operator(ids.EXPORT_GEOMETRY, text="Export Workbook", icon="EXPORT")
-        column.operator(ids.EXPORT_FOR_PROGRAM, text="Export for a Program", icon="EXPORT")
+        column.operator("mphdrr.export_geometry", text="Export Workbook", icon="EXPORT")
+        column.operator("mphdrr.export_for_program", text="Export for a Program", icon="EXPORT")
         column.separator()
-        column.operator(ids.REMOVE_SCANNER, icon="TRASH")
+        column.operator("mphdrr.remove_scanner", icon="TRASH")
 
 
 def _draw_pinholes(layout: bpy.types.UILayout, column: bpy.types.UILayout, properties: bpy.types.PropertyGroup) -> None:

@@ -27,8 +27,8 @@ class _Display:
         column.prop(settings, "low", text="Window Low")
         column.prop(settings, "high")
         picks = layout.row(align=True)
-        picks.operator(ids.PICK_WINDOW, text="Pick Low", icon="EYEDROPPER").end = "LOW"
-        picks.operator(ids.PICK_WINDOW, text="Pick High", icon="EYEDROPPER").end = "HIGH"
+        picks.operator("mphdrr.pick_window", text="Pick Low", icon="EYEDROPPER").end = "LOW"
+        picks.operator("mphdrr.pick_window", text="Pick High", icon="EYEDROPPER").end = "HIGH"
         layout.prop(settings, "half")
         if settings.problem:
             layout.label(text=settings.problem, icon="ERROR")

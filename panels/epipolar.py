@@ -21,8 +21,8 @@ class _Epipolar:
         layout = labelled(self.layout)  # type: ignore[attr-defined]
         settings = context.scene.mphdrr_epipolar
         row = invoking(layout.row(align=True))
-        row.operator(ids.PICK_PIXEL, icon="EYEDROPPER")
-        row.operator(ids.CLEAR_PIXEL, text="", icon="X")
+        row.operator("mphdrr.pick_pixel", icon="EYEDROPPER")
+        row.operator("mphdrr.clear_pixel", text="", icon="X")
         run = epipolar.run_views(context.scene)
         if run is None or settings.views != run.name:
             return

@@ -17,7 +17,7 @@ class MPHDRR_PT_event_set(Folded, bpy.types.Panel):
         jobs.draw_job(layout)
         column = layout.column(align=True)
         column.prop(settings, "recipe")
-        column.operator_menu_enum(ids.NEW_EVENT_RECIPE, "like", text="New Recipe", icon="FILE_NEW")
+        column.operator_menu_enum("mphdrr.new_event_recipe", "like", text="New Recipe", icon="FILE_NEW")
         recipe, made = event_notes.of_recipe(settings.recipe), event_notes.of_set(settings.folder)
         if recipe is not None:
             _draw_note(layout, recipe)
@@ -26,18 +26,18 @@ class MPHDRR_PT_event_set(Folded, bpy.types.Panel):
         if not (recipe or made or event_notes.NOTHING).is_wrong:
             column = layout.column(align=True)
             column.prop(settings, "number")
-            column.operator(ids.TRY_EVENT, text="Another One", icon="FILE_REFRESH")
+            column.operator("mphdrr.try_event", text="Another One", icon="FILE_REFRESH")
         if settings.tried:
             draw_text(layout, settings.tried[:1].upper() + settings.tried[1:], "OUTLINER_DATA_VOLUME")
         column = layout.column(align=True)
         draw_all(column, settings, "folder", "count")
-        column.operator(ids.MAKE_EVENT_SET, icon="FILE_CACHE")
+        column.operator("mphdrr.make_event_set", icon="FILE_CACHE")
         if made is not None:
             _draw_note(layout, made)
             column = layout.column(align=True)
             column.prop(settings, "opened")
             column.prop(settings, "model", placeholder="First")
-            column.operator(ids.OPEN_EVENT, icon="OUTLINER_OB_VOLUME")
+            column.operator("mphdrr.open_event", icon="OUTLINER_OB_VOLUME")
 
 
 def _draw_note(layout: bpy.types.UILayout, note: event_notes.Note) -> None:

@@ -58,8 +58,8 @@ class MPHDRR_PT_geometry(Sidebar, bpy.types.Panel):
         if collection is None and not jobs.is_running():
             row = layout.row()
             row.scale_y = 1.4
-            row.operator(ids.LOAD_EXAMPLE, icon="PLAY")
-        layout.operator(ids.IMPORT_GEOMETRY, text="Import Workbook", icon="IMPORT")
+            row.operator("mphdrr.load_example", icon="PLAY")
+        layout.operator("mphdrr.import_geometry", text="Import Workbook", icon="IMPORT")
         if collection is None:
             draw_hint(layout, "Or drop one on the viewport.")
             jobs.draw_job(layout)
@@ -69,7 +69,7 @@ class MPHDRR_PT_geometry(Sidebar, bpy.types.Panel):
         if not scanner.is_set_up(context.scene):
             box = layout.box().column(align=True)
             draw_text(box, "The scene's units are not millimetres")
-            box.operator(ids.SET_UP_SCENE, icon="SCENE_DATA")
+            box.operator("mphdrr.set_up_scene", icon="SCENE_DATA")
         properties = collection.mphdrr_scanner
         n_rings = sum(c.mphdrr_scanner.is_ring for c in collection.children)
         draw_facts(
@@ -128,7 +128,7 @@ class MPHDRR_PT_modules(ScannerPanel, bpy.types.Panel):
         camera = selection.listed_module(context.scene)
         if camera is not None:
             text = iface("Look Through {module}").format(module=camera.name)
-            look = layout.operator(ids.LOOK_THROUGH_MODULE, text=text, icon="OUTLINER_OB_CAMERA")
+            look = layout.operator("mphdrr.look_through_module", text=text, icon="OUTLINER_OB_CAMERA")
             look.number = camera.mphdrr_module.number
         row = layout.row(align=True)
         for name in ("show_rays", "show_frustums", "show_detectors"):
@@ -148,5 +148,5 @@ def _columns(layout: bpy.types.UILayout, name: str, *numbers: str) -> None:
 
 
 def _show(layout: bpy.types.UILayout, text: str, first: int, last: int, mode: str, icon: str = "NONE") -> None:
-    button = layout.operator(ids.SHOW_MODULES, text=text, icon=icon)
+    button = layout.operator("mphdrr.show_modules", text=text, icon=icon)
     button.first, button.last, button.mode = first, last, mode

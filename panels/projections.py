@@ -41,8 +41,8 @@ class MPHDRR_PT_projections(Sidebar, bpy.types.Panel):
         has_scanner = scanner.active_scanner(context.scene) is not None
         has_volume = bool(volumes.volume_objects(context.scene))
         row.enabled = has_scanner and has_volume
-        row.operator(ids.RENDER_PROJECTIONS, icon="RENDER_STILL")
-        layout.operator(ids.LOAD_RECIPE, icon="FILE_FOLDER")
+        row.operator("mphdrr.render_projections", icon="RENDER_STILL")
+        layout.operator("mphdrr.load_recipe", icon="FILE_FOLDER")
         if not has_scanner:
             draw_hint(layout, "Needs a scanner: Load Example.")
         elif not has_volume:
@@ -50,7 +50,7 @@ class MPHDRR_PT_projections(Sidebar, bpy.types.Panel):
         elif rendering.integrates_activity(context):
             draw_text(layout, "Line integrals of activity: for counts choose the model SPECT Counts.", icon="INFO")
         if settings.run_file:
-            layout.operator(ids.SHOW_PROJECTIONS, text="Show Mosaic", icon="IMAGE_DATA")
+            layout.operator("mphdrr.show_projections", text="Show Mosaic", icon="IMAGE_DATA")
             draw_changes(layout, context.scene)
 
 
@@ -60,7 +60,7 @@ class MPHDRR_PT_preview(Sidebar, bpy.types.Panel):
 
     def draw(self, context: bpy.types.Context) -> None:
         layout, session = self.layout, preview.session()
-        layout.operator(ids.LIVE_PREVIEW, icon="HIDE_OFF", depress=session is not None)
+        layout.operator("mphdrr.live_preview", icon="HIDE_OFF", depress=session is not None)
         if session is None:
             return
         column = layout.column(align=True)
@@ -77,7 +77,7 @@ class MPHDRR_PT_physics(Folded, bpy.types.Panel):
     poll = shown_where(lambda context: context.scene.mphdrr_projections.model != "INVERSE_SQUARE")
 
     def draw_header_preset(self, context: bpy.types.Context) -> None:
-        self.layout.operator_menu_enum(ids.USE_PRESET, "preset", text="", icon="PRESET")
+        self.layout.operator_menu_enum("mphdrr.use_preset", "preset", text="", icon="PRESET")
 
     def draw(self, context: bpy.types.Context) -> None:
         layout = labelled(self.layout)
@@ -106,8 +106,8 @@ class MPHDRR_PT_export(Sidebar, bpy.types.Panel):
         run_file = context.scene.mphdrr_projections.run_file
         row = layout.row()
         row.enabled = bool(run_file)
-        row.operator(ids.EXPORT_DATASET, text="Export Dataset", icon="EXPORT")
-        layout.operator(ids.EXPORT_FIGURE, text="Export Figure", icon="IMAGE_DATA")
+        row.operator("mphdrr.export_dataset", text="Export Dataset", icon="EXPORT")
+        layout.operator("mphdrr.export_figure", text="Export Figure", icon="IMAGE_DATA")
         if run_file:
             kept = run_file if run_file.startswith("//") else iface("kept when the .blend is saved")
             layout.label(text=iface("Shown run: {file}").format(file=kept), icon="FILE")

@@ -29,7 +29,7 @@ class MPHDRR_PT_reconstruction(Sidebar, bpy.types.Panel):
         draw_settings(layout.column(), settings, (each for each in drawn(settings) if each[0] in _MAIN))
         row = invoking(layout.row())
         row.scale_y = 1.4
-        row.operator(ids.RECONSTRUCT, text="Reconstruct", icon="OUTLINER_OB_VOLUME")
+        row.operator("mphdrr.reconstruct", text="Reconstruct", icon="OUTLINER_OB_VOLUME")
         known = settings.known
         if known and settings.volume is not None:
             _draw_result(layout, settings, known)
@@ -52,7 +52,7 @@ def _draw_result(layout: bpy.types.UILayout, settings: bpy.types.PropertyGroup, 
         row.label(text=value, translate=False)
     for text in known.get("flatters", ()):
         draw_text(box, text)
-    box.operator(ids.SHOW_RECONSTRUCTION, text="Show Slices", icon="IMAGE_DATA")
+    box.operator("mphdrr.show_reconstruction", text="Show Slices", icon="IMAGE_DATA")
 
 
 class MPHDRR_PT_reconstruction_model(Folded, bpy.types.Panel):
@@ -72,4 +72,4 @@ class MPHDRR_PT_backprojection(Folded, bpy.types.Panel):
     def draw(self, context: bpy.types.Context) -> None:
         layout = invoking(labelled(self.layout))
         layout.prop(context.scene.mphdrr_reconstruction, "how")
-        layout.operator(ids.BACKPROJECT, text="Back-Project", icon="OUTLINER_DATA_VOLUME")
+        layout.operator("mphdrr.backproject", text="Back-Project", icon="OUTLINER_DATA_VOLUME")

@@ -47,7 +47,7 @@ class _Runs:
         row.enabled = not jobs.is_running()
         row.template_list("MPHDRR_UL_runs", "", settings, "runs", settings, "active_run", rows=2, maxrows=6)
         buttons = invoking(row.column(align=True))
-        buttons.operator(ids.REMOVE_RUN, text="", icon="REMOVE").index = settings.active_run
+        buttons.operator("mphdrr.remove_run", text="", icon="REMOVE").index = settings.active_run
         column = layout.column(align=True)
         column.active = False
         for part in settings.run_summary.split(", ", 1):
@@ -56,7 +56,7 @@ class _Runs:
             column.label(text=iface("All runs: {size}").format(size=runs.size_text(settings.runs)))
             row = invoking(layout.row())
             row.enabled = not jobs.is_running()
-            row.operator_menu_enum(ids.COMPARE_RUNS, "other", text="Compare With", icon="SELECT_DIFFERENCE")
+            row.operator_menu_enum("mphdrr.compare_runs", "other", text="Compare With", icon="SELECT_DIFFERENCE")
             if text := images.difference_text():
                 draw_text(layout, text, icon="INFO")
 
@@ -84,5 +84,5 @@ def draw_changes(layout: bpy.types.UILayout, scene: bpy.types.Scene) -> None:
         return
     row = invoking(box.row())
     row.alert, row.enabled = False, not jobs.is_running()
-    again = row.operator(ids.RENDER_PROJECTIONS, text="Render Again", icon="FILE_REFRESH")
+    again = row.operator("mphdrr.render_projections", text="Render Again", icon="FILE_REFRESH")
     again.volume = runs.volume_to_render(scene)

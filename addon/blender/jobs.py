@@ -24,7 +24,7 @@ from ...core.cli.options import progress_bar
 from ...core.errors import InputError
 from ...core.progress import Cancelled, Progress, StagedProgress
 from ...core.recording import recorded_warnings
-from . import ids, storage
+from . import storage
 from .reports import Reported, warnings_reported
 from .windows import redraw_sidebars
 
@@ -457,10 +457,10 @@ def draw_job(layout: bpy.types.UILayout) -> None:
         if worker is _current:
             row.progress(factor=worker.share, type="BAR", text=worker.text)
             if worker.enough is not None:
-                row.operator(ids.FINISH_JOB, text="", icon="CHECKMARK")
+                row.operator("mphdrr.finish_job", text="", icon="CHECKMARK")
         else:
             row.label(text=iface("{job}: waits").format(job=iface(worker.label)), translate=False, icon="TIME")
-        row.operator(ids.CANCEL_JOB, text="", icon="CANCEL").number = worker.number
+        row.operator("mphdrr.cancel_job", text="", icon="CANCEL").number = worker.number
 
 
 def draw_status(header: bpy.types.Header, context: bpy.types.Context) -> None:
@@ -469,7 +469,7 @@ def draw_status(header: bpy.types.Header, context: bpy.types.Context) -> None:
         row = header.layout.row(align=True)
         row.ui_units_x = _STATUS_UNITS
         row.progress(factor=_current.share, type="BAR", text="mphDRR: " + _current.text)
-        row.operator(ids.CANCEL_JOB, text="", icon="CANCEL").number = _current.number
+        row.operator("mphdrr.cancel_job", text="", icon="CANCEL").number = _current.number
 
 
 def _argument(value: Any) -> Any:

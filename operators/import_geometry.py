@@ -11,11 +11,9 @@ from ..addon.blender.reports import run_reported, warnings_reported
 from ..addon.figures import studio
 from ..addon.scanner import column_maps, scanner
 from ..addon.scanner.scanner_files import WORKBOOK_SUFFIXES
-from ..core.errors import InputError
+from ..core import ColumnMap, InputError, PinholeSystem, kinds_in, read_scanner
 from ..core.geometry.collimator import Construction
 from ..core.geometry.scanner import SCANNERS, Scanner
-from ..core.geometry.system import PinholeSystem
-from ..core.workbook import ColumnMap, kinds_in, read_scanner
 from . import column_map_dialog
 
 

@@ -12,8 +12,7 @@ from typing import Any
 import bpy
 import numpy as np
 
-from ...core import events
-from ...core.errors import InputError
+from ...core import InputError, events
 from ...core.events.folders import INDEX, RECIPE, SetFolder
 from ...core.events.store import EVENTS, SHARDS, size_of
 from ...core.memory import readable_size

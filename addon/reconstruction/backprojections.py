@@ -5,11 +5,8 @@ from typing import Any
 
 import bpy
 
-from ...core.errors import InputError
+from ...core import InputError, Recipe, backproject_run, read_run
 from ...core.progress import Progress, stages_of
-from ...core.runs.backprojecting import backproject_run
-from ...core.runs.files import read_run
-from ...core.runs.recipe import Recipe
 from ...core.runs.reconstructing import reconstruction_grid
 from ..blender import jobs, storage
 from ..runs import rendering, runs

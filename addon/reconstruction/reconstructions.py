@@ -13,20 +13,15 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core.errors import InputError
+from ...core import InputError, ProjectionRun, Recipe, Volume, read_run, score_volume
 from ...core.figures.page import Page
 from ...core.figures.reconstructions import SIZE, SIZE_BESIDE_TRUTH, draw
 from ...core.progress import Progress, stages_of
 from ...core.reconstruction.methods import method_of
 from ...core.reconstruction.result import iterations_text
-from ...core.reconstruction.scores.summary import score_volume
-from ...core.runs.files import read_run
 from ...core.runs.mosaic import png
-from ...core.runs.recipe import Recipe
 from ...core.runs.reconstructing import reconstruct_run, reconstruction_grid
-from ...core.runs.run import ProjectionRun
 from ...core.runs.run_recipe import truth_of_run
-from ...core.volumes.volume import Volume
 from ..blender import ids, jobs, objects, plots, storage
 from ..pictures import images
 from ..runs import rendering, runs

@@ -10,9 +10,8 @@ from pathlib import Path
 import bpy
 from bpy.props import BoolProperty, CollectionProperty, EnumProperty, IntProperty, StringProperty
 
-from ...core.errors import InputError
+from ...core import InputError, PinholeSystem
 from ...core.geometry.columns import ANGLE_UNITS, LENGTH_UNITS
-from ...core.geometry.system import PinholeSystem
 from ...core.recording import recorded_warnings
 from ...core.workbook import ColumnMap, MappedColumn, MappedTable, draft_column_map, preview_workbook, read_system
 from ..blender import choices

@@ -5,10 +5,9 @@ from typing import Any
 
 import bpy
 
-from ...core.geometry.grid import Grid
+from ...core import Grid, Progress
 from ...core.memory import require
 from ...core.physics.maps import MAPS, within_roi
-from ...core.progress import Progress
 from ..blender import choices, jobs, storage
 from ..volumes import slices, volume_materials, volumes
 from ..volumes.stored_volumes import StoredVolume, store_volume

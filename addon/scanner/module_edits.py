@@ -9,12 +9,10 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core.errors import InputError
+from ...core import InputError, PinholeSystem, ring_order
 from ...core.geometry.frames import affine_matrix, rotations
 from ...core.geometry.module_parts import ModulePart
-from ...core.geometry.ring_fits import ring_order
 from ...core.geometry.scanner import Scanner
-from ...core.geometry.system import PinholeSystem
 from ..blender import ids, objects
 from ..blender.updates import FUNCTIONS
 from . import cameras, collimators, following, pinholes, scanner

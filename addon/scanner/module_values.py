@@ -15,11 +15,10 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core.errors import InputError
+from ...core import InputError, SystemSource
 from ...core.geometry.columns import Column
 from ...core.geometry.frames import module_poses
 from ...core.geometry.scanner import Scanner, scanner_kind
-from ...core.system_source import SystemSource
 from ..blender import objects
 from ..blender.decimals import typed
 from . import cameras, columns

@@ -8,12 +8,10 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core.errors import InputError
+from ...core import InputError, PinholeSystem, isocentre_performance, resolution, sensitivity
 from ...core.geometry import checks
 from ...core.geometry.collimator import Construction, EdgePlace
 from ...core.geometry.scanner import Scanner
-from ...core.geometry.system import PinholeSystem
-from ...core.physics.performance import isocentre_performance, resolution, sensitivity
 from ..blender.decimals import typed
 from . import collimators
 from .module_values import Kind

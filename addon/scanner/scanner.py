@@ -13,10 +13,9 @@ import bpy
 import numpy as np
 from mathutils import Quaternion
 
-from ...core.errors import InputError
+from ...core import InputError, PinholeSystem
 from ...core.geometry.collimator import Construction
 from ...core.geometry.scanner import SCANNERS, Scanner
-from ...core.geometry.system import PinholeSystem
 from ...core.workbook import ColumnMap, QuantityCells, SystemSource
 from ..blender import ids, objects
 from . import cameras, collimators, following, framing, pinholes

@@ -13,8 +13,7 @@ import bpy
 from .. import operators, panels
 from ..operators import add_phantom
 from . import preferences, properties, recovery
-from .blender import ids, jobs, plots, storage, timers, updates
-from .blender.layouts import invoking
+from .blender import ids, jobs, layouts, plots, storage, timers, updates
 from .events import event_notes
 from .figures import figures
 from .perspective import color_bar, epipolar_drawing, frustums
@@ -67,7 +66,7 @@ ENTRIES = {
 
 def _draw_entries(entries: dict[str, str]) -> Callable[..., None]:
     def draw(menu: bpy.types.Menu, context: bpy.types.Context) -> None:
-        layout = invoking(menu.layout)
+        layout = layouts.invoking(menu.layout)
         for operator, text in entries.items():
             layout.operator(operator, text=text)
 
@@ -88,7 +87,7 @@ def _draw_submenu(name: str, text: str, icon: str) -> Callable[..., None]:
 
 def _draw_splash(menu: bpy.types.Menu, context: bpy.types.Context) -> None:
     """An extension cannot bring an application template: Blender looks for these in its own folders only."""
-    invoking(menu.layout).operator("mphdrr.load_example", text="mphDRR Example", icon="PLAY")
+    layouts.invoking(menu.layout).operator("mphdrr.load_example", text="mphDRR Example", icon="PLAY")
     menu.layout.separator()
 
 
@@ -213,7 +212,7 @@ def _complete(cls: Any) -> None:
 def unregister() -> None:
     """Take back what `register` did."""
     atexit.unregister(unregister)
-    for module in (jobs, preview, live_scanner, plots, recoloring, event_notes, timers):
+    for module in (jobs, preview, plots, recoloring, event_notes, timers):
         module.stop()
     _registered.close()
 

@@ -3,8 +3,7 @@
 import bpy
 from bpy.app.translations import pgettext_iface as iface
 
-from ..addon.blender import ids
-from ..addon.blender.layouts import draw_all, labelled, shown_where
+from ..addon.blender import ids, layouts
 from ..addon.pictures import images, tiles
 from ..addon.scanner import selection
 from .sidebar import Folded, ImagesSidebar
@@ -15,12 +14,12 @@ class _Display:
 
     bl_label = "Display"
 
-    poll = shown_where(lambda context: ids.MOSAIC in bpy.data.images)
+    poll = layouts.shown_where(lambda context: ids.MOSAIC in bpy.data.images)
 
     def draw(self, context: bpy.types.Context) -> None:
-        layout = labelled(self.layout)  # type: ignore[attr-defined]
+        layout = layouts.labelled(self.layout)  # type: ignore[attr-defined]
         settings = context.scene.mphdrr_display
-        draw_all(layout, settings, "colors", "scale")
+        layouts.draw_all(layout, settings, "colors", "scale")
         layout.prop(settings, "automatic", text="Automatic Window")
         column = layout.column(align=True)
         column.active = not settings.automatic
@@ -64,7 +63,7 @@ class MPHDRR_PT_display(_Display, Folded, bpy.types.Panel):
         distance = column.row()
         distance.active = not settings.plane_at_detector
         distance.prop(settings, "plane_distance")
-        draw_all(layout, settings, "backgrounds", "plane_opacity")
+        layouts.draw_all(layout, settings, "backgrounds", "plane_opacity")
 
 
 class MPHDRR_PT_display_of_images(_Display, ImagesSidebar, bpy.types.Panel):

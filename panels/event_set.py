@@ -2,8 +2,7 @@
 
 import bpy
 
-from ..addon.blender import ids, jobs
-from ..addon.blender.layouts import draw_all, invoking, labelled
+from ..addon.blender import ids, jobs, layouts
 from ..addon.events import event_notes
 from .sidebar import Folded, draw_hint, draw_text
 
@@ -12,7 +11,7 @@ class MPHDRR_PT_event_set(Folded, bpy.types.Panel):
     bl_order = ids.ORDER_EVENTS
 
     def draw(self, context: bpy.types.Context) -> None:
-        layout = invoking(labelled(self.layout))
+        layout = layouts.invoking(layouts.labelled(self.layout))
         settings = context.scene.mphdrr_events
         jobs.draw_job(layout)
         column = layout.column(align=True)
@@ -30,7 +29,7 @@ class MPHDRR_PT_event_set(Folded, bpy.types.Panel):
         if settings.tried:
             draw_text(layout, settings.tried[:1].upper() + settings.tried[1:], "OUTLINER_DATA_VOLUME")
         column = layout.column(align=True)
-        draw_all(column, settings, "folder", "count")
+        layouts.draw_all(column, settings, "folder", "count")
         column.operator("mphdrr.make_event_set", icon="FILE_CACHE")
         if made is not None:
             _draw_note(layout, made)

@@ -6,8 +6,7 @@ import bpy
 import numpy as np
 from bpy.app.translations import pgettext_iface as iface
 
-from ..addon.blender import ids, jobs
-from ..addon.blender.layouts import invoking, shown_where
+from ..addon.blender import ids, jobs, layouts
 from ..addon.scanner import following, pinholes, scanner, selection
 from ..addon.scanner.module_values import kind_of
 from .sidebar import Folded, Sidebar, draw_facts, draw_hint, draw_text
@@ -49,11 +48,10 @@ class MPHDRR_UL_modules(bpy.types.UIList):
 class MPHDRR_PT_geometry(Sidebar, bpy.types.Panel):
     """Import, which scanner it is, and which part of it is shown."""
 
-    bl_label = "Geometry"
     bl_order = ids.ORDER_GEOMETRY
 
     def draw(self, context: bpy.types.Context) -> None:
-        layout = invoking(self.layout)
+        layout = layouts.invoking(self.layout)
         collection = scanner.active_scanner(context.scene)
         if collection is None and not jobs.is_running():
             row = layout.row()
@@ -89,7 +87,7 @@ class ScannerPanel(Folded):
 
     bl_parent_id = "MPHDRR_PT_geometry"
 
-    poll = shown_where(lambda context: scanner.active_scanner(context.scene) is not None)
+    poll = layouts.shown_where(lambda context: scanner.active_scanner(context.scene) is not None)
 
     def draw(self, context: bpy.types.Context) -> None:
         collection = scanner.active_scanner(context.scene)
@@ -102,8 +100,6 @@ class ScannerPanel(Folded):
 
 
 class MPHDRR_PT_modules(ScannerPanel, bpy.types.Panel):
-    bl_label = "Modules"
-
     def draw_scanner(self, context: bpy.types.Context, collection: bpy.types.Collection) -> None:
         layout = self.layout
         state = context.scene.mphdrr_geometry

@@ -6,8 +6,7 @@ import bpy
 from bpy.app.translations import pgettext_iface as iface
 
 from ..addon import recovery
-from ..addon.blender import ids, jobs, storage
-from ..addon.blender.layouts import draw_all, invoking, labelled
+from ..addon.blender import ids, jobs, layouts, storage
 from ..addon.perspective import frustums
 from ..addon.phantoms import phantom_properties, phantoms
 from ..addon.scanner import selection
@@ -19,7 +18,7 @@ class MPHDRR_PT_phantom(Sidebar, bpy.types.Panel):
     bl_order = ids.ORDER_PHANTOM
 
     def draw(self, context: bpy.types.Context) -> None:
-        layout = invoking(labelled(self.layout))
+        layout = layouts.invoking(layouts.labelled(self.layout))
         adding = layout.column()
         column = adding.column(align=True)
         column.menu("MPHDRR_MT_add", text="Add Phantom", icon="OUTLINER_DATA_VOLUME")
@@ -117,7 +116,7 @@ class MPHDRR_PT_perspective(Folded, bpy.types.Panel):
     bl_parent_id = "MPHDRR_PT_phantom"
 
     def draw(self, context: bpy.types.Context) -> None:
-        layout = invoking(labelled(self.layout))
+        layout = layouts.invoking(layouts.labelled(self.layout))
         settings, camera = context.scene.mphdrr_perspective, selection.active_module(context)
         if camera is None:
             draw_hint(layout, "Import a geometry first.")
@@ -126,7 +125,7 @@ class MPHDRR_PT_perspective(Folded, bpy.types.Panel):
         name = context.object.name if volumes.is_volume(context.object) else iface("no volume is selected")
         text = iface("{volume}, by {module}").format(volume=name, module=camera.name)
         layout.label(text=text, translate=False, icon="VIEW_PERSPECTIVE")
-        draw_all(layout.column(align=True), settings, "uniform", "planes")
+        layouts.draw_all(layout.column(align=True), settings, "uniform", "planes")
         row = layout.row(align=True)
         row.operator("mphdrr.show_in_perspective")
         row.operator("mphdrr.clear_perspective", text="", icon="X")

@@ -5,8 +5,7 @@ import textwrap
 import bpy
 from bpy.app.translations import pgettext_iface as iface
 
-from ..addon.blender import ids, jobs
-from ..addon.blender.layouts import draw_all, draw_settings, invoking, labelled, shown_where
+from ..addon.blender import ids, jobs, layouts
 from ..addon.runs import preview, rendering, runs
 from ..addon.runs.projection_properties import drawn, makes_counts
 from ..addon.scanner import scanner
@@ -23,20 +22,20 @@ class MPHDRR_PT_projections(Sidebar, bpy.types.Panel):
     bl_order = ids.ORDER_PROJECTIONS
 
     def draw(self, context: bpy.types.Context) -> None:
-        layout = labelled(self.layout)
+        layout = layouts.labelled(self.layout)
         settings = context.scene.mphdrr_projections
         jobs.draw_job(layout)  # at the top, where it is seen on small screens too
         column = layout.column()
         column.prop(settings, "volume", placeholder="Active volume")
         column.prop(settings, "model")
-        draw_settings(column, settings, (each for each in drawn(settings, "model") if each[0] in _MAIN))
-        draw_settings(column, settings, drawn(settings, "detector"))
+        layouts.draw_settings(column, settings, (each for each in drawn(settings, "model") if each[0] in _MAIN))
+        layouts.draw_settings(column, settings, drawn(settings, "detector"))
         modules = column.column(align=True)
         modules.prop(settings, "all_modules")
         if not settings.all_modules:
-            draw_all(modules, settings, "first", "last")
-        draw_settings(column, settings, drawn(settings, "compute"))
-        row = invoking(layout.row())
+            layouts.draw_all(modules, settings, "first", "last")
+        layouts.draw_settings(column, settings, drawn(settings, "compute"))
+        row = layouts.invoking(layout.row())
         row.scale_y = 1.4
         has_scanner = scanner.active_scanner(context.scene) is not None
         has_volume = bool(volumes.volume_objects(context.scene))
@@ -74,13 +73,13 @@ class MPHDRR_PT_preview(Sidebar, bpy.types.Panel):
 class MPHDRR_PT_physics(Folded, bpy.types.Panel):
     bl_parent_id = "MPHDRR_PT_projections"
 
-    poll = shown_where(lambda context: context.scene.mphdrr_projections.model != "INVERSE_SQUARE")
+    poll = layouts.shown_where(lambda context: context.scene.mphdrr_projections.model != "INVERSE_SQUARE")
 
     def draw_header_preset(self, context: bpy.types.Context) -> None:
         self.layout.operator_menu_enum("mphdrr.use_preset", "preset", text="", icon="PRESET")
 
     def draw(self, context: bpy.types.Context) -> None:
-        layout = labelled(self.layout)
+        layout = layouts.labelled(self.layout)
         settings = context.scene.mphdrr_projections
         column = layout.column(align=True)
         if settings.model == "EMISSION":
@@ -89,7 +88,7 @@ class MPHDRR_PT_physics(Folded, bpy.types.Panel):
             if collection is not None:
                 column.prop(collection.mphdrr_scanner, "opening_angle")
         others = (each for each in drawn(settings, "model") if each[0] not in (*_MAIN, "model"))
-        draw_settings(column, settings, others)
+        layouts.draw_settings(column, settings, others)
         row = layout.row(heading="Poisson Noise")
         row.active = makes_counts(settings)
         row.prop(settings, "noise", text="")
@@ -102,7 +101,7 @@ class MPHDRR_PT_export(Sidebar, bpy.types.Panel):
     bl_order = ids.ORDER_EXPORT
 
     def draw(self, context: bpy.types.Context) -> None:
-        layout = invoking(self.layout)
+        layout = layouts.invoking(self.layout)
         run_file = context.scene.mphdrr_projections.run_file
         row = layout.row()
         row.enabled = bool(run_file)

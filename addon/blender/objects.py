@@ -1,6 +1,7 @@
 """Objects of the scene: where they stand in float64, and how they are removed with what is theirs alone."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import bpy
 import numpy as np
@@ -93,3 +94,12 @@ def picture_empty(name: str, parent: bpy.types.Object, picture: bpy.types.Image 
     item.empty_display_type, item.data, item.use_empty_image_alpha, item.empty_image_side = "IMAGE", picture, True, side
     item.parent = parent
     return item
+
+
+def change(owner: Any, **values: Any) -> None:
+    """Set properties that have other values: setting one has the scene calculated and drawn again."""
+    for name, value in values.items():
+        now = getattr(owner, name)
+        same = now == value if isinstance(value, str | bool) else np.allclose(now, value, rtol=1e-6, atol=0)  # float32
+        if not same:
+            setattr(owner, name, value)

@@ -17,8 +17,7 @@ from ...core.events.folders import INDEX, RECIPE, SetFolder
 from ...core.events.store import EVENTS, SHARDS, size_of
 from ...core.memory import readable_size
 from ...core.recording import recorded_warnings
-from ..blender import storage, timers
-from ..blender.windows import redraw_sidebars
+from ..blender import storage, timers, windows
 
 _INTERVAL = 0.1  # s between two looks at a thread that reads
 _LOOK = 2.0  # s between two looks at a file's date
@@ -132,5 +131,5 @@ def _watch() -> float | None:
     for path in done:
         del _readers[path]
     if done:
-        redraw_sidebars()
+        windows.redraw_sidebars()
     return _INTERVAL if _readers else None

@@ -30,8 +30,7 @@ from ...core.runs.resizing import resized
 from ..blender import compat, ids, jobs, storage, timers
 from ..blender.choices import items
 from ..phantoms import phantoms
-from ..scanner import collimators, pinholes, scanner, selection
-from ..scanner.module_values import kind_of
+from ..scanner import collimators, module_values, pinholes, scanner, selection
 from ..volumes import looks, volumes
 from . import studio
 
@@ -92,7 +91,7 @@ def figure_job(
     if kind.one_module and modules is None and active is not None:
         modules = str(active.mphdrr_module.number)
     known: dict[str, Any] = {"modules": modules, "display": scene.mphdrr_display.display()}
-    if collection is not None and kind_of(collection) is PinholeSystem:
+    if collection is not None and module_values.kind_of(collection) is PinholeSystem:
         known["scanner"] = scanner.read_scanner(collection)
         known["construction"] = pinholes.construction(collection.mphdrr_scanner)
     later: dict[str, Callable[[], Any]] = {}

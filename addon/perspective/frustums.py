@@ -28,8 +28,7 @@ from ..phantoms import phantoms
 from ..pictures import images
 from ..runs import runs
 from ..scanner import scanner, selection
-from ..volumes import slices, volume_materials, volumes
-from ..volumes.stored_volumes import StoredVolume
+from ..volumes import slices, stored_volumes, volume_materials, volumes
 
 _KEY = "mphdrr_frustum"  # custom property of the lines: what the frustum was made of, JSON
 _NEAREST = 0.1  # of the pinhole's distance from the isocentre: where layers begin at the nearest
@@ -105,7 +104,7 @@ def resampling(context: bpy.types.Context, cells: int, uniform: str) -> jobs.Job
         volume, g, array = _followed(asked, cells, uniform, stages)
         return on_voxels(array, g, volume, stages("back on voxels"))
 
-    def finish(item: bpy.types.Object, stored: StoredVolume) -> str:
+    def finish(item: bpy.types.Object, stored: stored_volumes.StoredVolume) -> str:
         item.mphdrr_volume.display_low, item.mphdrr_volume.display_high = shown
         return f"Added {item.name!r}: {volumes.values_text(stored)}"
 
@@ -210,8 +209,7 @@ def after_update(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None
     for frustum in frustums(scene):
         hidden = frustum.parent is None or frustum.parent.hide_viewport
         for item in (frustum, *frustum.children):
-            if item.hide_viewport != hidden:  # writing the same value would make Blender evaluate it again
-                item.hide_viewport = hidden
+            objects.change(item, hide_viewport=hidden)
 
 
 def _request(context: bpy.types.Context) -> _Request:

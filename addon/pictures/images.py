@@ -19,9 +19,7 @@ from ...core.progress import Progress, part_of, tell
 from ...core.runs.display import Display
 from ...core.runs.exr import exr_bytes
 from ...core.runs.mosaic import Sheet, as_seen, labels, png, sheet, smaller
-from ..blender import ids, jobs
-from ..blender.reports import Need
-from ..blender.windows import areas
+from ..blender import ids, jobs, reports, windows
 
 _KEY = "mphdrr_projection"  # custom property: marks the images that a new run replaces
 _ARRAYS = ("sources", "detector_centers", "u_steps", "v_steps")
@@ -242,7 +240,7 @@ def store_difference(drawn: Sheet, numbers: list[int], unit: str, text: str) -> 
 def store_reconstruction(file: bytes) -> bpy.types.Image:
     """Make the image of a reconstruction, a PNG of it, until other projections are shown."""
     image = _store(ids.RECONSTRUCTION, file)
-    for area in areas("IMAGE_EDITOR"):
+    for area in windows.areas("IMAGE_EDITOR"):
         if area.spaces.active.image == image:
             area.tag_redraw()
     return image
@@ -301,7 +299,7 @@ def show(image: bpy.types.Image, context: bpy.types.Context) -> bool:
     return shown
 
 
-PROJECTED: Need = (lambda context: ids.MOSAIC in bpy.data.images, "No projections yet: render them first")
+PROJECTED: reports.Need = (lambda context: ids.MOSAIC in bpy.data.images, "No projections yet: render them first")
 
 
 def show_below(image: bpy.types.Image, context: bpy.types.Context) -> bool:

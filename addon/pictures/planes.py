@@ -84,7 +84,7 @@ def update(scene: bpy.types.Scene) -> None:
     settings = scene.mphdrr_display
     part = images.share_shown()
     for plane, shown in _wanted(scene):
-        _show(plane, shown)
+        objects.change(plane, hide_viewport=not shown)
         if plane.parent is None:
             continue
         _place(plane, settings, part)
@@ -121,11 +121,6 @@ def _backgrounds(plane: bpy.types.Object) -> list[bpy.types.CameraBackgroundImag
     return [found for found in plane.parent.data.background_images if found.image == plane.data]
 
 
-def _show(plane: bpy.types.Object, shown: bool) -> None:
-    if plane.hide_viewport == shown:  # writing the same value would make Blender evaluate the plane again
-        plane.hide_viewport = not shown
-
-
 def share_of_way(settings: bpy.types.PropertyGroup, module: bpy.types.PropertyGroup, distance: float) -> float:
     """Where a module's picture is shown: as a share of the way from its pinhole to the detector at `distance`, mm."""
     if settings.plane_at_detector:
@@ -137,7 +132,7 @@ def after_update(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None
     """Another module is active, modules were shown or hidden, or `l` was edited: planes and backgrounds follow."""
     if depsgraph.id_type_updated("SCENE") and scene == bpy.context.scene:
         for plane, shown in _wanted(scene):
-            _show(plane, shown)
+            objects.change(plane, hide_viewport=not shown)
     changed = {selection.module_of(each.id.original) for each in depsgraph.updates if each.id.id_type == "OBJECT"}
     changed.discard(None)
     if changed:

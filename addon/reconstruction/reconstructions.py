@@ -25,8 +25,7 @@ from ...core.runs.run_recipe import truth_of_run
 from ..blender import ids, jobs, objects, plots, storage
 from ..pictures import images
 from ..runs import rendering, runs
-from ..volumes import volumes
-from ..volumes.stored_volumes import StoredVolume, store_volume
+from ..volumes import stored_volumes, volumes
 
 _BETWEEN = 2.0  # s at least between two pictures of a reconstruction that runs
 _PNG_LEVEL = 1  # fast
@@ -36,7 +35,7 @@ _PNG_LEVEL = 1  # fast
 class _Shown:
     """What the scene shows of a reconstruction."""
 
-    stored: StoredVolume
+    stored: stored_volumes.StoredVolume
     picture: bytes  # PNG: slices, beside the truth, and the objective
     record: dict[str, Any]  # see `ReconstructionProperties.known`
 
@@ -71,7 +70,7 @@ def reconstructing(context: bpy.types.Context, recipe: Recipe) -> jobs.Job:
                 "name": method.objective, "objective": list(objective), "scores": list(scores), "flatters": flatters,
             }  # fmt: skip
             picture = _picture(run, volume, record, name)
-            stored = store_volume(volume, folder, None, {"reconstruction_of": name, **recipe.tables()})
+            stored = stored_volumes.store_volume(volume, folder, None, {"reconstruction_of": name, **recipe.tables()})
             shelf.files.append(stored.path)
             return _Shown(stored, picture, record)
 

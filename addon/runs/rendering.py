@@ -29,8 +29,7 @@ from ..phantoms import phantoms
 from ..pictures import images, planes, recoloring
 from ..scanner import following, scanner
 from ..volumes import volumes
-from . import runs
-from .projection_properties import OPENING_ANGLE, set_panel
+from . import projection_properties, runs
 
 _REST = 0.05  # s until the run that was chosen in the list is shown
 
@@ -121,10 +120,10 @@ def load_recipe(scene: bpy.types.Scene, path: Path) -> None:
 
 def _set_physics(scene: bpy.types.Scene, recipe: Recipe) -> None:
     """Set the panel, and the angle that it has from the scanner; raises InputError for what the panel cannot show."""
-    set_panel(scene.mphdrr_projections, recipe)
+    projection_properties.set_panel(scene.mphdrr_projections, recipe)
     collection = scanner.active_scanner(scene)
-    if collection is not None and OPENING_ANGLE in recipe.given:
-        collection.mphdrr_scanner.opening_angle = math.radians(recipe[OPENING_ANGLE])
+    if collection is not None and projection_properties.OPENING_ANGLE in recipe.given:
+        collection.mphdrr_scanner.opening_angle = math.radians(recipe[projection_properties.OPENING_ANGLE])
 
 
 def exporting(scene: bpy.types.Scene, filepath: str) -> jobs.Job:

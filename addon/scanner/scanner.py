@@ -284,7 +284,4 @@ def show_modules(collection: bpy.types.Collection, first: int, last: int, mode: 
 
 def _set_hidden(items: Iterable[bpy.types.Object], hide: bool) -> None:
     for item in items:
-        if item.hide_viewport != hide:  # writing the same value would make Blender evaluate the object again
-            item.hide_viewport = hide
-        if item.hide_render != hide:
-            item.hide_render = hide
+        objects.change(item, hide_viewport=hide, hide_render=hide)

@@ -10,8 +10,7 @@ from ...core.errors import several
 from ...core.geometry.module_parts import ModulePart
 from ...core.geometry.scanner import Scanner
 from ..blender import ids, objects
-from . import cameras, collimators, pinholes
-from .module_values import changes, write_modules
+from . import cameras, collimators, module_values, pinholes
 
 
 class NewScanner:
@@ -48,7 +47,7 @@ class NewScanner:
             objects.set_world_matrix(camera, matrix)
             camera.lock_scale = (True, True, True)  # or its collimator would grow with it
             self.rings[ring].objects.link(camera)
-        write_modules(list(self.cameras.values()), system)
+        module_values.write_modules(list(self.cameras.values()), system)
 
     def _make_parts(self, system: Scanner, parts: Sequence[ModulePart]) -> None:
         for part in parts:
@@ -94,7 +93,7 @@ def losses(collection: bpy.types.Collection) -> list[str]:
     parts, others = parts_and_others(collection)
     found = [o for o in parts if o.mphdrr_module.is_module]
     added = [o.mphdrr_module.added for o in found]
-    moved, edited = changes(found)
+    moved, edited = module_values.changes(found)
     by_others = [o.animation_data is not None or len(o.constraints) > 0 for o in found]
     lost = []
     for what, flags in (

@@ -11,8 +11,7 @@ from ...core.memory import require
 from ...core.progress import Progress, part_of
 from ...core.volumes.volume_files import READ_FORMATS, read_volume
 from ..blender import jobs, storage
-from . import vdb, volumes
-from .stored_volumes import StoredVolume
+from . import stored_volumes, vdb, volumes
 
 READ_ENDINGS = (*READ_FORMATS, ".vdb")
 """Endings of the names of files that can be read as volumes."""
@@ -69,7 +68,7 @@ def importing(
             states = [centered(volume, volume.grid.center - middle) for volume in states]
         return states
 
-    def finish(item: bpy.types.Object, stored: StoredVolume) -> str:
+    def finish(item: bpy.types.Object, stored: stored_volumes.StoredVolume) -> str:
         if item.data.is_sequence:
             item.data.frame_start = frame_start
         volume, states = stored.volume, f"{count} states of " if count > 1 else ""
@@ -107,7 +106,7 @@ def converting(item: bpy.types.Object, energy: float) -> jobs.Job:
             states.append(hu_to_mu(read(), energy))
         return states
 
-    def finish(made: bpy.types.Object, stored: StoredVolume) -> str:
+    def finish(made: bpy.types.Object, stored: stored_volumes.StoredVolume) -> str:
         made.data.frame_start, made.data.sequence_mode = frame_start, sequence_mode
         return f"Added {made.name!r}: {volumes.values_text(stored)} at {energy:g} keV"
 

@@ -18,12 +18,9 @@ from ...core import InputError, Volume
 from ...core.geometry.frames import checked_affine
 from ...core.memory import readable_size
 from ...core.progress import Progress, stages_of
-from ..blender import compat, ids, jobs, storage
-from ..blender.objects import world_matrix
-from ..blender.reports import Need
-from . import volume_materials
+from ..blender import compat, ids, jobs, objects, reports, storage
+from . import vdb, volume_materials
 from .stored_volumes import StoredVolume, moved, store_volume, write_states
-from .vdb import SMOKE, read_vdb
 
 
 def add_volume(
@@ -132,7 +129,7 @@ def reader(item: bpy.types.Object, path: Path | None = None) -> Callable[[], Vol
     `path` is the file of a state (`storage.files_of_states`); default: of the one at the current frame.
     """
     path, pose = source(item, path)
-    return lambda: moved(read_vdb(path), pose)
+    return lambda: moved(vdb.read_vdb(path), pose)
 
 
 def source(item: bpy.types.Object, path: Path | None = None) -> tuple[Path, NDArray[np.float64]]:
@@ -185,7 +182,7 @@ def pose_of_object(item: bpy.types.Object) -> NDArray[np.float64]:
 
     Blender keeps float32; the float64 pose that the object was given counts as long as it still rounds to Blender's.
     """
-    shown = world_matrix(item)
+    shown = objects.world_matrix(item)
     exact = item.mphdrr_volume.exact_pose
     if exact:
         pose = np.array(json.loads(exact))
@@ -211,7 +208,7 @@ def quantity_of(item: bpy.types.Object) -> str:
     return str(item.mphdrr_volume.quantity)
 
 
-ACTIVE: Need = (lambda context: is_volume(context.object), "No volume is active: select one first")
+ACTIVE: reports.Need = (lambda context: is_volume(context.object), "No volume is active: select one first")
 
 
 def volume_objects(scene: bpy.types.Scene) -> list[bpy.types.Object]:
@@ -238,7 +235,7 @@ def after_load(*_: Any) -> None:
         if settings.center_shift != compat.VDB_CENTER_SHIFT and item.data not in missing:
             settings.content = content_of(item)
             try:
-                states = [read_vdb(path) for path in storage.files_of_states(item.data)]
+                states = [vdb.read_vdb(path) for path in storage.files_of_states(item.data)]
                 item.data.filepath = storage.stored_path(write_states(states, storage.folder()))
                 settings.center_shift = compat.VDB_CENTER_SHIFT
                 settings.display_high = settings.display_high  # which draws it: its surface was elsewhere, too
@@ -279,7 +276,7 @@ def _show(data: bpy.types.Volume, stored: StoredVolume) -> None:
         data.is_sequence, data.filepath = before
         raise InputError(f"{stored.path}: {error}")
     # What the solid viewport draws.
-    data.grids.active_index = data.grids.find(SMOKE if SMOKE in data.grids else stored.volume.quantity)
+    data.grids.active_index = data.grids.find(vdb.SMOKE if vdb.SMOKE in data.grids else stored.volume.quantity)
     if len(stored.states) > 1:  # set after loading, which would look for frame 0 until the scene is evaluated
         data.is_sequence, data.frame_duration = True, len(stored.states)
 

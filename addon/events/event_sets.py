@@ -11,12 +11,11 @@ import numpy as np
 from mathutils import Matrix
 from numpy.typing import NDArray
 
-from ...core import InputError, ProjectionRun, events
+from ...core import InputError, ProjectionRun, events, memory
 from ...core.events.folders import SetFolder
 from ...core.events.templates import template_text
 from ...core.example import EXAMPLE
 from ...core.files import write_bytes
-from ...core.memory import readable_size
 from ...core.progress import Progress, stages_of
 from ..blender import jobs, storage
 from ..figures import studio
@@ -116,7 +115,7 @@ def making(filepath: str, folder: str, count: int) -> jobs.Job:
         there = len(SetFolder(path).store.places())
         if not made:
             return f"All events asked for are there already: {there} in {path}"
-        size = readable_size(sum(event.size for event in made))
+        size = memory.readable_size(sum(event.size for event in made))
         return f"Made {_events(len(made))}, {size} in {seconds:.1f} s: {there} in {path}"
 
     def left() -> str:

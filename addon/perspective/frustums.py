@@ -16,9 +16,8 @@ import numpy as np
 from mathutils import Matrix
 from numpy.typing import NDArray
 
-from ...core import InputError, PerspectiveGrid, Views, from_perspective, to_perspective
+from ...core import InputError, PerspectiveGrid, Views, from_perspective, memory, to_perspective
 from ...core.geometry.frames import affine_matrix
-from ...core.memory import require
 from ...core.progress import Progress, Stages, stages_of, tell
 from ...core.runs.mosaic import as_seen, png
 from ...core.runs.run_recipe import recipe_views
@@ -63,7 +62,7 @@ def showing(context: bpy.types.Context, planes: int, uniform: str) -> jobs.Job:
     low, high = _display_range(context.object)
     quantity, scene_uid = asked.state["quantity"], context.scene.session_uid
     rows, columns = asked.views.shape
-    require(_BYTES * planes * rows * columns, f"{planes} pictures of {columns} x {rows} pixels")
+    memory.require(_BYTES * planes * rows * columns, f"{planes} pictures of {columns} x {rows} pixels")
 
     def work(progress: Progress) -> tuple[PerspectiveGrid, list[bytes]]:
         stages = stages_of(progress)
@@ -96,7 +95,7 @@ def resampling(context: bpy.types.Context, cells: int, uniform: str) -> jobs.Job
     asked, shown = _request(context), _shown_range(context.object)
     rows, columns = asked.views.shape
     voxels = float(np.prod(context.object.mphdrr_volume.shape))
-    require(8.0 * cells * rows * columns + 8.0 * voxels, f"{columns} x {rows} x {cells} cells")
+    memory.require(8.0 * cells * rows * columns + 8.0 * voxels, f"{columns} x {rows} x {cells} cells")
     provenance = {"volume": asked.name, "through": asked.module, "cells": [columns, rows, cells], "evenly_in": uniform}
 
     def make(progress: Progress) -> Volume:

@@ -16,10 +16,9 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core import InputError, Mesh, Phantom
+from ...core import InputError, Mesh, Phantom, memory
 from ...core.geometry.frames import affine_matrix
 from ...core.geometry.grid import Grid, grid_around
-from ...core.memory import require
 from ...core.progress import Progress, part_of, stages_of
 from ..blender import jobs, objects, storage
 from ..blender.reports import Need
@@ -63,7 +62,7 @@ class Recipe:
                 raise InputError(f"the {title} has no {quantity}")
         if count > 1:
             shape = " x ".join(map(str, self.grid.shape))
-            require(4.0 * count * self.grid.n_voxels, f"{title}: {count} volumes of {shape} voxels")
+            memory.require(4.0 * count * self.grid.n_voxels, f"{title}: {count} volumes of {shape} voxels")
         stages = stages_of(progress)
         voxelizing = stages("voxelizing")
         reports = (part_of(voxelizing, number, count) for number in range(count))

@@ -13,8 +13,7 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core import PinholeSystem, ProjectionRun, Views
-from ...core.memory import cores
+from ...core import PinholeSystem, ProjectionRun, Views, memory
 from ...core.progress import Progress, part_of, tell
 from ...core.runs.display import Display
 from ...core.runs.exr import exr_bytes
@@ -210,7 +209,7 @@ def _mosaic(
 def _in_threads(make: Callable[[Any], bytes], pictures: NDArray[np.float32], progress: Progress | None) -> list[bytes]:
     """What `make` makes of each picture."""
     files: list[bytes] = []
-    with ThreadPoolExecutor(cores()) as pool:
+    with ThreadPoolExecutor(memory.cores()) as pool:
         for file in pool.map(make, pictures):
             files.append(file)
             tell(progress, len(files), len(pictures))

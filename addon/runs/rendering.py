@@ -13,10 +13,9 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core import ProjectionRun, Recipe, read_recipe, read_run, write_run
+from ...core import ProjectionRun, Recipe, memory, read_recipe, read_run, write_run
 from ...core.errors import InputError, warn
 from ...core.geometry.system import chosen_modules
-from ...core.memory import require
 from ...core.progress import Progress, Stages, stages_of
 from ...core.projector import Model
 from ...core.runs.display import Display
@@ -49,7 +48,7 @@ def render_job(context: bpy.types.Context, recipe: Recipe, volume: str = "", mu:
         phantoms.require_current(chosen)
     rows, columns = recipe["detector.rows"], recipe["detector.columns"]
     # The array, means and colours of it, and the packed images, in our memory and in Blender's beside those of the last run.
-    require(16.0 * len(system) * rows * columns, f"{len(system)} images of {columns} x {rows} pixels")
+    memory.require(16.0 * len(system) * rows * columns, f"{len(system)} images of {columns} x {rows} pixels")
     recipe = recipe.updated({"volume.object": item.name, "attenuation.object": mu_item and mu_item.name})
     recipe = _with_volume(recipe, item)
     read_volume, read_mu = volumes.reader(item), mu_item and volumes.reader(mu_item)

@@ -9,12 +9,11 @@ from typing import Any
 import bpy
 import numpy as np
 
-from ...core import workbook
+from ...core import recording, workbook
 from ...core.errors import InputError, warn
 from ...core.exchange import FORMATS, write_geometry
 from ...core.geometry.scanner import Detector, Scanner, first
 from ...core.progress import Progress, stages_of
-from ...core.recording import recorded_warnings
 from ..blender import decimals, jobs, storage
 from . import module_values, pinholes, scanner
 
@@ -36,7 +35,7 @@ def exporting_scanner(collection: bpy.types.Collection, path: Path, use_template
     def work(progress: Progress) -> Scanner:
         stages_of(progress)("writing the workbook")
         own = workbook.write_system(system, path, template, columns).columns
-        with recorded_warnings():  # the writer has already warned of the template's doubts
+        with recording.recorded_warnings():  # the writer has already warned of the template's doubts
             written = workbook.read_scanner(path, system.kind, own)
         different = _difference(system, written)
         if different:

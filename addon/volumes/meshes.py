@@ -7,10 +7,9 @@ import numpy as np
 from mathutils import Matrix
 from numpy.typing import NDArray
 
-from ...core import Progress, volume_to_mesh, voxelize_mesh
+from ...core import Progress, memory, volume_to_mesh, voxelize_mesh
 from ...core.errors import InputError, naming
 from ...core.geometry.grid import grid_around
-from ...core.memory import require
 from ...core.volumes.meshes.mesh import Mesh, require_closed
 from ...core.volumes.volume import UNITS, Volume
 from ..blender import jobs, objects
@@ -41,7 +40,7 @@ def voxelizing(
     spacing = voxel_size or float(np.ptp(vertices, axis=0).max()) / max(1, voxels - 2)
     grid = grid_around(vertices, spacing)
     shape = " x ".join(map(str, grid.shape))
-    require(_BYTES * grid.n_voxels, f"a volume of {shape} voxels")
+    memory.require(_BYTES * grid.n_voxels, f"a volume of {shape} voxels")
     name = name or f"{items[0].name} {quantity}"
     provenance = {"meshes": [item.name for item in items], "values": values}
 

@@ -14,9 +14,8 @@ import numpy as np
 from mathutils import Matrix
 from numpy.typing import ArrayLike, NDArray
 
-from ...core import InputError, Volume
+from ...core import InputError, Volume, memory
 from ...core.geometry.frames import checked_affine
-from ...core.memory import readable_size
 from ...core.progress import Progress, stages_of
 from ..blender import compat, ids, jobs, objects, reports, storage
 from . import vdb, volume_materials
@@ -174,7 +173,7 @@ def file_state(item: bpy.types.Object) -> str:
         return "missing"
     shown = ", coarser copy shown" if ids.PREVIEW in item.data.filepath else ""
     kept = "" if bpy.data.filepath else ", until saved"
-    return readable_size(size) + shown + kept
+    return memory.readable_size(size) + shown + kept
 
 
 def pose_of_object(item: bpy.types.Object) -> NDArray[np.float64]:

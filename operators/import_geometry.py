@@ -123,9 +123,8 @@ class MPHDRR_OT_import_geometry(bpy.types.Operator):
             return
         if context.space_data.type == "FILE_BROWSER":  # not in the panel of the last operation
             layout.operator("mphdrr.browse_example", icon="FILE_FOLDER")
-        layouts.labelled(layout)
-        for name in ("name", "plate_thickness", "wall_thickness", "image_size", "columns", "choose_columns"):
-            layout.prop(self, name)
+        names = ("name", "plate_thickness", "wall_thickness", "image_size", "columns", "choose_columns")
+        layouts.draw_all(layouts.labelled(layout), self, *names)
 
     _dialog: Literal["", "COLUMNS", "REPLACE"] = ""  # which one is open
     _losses: list[str] | tuple[str, ...] = ()

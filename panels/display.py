@@ -6,7 +6,7 @@ from bpy.app.translations import pgettext_iface as iface
 from ..addon.blender import ids, layouts
 from ..addon.pictures import images, tiles
 from ..addon.scanner import selection
-from .sidebar import Folded, ImagesSidebar
+from .sidebar import Folded, ImagesSidebar, draw_facts
 
 
 class _Display:
@@ -43,11 +43,10 @@ def _draw_totals(layout: bpy.types.UILayout, context: bpy.types.Context) -> None
     column = layout.column(align=True)
     text = iface("{name}, central half ({unit})") if shown["half"] else "{name} ({unit})"
     column.label(text=text.format(name=camera.name, unit=shown["unit"]), translate=False)
-    for text, value in ((shown["summed"].capitalize(), shown["totals"][index]), ("Maximum", shown["maxima"][index])):
-        row = column.split(factor=0.4)
-        row.active = False
-        row.label(text=text)
-        row.label(text=f"{value:.6g}", translate=False)
+    numbers = column.split(factor=0.4)
+    numbers.active = False
+    total, most = (f"{shown[name][index]:.6g}" for name in ("totals", "maxima"))
+    draw_facts(numbers, (shown["summed"].capitalize(), total), ("Maximum", most))
 
 
 class MPHDRR_PT_display(_Display, Folded, bpy.types.Panel):

@@ -1,7 +1,5 @@
 """Sidebar, third and last step: the projections, and the dataset that they give."""
 
-import textwrap
-
 import bpy
 from bpy.app.translations import pgettext_iface as iface
 
@@ -15,7 +13,6 @@ from .sidebar import Folded, Sidebar, draw_hint, draw_text
 
 _MAIN = ("time", "photons", "hole", "aperture_points", "pixel_points")
 """Settings of models that the panel itself shows; the others stand under Physics."""
-_LINE = 34  # letters that fit into the sidebar at its usual width
 
 
 class MPHDRR_PT_projections(Sidebar, bpy.types.Panel):
@@ -64,9 +61,7 @@ class MPHDRR_PT_preview(Sidebar, bpy.types.Panel):
             return
         column = layout.column(align=True)
         column.active = False
-        if session.problem:
-            for line in textwrap.wrap(session.problem, _LINE):
-                column.label(text=line)
+        draw_text(column, session.problem)
         column.label(text=iface("{size} of voxels kept in memory").format(size=session.kept))
 
 

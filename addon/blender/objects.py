@@ -1,6 +1,6 @@
 """Objects of the scene: where they stand in float64, and how they are removed with what is theirs alone."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import bpy
@@ -47,9 +47,14 @@ def unparent(item: bpy.types.Object) -> None:
 
 def remove_objects(items: Sequence[bpy.types.Object]) -> None:
     """Remove objects, and their meshes or cameras that nothing else uses."""
-    datas = {item.data for item in items if item.data is not None}
+    datas = {item.data for item in items}
     bpy.data.batch_remove(list(items))
-    bpy.data.batch_remove([data for data in datas if data.users == 0])
+    remove_unused(datas)
+
+
+def remove_unused(datablocks: Iterable[bpy.types.ID | None]) -> None:
+    """Remove those of some datablocks that nothing uses any more."""
+    bpy.data.batch_remove([each for each in datablocks if each is not None and each.users == 0])
 
 
 def euler_angles(matrix: NDArray[np.float64]) -> tuple[float, float, float]:

@@ -239,9 +239,7 @@ def store_difference(drawn: Sheet, numbers: list[int], unit: str, text: str) -> 
 def store_reconstruction(file: bytes) -> bpy.types.Image:
     """Make the image of a reconstruction, a PNG of it, until other projections are shown."""
     image = _store(ids.RECONSTRUCTION, file)
-    for area in windows.areas("IMAGE_EDITOR"):
-        if area.spaces.active.image == image:
-            area.tag_redraw()
+    windows.redraw("IMAGE_EDITOR")
     return image
 
 

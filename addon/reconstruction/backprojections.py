@@ -5,7 +5,7 @@ from typing import Any
 
 import bpy
 
-from ...core import InputError, Recipe, backproject_run, read_run
+from ...core import Recipe, backproject_run, read_run
 from ...core.progress import Progress, stages_of
 from ...core.runs.reconstructing import reconstruction_grid
 from ..blender import jobs, storage
@@ -19,9 +19,7 @@ def backprojecting(context: bpy.types.Context, recipe: Recipe, how: str) -> jobs
 
     `how` is one of those of `core.perspective.backprojection`. Raises InputError where no run is shown.
     """
-    scene, shown = context.scene, runs.shown(context.scene)
-    if shown is None:
-        raise InputError("nothing to back-project: render the projections first, or choose a run")
+    scene, shown = context.scene, runs.required(context.scene, "back-project")
     path, name, folder, uid = rendering.file_of(shown.file), shown.name, storage.folder(), scene.session_uid
     label, start = HOW_LABELS[how], time.perf_counter()
 

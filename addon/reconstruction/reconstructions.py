@@ -22,7 +22,7 @@ from ...core.reconstruction.result import iterations_text
 from ...core.runs.mosaic import png
 from ...core.runs.reconstructing import reconstruct_run, reconstruction_grid
 from ...core.runs.run_recipe import truth_of_run
-from ..blender import ids, jobs, objects, plots, storage
+from ..blender import ids, jobs, objects, plots, storage, windows
 from ..pictures import images
 from ..runs import rendering, runs
 from ..volumes import stored_volumes, volumes
@@ -45,14 +45,12 @@ def reconstructing(context: bpy.types.Context, recipe: Recipe) -> jobs.Job:
 
     The volume comes into the scene with the first iteration that is shown. The object of an earlier reconstruction stays.
     """
-    scene, shown = context.scene, runs.shown(context.scene)
-    if shown is None:
-        raise InputError("nothing to reconstruct: render the projections first, or choose a run")
+    scene, shown = context.scene, runs.required(context.scene, "reconstruct")
     path, name, folder = rendering.file_of(shown.file), shown.name, storage.folder()
     method = method_of(recipe["reconstruction.method"])
     readers = _readers_of_mu(scene)
     uid, start = scene.session_uid, time.perf_counter()
-    is_watched = _is_watched()
+    is_watched = windows.has_window()
     shelf = _Shelf(scene, f"{name} {method.label}")
 
     def work(progress: Progress) -> _Shown:
@@ -146,9 +144,9 @@ class _Shelf:
         """Take everything back."""
         item = jobs.found_again(bpy.data.objects, self._item)
         if item is not None:
-            materials = [material for material in item.data.materials if material]
+            materials = list(item.data.materials)
             objects.remove_objects([item, *item.children])
-            bpy.data.batch_remove([material for material in materials if material.users == 0])
+            objects.remove_unused(materials)
         scene = jobs.found_again(bpy.data.scenes, self._scene)
         if scene is not None and self._item:
             settings = scene.mphdrr_reconstruction
@@ -187,11 +185,6 @@ def _scores(run: ProjectionRun, volume: Volume, progress: Progress | None) -> li
         score_text = f"{sphere.contrast_recovery:.1f} % contrast, {sphere.background_variability:.1f} % variability"
         lines.append((f"{sphere.diameter:g} mm sphere", score_text))
     return lines
-
-
-def _is_watched() -> bool:
-    """Whether there is a window, in which states are shown before the end."""
-    return not bpy.app.background
 
 
 def _readers_of_mu(scene: bpy.types.Scene) -> dict[str, Callable[[], Volume]]:

@@ -107,6 +107,14 @@ def shown(scene: bpy.types.Scene) -> bpy.types.PropertyGroup | None:
     return next((item for item in settings.runs if item.file == settings.run_file), None)
 
 
+def required(scene: bpy.types.Scene, to_do: str) -> bpy.types.PropertyGroup:
+    """The `shown` run; `InputError`, with what there was `to_do`, where there is none."""
+    item = shown(scene)
+    if item is None:
+        raise InputError(f"nothing to {to_do}: render the projections first, or choose a run")
+    return item
+
+
 def changes(scene: bpy.types.Scene, item: bpy.types.PropertyGroup | None = None) -> list[str]:
     """What of the scene, and of its panel's settings, is not as it was for a run, by default the shown one, in words."""
     item = item or shown(scene)

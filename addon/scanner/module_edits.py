@@ -224,8 +224,7 @@ def remove_scanner(scene: bpy.types.Scene, collection: bpy.types.Collection) -> 
     objects.remove_objects([item for item in others if item.mphdrr_module.part != "NONE"])  # copies
     clear(scene, collection, {})
     bpy.data.collections.remove(collection)
-    materials = [bpy.data.materials.get(name) for name, _ in collimators.LOOKS.values()]
-    bpy.data.batch_remove([material for material in materials if material is not None and material.users == 0])
+    objects.remove_unused(bpy.data.materials.get(name) for name, _ in collimators.LOOKS.values())
 
 
 def renumber(collection: bpy.types.Collection, order: Literal["RINGS", "LIST"] = "RINGS") -> int:

@@ -27,7 +27,7 @@ class NewScanner:
             self.roi = self._make_roi(system)
         except BaseException:
             bpy.data.batch_remove([datablock for datablock, _ in self._named])
-            bpy.data.batch_remove([m for m in self._materials.values() if m.users == 0])
+            objects.remove_unused(self._materials.values())
             raise
 
     def _make_cameras(self, system: Scanner) -> None:
@@ -140,14 +140,14 @@ def clear(scene: bpy.types.Scene, collection: bpy.types.Collection, replacements
         if item.parent in ours and item not in ours and new_of.get(item.parent) is None:
             objects.unparent(item)
 
-    datas = {o.data for o in parts if o.data is not None}
+    datas = {o.data for o in parts}
     bpy.data.batch_remove([o for o in parts if o not in new_of])
     rings = set(homes[1:])
     for camera, users in bpy.data.user_map(subset=set(new_of)).items():
         if new_of[camera] is not None and users - rings:
             camera.user_remap(new_of[camera])
     bpy.data.batch_remove([*new_of, *rings])
-    bpy.data.batch_remove([data for data in datas if data.users == 0])
+    objects.remove_unused(datas)
 
 
 def parts_and_others(collection: bpy.types.Collection) -> tuple[list[bpy.types.Object], list[bpy.types.Object]]:

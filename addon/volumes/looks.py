@@ -66,7 +66,7 @@ def remove_surface(item: bpy.types.Object) -> None:
     if surface is not None:
         rest = [surface.modifiers[1].node_group, *surface.data.materials]
         objects.remove_objects([surface])
-        bpy.data.batch_remove([datablock for datablock in rest if datablock is not None and datablock.users == 0])
+        objects.remove_unused(rest)
 
 
 def _shift(item: bpy.types.Object) -> Vector:

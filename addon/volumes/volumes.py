@@ -100,10 +100,10 @@ def replace_stored(item: bpy.types.Object, stored: StoredVolume) -> None:
     item.data = data = _volume_data(stored, item.name)
     _describe(item, stored)
     if old.users == 0:
-        name, materials = old.name, {material for material in old.materials if material}
+        name, materials = old.name, set(old.materials)
         bpy.data.volumes.remove(old)
         data.name = name
-        bpy.data.batch_remove([material for material in materials if material.users == 0])
+        objects.remove_unused(materials)
 
 
 def make_active(context: bpy.types.Context, item: bpy.types.Object) -> None:

@@ -16,9 +16,8 @@ from ..blender import ids, objects
 from ..scanner import grabbing, scanner, selection
 from . import images
 
-_KEY = (
-    "mphdrr_field"  # custom property of a plane: middle and size (5,) of the virtual detector in the camera's frame, mm
-)
+_KEY = "mphdrr_field"
+"""Custom property of a plane: middle and size (5,) of the virtual detector in the camera's frame, mm."""
 _NEAR = 1e-5  # rounding
 _BETWEEN = 0.3  # of the way from the pinhole to the ROI's surface: where a plane is by default
 

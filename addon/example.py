@@ -11,8 +11,7 @@ from ..core.example import EULER_DEGREES, EXAMPLE
 from ..core.progress import Progress, stages_of
 from .blender import jobs
 from .figures import studio
-from .phantoms import phantoms
-from .phantoms.phantom_properties import plain_settings
+from .phantoms import phantom_properties, phantoms
 from .pictures import images
 from .runs import rendering, runs
 from .scanner import scanner
@@ -26,7 +25,7 @@ def example_job(context: bpy.types.Context) -> jobs.Job:
     """The job that puts the example into the context's scene and shows it."""
     scene, system = context.scene, read_system(EXAMPLE)
     pose = euler_pose(*np.deg2rad(EULER_DEGREES))
-    settings = plain_settings("derenzo", voxels=_VOXELS)
+    settings = phantom_properties.plain_settings("derenzo", voxels=_VOXELS)
     adding = phantoms.adding(settings, "Derenzo", pose)
     detector = {"detector.rows": _PIXELS, "detector.columns": _PIXELS}
     recipe = rendering.of_phantom(Recipe({"system.file": str(EXAMPLE), **detector}), settings, pose)

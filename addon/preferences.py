@@ -14,7 +14,6 @@ from bpy.props import IntProperty
 from ..core import cache
 from ..core.memory import readable_size
 from ..core.projector import backends, parallel
-from .blender import ids
 from .blender.layouts import invoking
 
 PACKAGE = __package__.rpartition(".")[0]  # "mphdrr", or "bl_ext.<repo>.mphdrr" when installed as an extension
@@ -38,7 +37,7 @@ class MPHDRR_Preferences(bpy.types.AddonPreferences):
         """Called by Blender."""
         layout = self.layout
         row = invoking(layout.row())
-        row.operator(ids.LOAD_EXAMPLE, icon="PLAY")
+        row.operator("mphdrr.load_example", icon="PLAY")
         if website():
             row.operator("wm.url_open", text="Website and Documentation", icon="URL").url = website()
         box = layout.box()
@@ -54,7 +53,7 @@ class MPHDRR_Preferences(bpy.types.AddonPreferences):
             row = layout.row()
             text = iface("Compiled code, {size} in {folder}")
             row.label(text=text.format(size=readable_size(cache_size()), folder=folder), translate=False)
-            row.operator(ids.CLEAN_CACHE, text="Clean", icon="TRASH")
+            row.operator("mphdrr.clean_cache", text="Clean", icon="TRASH")
 
 
 def cache_folder() -> Path | None:

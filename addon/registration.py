@@ -13,8 +13,7 @@ import bpy
 from .. import operators, panels
 from ..operators import add_phantom
 from . import preferences, properties, recovery
-from .blender import ids, jobs, plots, storage, timers, updates
-from .blender.layouts import invoking
+from .blender import ids, jobs, layouts, plots, storage, timers, updates
 from .events import event_notes
 from .figures import figures
 from .perspective import color_bar, epipolar_drawing, frustums
@@ -46,28 +45,28 @@ CLASSES: tuple[Any, ...] = (
 # Entries in Blender's own menus: operators with their texts.
 ENTRIES = {
     bpy.types.TOPBAR_MT_file_import: {
-        ids.IMPORT_GEOMETRY: "Pinhole Geometry (.xlsx)",
-        ids.IMPORT_VOLUME: "Volume for Projection (.nii, DICOM, .nrrd, .vdb, ...)",
-        ids.IMPORT_VOLUME_SEQUENCE: "Volume Sequence (.nii, .nrrd, .vdb, ...)",
-        ids.IMPORT_COUNTS: "Measured Counts (.npy, .h5, DICOM, .mhd, .hdr, ...)",
+        "mphdrr.import_geometry": "Pinhole Geometry (.xlsx)",
+        "mphdrr.import_volume": "Volume for Projection (.nii, DICOM, .nrrd, .vdb, ...)",
+        "mphdrr.import_volume_sequence": "Volume Sequence (.nii, .nrrd, .vdb, ...)",
+        "mphdrr.import_counts": "Measured Counts (.npy, .h5, DICOM, .mhd, .hdr, ...)",
     },
     bpy.types.TOPBAR_MT_file_export: {
-        ids.EXPORT_GEOMETRY: "Pinhole Geometry (.xlsx)",
-        ids.EXPORT_FOR_PROGRAM: "Pinhole Geometry for Programs",
-        ids.EXPORT_VOLUME: "Volume (.vdb, .nii, .nrrd, ...)",
-        ids.EXPORT_DATASET: "mphDRR Dataset (.h5/.npz/.pt)",
-        ids.EXPORT_FIGURE: "mphDRR Figure (.png/.svg)",
+        "mphdrr.export_geometry": "Pinhole Geometry (.xlsx)",
+        "mphdrr.export_for_program": "Pinhole Geometry for Programs",
+        "mphdrr.export_volume": "Volume (.vdb, .nii, .nrrd, ...)",
+        "mphdrr.export_dataset": "mphDRR Dataset (.h5/.npz/.pt)",
+        "mphdrr.export_figure": "mphDRR Figure (.png/.svg)",
     },
     bpy.types.VIEW3D_MT_object_convert: {
-        ids.VOXELIZE_OBJECTS: "Voxelize Meshes",
-        ids.MESH_FROM_VOLUME: "Mesh from Volume",
+        "mphdrr.voxelize_objects": "Voxelize Meshes",
+        "mphdrr.mesh_from_volume": "Mesh from Volume",
     },
 }
 
 
 def _draw_entries(entries: dict[str, str]) -> Callable[..., None]:
     def draw(menu: bpy.types.Menu, context: bpy.types.Context) -> None:
-        layout = invoking(menu.layout)
+        layout = layouts.invoking(menu.layout)
         for operator, text in entries.items():
             layout.operator(operator, text=text)
 
@@ -88,7 +87,7 @@ def _draw_submenu(name: str, text: str, icon: str) -> Callable[..., None]:
 
 def _draw_splash(menu: bpy.types.Menu, context: bpy.types.Context) -> None:
     """An extension cannot bring an application template: Blender looks for these in its own folders only."""
-    invoking(menu.layout).operator(ids.LOAD_EXAMPLE, text="mphDRR Example", icon="PLAY")
+    layouts.invoking(menu.layout).operator("mphdrr.load_example", text="mphDRR Example", icon="PLAY")
     menu.layout.separator()
 
 
@@ -188,7 +187,7 @@ def register(command: Callable[..., int] | None = None) -> None:
                 _registered.callback(space.draw_handler_remove, drawing, "WINDOW")
             for name in ("Image", "Image Editor Tool: Sample"):  # the editor's usual tool takes clicks first
                 keymap = bpy.context.window_manager.keyconfigs.addon.keymaps.new(name, space_type="IMAGE_EDITOR")
-                click = keymap.keymap_items.new(ids.PICK_MODULE, "LEFTMOUSE", "PRESS")
+                click = keymap.keymap_items.new("mphdrr.pick_module", "LEFTMOUSE", "PRESS")
                 _registered.callback(keymap.keymap_items.remove, click)
         if command is not None:
             _registered.callback(bpy.utils.unregister_cli_command, bpy.utils.register_cli_command(ids.PREFIX, command))
@@ -213,7 +212,7 @@ def _complete(cls: Any) -> None:
 def unregister() -> None:
     """Take back what `register` did."""
     atexit.unregister(unregister)
-    for module in (jobs, preview, live_scanner, plots, recoloring, event_notes, timers):
+    for module in (jobs, preview, plots, recoloring, event_notes, timers):
         module.stop()
     _registered.close()
 

@@ -5,9 +5,7 @@ from typing import Any
 import bpy
 from bpy.props import BoolProperty, FloatProperty, FloatVectorProperty, StringProperty
 
-from ..addon.blender import jobs, storage
-from ..addon.blender.file_properties import file_property, shown_files
-from ..addon.blender.layouts import draw_all, labelled
+from ..addon.blender import file_properties, jobs, layouts, storage
 from ..addon.phantoms import phantoms
 from ..addon.phantoms.phantom_properties import FILE, PhantomSettings, identifier, sampling, settings_class
 from ..core import Phantom, euler_pose, read_phantom
@@ -27,13 +25,13 @@ class AddPhantom(jobs.JobOperator):
     psi: FloatProperty(name="Psi", description="Turn about the phantom's own axis, done first", subtype="ANGLE")
 
     def draw(self: Any, context: bpy.types.Context) -> None:
-        layout = labelled(self.layout)
+        layout = layouts.labelled(self.layout)
         self.draw_settings(layout)
         row = layout.row()
         row.enabled = self.quantity == "activity"
         row.prop(self, "attenuation")
         layout.column(align=True).prop(self, "location")
-        draw_all(layout.column(align=True), self, "phi", "theta", "psi")
+        layouts.draw_all(layout.column(align=True), self, "phi", "theta", "psi")
 
     def adding(self: Any, name: str) -> jobs.Job:
         pose = euler_pose(self.phi, self.theta, self.psi, self.location)
@@ -67,8 +65,8 @@ class MPHDRR_OT_import_phantom(PhantomSettings, AddPhantom, bpy.types.Operator):
     """Add the phantom that a TOML file describes as a volume; its text becomes one of the .blend"""
 
     __annotations__ = {
-        "filepath": file_property("Phantom to read"),
-        "filter_glob": shown_files((".toml",)),
+        "filepath": file_properties.file_property("Phantom to read"),
+        "filter_glob": file_properties.shown_files((".toml",)),
         "name": StringProperty(name="Name", description="Of the object; empty: the phantom's", options={"SKIP_SAVE"}),
         **sampling(),
     }

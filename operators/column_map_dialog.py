@@ -22,18 +22,17 @@ def draw(layout: bpy.types.UILayout, form: ColumnMapProperties) -> None:
     row = layout.row()
     draw_all(row, form, "n_tables", "unit")
     _tables(layout, form)
-    compared = [quantity for quantity in form.quantities if quantity.name in PinholeSystem.columns.derived]
+    needed, compared = ([q for q in form.quantities if _is_derived(q) == derived] for derived in (False, True))
     split = layout.split(factor=0.6) if compared else layout
-    _columns(
-        split,
-        "Quantity",
-        [quantity for quantity in form.quantities if quantity.name not in PinholeSystem.columns.derived],
-        0.38,
-    )
+    _columns(split, "Quantity", needed, 0.38)
     if compared:
         _columns(split, "Compared", compared, 0.2)
     _result(layout, form)
     layout.prop(form, "save_as")
+
+
+def _is_derived(quantity: ColumnMapQuantity) -> bool:
+    return quantity.name in PinholeSystem.columns.derived
 
 
 def _tables(layout: bpy.types.UILayout, form: ColumnMapProperties) -> None:
@@ -58,9 +57,7 @@ def _columns(layout: bpy.types.UILayout, head: str, quantities: list[ColumnMapQu
         cell.label(text=text)
     for quantity in quantities:
         name, table, column, unit, seen = _cells(box, factor)
-        described = (
-            () if quantity.name in PinholeSystem.columns.derived else PinholeSystem.columns[quantity.name].headings[1:2]
-        )
+        described = () if _is_derived(quantity) else PinholeSystem.columns[quantity.name].headings[1:2]
         name.label(text=" ".join([quantity.name, *(f"({text})" for text in described)]))
         table.prop(quantity, "table", text="")
         column.prop(quantity, "column", text="")

@@ -2,7 +2,6 @@
 
 import bpy
 
-from ..addon.blender import ids
 from ..addon.scanner.scanner_files import WORKBOOK_SUFFIXES
 from ..addon.volumes.volume_import import READ_ENDINGS
 
@@ -15,17 +14,17 @@ class _Dropped:
 
 class MPHDRR_FH_workbook(_Dropped, bpy.types.FileHandler):
     bl_label = "Pinhole Geometry"
-    bl_import_operator = ids.IMPORT_GEOMETRY
+    bl_import_operator = "mphdrr.import_geometry"
     bl_file_extensions = ";".join(WORKBOOK_SUFFIXES)
 
 
 class MPHDRR_FH_phantom(_Dropped, bpy.types.FileHandler):
-    bl_import_operator = ids.IMPORT_PHANTOM
+    bl_import_operator = "mphdrr.import_phantom"
     bl_file_extensions = ".toml"
 
 
 class MPHDRR_FH_volume(_Dropped, bpy.types.FileHandler):
     bl_label = "Volume for Projection"
-    bl_import_operator = ids.IMPORT_VOLUME
+    bl_import_operator = "mphdrr.import_volume"
     # Blender compares the last suffix only. Most .hdr files are pictures of surroundings, not Analyze images.
     bl_file_extensions = ";".join(sorted({"." + ending.rsplit(".", 1)[1] for ending in READ_ENDINGS} - {".hdr"}))

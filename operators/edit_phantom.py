@@ -2,8 +2,7 @@
 
 import bpy
 
-from ..addon.blender import jobs
-from ..addon.blender.reports import Reported, needs
+from ..addon.blender import jobs, reports
 from ..addon.phantoms import phantoms
 
 
@@ -12,7 +11,7 @@ class _EditPhantom(jobs.JobOperator):
 
     bake = False
 
-    poll = needs(phantoms.ACTIVE)
+    poll = reports.needs(phantoms.ACTIVE)
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
         return phantoms.updating(context.object, self.bake)
@@ -30,12 +29,12 @@ class MPHDRR_OT_apply_phantom_pose(_EditPhantom, bpy.types.Operator):
     bake = True
 
 
-class MPHDRR_OT_show_phantom_outline(Reported, bpy.types.Operator):
+class MPHDRR_OT_show_phantom_outline(reports.Reported, bpy.types.Operator):
     """Show or hide the surfaces of the active phantom's shapes as wires that go with it"""
 
     bl_label = "Outline"
 
-    poll = needs(phantoms.ACTIVE)
+    poll = reports.needs(phantoms.ACTIVE)
 
     def act(self, context: bpy.types.Context) -> str:
         return phantoms.toggle_outline(context.object)

@@ -4,8 +4,7 @@ import bpy
 from bpy.props import FloatProperty, StringProperty
 
 from ..addon import recovery
-from ..addon.blender import jobs, storage
-from ..addon.blender.decimals import typed
+from ..addon.blender import decimals, jobs, storage
 from ..addon.blender.reports import Reported, ask_to_remove, needs
 from ..addon.volumes import slices, volume_import, volumes
 
@@ -45,7 +44,7 @@ class MPHDRR_OT_ct_to_attenuation(jobs.JobOperator, bpy.types.Operator):
     poll = needs((_is_ct, "No CT is active: select a volume of CT numbers (hu)"))
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        return volume_import.converting(context.object, typed(self.energy))
+        return volume_import.converting(context.object, decimals.typed(self.energy))
 
 
 class MPHDRR_OT_clean_volume_files(Reported, bpy.types.Operator):

@@ -4,21 +4,18 @@ import bpy
 from bpy.props import EnumProperty
 from bpy_extras.io_utils import ExportHelper
 
-from ..addon.blender import choices, jobs
-from ..addon.blender.file_properties import shown_files
-from ..addon.blender.reports import Reported
-from ..addon.events import event_sets
-from ..addon.events.event_properties import COUNT, FOLDER, MODEL, NEXT, OPENED, RECIPE
+from ..addon.blender import choices, file_properties, jobs, reports
+from ..addon.events import event_properties, event_sets
 from ..core.events.templates import TEMPLATES
 
 
-class MPHDRR_OT_new_event_recipe(Reported, ExportHelper, bpy.types.Operator):
+class MPHDRR_OT_new_event_recipe(reports.Reported, ExportHelper, bpy.types.Operator):
     """Write a recipe for events with comments in it, to be edited and tried. Its scanner is the scene's workbook, or the
     example's where there is none
     """
 
     filename_ext = ".toml"
-    filter_glob: shown_files((".toml",))
+    filter_glob: file_properties.shown_files((".toml",))
     like: EnumProperty(
         name="Like", description="What the recipe begins with",
         items=choices.items({}, ((name, name.capitalize(), text) for name, text in TEMPLATES.items())),
@@ -35,9 +32,9 @@ class MPHDRR_OT_try_event(jobs.JobOperator, bpy.types.Operator):
 
     bl_label = "Another Phantom of the Recipe"
 
-    recipe: RECIPE
-    number: NEXT
-    folder: FOLDER
+    recipe: event_properties.RECIPE
+    number: event_properties.NEXT
+    folder: event_properties.FOLDER
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
         return event_sets.trying(context, *self.given(context.scene.mphdrr_events, "recipe", "number", "folder"))
@@ -48,9 +45,9 @@ class MPHDRR_OT_make_event_set(jobs.JobOperator, bpy.types.Operator):
     on from there the next time
     """
 
-    recipe: RECIPE
-    folder: FOLDER
-    count: COUNT
+    recipe: event_properties.RECIPE
+    folder: event_properties.FOLDER
+    count: event_properties.COUNT
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
         return event_sets.making(*self.given(context.scene.mphdrr_events, "recipe", "folder", "count"))
@@ -61,9 +58,9 @@ class MPHDRR_OT_open_event(jobs.JobOperator, bpy.types.Operator):
     with its settings, hidden, and its projections as a run
     """
 
-    folder: FOLDER
-    opened: OPENED
-    model: MODEL
+    folder: event_properties.FOLDER
+    opened: event_properties.OPENED
+    model: event_properties.MODEL
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
         return event_sets.opening(context, *self.given(context.scene.mphdrr_events, "folder", "opened", "model"))

@@ -5,12 +5,8 @@ from pathlib import Path
 import bpy
 from bpy.props import BoolProperty, EnumProperty
 
-from ..addon.blender import jobs, storage
-from ..addon.blender.decimals import typed
-from ..addon.blender.file_properties import file_property, shown_files
-from ..addon.blender.reports import needs
+from ..addon.blender import decimals, file_properties, jobs, reports, storage
 from ..addon.scanner import scanner, scanner_files, selection
-from ..addon.scanner.scanner_files import WORKBOOK_SUFFIXES
 from ..core.exchange import FORMAT_NUMBERS, FORMATS
 
 _FORMATS = tuple((f.name, f.name, f.title, FORMAT_NUMBERS[f.name]) for f in FORMATS.values())
@@ -20,12 +16,13 @@ class MPHDRR_OT_export_geometry(jobs.ExportJob, bpy.types.Operator):
     """Write the scanner as it stands in the scene to a workbook, into a copy of the one it came from"""
 
     bl_label = "Export Pinhole Geometry"
+    bl_options = {"REGISTER", "UNDO"}  # the scanner takes the new workbook for its own
 
-    poll = needs(selection.SCANNER)
+    poll = reports.needs(selection.SCANNER)
 
-    endings = WORKBOOK_SUFFIXES
-    filepath: file_property("Workbook to write")
-    filter_glob: shown_files(WORKBOOK_SUFFIXES)
+    endings = scanner_files.WORKBOOK_SUFFIXES
+    filepath: file_properties.file_property("Workbook to write")
+    filter_glob: file_properties.shown_files(scanner_files.WORKBOOK_SUFFIXES)
     use_template: BoolProperty(
         name="Keep Workbook",
         description="Write into a copy of the workbook that the scanner was imported from: its other sheets, formulas, "
@@ -52,12 +49,11 @@ class MPHDRR_OT_export_for_program(jobs.ExportJob, bpy.types.Operator):
     """
 
     bl_label = "Export Geometry for a Program"
-    bl_options = set()
 
-    poll = needs(selection.SCANNER)
+    poll = reports.needs(selection.SCANNER)
 
     endings = ("",)
-    filepath: file_property("File to write, or new folder for formats of several files")
+    filepath: file_properties.file_property("File to write, or new folder for formats of several files")
     format: EnumProperty(name="Format", description="What is written", items=_FORMATS)
 
     def check(self, context: bpy.types.Context) -> bool:
@@ -72,7 +68,7 @@ class MPHDRR_OT_export_for_program(jobs.ExportJob, bpy.types.Operator):
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
         path, images = self.given_file("set filepath"), context.scene.mphdrr_projections
-        shape, magnification = (images.height, images.width), typed(images.magnification)
+        shape, magnification = (images.height, images.width), decimals.typed(images.magnification)
         collection, detector = scanner.required_scanner(context.scene), images.detector.lower()
         return scanner_files.exporting_for_program(collection, path, self.format, shape, detector, magnification)
 

@@ -2,9 +2,7 @@
 
 import bpy
 
-from ..addon.blender import jobs
-from ..addon.blender.file_properties import file_property, shown_files
-from ..addon.blender.reports import needs
+from ..addon.blender import file_properties, jobs, reports
 from ..addon.phantoms.volume_export import WRITTEN_ENDINGS, exporting
 from ..addon.volumes import volumes
 
@@ -13,13 +11,11 @@ class MPHDRR_OT_export_volume(jobs.ExportJob, bpy.types.Operator):
     bl_description = (
         f"Write every voxel of the active volume, where it stands in the world; endings: {', '.join(WRITTEN_ENDINGS)}"
     )
-    bl_options = set()
-
     endings = WRITTEN_ENDINGS
-    filepath: file_property("File to write")
-    filter_glob: shown_files(WRITTEN_ENDINGS)
+    filepath: file_properties.file_property("File to write")
+    filter_glob: file_properties.shown_files(WRITTEN_ENDINGS)
 
-    poll = needs(volumes.ACTIVE)
+    poll = reports.needs(volumes.ACTIVE)
 
     def ask(self, context: bpy.types.Context) -> set[str] | None:
         if self.filepath:

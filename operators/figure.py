@@ -3,9 +3,7 @@
 import bpy
 from bpy.props import BoolProperty, EnumProperty, IntProperty, StringProperty
 
-from ..addon.blender import jobs
-from ..addon.blender.file_properties import file_property, shown_files
-from ..addon.blender.reports import Need, needs
+from ..addon.blender import file_properties, jobs, reports
 from ..addon.figures import figures
 from ..addon.scanner import scanner
 from ..addon.volumes import volumes
@@ -13,7 +11,7 @@ from ..core.errors import InputError
 from ..core.figures.page import LARGEST, SUFFIXES
 
 _PIXELS = {"description": "Pixels; 0: what suits the figure", "min": 0, "max": LARGEST, "subtype": "PIXEL"}
-_SHOWN: Need = (
+_SHOWN: reports.Need = (
     lambda context: scanner.active_scanner(context.scene) or volumes.volume_objects(context.scene),
     "Nothing to show: import a workbook or add a phantom first",
 )
@@ -22,11 +20,9 @@ _SHOWN: Need = (
 class MPHDRR_OT_export_figure(jobs.ExportJob, bpy.types.Operator):
     """Draw a figure of the scanner, the volume or the last projections as PNG, or as SVG whose labels are text"""
 
-    bl_options = set()
-
     endings = SUFFIXES
-    filepath: file_property("File to write")
-    filter_glob: shown_files(SUFFIXES)
+    filepath: file_properties.file_property("File to write")
+    filter_glob: file_properties.shown_files(SUFFIXES)
     figure: EnumProperty(name="Figure", description="What is shown", items=figures.KIND_ITEMS, default="SCANNER")
     width: IntProperty(name="Width", **_PIXELS)
     height: IntProperty(name="Height", **_PIXELS)
@@ -39,7 +35,7 @@ class MPHDRR_OT_export_figure(jobs.ExportJob, bpy.types.Operator):
         default=figures.SAMPLES, min=1, soft_max=256,
     )  # fmt: skip
 
-    poll = needs(_SHOWN)
+    poll = reports.needs(_SHOWN)
 
     def ask(self, context: bpy.types.Context) -> set[str] | None:
         if self.filepath:

@@ -3,18 +3,10 @@
 from typing import Any
 
 import bpy
-from bpy.props import (
-    BoolProperty,
-    EnumProperty,
-    FloatProperty,
-    IntVectorProperty,
-    StringProperty,
-)
+from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntVectorProperty, StringProperty
 
-from ..addon.blender import choices, jobs, storage
-from ..addon.blender.decimals import typed
+from ..addon.blender import choices, decimals, jobs, layouts, storage
 from ..addon.blender.file_properties import DIRECTORY, file_property, files_property, shown_files
-from ..addon.blender.layouts import draw_all, labelled
 from ..addon.runs import counts_import
 from ..core.runs.frame_files import COUNTS_FORMATS, RAW_TYPES
 from ..core.runs.orientations import ORIENTATIONS
@@ -71,10 +63,10 @@ class MPHDRR_OT_import_counts(jobs.JobOperator, bpy.types.Operator):
     raw_big_endian: BoolProperty(name="Big-Endian", description="The most significant byte of a number comes first")
 
     def draw(self, context: bpy.types.Context) -> None:
-        layout = labelled(self.layout)
-        draw_all(layout, self, "frames", "orientation", "time")
-        draw_all(layout.column(heading="If Needed"), self, "modules", "pixel", "expected", "dataset")
-        draw_all(layout.column(heading="Raw File"), self, "raw_type", "raw_shape", "raw_big_endian")
+        layout = layouts.labelled(self.layout)
+        layouts.draw_all(layout, self, "frames", "orientation", "time")
+        layouts.draw_all(layout.column(heading="If Needed"), self, "modules", "pixel", "expected", "dataset")
+        layouts.draw_all(layout.column(heading="Raw File"), self, "raw_type", "raw_shape", "raw_big_endian")
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
         names = sorted({item.name for item in self.files if item.name})
@@ -92,7 +84,7 @@ class MPHDRR_OT_import_counts(jobs.JobOperator, bpy.types.Operator):
             "counts.raw_type": None if self.raw_type == _NONE else self.raw_type,
             "counts.raw_shape": tuple(self.raw_shape) if any(self.raw_shape) else None,
             "counts.raw_big_endian": self.raw_big_endian or None,
-            "model.time": typed(self.time) or None,
-            "detector.pitch": typed(self.pixel) or None,
+            "model.time": decimals.typed(self.time) or None,
+            "detector.pitch": decimals.typed(self.pixel) or None,
             "system.modules": self.modules or None,
         }

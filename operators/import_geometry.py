@@ -6,17 +6,12 @@ from typing import Literal
 import bpy
 from bpy.props import BoolProperty, FloatProperty, IntVectorProperty, StringProperty
 
-from ..addon.blender import ids
-from ..addon.blender.layouts import labelled
-from ..addon.blender.reports import run_reported, warnings_reported
+from ..addon.blender import file_properties, layouts, reports
 from ..addon.figures import studio
-from ..addon.scanner import column_maps, scanner
-from ..addon.scanner.scanner_files import WORKBOOK_SUFFIXES
-from ..core.errors import InputError
+from ..addon.scanner import column_maps, scanner, scanner_files
+from ..core import ColumnMap, InputError, PinholeSystem, kinds_in, read_scanner
 from ..core.geometry.collimator import Construction
 from ..core.geometry.scanner import SCANNERS, Scanner
-from ..core.geometry.system import PinholeSystem
-from ..core.workbook import ColumnMap, kinds_in, read_scanner
 from . import column_map_dialog
 
 
@@ -26,8 +21,8 @@ class MPHDRR_OT_import_geometry(bpy.types.Operator):
     bl_label = "Import Pinhole Geometry"
     bl_options = {"REGISTER", "UNDO"}
 
-    filepath: StringProperty(name="File", description="Workbook to read", subtype="FILE_PATH", options={"SKIP_SAVE"})
-    filter_glob: StringProperty(default=";".join(f"*{s}" for s in WORKBOOK_SUFFIXES), options={"HIDDEN"})
+    filepath: file_properties.file_property("Workbook to read")
+    filter_glob: file_properties.shown_files(scanner_files.WORKBOOK_SUFFIXES)
     name: StringProperty(
         name="Name", description="Name of the scanner, which replaces one of the same name. Empty: the file's",
         options={"SKIP_SAVE"},
@@ -78,7 +73,7 @@ class MPHDRR_OT_import_geometry(bpy.types.Operator):
                     )
                 column_maps.fill(form, self._workbook(), self._columns())
                 return self._ask_columns(context)
-            with warnings_reported(self):
+            with reports.warnings_reported(self):
                 system = read_scanner(self._workbook(), self._kind(), self._columns())
         except InputError as error:
             if self._dialog_can_help(form, error):
@@ -95,7 +90,7 @@ class MPHDRR_OT_import_geometry(bpy.types.Operator):
                 return context.window_manager.invoke_props_dialog(
                     self, width=440, title=f"Replace '{old.name}'?", confirm_text="Replace"
                 )
-        return run_reported(self, lambda: self._build(context, system))
+        return reports.run_reported(self, lambda: self._build(context, system))
 
     def _build(self, context: bpy.types.Context, system: Scanner) -> str:
         collection = scanner.build_scanner(
@@ -127,10 +122,9 @@ class MPHDRR_OT_import_geometry(bpy.types.Operator):
                 column.label(text=line[:1].upper() + line[1:], icon="DOT")
             return
         if context.space_data.type == "FILE_BROWSER":  # not in the panel of the last operation
-            layout.operator(ids.BROWSE_EXAMPLE, icon="FILE_FOLDER")
-        labelled(layout)
-        for name in ("name", "plate_thickness", "wall_thickness", "image_size", "columns", "choose_columns"):
-            layout.prop(self, name)
+            layout.operator("mphdrr.browse_example", icon="FILE_FOLDER")
+        names = ("name", "plate_thickness", "wall_thickness", "image_size", "columns", "choose_columns")
+        layouts.draw_all(layouts.labelled(layout), self, *names)
 
     _dialog: Literal["", "COLUMNS", "REPLACE"] = ""  # which one is open
     _losses: list[str] | tuple[str, ...] = ()

@@ -9,10 +9,7 @@ from typing import Any
 import bpy
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, StringProperty
 
-from ..addon.blender import choices, jobs, storage
-from ..addon.blender.decimals import typed
-from ..addon.blender.file_properties import DIRECTORY, file_property, files_property, shown_files
-from ..addon.blender.layouts import draw_all, labelled
+from ..addon.blender import choices, decimals, file_properties, jobs, layouts, storage
 from ..addon.volumes.volume_import import READ_ENDINGS, importing, name_of
 from ..core.errors import InputError
 from ..core.volumes.volume import UNITS
@@ -60,12 +57,12 @@ class ReadVolumes(jobs.JobOperator):
     own_names: tuple[str, ...] = ("name",)  # the operator's own properties, in the order of drawing
 
     def draw(self: Any, context: bpy.types.Context) -> None:
-        layout = labelled(self.layout)
-        draw_all(layout, self, *self.own_names, "quantity", "center", "attenuation")
+        layout = layouts.labelled(self.layout)
+        layouts.draw_all(layout, self, *self.own_names, "quantity", "center", "attenuation")
         row = layout.row()
         row.enabled = self.attenuation
         row.prop(self, "energy")
-        draw_all(layout.column(heading="OpenVDB", align=True), self, "grid", "unit")
+        layouts.draw_all(layout.column(heading="OpenVDB", align=True), self, "grid", "unit")
 
     def importing(self, paths: Sequence[Path], name: str, frame_start: int = 1) -> jobs.Job:
         return importing(
@@ -73,9 +70,9 @@ class ReadVolumes(jobs.JobOperator):
             name,
             quantity=None if self.quantity == "AUTO" else self.quantity,
             center=self.center,
-            energy=typed(self.energy) if self.attenuation else None,
+            energy=decimals.typed(self.energy) if self.attenuation else None,
             grid=self.grid or None,
-            unit=typed(self.unit),
+            unit=decimals.typed(self.unit),
             frame_start=frame_start,
         )
 
@@ -85,8 +82,8 @@ class MPHDRR_OT_import_volume(ReadVolumes, bpy.types.Operator):
 
     asks_for = "filepath"
 
-    filepath: file_property("Or folder of a DICOM series")
-    filter_glob: shown_files(READ_ENDINGS)
+    filepath: file_properties.file_property("Or folder of a DICOM series")
+    filter_glob: file_properties.shown_files(READ_ENDINGS)
     name: StringProperty(name="Name", description="The object's name. Empty: the file's", options={"SKIP_SAVE"})
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
@@ -99,9 +96,9 @@ class MPHDRR_OT_import_volume_sequence(ReadVolumes, bpy.types.Operator):
 
     asks_for = "files"
 
-    directory: DIRECTORY
-    files: files_property("Of one volume for each frame")
-    filter_glob: shown_files(_STATES)
+    directory: file_properties.DIRECTORY
+    files: file_properties.files_property("Of one volume for each frame")
+    filter_glob: file_properties.shown_files(_STATES)
     name: StringProperty(name="Name", description="Empty: what the files' have in common", options={"SKIP_SAVE"})
     frame_start: IntProperty(name="First Frame", description="Frame that shows the first file", default=1)
 

@@ -5,17 +5,13 @@ import math
 import bpy
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty
 
-from ..addon.blender import jobs
-from ..addon.blender.decimals import typed
-from ..addon.blender.reports import ask_to_remove, needs
+from ..addon.blender import decimals, jobs, reports
 from ..addon.scanner import following, maps, module_edits, scanner, selection
 from ..addon.scanner.scanner_parts import modules_text
 
 
 class MPHDRR_OT_show_modules(selection.OnScanner, bpy.types.Operator):
     """Show or hide modules with their collimators and crystals, in the viewport and in renders"""
-
-    bl_label = "Show Modules"
 
     first: IntProperty(name="First", description="First module number of the range", default=1)
     last: IntProperty(name="Last", description="Last module number of the range", default=1)
@@ -36,8 +32,6 @@ class MPHDRR_OT_show_modules(selection.OnScanner, bpy.types.Operator):
 
 class MPHDRR_OT_look_through_module(selection.OnScanner, bpy.types.Operator):
     """Make the module's pinhole camera the scene's camera, and look through it"""
-
-    bl_label = "Look Through Module"
 
     number: IntProperty(name="Number", description="Module number", default=1)
 
@@ -84,8 +78,6 @@ class MPHDRR_OT_duplicate_modules(selection.OnModules, bpy.types.Operator):
 class MPHDRR_OT_remove_modules(selection.OnModules, bpy.types.Operator):
     """Delete the selected modules with their collimators and crystals"""
 
-    bl_label = "Remove Modules"
-
     def change(self, context: bpy.types.Context, collection: bpy.types.Collection) -> str:
         modules = selection.selected_modules(context)
         text = modules_text([o.mphdrr_module.number for o in modules])
@@ -98,8 +90,6 @@ class MPHDRR_OT_tidy_modules(selection.OnScanner, bpy.types.Operator):
     crystals whose camera was deleted
     """
 
-    bl_label = "Tidy Modules"
-
     def change(self, context: bpy.types.Context, collection: bpy.types.Collection) -> str:
         tidied = [module_edits.tidy(each) for each in scanner.scanners(context.scene)]
         made, removed = [n for numbers, _ in tidied for n in numbers], sum(n for _, n in tidied)
@@ -110,8 +100,6 @@ class MPHDRR_OT_tidy_modules(selection.OnScanner, bpy.types.Operator):
 
 class MPHDRR_OT_renumber_modules(selection.OnScanner, bpy.types.Operator):
     """Number all modules 1, 2, ...; they are listed, projected and exported in that order from now on"""
-
-    bl_label = "Renumber Modules"
 
     order: EnumProperty(
         name="Order",
@@ -130,8 +118,6 @@ class MPHDRR_OT_renumber_modules(selection.OnScanner, bpy.types.Operator):
 class MPHDRR_OT_reset_cameras(selection.OnScanner, bpy.types.Operator):
     """Set lens and sensor of the modules' cameras to what the projections show"""
 
-    bl_label = "Reset Cameras"
-
     def change(self, context: bpy.types.Context, collection: bpy.types.Collection) -> str:
         reset = following.reset_views(collection)
         return f"Reset the cameras of {modules_text(reset)}" if reset else "All cameras see what their projections show"
@@ -139,8 +125,6 @@ class MPHDRR_OT_reset_cameras(selection.OnScanner, bpy.types.Operator):
 
 class MPHDRR_OT_set_up_scene(selection.OnScanner, bpy.types.Operator):
     """Set the scene's units to millimetres, and look at the whole scanner: for a scanner from another file"""
-
-    bl_label = "Set Up Scene"
 
     def change(self, context: bpy.types.Context, collection: bpy.types.Collection) -> str:
         scanner.set_up_scene(context.scene, collection)
@@ -150,13 +134,11 @@ class MPHDRR_OT_set_up_scene(selection.OnScanner, bpy.types.Operator):
 class MPHDRR_OT_remove_scanner(selection.OnScanner, bpy.types.Operator):
     """Remove the scanner with its cameras, collimators, crystals and projections in the scene; your own objects stay"""
 
-    bl_label = "Remove Scanner"
-
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         collection = scanner.required_scanner(context.scene)
         n = len(scanner.modules(collection))
         message = f"With its {n} modules; your own objects stay"
-        return ask_to_remove(self, context, event, f"Remove '{collection.name}'?", message)
+        return reports.ask_to_remove(self, context, event, f"Remove '{collection.name}'?", message)
 
     def change(self, context: bpy.types.Context, collection: bpy.types.Collection) -> str:
         name = collection.name
@@ -168,8 +150,6 @@ class MPHDRR_OT_check_geometry(selection.OnScanner, bpy.types.Operator):
     """Look for collimators and crystals that overlap, holes that another module blocks, and modules that do not see
     their ROI; select the modules concerned
     """
-
-    bl_label = "Check Geometry"
 
     def change(self, context: bpy.types.Context, collection: bpy.types.Collection) -> str:
         found, concerned = scanner.check_geometry(collection)
@@ -185,9 +165,7 @@ class MPHDRR_OT_add_map(jobs.JobOperator, bpy.types.Operator):
     in place of the scanner's last map of this quantity
     """
 
-    bl_label = "Add Map"
-
-    poll = needs(selection.SCANNER)
+    poll = reports.needs(selection.SCANNER)
 
     quantity: EnumProperty(name="Quantity", description="What is mapped", items=maps.QUANTITIES)
     voxels: IntProperty(
@@ -200,4 +178,4 @@ class MPHDRR_OT_add_map(jobs.JobOperator, bpy.types.Operator):
     within_roi: BoolProperty(name="Within ROI", description="Leave out what lies outside the ROI sphere", default=True)
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        return maps.mapping(context.scene, self.quantity, self.voxels, typed(self.side), self.within_roi)
+        return maps.mapping(context.scene, self.quantity, self.voxels, decimals.typed(self.side), self.within_roi)

@@ -2,18 +2,16 @@
 
 import bpy
 
-from ..addon.blender import jobs
-from ..addon.blender.reports import Reported, needs
-from ..addon.perspective import frustums
-from ..addon.perspective.perspective_properties import PerspectiveSettings
+from ..addon.blender import jobs, reports
+from ..addon.perspective import frustums, perspective_properties
 from ..addon.scanner import selection
 from ..addon.volumes import volumes
 
 
-class _InPerspective(PerspectiveSettings, jobs.JobOperator):
+class _InPerspective(perspective_properties.PerspectiveSettings, jobs.JobOperator):
     """Mix into an operator that takes the active volume into the coordinates of the active module."""
 
-    poll = needs((selection.active_module, "No module is active: import a geometry first"), volumes.ACTIVE)
+    poll = reports.needs((selection.active_module, "No module is active: import a geometry first"), volumes.ACTIVE)
 
 
 class MPHDRR_OT_show_in_perspective(_InPerspective, bpy.types.Operator):
@@ -37,10 +35,10 @@ class MPHDRR_OT_resample_in_perspective(_InPerspective, bpy.types.Operator):
         return frustums.resampling(context, *self.given(context.scene.mphdrr_perspective, "cells", "uniform"))
 
 
-class MPHDRR_OT_clear_perspective(Reported, bpy.types.Operator):
+class MPHDRR_OT_clear_perspective(reports.Reported, bpy.types.Operator):
     """Remove all volumes in perspective, of all modules"""
 
-    poll = needs((lambda context: frustums.frustums(context.scene), "No volume is shown in perspective"))
+    poll = reports.needs((lambda context: frustums.frustums(context.scene), "No volume is shown in perspective"))
 
     def act(self, context: bpy.types.Context) -> str:
         count = frustums.remove(context.scene)

@@ -5,10 +5,7 @@ import numpy as np
 from bpy.props import EnumProperty, FloatProperty, IntProperty
 from bpy_extras import view3d_utils
 
-from ..addon.blender import choices, ids
-from ..addon.blender.decimals import typed
-from ..addon.blender.eyedropper import Eyedropper, region_under
-from ..addon.blender.reports import Reported, needs
+from ..addon.blender import choices, decimals, eyedropper, ids, reports
 from ..addon.perspective import epipolar, epipolar_drawing
 from ..addon.pictures import images, tiles
 from ..core.errors import InputError
@@ -16,7 +13,7 @@ from ..core.errors import InputError
 _COUNTED = "Of the pixel, counted as in the arrays; 0: the centre of pixel 0"
 
 
-class MPHDRR_OT_pick_pixel(Eyedropper, Reported, bpy.types.Operator):
+class MPHDRR_OT_pick_pixel(eyedropper.Eyedropper, reports.Reported, bpy.types.Operator):
     """Click on a pixel of a projection, in the Image Editor or on a plane in the scene: its ray is drawn there, and on the
     other modules' projections its epipolar lines. Esc or a right click leaves all as it was
     """
@@ -30,7 +27,7 @@ class MPHDRR_OT_pick_pixel(Eyedropper, Reported, bpy.types.Operator):
     )  # fmt: skip
 
     asks = "a pixel of a projection"
-    poll = needs(images.PROJECTED)
+    poll = reports.needs(images.PROJECTED)
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         try:
@@ -41,14 +38,14 @@ class MPHDRR_OT_pick_pixel(Eyedropper, Reported, bpy.types.Operator):
         return super().invoke(context, event)
 
     def act(self, context: bpy.types.Context) -> str:
-        pixel = (typed(each) for each in (self.column, self.row, self.k))
+        pixel = (decimals.typed(each) for each in (self.column, self.row, self.k))
         found = epipolar.pick(context.scene, self.module, *pixel)
         column, row = found.pixel
         return f"Module {self.module}, column {column:g}, row {row:g}: {found.seen_by} modules see the marker"
 
     def under(self, context: bpy.types.Context, event: bpy.types.Event) -> tuple[int, int, int] | None:
         """The module's number, and column and row, of the pixel under the mouse."""
-        found, run = region_under(context, event), epipolar.run_views(context.scene)
+        found, run = eyedropper.region_under(context, event), epipolar.run_views(context.scene)
         if found is None or run is None:
             return None
         area, region, place = found
@@ -73,12 +70,12 @@ class MPHDRR_OT_pick_pixel(Eyedropper, Reported, bpy.types.Operator):
         return self.execute(context) == {"FINISHED"}
 
 
-class MPHDRR_OT_clear_pixel(Reported, bpy.types.Operator):
+class MPHDRR_OT_clear_pixel(reports.Reported, bpy.types.Operator):
     """Draw no ray and no epipolar lines any more"""
 
     bl_label = "Clear Picked Pixel"
 
-    poll = needs((lambda context: context.scene.mphdrr_epipolar.views, "No pixel is picked"))
+    poll = reports.needs((lambda context: context.scene.mphdrr_epipolar.views, "No pixel is picked"))
 
     def act(self, context: bpy.types.Context) -> None:
         epipolar.clear(context.scene)
@@ -88,7 +85,7 @@ def _has_image_editor(context: bpy.types.Context) -> bool:
     return bool(context.window) and any(area.type == "IMAGE_EDITOR" for area in context.window.screen.areas)
 
 
-class MPHDRR_OT_pick_window(Eyedropper, bpy.types.Operator):
+class MPHDRR_OT_pick_window(eyedropper.Eyedropper, bpy.types.Operator):
     """Click on a picture of the projections: the exact number there becomes the window's low or high end. The number under
     the mouse stands in the status bar; Esc or a right click leaves all as it was
     """
@@ -103,14 +100,14 @@ class MPHDRR_OT_pick_window(Eyedropper, bpy.types.Operator):
     )  # fmt: skip
 
     asks = "a picture of the projections"
-    poll = needs(
+    poll = reports.needs(
         (lambda context: images.tiles(bpy.data.images.get(ids.MOSAIC)), images.PROJECTED[1]),
         (_has_image_editor, "No Image Editor is open: press Show Mosaic"),
     )
 
     def under(self, context: bpy.types.Context, event: bpy.types.Event) -> tuple[str, float] | None:
         """The exact number under the mouse, and what it is."""
-        found = region_under(context, event)
+        found = eyedropper.region_under(context, event)
         if found is None or found[0].type != "IMAGE_EDITOR":
             return None
         area, region, place = found
@@ -144,7 +141,7 @@ class MPHDRR_OT_pick_module(bpy.types.Operator):
 
     bl_options = {"UNDO", "INTERNAL"}
 
-    poll = needs((_shows_mosaic, "Only in an Image Editor that shows the mosaic"))
+    poll = reports.needs((_shows_mosaic, "Only in an Image Editor that shows the mosaic"))
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         try:

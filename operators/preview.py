@@ -2,8 +2,7 @@
 
 import bpy
 
-from ..addon.blender import jobs
-from ..addon.blender.reports import needs
+from ..addon.blender import jobs, reports
 from ..addon.runs import preview
 from ..addon.scanner import selection
 from ..addon.volumes import volumes
@@ -12,7 +11,7 @@ from ..addon.volumes import volumes
 class MPHDRR_OT_live_preview(bpy.types.Operator):
     """Show in the 3D views what the active module sees, made again while it, the phantom or a number changes; again: stop"""
 
-    _can_start = needs(
+    _can_start = reports.needs(
         (lambda context: not bpy.app.background, "Needs a window"),
         selection.SCANNER,
         (lambda context: volumes.volume_objects(context.scene), "No volume in the scene: add a phantom first"),

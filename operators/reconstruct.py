@@ -4,13 +4,7 @@ import bpy
 
 from ..addon.blender import ids, jobs
 from ..addon.blender.reports import Need, needs
-from ..addon.reconstruction import backprojections, reconstructions
-from ..addon.reconstruction.reconstruction_properties import (
-    BackprojectionSettings,
-    ReconstructionSettings,
-    settings_recipe,
-    voxels_recipe,
-)
+from ..addon.reconstruction import backprojections, reconstruction_properties, reconstructions
 from ..addon.runs import runs
 from .render_projections import ShowPicture
 
@@ -18,7 +12,7 @@ _DONE: Need = (lambda _: ids.RECONSTRUCTION in bpy.data.images, "No reconstructi
 _RUN: Need = (lambda context: runs.shown(context.scene) is not None, "No run yet: render the projections first")
 
 
-class MPHDRR_OT_reconstruct(ReconstructionSettings, jobs.JobOperator, bpy.types.Operator):
+class MPHDRR_OT_reconstruct(reconstruction_properties.ReconstructionSettings, jobs.JobOperator, bpy.types.Operator):
     """Find the volume that the shown run's projections are of. It is in the scene from its first iterations on; Cancel takes
     it away again, Finish Now keeps what there is. The settings are what the panel says now, unless a script gives others
     """
@@ -30,11 +24,13 @@ class MPHDRR_OT_reconstruct(ReconstructionSettings, jobs.JobOperator, bpy.types.
     def job(self, context: bpy.types.Context) -> jobs.Job:
         return reconstructions.reconstructing(
             context,
-            settings_recipe(self.given_or(context.scene.mphdrr_reconstruction), self.properties.is_property_set),
+            reconstruction_properties.settings_recipe(
+                self.given_or(context.scene.mphdrr_reconstruction), self.properties.is_property_set
+            ),
         )
 
 
-class MPHDRR_OT_backproject(BackprojectionSettings, jobs.JobOperator, bpy.types.Operator):
+class MPHDRR_OT_backproject(reconstruction_properties.BackprojectionSettings, jobs.JobOperator, bpy.types.Operator):
     """Put together what the shown run's modules say of each voxel along their rays, as a volume. It is no reconstruction: a
     value is that of whole rays, not of the voxel. Voxels are those of a reconstruction, as the panel says now, unless a
     script gives others
@@ -46,7 +42,7 @@ class MPHDRR_OT_backproject(BackprojectionSettings, jobs.JobOperator, bpy.types.
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
         get = self.given_or(context.scene.mphdrr_reconstruction)
-        return backprojections.backprojecting(context, voxels_recipe(get), get("how").lower())
+        return backprojections.backprojecting(context, reconstruction_properties.voxels_recipe(get), get("how").lower())
 
 
 class MPHDRR_OT_show_reconstruction(ShowPicture, bpy.types.Operator):

@@ -8,20 +8,16 @@ import bpy
 from bpy.props import EnumProperty, FloatProperty, StringProperty
 from bpy_extras.io_utils import ImportHelper
 
-from ..addon.blender import choices, ids, jobs, storage
-from ..addon.blender.decimals import typed
-from ..addon.blender.file_properties import shown_files
-from ..addon.blender.reports import Reported, needs
+from ..addon.blender import choices, decimals, file_properties, ids, jobs, reports, storage
 from ..addon.pictures import images
-from ..addon.runs import rendering, runs
-from ..addon.runs.projection_properties import OPENING_ANGLE, ProjectionSettings, settings_recipe, use_preset
+from ..addon.runs import projection_properties, rendering, runs
 from ..addon.scanner import scanner
 from ..core.errors import InputError
 from ..core.runs.files import FORMATS
 from ..core.runs.presets import PRESETS
 
 
-class MPHDRR_OT_render_projections(ProjectionSettings, jobs.JobOperator, bpy.types.Operator):
+class MPHDRR_OT_render_projections(projection_properties.ProjectionSettings, jobs.JobOperator, bpy.types.Operator):
     """Project the volume into every module: exact line integrals or SPECT counts, stored as images and as a file beside
     the .blend. The settings are what the panel says now, unless a script gives others
     """
@@ -39,10 +35,10 @@ class MPHDRR_OT_render_projections(ProjectionSettings, jobs.JobOperator, bpy.typ
         collection = scanner.required_scanner(context.scene)
         own_angle = self.properties.is_property_set("opening_angle")
         angle = self.opening_angle if own_angle else collection.mphdrr_scanner.opening_angle
-        recipe = settings_recipe(
+        recipe = projection_properties.settings_recipe(
             lambda name: self._setting(context.scene, name),
             self.properties.is_property_set,
-            {OPENING_ANGLE: math.degrees(typed(angle))},
+            {projection_properties.OPENING_ANGLE: math.degrees(decimals.typed(angle))},
         )
         return rendering.render_job(context, recipe, self.volume, self.mu)
 
@@ -54,7 +50,7 @@ class MPHDRR_OT_render_projections(ProjectionSettings, jobs.JobOperator, bpy.typ
         return self.given_or(scene.mphdrr_projections)(name)
 
 
-class MPHDRR_OT_use_preset(Reported, bpy.types.Operator):
+class MPHDRR_OT_use_preset(reports.Reported, bpy.types.Operator):
     """Count photons, with isotope, aperture and crystal chosen together; time, noise, attenuation and the detector's own
     blur stay as they are
     """
@@ -68,15 +64,15 @@ class MPHDRR_OT_use_preset(Reported, bpy.types.Operator):
     )
 
     def act(self, context: bpy.types.Context) -> None:
-        use_preset(context.scene.mphdrr_projections, self.preset)
+        projection_properties.use_preset(context.scene.mphdrr_projections, self.preset)
 
 
-class MPHDRR_OT_load_recipe(Reported, ImportHelper, bpy.types.Operator):
+class MPHDRR_OT_load_recipe(reports.Reported, ImportHelper, bpy.types.Operator):
     """Set the panel as a recipe (.toml) or a run (.h5, .npz, .pt) says: model, detector, noise, modules and, where the
     scene has objects of their names, volumes. By default the recipe of the last run
     """
 
-    filter_glob: shown_files((".toml", *FORMATS))
+    filter_glob: file_properties.shown_files((".toml", *FORMATS))
 
     def act(self, context: bpy.types.Context) -> str:
         filepath = self.filepath or context.scene.mphdrr_projections.run_file
@@ -86,7 +82,7 @@ class MPHDRR_OT_load_recipe(Reported, ImportHelper, bpy.types.Operator):
         return f"Set the panel as {bpy.path.basename(filepath)} says"
 
 
-class ShowPicture(Reported):
+class ShowPicture(reports.Reported):
     """Mix into an operator that shows one of the pictures that are made here."""
 
     bl_options = set()
@@ -100,17 +96,16 @@ class ShowPicture(Reported):
 class MPHDRR_OT_show_projections(ShowPicture, bpy.types.Operator):
     """Show the mosaic of the last run in an Image Editor, opened below the 3D view if there is none"""
 
-    poll = needs(images.PROJECTED)
+    poll = reports.needs(images.PROJECTED)
 
 
 class MPHDRR_OT_export_dataset(jobs.ExportJob, bpy.types.Operator):
     """Write the shown run, with geometry, volume and provenance, as HDF5 (.h5), NumPy (.npz) or PyTorch (.pt)"""
 
     bl_label = "Export mphDRR Dataset"
-    bl_options = set()
 
     endings = FORMATS
-    filter_glob: shown_files(FORMATS)
+    filter_glob: file_properties.shown_files(FORMATS)
 
     def draw(self, context: bpy.types.Context) -> None:
         """Beside the file browser: where the run is not of the scene as it is now."""

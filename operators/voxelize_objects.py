@@ -3,9 +3,8 @@
 import bpy
 from bpy.props import EnumProperty, FloatProperty, IntProperty, StringProperty
 
-from ..addon.blender import choices, jobs
+from ..addon.blender import choices, jobs, reports
 from ..addon.blender.decimals import typed
-from ..addon.blender.reports import needs
 from ..addon.volumes import meshes, volumes
 
 
@@ -31,7 +30,7 @@ class MPHDRR_OT_voxelize_objects(jobs.JobOperator, bpy.types.Operator):
     )
     name: StringProperty(name="Name", description="The volume's name; empty: the mesh's")
 
-    poll = needs((lambda context: _chosen(context), "Select closed mesh objects first"))
+    poll = reports.needs((lambda context: _chosen(context), "Select closed mesh objects first"))
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
         return meshes.voxelizing(
@@ -49,7 +48,7 @@ class MPHDRR_OT_mesh_from_volume(jobs.JobOperator, bpy.types.Operator):
         description="The surface's value, in the unit that the panel shows; 0: halfway from outside to the largest",
     )
 
-    poll = needs(volumes.ACTIVE)
+    poll = reports.needs(volumes.ACTIVE)
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
         return meshes.extracting(context.object, typed(self.level) or None)

@@ -7,10 +7,8 @@ import bpy
 import numpy as np
 from bpy.app.translations import pgettext_iface as iface
 
-from ..addon.blender import ids, jobs
-from ..addon.blender.layouts import invoking, labelled
-from ..addon.scanner import columns, following, pinholes, scanner, selection
-from ..addon.scanner.module_values import Column, Kind, designed, kind_of
+from ..addon.blender import jobs, layouts
+from ..addon.scanner import columns, following, module_values, pinholes, scanner, selection
 from .geometry import ScannerPanel
 from .sidebar import draw_facts, draw_text
 
@@ -21,34 +19,32 @@ _ANYWHERE = np.ones((1, 3))  # mm
 class MPHDRR_PT_design(ScannerPanel, bpy.types.Panel):
     """The active module."""
 
-    bl_label = "Design"
-
     def draw_scanner(self, context: bpy.types.Context, collection: bpy.types.Collection) -> None:
         layout = self.layout
         properties = collection.mphdrr_scanner
         if properties.untidy:
             box = layout.box().column(align=True)
             box.label(text=properties.untidy.capitalize(), icon="ERROR")
-            box.operator(ids.TIDY_MODULES, icon="BRUSH_DATA")
+            box.operator("mphdrr.tidy_modules", icon="BRUSH_DATA")
         edited = sum(not following.shows_its_field(camera) for camera in scanner.modules(collection))
         if edited:
             box = layout.box().column(align=True)
             draw_text(
                 box, f"Lens or sensor edited of {edited} camera{'s' * (edited > 1)}: not what the projections show"
             )
-            box.operator(ids.RESET_CAMERAS, icon="CAMERA_DATA")
+            box.operator("mphdrr.reset_cameras", icon="CAMERA_DATA")
         camera = selection.active_module(context)
         if camera is None:
             layout.label(text="Select a module's camera", icon="INFO")
         else:
-            _draw_module(layout, camera, kind_of(collection))
-        row = invoking(layout.row(align=True))
-        row.operator(ids.DUPLICATE_MODULES, text="Duplicate", icon="DUPLICATE")
-        row.operator(ids.REMOVE_MODULES, text="Remove", icon="TRASH")
-        if kind_of(collection).aimed(_ANYWHERE) is not None:
+            _draw_module(layout, camera, module_values.kind_of(collection))
+        row = layouts.invoking(layout.row(align=True))
+        row.operator("mphdrr.duplicate_modules", text="Duplicate", icon="DUPLICATE")
+        row.operator("mphdrr.remove_modules", text="Remove", icon="TRASH")
+        if module_values.kind_of(collection).aimed(_ANYWHERE) is not None:
             row = layout.row(align=True)
             row.prop(properties, "keep_aimed", toggle=True, icon="CON_TRACKTO")
-            row.operator(ids.AIM_MODULES)
+            row.operator("mphdrr.aim_modules")
 
 
 class MPHDRR_PT_scanner_design(ScannerPanel, bpy.types.Panel):
@@ -59,13 +55,13 @@ class MPHDRR_PT_scanner_design(ScannerPanel, bpy.types.Panel):
     def draw_scanner(self, context: bpy.types.Context, collection: bpy.types.Collection) -> None:
         layout = self.layout
         properties = collection.mphdrr_scanner
-        kind = kind_of(collection)
+        kind = module_values.kind_of(collection)
         column = _draw_values(layout, properties, kind, properties.mixed.split())
         if pinholes.has_pinholes(kind):
             _draw_pinholes(layout, column, properties)
-        layout.operator_menu_enum(ids.RENUMBER_MODULES, "order", text="Renumber", icon="LINENUMBERS_ON")
+        layout.operator_menu_enum("mphdrr.renumber_modules", "order", text="Renumber", icon="LINENUMBERS_ON")
         if pinholes.has_pinholes(kind):
-            layout.operator(ids.CHECK_GEOMETRY, icon="CHECKMARK")
+            layout.operator("mphdrr.check_geometry", icon="CHECKMARK")
         if properties.findings:
             findings = json.loads(properties.findings)
             if not findings:
@@ -75,15 +71,15 @@ class MPHDRR_PT_scanner_design(ScannerPanel, bpy.types.Panel):
             if len(findings) > _MOST_FINDINGS:
                 more = iface("... and {count} more").format(count=len(findings) - _MOST_FINDINGS)
                 layout.label(text=more, icon="BLANK1")
-        column = invoking(layout.column(align=True))
+        column = layouts.invoking(layout.column(align=True))
         if pinholes.has_pinholes(kind):
-            column.operator_menu_enum(ids.ADD_MAP, "quantity", text="Add Map", icon="OUTLINER_DATA_VOLUME")
+            column.operator_menu_enum("mphdrr.add_map", "quantity", text="Add Map", icon="OUTLINER_DATA_VOLUME")
         jobs.draw_job(column)
-        column = invoking(layout.column(align=True))
-        column.operator(ids.EXPORT_GEOMETRY, text="Export Workbook", icon="EXPORT")
-        column.operator(ids.EXPORT_FOR_PROGRAM, text="Export for a Program", icon="EXPORT")
+        column = layouts.invoking(layout.column(align=True))
+        column.operator("mphdrr.export_geometry", text="Export Workbook", icon="EXPORT")
+        column.operator("mphdrr.export_for_program", text="Export for a Program", icon="EXPORT")
         column.separator()
-        column.operator(ids.REMOVE_SCANNER, icon="TRASH")
+        column.operator("mphdrr.remove_scanner", icon="TRASH")
 
 
 def _draw_pinholes(layout: bpy.types.UILayout, column: bpy.types.UILayout, properties: bpy.types.PropertyGroup) -> None:
@@ -102,7 +98,7 @@ def _draw_pinholes(layout: bpy.types.UILayout, column: bpy.types.UILayout, prope
     )
 
 
-def _draw_module(layout: bpy.types.UILayout, camera: bpy.types.Object, kind: Kind) -> None:
+def _draw_module(layout: bpy.types.UILayout, camera: bpy.types.Object, kind: module_values.Kind) -> None:
     module = camera.mphdrr_module
     layout.label(text=camera.name, icon="OUTLINER_OB_CAMERA")
     _draw_values(layout, module, kind, mixed=())
@@ -124,10 +120,10 @@ def _draw_module(layout: bpy.types.UILayout, camera: bpy.types.Object, kind: Kin
 
 
 def _draw_values(
-    layout: bpy.types.UILayout, values: bpy.types.PropertyGroup, kind: Kind, mixed: Sequence[str]
+    layout: bpy.types.UILayout, values: bpy.types.PropertyGroup, kind: module_values.Kind, mixed: Sequence[str]
 ) -> bpy.types.UILayout:
     """Draw the values of a module's columns, those by formula last; "mixed" stands beside those that differ."""
-    column, last = labelled(layout.column(align=True)), designed(kind)
+    column, last = layouts.labelled(layout.column(align=True)), module_values.designed(kind)
     for one in kind.columns.scalars.values():
         if one not in last:
             column.prop(values, one.field, text=_label(one, mixed))
@@ -140,7 +136,7 @@ def _draw_values(
     return column
 
 
-def _label(column: Column, mixed: Sequence[str]) -> str:
+def _label(column: module_values.Column, mixed: Sequence[str]) -> str:
     name = iface(columns.short_label(column))
     if column.field in mixed:
         return iface("{name}, mixed").format(name=name)

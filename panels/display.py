@@ -3,11 +3,10 @@
 import bpy
 from bpy.app.translations import pgettext_iface as iface
 
-from ..addon.blender import ids
-from ..addon.blender.layouts import draw_all, labelled, shown_where
+from ..addon.blender import ids, layouts
 from ..addon.pictures import images, tiles
 from ..addon.scanner import selection
-from .sidebar import Folded, ImagesSidebar
+from .sidebar import Folded, ImagesSidebar, draw_facts
 
 
 class _Display:
@@ -15,20 +14,20 @@ class _Display:
 
     bl_label = "Display"
 
-    poll = shown_where(lambda context: ids.MOSAIC in bpy.data.images)
+    poll = layouts.shown_where(lambda context: ids.MOSAIC in bpy.data.images)
 
     def draw(self, context: bpy.types.Context) -> None:
-        layout = labelled(self.layout)  # type: ignore[attr-defined]
+        layout = layouts.labelled(self.layout)  # type: ignore[attr-defined]
         settings = context.scene.mphdrr_display
-        draw_all(layout, settings, "colors", "scale")
+        layouts.draw_all(layout, settings, "colors", "scale")
         layout.prop(settings, "automatic", text="Automatic Window")
         column = layout.column(align=True)
         column.active = not settings.automatic
         column.prop(settings, "low", text="Window Low")
         column.prop(settings, "high")
         picks = layout.row(align=True)
-        picks.operator(ids.PICK_WINDOW, text="Pick Low", icon="EYEDROPPER").end = "LOW"
-        picks.operator(ids.PICK_WINDOW, text="Pick High", icon="EYEDROPPER").end = "HIGH"
+        picks.operator("mphdrr.pick_window", text="Pick Low", icon="EYEDROPPER").end = "LOW"
+        picks.operator("mphdrr.pick_window", text="Pick High", icon="EYEDROPPER").end = "HIGH"
         layout.prop(settings, "half")
         if settings.problem:
             layout.label(text=settings.problem, icon="ERROR")
@@ -44,11 +43,10 @@ def _draw_totals(layout: bpy.types.UILayout, context: bpy.types.Context) -> None
     column = layout.column(align=True)
     text = iface("{name}, central half ({unit})") if shown["half"] else "{name} ({unit})"
     column.label(text=text.format(name=camera.name, unit=shown["unit"]), translate=False)
-    for text, value in ((shown["summed"].capitalize(), shown["totals"][index]), ("Maximum", shown["maxima"][index])):
-        row = column.split(factor=0.4)
-        row.active = False
-        row.label(text=text)
-        row.label(text=f"{value:.6g}", translate=False)
+    numbers = column.split(factor=0.4)
+    numbers.active = False
+    total, most = (f"{shown[name][index]:.6g}" for name in ("totals", "maxima"))
+    draw_facts(numbers, (shown["summed"].capitalize(), total), ("Maximum", most))
 
 
 class MPHDRR_PT_display(_Display, Folded, bpy.types.Panel):
@@ -64,7 +62,7 @@ class MPHDRR_PT_display(_Display, Folded, bpy.types.Panel):
         distance = column.row()
         distance.active = not settings.plane_at_detector
         distance.prop(settings, "plane_distance")
-        draw_all(layout, settings, "backgrounds", "plane_opacity")
+        layouts.draw_all(layout, settings, "backgrounds", "plane_opacity")
 
 
 class MPHDRR_PT_display_of_images(_Display, ImagesSidebar, bpy.types.Panel):

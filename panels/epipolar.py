@@ -3,8 +3,7 @@
 import bpy
 from bpy.app.translations import pgettext_iface as iface
 
-from ..addon.blender import ids
-from ..addon.blender.layouts import draw_all, invoking, labelled, shown_where
+from ..addon.blender import ids, layouts
 from ..addon.perspective import epipolar
 from .sidebar import ImagesSidebar, Sidebar, draw_facts, draw_text
 
@@ -15,18 +14,18 @@ class _Epipolar:
     bl_label = "Epipolar Lines"
     bl_options = {"DEFAULT_CLOSED"}
 
-    poll = shown_where(lambda context: ids.MOSAIC in bpy.data.images)
+    poll = layouts.shown_where(lambda context: ids.MOSAIC in bpy.data.images)
 
     def draw(self, context: bpy.types.Context) -> None:
-        layout = labelled(self.layout)  # type: ignore[attr-defined]
+        layout = layouts.labelled(self.layout)  # type: ignore[attr-defined]
         settings = context.scene.mphdrr_epipolar
-        row = invoking(layout.row(align=True))
-        row.operator(ids.PICK_PIXEL, icon="EYEDROPPER")
-        row.operator(ids.CLEAR_PIXEL, text="", icon="X")
+        row = layouts.invoking(layout.row(align=True))
+        row.operator("mphdrr.pick_pixel", icon="EYEDROPPER")
+        row.operator("mphdrr.clear_pixel", text="", icon="X")
         run = epipolar.run_views(context.scene)
         if run is None or settings.views != run.name:
             return
-        draw_all(layout.column(align=True), settings, "module", "column", "row")
+        layouts.draw_all(layout.column(align=True), settings, "module", "column", "row")
         found, problem = epipolar.shown(context.scene)
         if problem:
             draw_text(layout, problem)

@@ -2,8 +2,7 @@
 
 import bpy
 
-from ..addon.blender import ids, jobs
-from ..addon.blender.layouts import draw_all, invoking, labelled
+from ..addon.blender import ids, jobs, layouts
 from ..addon.events import event_notes
 from .sidebar import Folded, draw_hint, draw_text
 
@@ -12,12 +11,12 @@ class MPHDRR_PT_event_set(Folded, bpy.types.Panel):
     bl_order = ids.ORDER_EVENTS
 
     def draw(self, context: bpy.types.Context) -> None:
-        layout = invoking(labelled(self.layout))
+        layout = layouts.invoking(layouts.labelled(self.layout))
         settings = context.scene.mphdrr_events
         jobs.draw_job(layout)
         column = layout.column(align=True)
         column.prop(settings, "recipe")
-        column.operator_menu_enum(ids.NEW_EVENT_RECIPE, "like", text="New Recipe", icon="FILE_NEW")
+        column.operator_menu_enum("mphdrr.new_event_recipe", "like", text="New Recipe", icon="FILE_NEW")
         recipe, made = event_notes.of_recipe(settings.recipe), event_notes.of_set(settings.folder)
         if recipe is not None:
             _draw_note(layout, recipe)
@@ -26,18 +25,18 @@ class MPHDRR_PT_event_set(Folded, bpy.types.Panel):
         if not (recipe or made or event_notes.NOTHING).is_wrong:
             column = layout.column(align=True)
             column.prop(settings, "number")
-            column.operator(ids.TRY_EVENT, text="Another One", icon="FILE_REFRESH")
+            column.operator("mphdrr.try_event", text="Another One", icon="FILE_REFRESH")
         if settings.tried:
             draw_text(layout, settings.tried[:1].upper() + settings.tried[1:], "OUTLINER_DATA_VOLUME")
         column = layout.column(align=True)
-        draw_all(column, settings, "folder", "count")
-        column.operator(ids.MAKE_EVENT_SET, icon="FILE_CACHE")
+        layouts.draw_all(column, settings, "folder", "count")
+        column.operator("mphdrr.make_event_set", icon="FILE_CACHE")
         if made is not None:
             _draw_note(layout, made)
             column = layout.column(align=True)
             column.prop(settings, "opened")
             column.prop(settings, "model", placeholder="First")
-            column.operator(ids.OPEN_EVENT, icon="OUTLINER_OB_VOLUME")
+            column.operator("mphdrr.open_event", icon="OUTLINER_OB_VOLUME")
 
 
 def _draw_note(layout: bpy.types.UILayout, note: event_notes.Note) -> None:

@@ -6,8 +6,7 @@ import bpy
 import numpy as np
 from bpy.app.translations import pgettext_iface as iface
 
-from ..addon.blender import ids, jobs
-from ..addon.blender.layouts import invoking, shown_where
+from ..addon.blender import ids, jobs, layouts
 from ..addon.scanner import following, pinholes, scanner, selection
 from ..addon.scanner.module_values import kind_of
 from .sidebar import Folded, Sidebar, draw_facts, draw_hint, draw_text
@@ -49,17 +48,16 @@ class MPHDRR_UL_modules(bpy.types.UIList):
 class MPHDRR_PT_geometry(Sidebar, bpy.types.Panel):
     """Import, which scanner it is, and which part of it is shown."""
 
-    bl_label = "Geometry"
     bl_order = ids.ORDER_GEOMETRY
 
     def draw(self, context: bpy.types.Context) -> None:
-        layout = invoking(self.layout)
+        layout = layouts.invoking(self.layout)
         collection = scanner.active_scanner(context.scene)
         if collection is None and not jobs.is_running():
             row = layout.row()
             row.scale_y = 1.4
-            row.operator(ids.LOAD_EXAMPLE, icon="PLAY")
-        layout.operator(ids.IMPORT_GEOMETRY, text="Import Workbook", icon="IMPORT")
+            row.operator("mphdrr.load_example", icon="PLAY")
+        layout.operator("mphdrr.import_geometry", text="Import Workbook", icon="IMPORT")
         if collection is None:
             draw_hint(layout, "Or drop one on the viewport.")
             jobs.draw_job(layout)
@@ -69,7 +67,7 @@ class MPHDRR_PT_geometry(Sidebar, bpy.types.Panel):
         if not scanner.is_set_up(context.scene):
             box = layout.box().column(align=True)
             draw_text(box, "The scene's units are not millimetres")
-            box.operator(ids.SET_UP_SCENE, icon="SCENE_DATA")
+            box.operator("mphdrr.set_up_scene", icon="SCENE_DATA")
         properties = collection.mphdrr_scanner
         n_rings = sum(c.mphdrr_scanner.is_ring for c in collection.children)
         draw_facts(
@@ -89,7 +87,7 @@ class ScannerPanel(Folded):
 
     bl_parent_id = "MPHDRR_PT_geometry"
 
-    poll = shown_where(lambda context: scanner.active_scanner(context.scene) is not None)
+    poll = layouts.shown_where(lambda context: scanner.active_scanner(context.scene) is not None)
 
     def draw(self, context: bpy.types.Context) -> None:
         collection = scanner.active_scanner(context.scene)
@@ -102,8 +100,6 @@ class ScannerPanel(Folded):
 
 
 class MPHDRR_PT_modules(ScannerPanel, bpy.types.Panel):
-    bl_label = "Modules"
-
     def draw_scanner(self, context: bpy.types.Context, collection: bpy.types.Collection) -> None:
         layout = self.layout
         state = context.scene.mphdrr_geometry
@@ -128,7 +124,7 @@ class MPHDRR_PT_modules(ScannerPanel, bpy.types.Panel):
         camera = selection.listed_module(context.scene)
         if camera is not None:
             text = iface("Look Through {module}").format(module=camera.name)
-            look = layout.operator(ids.LOOK_THROUGH_MODULE, text=text, icon="OUTLINER_OB_CAMERA")
+            look = layout.operator("mphdrr.look_through_module", text=text, icon="OUTLINER_OB_CAMERA")
             look.number = camera.mphdrr_module.number
         row = layout.row(align=True)
         for name in ("show_rays", "show_frustums", "show_detectors"):
@@ -148,5 +144,5 @@ def _columns(layout: bpy.types.UILayout, name: str, *numbers: str) -> None:
 
 
 def _show(layout: bpy.types.UILayout, text: str, first: int, last: int, mode: str, icon: str = "NONE") -> None:
-    button = layout.operator(ids.SHOW_MODULES, text=text, icon=icon)
+    button = layout.operator("mphdrr.show_modules", text=text, icon=icon)
     button.first, button.last, button.mode = first, last, mode

@@ -6,7 +6,6 @@ What adds something is under Add > mphDRR, what reads and writes files also unde
 import bpy
 from bpy.app.translations import pgettext_iface as iface
 
-from ..addon.blender import ids
 from ..addon.blender.layouts import invoking
 from ..addon.phantoms.phantom_properties import menu_entries
 from ..addon.scanner import selection
@@ -18,16 +17,16 @@ class MPHDRR_MT_add(bpy.types.Menu):
     def draw(self, context: bpy.types.Context) -> None:
         layout = invoking(self.layout)
         for kind, label, beats in menu_entries():
-            layout.operator(ids.ADD_PHANTOM + kind, text=label, icon="OUTLINER_DATA_VOLUME")
+            layout.operator("mphdrr.add_" + kind, text=label, icon="OUTLINER_DATA_VOLUME")
             if beats:
                 text = iface("Beating {phantom}").format(phantom=iface(label))
-                layout.operator(ids.ADD_PHANTOM + kind, text=text, icon="OUTLINER_DATA_VOLUME").frames = 24
-        layout.operator(ids.IMPORT_PHANTOM, text="Phantom from TOML File", icon="FILE_TEXT")
+                layout.operator("mphdrr.add_" + kind, text=text, icon="OUTLINER_DATA_VOLUME").frames = 24
+        layout.operator("mphdrr.import_phantom", text="Phantom from TOML File", icon="FILE_TEXT")
         layout.separator()
-        layout.operator(ids.IMPORT_VOLUME, text="Volume from File", icon="IMPORT")
-        layout.operator(ids.IMPORT_VOLUME_SEQUENCE, text="Volume Sequence from Files", icon="RENDER_ANIMATION")
-        layout.operator(ids.VOXELIZE_OBJECTS, text="Volume from Meshes", icon="OUTLINER_DATA_MESH")
-        layout.operator(ids.ADD_MAP, text="Map of the Scanner", icon="OUTLINER_DATA_LIGHTPROBE")
+        layout.operator("mphdrr.import_volume", text="Volume from File", icon="IMPORT")
+        layout.operator("mphdrr.import_volume_sequence", text="Volume Sequence from Files", icon="RENDER_ANIMATION")
+        layout.operator("mphdrr.voxelize_objects", text="Volume from Meshes", icon="OUTLINER_DATA_MESH")
+        layout.operator("mphdrr.add_map", text="Map of the Scanner", icon="OUTLINER_DATA_LIGHTPROBE")
 
 
 class MPHDRR_MT_commands(bpy.types.Menu):
@@ -39,7 +38,7 @@ class MPHDRR_MT_commands(bpy.types.Menu):
         layout.menu("MPHDRR_MT_volumes", icon="OUTLINER_DATA_VOLUME")
         layout.menu("MPHDRR_MT_projections", icon="RENDER_STILL")
         layout.separator()
-        layout.operator(ids.LOAD_EXAMPLE, icon="PLAY")
+        layout.operator("mphdrr.load_example", icon="PLAY")
 
 
 class MPHDRR_MT_modules(bpy.types.Menu):
@@ -47,31 +46,31 @@ class MPHDRR_MT_modules(bpy.types.Menu):
 
     def draw(self, context: bpy.types.Context) -> None:
         layout = invoking(self.layout)
-        layout.operator(ids.IMPORT_GEOMETRY, icon="IMPORT")
-        layout.operator(ids.EXPORT_GEOMETRY, icon="EXPORT")
-        layout.operator(ids.EXPORT_FOR_PROGRAM)
+        layout.operator("mphdrr.import_geometry", icon="IMPORT")
+        layout.operator("mphdrr.export_geometry", icon="EXPORT")
+        layout.operator("mphdrr.export_for_program")
         layout.separator()
         state = context.scene.mphdrr_geometry
         text = iface("Show Only Modules {first} to {last}").format(first=state.first, last=state.last)
-        shown = layout.operator(ids.SHOW_MODULES, text=text)
+        shown = layout.operator("mphdrr.show_modules", text=text)
         shown.first, shown.last, shown.mode = state.first, state.last, "ONLY"
-        layout.operator(ids.SHOW_MODULES, text="Show All Modules", icon="HIDE_OFF").mode = "ALL"
+        layout.operator("mphdrr.show_modules", text="Show All Modules", icon="HIDE_OFF").mode = "ALL"
         camera = selection.listed_module(context.scene)
-        look = layout.operator(ids.LOOK_THROUGH_MODULE, text="Look Through Active Module")
+        look = layout.operator("mphdrr.look_through_module", text="Look Through Active Module")
         look.number = camera.mphdrr_module.number if camera else 1
         layout.separator()
-        layout.operator(ids.DUPLICATE_MODULES, icon="DUPLICATE")
-        layout.operator(ids.REMOVE_MODULES, icon="TRASH")
-        layout.operator(ids.AIM_MODULES, icon="CON_TRACKTO")
-        layout.operator(ids.RESET_CAMERAS, icon="LOOP_BACK")
-        layout.operator(ids.TIDY_MODULES, icon="BRUSH_DATA")
-        layout.operator_menu_enum(ids.RENUMBER_MODULES, "order", icon="LINENUMBERS_ON")
+        layout.operator("mphdrr.duplicate_modules", icon="DUPLICATE")
+        layout.operator("mphdrr.remove_modules", icon="TRASH")
+        layout.operator("mphdrr.aim_modules", icon="CON_TRACKTO")
+        layout.operator("mphdrr.reset_cameras", icon="LOOP_BACK")
+        layout.operator("mphdrr.tidy_modules", icon="BRUSH_DATA")
+        layout.operator_menu_enum("mphdrr.renumber_modules", "order", icon="LINENUMBERS_ON")
         layout.separator()
-        layout.operator(ids.CHECK_GEOMETRY, icon="CHECKMARK")
-        layout.operator_menu_enum(ids.ADD_MAP, "quantity", icon="OUTLINER_DATA_LIGHTPROBE")
+        layout.operator("mphdrr.check_geometry", icon="CHECKMARK")
+        layout.operator_menu_enum("mphdrr.add_map", "quantity", icon="OUTLINER_DATA_LIGHTPROBE")
         layout.separator()
-        layout.operator(ids.SET_UP_SCENE, icon="SCENE_DATA")
-        layout.operator(ids.REMOVE_SCANNER, icon="TRASH")
+        layout.operator("mphdrr.set_up_scene", icon="SCENE_DATA")
+        layout.operator("mphdrr.remove_scanner", icon="TRASH")
 
 
 class MPHDRR_MT_volumes(bpy.types.Menu):
@@ -81,50 +80,50 @@ class MPHDRR_MT_volumes(bpy.types.Menu):
         layout = invoking(self.layout)
         layout.menu("MPHDRR_MT_add", text="Add Phantom or Volume", icon="ADD")
         layout.separator()
-        layout.operator(ids.UPDATE_PHANTOM, icon="FILE_REFRESH")
-        layout.operator(ids.TRY_EVENT)
-        layout.operator(ids.APPLY_PHANTOM_POSE, icon="OBJECT_ORIGIN")
-        layout.operator(ids.SHOW_PHANTOM_OUTLINE, text="Show or Hide Outline", icon="SHADING_WIRE")
+        layout.operator("mphdrr.update_phantom", icon="FILE_REFRESH")
+        layout.operator("mphdrr.try_event")
+        layout.operator("mphdrr.apply_phantom_pose", icon="OBJECT_ORIGIN")
+        layout.operator("mphdrr.show_phantom_outline", text="Show or Hide Outline", icon="SHADING_WIRE")
         layout.separator()
-        layout.operator(ids.CT_TO_ATTENUATION, icon="MOD_FLUIDSIM")
-        layout.operator(ids.ADD_SLICES, icon="MESH_PLANE")
-        layout.operator(ids.REMOVE_SLICES, icon="X")
-        layout.operator(ids.SHOW_IN_PERSPECTIVE, icon="VIEW_PERSPECTIVE")
-        layout.operator(ids.RESAMPLE_IN_PERSPECTIVE, icon="OUTLINER_DATA_VOLUME")
-        layout.operator(ids.CLEAR_PERSPECTIVE, icon="X")
-        layout.operator(ids.VOXELIZE_OBJECTS, icon="OUTLINER_DATA_MESH")
-        layout.operator(ids.MESH_FROM_VOLUME, icon="MESH_DATA")
+        layout.operator("mphdrr.ct_to_attenuation", icon="MOD_FLUIDSIM")
+        layout.operator("mphdrr.add_slices", icon="MESH_PLANE")
+        layout.operator("mphdrr.remove_slices", icon="X")
+        layout.operator("mphdrr.show_in_perspective", icon="VIEW_PERSPECTIVE")
+        layout.operator("mphdrr.resample_in_perspective", icon="OUTLINER_DATA_VOLUME")
+        layout.operator("mphdrr.clear_perspective", icon="X")
+        layout.operator("mphdrr.voxelize_objects", icon="OUTLINER_DATA_MESH")
+        layout.operator("mphdrr.mesh_from_volume", icon="MESH_DATA")
         layout.separator()
-        layout.operator(ids.EXPORT_VOLUME, icon="EXPORT")
-        layout.operator(ids.REMAKE_VOLUMES, icon="FILE_REFRESH")
-        layout.operator(ids.FIND_VOLUME_FILES, icon="VIEWZOOM")
-        layout.operator(ids.CLEAN_VOLUME_FILES, icon="TRASH")
+        layout.operator("mphdrr.export_volume", icon="EXPORT")
+        layout.operator("mphdrr.remake_volumes", icon="FILE_REFRESH")
+        layout.operator("mphdrr.find_volume_files", icon="VIEWZOOM")
+        layout.operator("mphdrr.clean_volume_files", icon="TRASH")
 
 
 class MPHDRR_MT_projections(bpy.types.Menu):
     def draw(self, context: bpy.types.Context) -> None:
         layout = invoking(self.layout)
-        layout.operator(ids.RENDER_PROJECTIONS, icon="RENDER_STILL")
-        layout.operator(ids.IMPORT_COUNTS, icon="IMPORT")
-        layout.operator(ids.LIVE_PREVIEW, icon="VIEW_CAMERA")
-        layout.operator(ids.SHOW_PROJECTIONS, icon="IMAGE_DATA")
-        layout.operator_menu_enum(ids.PICK_WINDOW, "end", icon="EYEDROPPER")
-        layout.operator(ids.PICK_PIXEL, icon="EYEDROPPER")
-        layout.operator(ids.CLEAR_PIXEL, icon="X")
+        layout.operator("mphdrr.render_projections", icon="RENDER_STILL")
+        layout.operator("mphdrr.import_counts", icon="IMPORT")
+        layout.operator("mphdrr.live_preview", icon="VIEW_CAMERA")
+        layout.operator("mphdrr.show_projections", icon="IMAGE_DATA")
+        layout.operator_menu_enum("mphdrr.pick_window", "end", icon="EYEDROPPER")
+        layout.operator("mphdrr.pick_pixel", icon="EYEDROPPER")
+        layout.operator("mphdrr.clear_pixel", icon="X")
         layout.separator()
-        layout.operator(ids.RECONSTRUCT, icon="OUTLINER_OB_VOLUME")
-        layout.operator(ids.SHOW_RECONSTRUCTION, icon="IMAGE_DATA")
-        layout.operator_menu_enum(ids.BACKPROJECT, "how", icon="OUTLINER_DATA_VOLUME")
+        layout.operator("mphdrr.reconstruct", icon="OUTLINER_OB_VOLUME")
+        layout.operator("mphdrr.show_reconstruction", icon="IMAGE_DATA")
+        layout.operator_menu_enum("mphdrr.backproject", "how", icon="OUTLINER_DATA_VOLUME")
         layout.separator()
-        layout.operator_menu_enum(ids.NEW_EVENT_RECIPE, "like", icon="FILE_NEW")
-        layout.operator(ids.MAKE_EVENT_SET, icon="FILE_CACHE")
-        layout.operator(ids.OPEN_EVENT, icon="OUTLINER_OB_VOLUME")
+        layout.operator_menu_enum("mphdrr.new_event_recipe", "like", icon="FILE_NEW")
+        layout.operator("mphdrr.make_event_set", icon="FILE_CACHE")
+        layout.operator("mphdrr.open_event", icon="OUTLINER_OB_VOLUME")
         layout.separator()
         settings = context.scene.mphdrr_projections
-        layout.operator_menu_enum(ids.COMPARE_RUNS, "other", icon="SELECT_DIFFERENCE")
-        layout.operator(ids.REMOVE_RUN, icon="TRASH").index = settings.active_run
+        layout.operator_menu_enum("mphdrr.compare_runs", "other", icon="SELECT_DIFFERENCE")
+        layout.operator("mphdrr.remove_run", icon="TRASH").index = settings.active_run
         layout.separator()
-        layout.operator_menu_enum(ids.USE_PRESET, "preset", icon="PRESET")
-        layout.operator(ids.LOAD_RECIPE, icon="FILE_FOLDER")
-        layout.operator(ids.EXPORT_DATASET, icon="EXPORT")
-        layout.operator(ids.EXPORT_FIGURE, icon="IMAGE_DATA")
+        layout.operator_menu_enum("mphdrr.use_preset", "preset", icon="PRESET")
+        layout.operator("mphdrr.load_recipe", icon="FILE_FOLDER")
+        layout.operator("mphdrr.export_dataset", icon="EXPORT")
+        layout.operator("mphdrr.export_figure", icon="IMAGE_DATA")

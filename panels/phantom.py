@@ -6,8 +6,7 @@ import bpy
 from bpy.app.translations import pgettext_iface as iface
 
 from ..addon import recovery
-from ..addon.blender import ids, jobs, storage
-from ..addon.blender.layouts import draw_all, invoking, labelled
+from ..addon.blender import ids, jobs, layouts, storage
 from ..addon.perspective import frustums
 from ..addon.phantoms import phantom_properties, phantoms
 from ..addon.scanner import selection
@@ -19,11 +18,11 @@ class MPHDRR_PT_phantom(Sidebar, bpy.types.Panel):
     bl_order = ids.ORDER_PHANTOM
 
     def draw(self, context: bpy.types.Context) -> None:
-        layout = invoking(labelled(self.layout))
+        layout = layouts.invoking(layouts.labelled(self.layout))
         adding = layout.column()
         column = adding.column(align=True)
         column.menu("MPHDRR_MT_add", text="Add Phantom", icon="OUTLINER_DATA_VOLUME")
-        column.operator(ids.IMPORT_VOLUME, text="Import Volume", icon="IMPORT")
+        column.operator("mphdrr.import_volume", text="Import Volume", icon="IMPORT")
         if storage.missing_volumes():
             _draw_missing(adding.column(align=True), context.scene)
         item = context.object
@@ -36,7 +35,7 @@ class MPHDRR_PT_phantom(Sidebar, bpy.types.Panel):
         phantom = phantoms.settings_of(item)
         if phantom is not None:
             _draw_phantom(layout, item, phantom)
-        layout.operator(ids.CLEAN_VOLUME_FILES, icon="TRASH")
+        layout.operator("mphdrr.clean_volume_files", icon="TRASH")
 
 
 def _draw_missing(column: bpy.types.UILayout, scene: bpy.types.Scene) -> None:
@@ -46,10 +45,12 @@ def _draw_missing(column: bpy.types.UILayout, scene: bpy.types.Scene) -> None:
     column.label(text="Files of voxels are missing", icon="ERROR")
     if again:
         names = ", ".join(item.name for item in again)
-        column.operator(ids.REMAKE_VOLUMES, text=iface("Make Again: {names}").format(names=names), icon="FILE_REFRESH")
+        column.operator(
+            "mphdrr.remake_volumes", text=iface("Make Again: {names}").format(names=names), icon="FILE_REFRESH"
+        )
     if others:
         draw_text(column, recovery.what_to_do(others), "BLANK1")
-    column.operator(ids.FIND_VOLUME_FILES, icon="VIEWZOOM")
+    column.operator("mphdrr.find_volume_files", icon="VIEWZOOM")
 
 
 def _draw_numbers(layout: bpy.types.UILayout, item: bpy.types.Object) -> None:
@@ -69,7 +70,7 @@ def _draw_numbers(layout: bpy.types.UILayout, item: bpy.types.Object) -> None:
 def _draw_display(layout: bpy.types.UILayout, item: bpy.types.Object) -> None:
     settings = item.mphdrr_volume
     if settings.quantity == "hu":
-        layout.operator(ids.CT_TO_ATTENUATION, icon="MOD_FLUIDSIM")
+        layout.operator("mphdrr.ct_to_attenuation", icon="MOD_FLUIDSIM")
     column = layout.column(align=True)
     column.prop(settings, "display_low", text=iface("Low, {unit}").format(unit=settings.unit))
     column.prop(settings, "display_high", text=iface("High, {unit}").format(unit=settings.unit))
@@ -87,9 +88,9 @@ def _draw_display(layout: bpy.types.UILayout, item: bpy.types.Object) -> None:
         column = layout.column(align=True)
         for axis, name in enumerate(slices.names(item)):
             column.prop(settings, "slices", index=axis, text=name)
-        column.operator(ids.REMOVE_SLICES, icon="X")
+        column.operator("mphdrr.remove_slices", icon="X")
     else:
-        layout.operator(ids.ADD_SLICES, icon="MESH_PLANE")
+        layout.operator("mphdrr.add_slices", icon="MESH_PLANE")
 
 
 def _draw_phantom(layout: bpy.types.UILayout, item: bpy.types.Object, phantom: Any) -> None:
@@ -104,18 +105,18 @@ def _draw_phantom(layout: bpy.types.UILayout, item: bpy.types.Object, phantom: A
     row = column.row(align=True)
     row.alert = settings.outdated
     text = "Changed: Update" if settings.outdated else "Update Phantom"
-    row.operator(ids.UPDATE_PHANTOM, text=text, icon="FILE_REFRESH")
-    column.operator(ids.APPLY_PHANTOM_POSE, icon="OBJECT_ORIGIN")
+    row.operator("mphdrr.update_phantom", text=text, icon="FILE_REFRESH")
+    column.operator("mphdrr.apply_phantom_pose", icon="OBJECT_ORIGIN")
     shown = phantoms.outline_of(item) is not None
     text = "Hide Outline" if shown else "Show Outline"
-    column.operator(ids.SHOW_PHANTOM_OUTLINE, text=text, icon="SHADING_WIRE", depress=shown)
+    column.operator("mphdrr.show_phantom_outline", text=text, icon="SHADING_WIRE", depress=shown)
 
 
 class MPHDRR_PT_perspective(Folded, bpy.types.Panel):
     bl_parent_id = "MPHDRR_PT_phantom"
 
     def draw(self, context: bpy.types.Context) -> None:
-        layout = invoking(labelled(self.layout))
+        layout = layouts.invoking(layouts.labelled(self.layout))
         settings, camera = context.scene.mphdrr_perspective, selection.active_module(context)
         if camera is None:
             draw_hint(layout, "Import a geometry first.")
@@ -124,14 +125,14 @@ class MPHDRR_PT_perspective(Folded, bpy.types.Panel):
         name = context.object.name if volumes.is_volume(context.object) else iface("no volume is selected")
         text = iface("{volume}, by {module}").format(volume=name, module=camera.name)
         layout.label(text=text, translate=False, icon="VIEW_PERSPECTIVE")
-        draw_all(layout.column(align=True), settings, "uniform", "planes")
+        layouts.draw_all(layout.column(align=True), settings, "uniform", "planes")
         row = layout.row(align=True)
-        row.operator(ids.SHOW_IN_PERSPECTIVE)
-        row.operator(ids.CLEAR_PERSPECTIVE, text="", icon="X")
+        row.operator("mphdrr.show_in_perspective")
+        row.operator("mphdrr.clear_perspective", text="", icon="X")
         for frustum in frustums.frustums(context.scene):
             _draw_frustum(layout.column(align=True), context.scene, frustum)
         layout.prop(settings, "cells")
-        layout.operator(ids.RESAMPLE_IN_PERSPECTIVE)
+        layout.operator("mphdrr.resample_in_perspective")
 
 
 def _draw_frustum(column: bpy.types.UILayout, scene: bpy.types.Scene, frustum: bpy.types.Object) -> None:

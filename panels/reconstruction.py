@@ -3,8 +3,7 @@
 import bpy
 from bpy.app.translations import pgettext_iface as iface
 
-from ..addon.blender import ids, jobs, plots
-from ..addon.blender.layouts import draw_settings, invoking, labelled
+from ..addon.blender import ids, jobs, layouts, plots
 from ..addon.reconstruction.reconstruction_properties import drawn
 from ..addon.runs import runs
 from .sidebar import Folded, Sidebar, draw_hint, draw_text
@@ -18,7 +17,7 @@ class MPHDRR_PT_reconstruction(Sidebar, bpy.types.Panel):
     bl_order = ids.ORDER_RECONSTRUCTION
 
     def draw(self, context: bpy.types.Context) -> None:
-        layout = labelled(self.layout)
+        layout = layouts.labelled(self.layout)
         settings = context.scene.mphdrr_reconstruction
         run = runs.shown(context.scene)
         if run is None:
@@ -26,10 +25,10 @@ class MPHDRR_PT_reconstruction(Sidebar, bpy.types.Panel):
         else:
             jobs.draw_job(layout)
             layout.label(text=iface("Of {run}").format(run=run.name), translate=False, icon="RENDER_STILL")
-        draw_settings(layout.column(), settings, (each for each in drawn(settings) if each[0] in _MAIN))
-        row = invoking(layout.row())
+        layouts.draw_settings(layout.column(), settings, (each for each in drawn(settings) if each[0] in _MAIN))
+        row = layouts.invoking(layout.row())
         row.scale_y = 1.4
-        row.operator(ids.RECONSTRUCT, text="Reconstruct", icon="OUTLINER_OB_VOLUME")
+        row.operator("mphdrr.reconstruct", text="Reconstruct", icon="OUTLINER_OB_VOLUME")
         known = settings.known
         if known and settings.volume is not None:
             _draw_result(layout, settings, known)
@@ -52,7 +51,7 @@ def _draw_result(layout: bpy.types.UILayout, settings: bpy.types.PropertyGroup, 
         row.label(text=value, translate=False)
     for text in known.get("flatters", ()):
         draw_text(box, text)
-    box.operator(ids.SHOW_RECONSTRUCTION, text="Show Slices", icon="IMAGE_DATA")
+    box.operator("mphdrr.show_reconstruction", text="Show Slices", icon="IMAGE_DATA")
 
 
 class MPHDRR_PT_reconstruction_model(Folded, bpy.types.Panel):
@@ -62,7 +61,7 @@ class MPHDRR_PT_reconstruction_model(Folded, bpy.types.Panel):
     def draw(self, context: bpy.types.Context) -> None:
         settings = context.scene.mphdrr_reconstruction
         others = (each for each in drawn(settings) if each[0] not in _MAIN)
-        draw_settings(labelled(self.layout).column(), settings, others)
+        layouts.draw_settings(layouts.labelled(self.layout).column(), settings, others)
 
 
 class MPHDRR_PT_backprojection(Folded, bpy.types.Panel):
@@ -70,6 +69,6 @@ class MPHDRR_PT_backprojection(Folded, bpy.types.Panel):
     bl_parent_id = "MPHDRR_PT_reconstruction"
 
     def draw(self, context: bpy.types.Context) -> None:
-        layout = invoking(labelled(self.layout))
+        layout = layouts.invoking(layouts.labelled(self.layout))
         layout.prop(context.scene.mphdrr_reconstruction, "how")
-        layout.operator(ids.BACKPROJECT, text="Back-Project", icon="OUTLINER_DATA_VOLUME")
+        layout.operator("mphdrr.backproject", text="Back-Project", icon="OUTLINER_DATA_VOLUME")

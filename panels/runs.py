@@ -3,8 +3,7 @@
 import bpy
 from bpy.app.translations import pgettext_iface as iface
 
-from ..addon.blender import ids, jobs
-from ..addon.blender.layouts import invoking, shown_where
+from ..addon.blender import ids, jobs, layouts
 from ..addon.pictures import images
 from ..addon.runs import runs
 from .sidebar import ImagesSidebar, Sidebar, draw_text
@@ -35,7 +34,7 @@ class _Runs:
 
     bl_label = "Runs"
 
-    poll = shown_where(lambda context: context.scene.mphdrr_projections.runs)
+    poll = layouts.shown_where(lambda context: context.scene.mphdrr_projections.runs)
 
     def draw(self, context: bpy.types.Context) -> None:
         layout = self.layout  # type: ignore[attr-defined]
@@ -46,17 +45,17 @@ class _Runs:
         row = layout.row()
         row.enabled = not jobs.is_running()
         row.template_list("MPHDRR_UL_runs", "", settings, "runs", settings, "active_run", rows=2, maxrows=6)
-        buttons = invoking(row.column(align=True))
-        buttons.operator(ids.REMOVE_RUN, text="", icon="REMOVE").index = settings.active_run
+        buttons = layouts.invoking(row.column(align=True))
+        buttons.operator("mphdrr.remove_run", text="", icon="REMOVE").index = settings.active_run
         column = layout.column(align=True)
         column.active = False
         for part in settings.run_summary.split(", ", 1):
             column.label(text=part)
         if len(settings.runs) > 1:
             column.label(text=iface("All runs: {size}").format(size=runs.size_text(settings.runs)))
-            row = invoking(layout.row())
+            row = layouts.invoking(layout.row())
             row.enabled = not jobs.is_running()
-            row.operator_menu_enum(ids.COMPARE_RUNS, "other", text="Compare With", icon="SELECT_DIFFERENCE")
+            row.operator_menu_enum("mphdrr.compare_runs", "other", text="Compare With", icon="SELECT_DIFFERENCE")
             if text := images.difference_text():
                 draw_text(layout, text, icon="INFO")
 
@@ -82,7 +81,7 @@ def draw_changes(layout: bpy.types.UILayout, scene: bpy.types.Scene) -> None:
         draw_text(column, line, icon="DOT")
     if runs.measured_text(scene):
         return
-    row = invoking(box.row())
+    row = layouts.invoking(box.row())
     row.alert, row.enabled = False, not jobs.is_running()
-    again = row.operator(ids.RENDER_PROJECTIONS, text="Render Again", icon="FILE_REFRESH")
+    again = row.operator("mphdrr.render_projections", text="Render Again", icon="FILE_REFRESH")
     again.volume = runs.volume_to_render(scene)

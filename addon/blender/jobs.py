@@ -24,9 +24,7 @@ from ...core.cli.options import progress_bar
 from ...core.errors import InputError
 from ...core.progress import Cancelled, Progress, StagedProgress
 from ...core.recording import recorded_warnings
-from . import ids, storage
-from .reports import Reported, warnings_reported
-from .windows import redraw_sidebars
+from . import reports, storage, windows
 
 _INTERVAL = 0.1  # s between two looks at the thread, and between two drawings of how far it is
 _STEP = 0.02  # s that finishing may take of the main thread before the window has its turn, which is as long
@@ -257,7 +255,7 @@ class JobOperator:
         try:
             if is_running():
                 raise InputError("another job is running: wait for it or cancel it")
-            with warnings_reported(self):
+            with reports.warnings_reported(self):
                 job = self.job(context)
                 text = run(job, StagedProgress(progress_bar, job.label))
             self.report({"INFO"}, text)
@@ -274,7 +272,7 @@ class JobOperator:
             if asked is not None:
                 self._asked = True
                 return asked
-            with warnings_reported(self):
+            with reports.warnings_reported(self):
                 job = self.job(context)
         except Exception as error:
             return self._failed(error)
@@ -317,7 +315,7 @@ class JobOperator:
             # Drawing is work, too. A window that is drawn slowly has few turns, and does more in each.
             since = time.perf_counter() - self._left
             enough = time.perf_counter() + max(0.0 if is_drawing else _STEP, min(_SHARE * since, _MOST))
-            with warnings_reported(self):  # type: ignore[arg-type]
+            with reports.warnings_reported(self):  # type: ignore[arg-type]
                 while True:
                     step = worker.steps.throw(Cancelled()) if worker.is_stoppable else next(worker.steps)
                     worker.show_step(step)
@@ -404,6 +402,7 @@ class JobOperator:
 class ExportJob(JobOperator, ExportHelper):
     """Mix into an operator whose job writes the file that the user chooses, with one of the `endings` in its name."""
 
+    bl_options: set[str] = set()
     endings: tuple[str, ...] = ()
 
     @property
@@ -423,7 +422,7 @@ class ExportJob(JobOperator, ExportHelper):
         return True
 
 
-class MPHDRR_OT_cancel_job(Reported, bpy.types.Operator):
+class MPHDRR_OT_cancel_job(reports.Reported, bpy.types.Operator):
     """Stop a job, or take it out of the queue; the scene stays as it was"""
 
     bl_label = "Cancel"
@@ -438,7 +437,7 @@ class MPHDRR_OT_cancel_job(Reported, bpy.types.Operator):
                 worker.cancel.set()
 
 
-class MPHDRR_OT_finish_job(Reported, bpy.types.Operator):
+class MPHDRR_OT_finish_job(reports.Reported, bpy.types.Operator):
     """End the running job after the step that it is at, and keep what it has made so far"""
 
     bl_label = "Finish Now"
@@ -457,10 +456,10 @@ def draw_job(layout: bpy.types.UILayout) -> None:
         if worker is _current:
             row.progress(factor=worker.share, type="BAR", text=worker.text)
             if worker.enough is not None:
-                row.operator(ids.FINISH_JOB, text="", icon="CHECKMARK")
+                row.operator("mphdrr.finish_job", text="", icon="CHECKMARK")
         else:
             row.label(text=iface("{job}: waits").format(job=iface(worker.label)), translate=False, icon="TIME")
-        row.operator(ids.CANCEL_JOB, text="", icon="CANCEL").number = worker.number
+        row.operator("mphdrr.cancel_job", text="", icon="CANCEL").number = worker.number
 
 
 def draw_status(header: bpy.types.Header, context: bpy.types.Context) -> None:
@@ -469,7 +468,7 @@ def draw_status(header: bpy.types.Header, context: bpy.types.Context) -> None:
         row = header.layout.row(align=True)
         row.ui_units_x = _STATUS_UNITS
         row.progress(factor=_current.share, type="BAR", text="mphDRR: " + _current.text)
-        row.operator(ids.CANCEL_JOB, text="", icon="CANCEL").number = _current.number
+        row.operator("mphdrr.cancel_job", text="", icon="CANCEL").number = _current.number
 
 
 def _argument(value: Any) -> Any:
@@ -486,4 +485,4 @@ def _redraw(context: bpy.types.Context) -> None:
     for window in context.window_manager.windows:
         with bpy.context.temp_override(window=window):
             window.workspace.status_text_set(None)  # there is no other way to have the status bar drawn
-    redraw_sidebars()
+    windows.redraw_sidebars()

@@ -1,6 +1,7 @@
 """Objects of the scene: where they stand in float64, and how they are removed with what is theirs alone."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from typing import Any
 
 import bpy
 import numpy as np
@@ -46,9 +47,14 @@ def unparent(item: bpy.types.Object) -> None:
 
 def remove_objects(items: Sequence[bpy.types.Object]) -> None:
     """Remove objects, and their meshes or cameras that nothing else uses."""
-    datas = {item.data for item in items if item.data is not None}
+    datas = {item.data for item in items}
     bpy.data.batch_remove(list(items))
-    bpy.data.batch_remove([data for data in datas if data.users == 0])
+    remove_unused(datas)
+
+
+def remove_unused(datablocks: Iterable[bpy.types.ID | None]) -> None:
+    """Remove those of some datablocks that nothing uses any more."""
+    bpy.data.batch_remove([each for each in datablocks if each is not None and each.users == 0])
 
 
 def euler_angles(matrix: NDArray[np.float64]) -> tuple[float, float, float]:
@@ -93,3 +99,12 @@ def picture_empty(name: str, parent: bpy.types.Object, picture: bpy.types.Image 
     item.empty_display_type, item.data, item.use_empty_image_alpha, item.empty_image_side = "IMAGE", picture, True, side
     item.parent = parent
     return item
+
+
+def change(owner: Any, **values: Any) -> None:
+    """Set properties that have other values: setting one has the scene calculated and drawn again."""
+    for name, value in values.items():
+        now = getattr(owner, name)
+        same = now == value if isinstance(value, str | bool) else np.allclose(now, value, rtol=1e-6, atol=0)  # float32
+        if not same:
+            setattr(owner, name, value)

@@ -8,8 +8,7 @@ from bpy.props import BoolProperty, EnumProperty, FloatProperty, FloatVectorProp
 from ...core.errors import InputError
 from ...core.runs.recipe import is_met
 from ...core.runs.settings import Setting
-from . import choices
-from .decimals import typed
+from . import choices, decimals
 
 Settings = Mapping[str, Setting]
 """Settings by the names of their properties. A coefficient has a second property, of its material."""
@@ -79,9 +78,9 @@ def values_of(settings: Settings, get: Callable[[str], Any]) -> dict[str, Any]:
                 raise InputError(f"{setting.label}: {value!r} is not known to this version; choose another")
             values[setting.key] = words[value]
         elif _is_vector(setting):
-            values[setting.key] = tuple(map(typed, value)) if any(value) else None
+            values[setting.key] = tuple(map(decimals.typed, value)) if any(value) else None
         else:
-            number = typed(value) if isinstance(value, float) else value
+            number = decimals.typed(value) if isinstance(value, float) else value
             values[setting.key] = number if number or setting.default is not None else None
     return values
 

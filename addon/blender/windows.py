@@ -9,6 +9,11 @@ import gpu
 from gpu_extras.batch import batch_for_shader
 
 
+def has_window() -> bool:
+    """Whether there is a window, which alone has Blender's timers run and shows what changes."""
+    return not bpy.app.background
+
+
 def areas(*types: str) -> Iterator[bpy.types.Area]:
     """The editors of some types, in all windows."""
     for window in bpy.context.window_manager.windows:

@@ -8,11 +8,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from ...core import ProjectionRun, Recipe, run_recipe, write_run
+from ...core import ProjectionRun, Recipe, files, run_recipe, write_run
 from ...core.cli.options import add_command, add_workbook, progress_bar, read_workbook
 from ...core.errors import warn
 from ...core.example import EULER_DEGREES, EXAMPLE
-from ...core.files import ensure_folder
 from ...core.runs.mosaic import write_sheet
 from .scene import INSTALL_BLENDER, new_scene, quiet, save_scene
 
@@ -38,7 +37,7 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
 
 
 def _run(arguments: argparse.Namespace) -> None:
-    out = ensure_folder(arguments.output)
+    out = files.ensure_folder(arguments.output)
     has_blender = importlib.util.find_spec("bpy") is not None
     scene = new_scene() if has_blender else None  # before the long work: what is wrong with Blender shows at once
     with _step("geometry"):

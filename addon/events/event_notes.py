@@ -12,14 +12,11 @@ from typing import Any
 import bpy
 import numpy as np
 
-from ...core import events
-from ...core.errors import InputError
+from ...core import InputError, events, recording
 from ...core.events.folders import INDEX, RECIPE, SetFolder
 from ...core.events.store import EVENTS, SHARDS, size_of
 from ...core.memory import readable_size
-from ...core.recording import recorded_warnings
-from ..blender import storage, timers
-from ..blender.windows import redraw_sidebars
+from ..blender import storage, timers, windows
 
 _INTERVAL = 0.1  # s between two looks at a thread that reads
 _LOOK = 2.0  # s between two looks at a file's date
@@ -102,7 +99,7 @@ def _note(path: Path, read: Callable[[Path], Note]) -> Note:
 
 def _read(path: Path, stamp: _Stamp, read: Callable[[Path], Note]) -> None:
     try:
-        with recorded_warnings():
+        with recording.recorded_warnings():
             note = read(path)
     except InputError as error:
         note = Note(str(error).removeprefix(f"{path}: "), is_wrong=True)
@@ -133,5 +130,5 @@ def _watch() -> float | None:
     for path in done:
         del _readers[path]
     if done:
-        redraw_sidebars()
+        windows.redraw_sidebars()
     return _INTERVAL if _readers else None

@@ -11,22 +11,19 @@ import numpy as np
 from mathutils import Matrix
 from numpy.typing import NDArray
 
-from ...core import InputError, ProjectionRun, events
+from ...core import InputError, ProjectionRun, events, memory
 from ...core.events.folders import SetFolder
 from ...core.events.templates import template_text
 from ...core.example import EXAMPLE
 from ...core.files import write_bytes
-from ...core.memory import readable_size
 from ...core.progress import Progress, stages_of
 from ..blender import jobs, storage
 from ..figures import studio
-from ..phantoms import phantoms
-from ..phantoms.phantom_properties import KindSettings, plain_settings
+from ..phantoms import phantom_properties, phantoms
 from ..pictures import images
 from ..runs import rendering, runs
 from ..scanner import scanner
-from ..volumes import volumes
-from ..volumes.stored_volumes import StoredVolume, store_volume
+from ..volumes import stored_volumes, volumes
 
 _VOXELS = 128
 """Along each side of a phantom, at most, unless the phantom in the scene says another number."""
@@ -45,8 +42,8 @@ class _Target:
 class _Phantom:
     """An event's phantom, its voxels stored."""
 
-    stored: list[StoredVolume]
-    settings: KindSettings | None  # None: of no kind, but a file's
+    stored: list[stored_volumes.StoredVolume]
+    settings: phantom_properties.KindSettings | None  # None: of no kind, but a file's
     placement: NDArray[np.float64]  # world from object
 
 
@@ -118,7 +115,7 @@ def making(filepath: str, folder: str, count: int) -> jobs.Job:
         there = len(SetFolder(path).store.places())
         if not made:
             return f"All events asked for are there already: {there} in {path}"
-        size = readable_size(sum(event.size for event in made))
+        size = memory.readable_size(sum(event.size for event in made))
         return f"Made {_events(len(made))}, {size} in {seconds:.1f} s: {there} in {path}"
 
     def left() -> str:
@@ -133,7 +130,7 @@ class _Opened:
 
     name: str
     text: str
-    truth: StoredVolume
+    truth: stored_volumes.StoredVolume
     phantom: _Phantom | None  # of one that a volume's file describes: the truth is all there is
     run: ProjectionRun | None
     pictures: images.Pictures | None
@@ -157,7 +154,7 @@ def opening(context: bpy.types.Context, folder: str, number: int, model: str = "
         event = _event(path, number)
         name, planned = f"Event {number} {event.name}", event.planned
         stages("writing the voxels")
-        truth = store_volume(event.truth, files, event.placement, {"event": number, "set": str(path)})
+        truth = stored_volumes.store_volume(event.truth, files, event.placement, {"event": number, "set": str(path)})
         phantom = None if planned.entry.kind is None else _phantom_of(planned, target, files, progress)
         models = planned.recipe.models
         if not models:
@@ -224,7 +221,7 @@ def _phantom_of(planned: events.PlannedEvent, target: _Target, files: Path, prog
     if entry.kind is None or phantom is None:
         stages_of(progress)("voxelizing")
         truth = events.EventMaker(recipe).truth(planned)
-        return _Phantom([store_volume(truth, files, placement, planned.all_settings)], None, placement)
+        return _Phantom([stored_volumes.store_volume(truth, files, placement, planned.all_settings)], None, placement)
     values: dict[str, Any] = {}
     known: tuple[Any, ...] = fields(phantom)  # type: ignore[arg-type]
     for field in known:
@@ -234,7 +231,7 @@ def _phantom_of(planned: events.PlannedEvent, target: _Target, files: Path, prog
     if entry["gates"] > 1:
         values["frames"] = entry["gates"]
     voxels = target.voxels or min(_VOXELS, *recipe.grid.shape)
-    settings = plain_settings(entry.kind.name, **values, quantity=recipe.quantity, voxels=voxels)
+    settings = phantom_properties.plain_settings(entry.kind.name, **values, quantity=recipe.quantity, voxels=voxels)
     quantities = [recipe.quantity, *target.others]
     made = phantoms.recipe_of(settings).voxelize(quantities, [placement] * len(quantities), files, progress)
     return _Phantom(made, settings, placement)

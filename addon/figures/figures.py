@@ -17,7 +17,7 @@ import numpy as np
 from mathutils import Vector
 from numpy.typing import NDArray
 
-from ...core import Cancelled, PinholeSystem, Progress, read_run
+from ...core import Cancelled, PinholeSystem, Progress, read_run, recording
 from ...core.cli.options import output_path
 from ...core.errors import InputError, warn
 from ...core.figures.kinds import KINDS, Studio, figure_kind
@@ -25,13 +25,11 @@ from ...core.figures.page import SUFFIXES, Page, box
 from ...core.figures.parts import heading, heading_height
 from ...core.figures.subject import Subject, require
 from ...core.geometry.collimator import Construction
-from ...core.recording import recorded_warnings
 from ...core.runs.resizing import resized
 from ..blender import compat, ids, jobs, storage, timers
 from ..blender.choices import items
 from ..phantoms import phantoms
-from ..scanner import collimators, pinholes, scanner, selection
-from ..scanner.module_values import kind_of
+from ..scanner import collimators, module_values, pinholes, scanner, selection
 from ..volumes import looks, volumes
 from . import studio
 
@@ -92,7 +90,7 @@ def figure_job(
     if kind.one_module and modules is None and active is not None:
         modules = str(active.mphdrr_module.number)
     known: dict[str, Any] = {"modules": modules, "display": scene.mphdrr_display.display()}
-    if collection is not None and kind_of(collection) is PinholeSystem:
+    if collection is not None and module_values.kind_of(collection) is PinholeSystem:
         known["scanner"] = scanner.read_scanner(collection)
         known["construction"] = pinholes.construction(collection.mphdrr_scanner)
     later: dict[str, Callable[[], Any]] = {}
@@ -330,7 +328,7 @@ def _say_what_is_unseen() -> float | None:
         elif scene.render.engine == "CYCLES" and known not in _drawn:
             reach = max((item.matrix_world @ Vector(corner)).length for corner in item.bound_box) + 1.0
             sizes = reach / np.array([50, 10, 10, 50, 1])  # of a small module behind it, as seen
-            with recorded_warnings() as caught:
+            with recording.recorded_warnings() as caught:
                 subject = Subject(PinholeSystem(-2 * reach * np.array([_DIRECTION]), *sizes))
                 list(rendering(Page(_SMALL, _SMALL), subject, Studio(volume=True, near=True), item, False, 1))
             why = _UNSEEN if any(_UNSEEN in text for text in caught) else ""

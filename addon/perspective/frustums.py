@@ -16,9 +16,8 @@ import numpy as np
 from mathutils import Matrix
 from numpy.typing import NDArray
 
-from ...core import InputError, PerspectiveGrid, Views, from_perspective, to_perspective
+from ...core import InputError, PerspectiveGrid, Views, from_perspective, memory, to_perspective
 from ...core.geometry.frames import affine_matrix
-from ...core.memory import require
 from ...core.progress import Progress, Stages, stages_of, tell
 from ...core.runs.mosaic import as_seen, png
 from ...core.runs.run_recipe import recipe_views
@@ -28,8 +27,7 @@ from ..phantoms import phantoms
 from ..pictures import images
 from ..runs import runs
 from ..scanner import scanner, selection
-from ..volumes import slices, volume_materials, volumes
-from ..volumes.stored_volumes import StoredVolume
+from ..volumes import slices, stored_volumes, volume_materials, volumes
 
 _KEY = "mphdrr_frustum"  # custom property of the lines: what the frustum was made of, JSON
 _NEAREST = 0.1  # of the pinhole's distance from the isocentre: where layers begin at the nearest
@@ -64,7 +62,7 @@ def showing(context: bpy.types.Context, planes: int, uniform: str) -> jobs.Job:
     low, high = _display_range(context.object)
     quantity, scene_uid = asked.state["quantity"], context.scene.session_uid
     rows, columns = asked.views.shape
-    require(_BYTES * planes * rows * columns, f"{planes} pictures of {columns} x {rows} pixels")
+    memory.require(_BYTES * planes * rows * columns, f"{planes} pictures of {columns} x {rows} pixels")
 
     def work(progress: Progress) -> tuple[PerspectiveGrid, list[bytes]]:
         stages = stages_of(progress)
@@ -97,7 +95,7 @@ def resampling(context: bpy.types.Context, cells: int, uniform: str) -> jobs.Job
     asked, shown = _request(context), _shown_range(context.object)
     rows, columns = asked.views.shape
     voxels = float(np.prod(context.object.mphdrr_volume.shape))
-    require(8.0 * cells * rows * columns + 8.0 * voxels, f"{columns} x {rows} x {cells} cells")
+    memory.require(8.0 * cells * rows * columns + 8.0 * voxels, f"{columns} x {rows} x {cells} cells")
     provenance = {"volume": asked.name, "through": asked.module, "cells": [columns, rows, cells], "evenly_in": uniform}
 
     def make(progress: Progress) -> Volume:
@@ -105,7 +103,7 @@ def resampling(context: bpy.types.Context, cells: int, uniform: str) -> jobs.Job
         volume, g, array = _followed(asked, cells, uniform, stages)
         return on_voxels(array, g, volume, stages("back on voxels"))
 
-    def finish(item: bpy.types.Object, stored: StoredVolume) -> str:
+    def finish(item: bpy.types.Object, stored: stored_volumes.StoredVolume) -> str:
         item.mphdrr_volume.display_low, item.mphdrr_volume.display_high = shown
         return f"Added {item.name!r}: {volumes.values_text(stored)}"
 
@@ -210,8 +208,7 @@ def after_update(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None
     for frustum in frustums(scene):
         hidden = frustum.parent is None or frustum.parent.hide_viewport
         for item in (frustum, *frustum.children):
-            if item.hide_viewport != hidden:  # writing the same value would make Blender evaluate it again
-                item.hide_viewport = hidden
+            objects.change(item, hide_viewport=hidden)
 
 
 def _request(context: bpy.types.Context) -> _Request:

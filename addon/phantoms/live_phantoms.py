@@ -4,7 +4,7 @@ import bpy
 
 from ...core.errors import InputError
 from ...core.recording import recorded_warnings
-from ..blender import jobs, timers
+from ..blender import jobs, timers, windows
 from . import phantoms
 
 QUICK_VOXELS = 64**3
@@ -34,15 +34,10 @@ def settings_changed(item: bpy.types.ID) -> None:
             properties.message = str(error)
             return
     properties.message = next(iter(caught), "")
-    if properties.outdated and settings.n_voxels <= RESTED_VOXELS and _has_window():
+    if properties.outdated and settings.n_voxels <= RESTED_VOXELS and windows.has_window():
         _edited = item.name
         timers.forget(_rested)
         timers.soon(_rested, _REST)
-
-
-def _has_window() -> bool:
-    """Whether Blender's timers run."""
-    return not bpy.app.background
 
 
 def _rested() -> float | None:

@@ -22,9 +22,7 @@ from ...core import Grid, InputError, Phantom
 from ...core.phantoms.kinds import KINDS, Kind
 from ...core.phantoms.language import parse_phantom
 from ...core.volumes.volume import UNITS
-from ..blender import choices
-from ..blender.decimals import typed
-from ..blender.layouts import draw_all
+from ..blender import choices, decimals, layouts
 from ..blender.updates import on_edit
 
 FILE = "file"  # beside the names of `KINDS`: a phantom that a text in TOML describes
@@ -69,7 +67,7 @@ class PhantomSettings:
         low, high = phantom.box
         # One voxel is kept free all around, so that nothing touches the edge.
         fitted = float((high - low).max()) / max(1, self.voxels - 2)
-        return Grid.centered((self.voxels,) * 3, typed(self.voxel_size) or fitted, (low + high) / 2)
+        return Grid.centered((self.voxels,) * 3, decimals.typed(self.voxel_size) or fitted, (low + high) / 2)
 
     def draw_settings(self, layout: bpy.types.UILayout) -> None:
         """Draw the settings into a panel or a dialog."""
@@ -86,7 +84,7 @@ class PhantomSettings:
                         row.prop(self, name, index=k, text="")
             else:
                 own.prop(self, name)
-        draw_all(layout.column(align=True), self, *sampling())
+        layouts.draw_all(layout.column(align=True), self, *sampling())
 
 
 class KindSettings(PhantomSettings):
@@ -218,7 +216,7 @@ def _plain(value: Any) -> Any:
     """A setting as the phantom's classes take it."""
     if isinstance(value, bpy.types.bpy_prop_array | tuple):
         return tuple(_plain(item) for item in value)
-    return typed(value) if isinstance(value, float) else value
+    return decimals.typed(value) if isinstance(value, float) else value
 
 
 class PhantomTextProperties(PhantomSettings, bpy.types.PropertyGroup):

@@ -16,17 +16,14 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core import InputError, Mesh, Phantom
+from ...core import InputError, Mesh, Phantom, memory
 from ...core.geometry.frames import affine_matrix
 from ...core.geometry.grid import Grid, grid_around
-from ...core.memory import require
 from ...core.progress import Progress, part_of, stages_of
-from ..blender import jobs, storage
-from ..blender.objects import remove_objects, set_world_matrix, world_matrix
+from ..blender import jobs, objects, storage
 from ..blender.reports import Need
-from ..volumes import meshes, volumes
+from ..volumes import meshes, vdb, volumes
 from ..volumes.stored_volumes import StoredVolume, moved, store_volume
-from ..volumes.vdb import provenance_of
 from .phantom_properties import FILE, PhantomSettings
 
 _OUTLINE = "mphdrr_outline"  # custom property of an outline's object
@@ -65,7 +62,7 @@ class Recipe:
                 raise InputError(f"the {title} has no {quantity}")
         if count > 1:
             shape = " x ".join(map(str, self.grid.shape))
-            require(4.0 * count * self.grid.n_voxels, f"{title}: {count} volumes of {shape} voxels")
+            memory.require(4.0 * count * self.grid.n_voxels, f"{title}: {count} volumes of {shape} voxels")
         stages = stages_of(progress)
         voxelizing = stages("voxelizing")
         reports = (part_of(voxelizing, number, count) for number in range(count))
@@ -197,10 +194,10 @@ def replace(item: bpy.types.Object, stored: Sequence[StoredVolume], baked: bool 
         if not baked:
             volume_object.matrix_basis = basis  # a sheared world matrix would not set it back
             continue
-        set_world_matrix(volume_object, new.pose)
-        if not np.allclose(world_matrix(volume_object), new.pose, rtol=1e-5, atol=1e-5):
+        objects.set_world_matrix(volume_object, new.pose)
+        if not np.allclose(objects.world_matrix(volume_object), new.pose, rtol=1e-5, atol=1e-5):
             volume_object.parent = None  # its shear cannot be undone by the object's own matrix
-            set_world_matrix(volume_object, new.pose)
+            objects.set_world_matrix(volume_object, new.pose)
     properties = item.mphdrr_volume
     properties.outdated, properties.message = False, ""
     if not baked:
@@ -223,7 +220,7 @@ def mu_energy(item: bpy.types.Object) -> float | None:
     if (root := root_of(item)) is not None:
         return recipe_of(settings_of(root)).phantom.mu_energy
     path = volumes.file_of(item)
-    energy = provenance_of(path).get("energy_keV") if path.is_file() else None
+    energy = vdb.provenance_of(path).get("energy_keV") if path.is_file() else None
     return None if energy is None else float(energy)
 
 
@@ -270,7 +267,7 @@ def remove_outline(item: bpy.types.Object) -> None:
     """Remove a phantom's outline, if it has one."""
     outline = outline_of(item)
     if outline is not None:
-        remove_objects([outline])
+        objects.remove_objects([outline])
 
 
 def _show_outline(item: bpy.types.Object) -> None:

@@ -5,8 +5,7 @@ from bpy.props import BoolProperty, EnumProperty, FloatProperty
 
 from ...core.errors import InputError
 from ...core.runs.display import COLORS, SCALES, Display
-from ..blender import choices
-from ..blender.updates import on_edit
+from ..blender import choices, updates
 
 _SCALE_TEXTS = {
     "linear": ("Linear", "Colours in proportion to the numbers"),
@@ -27,46 +26,46 @@ class DisplayProperties(bpy.types.PropertyGroup):
     colors: EnumProperty(
         name="Colors", description="Colours of the numbers; all but grey are perceptually uniform",
         items=choices.items({}, ((name.upper(), name.capitalize(), "") for name in COLORS)),
-        default="INFERNO", update=on_edit("display"),
+        default="INFERNO", update=updates.on_edit("display"),
     )  # fmt: skip
     scale: EnumProperty(
         name="Scale", description="How the colours follow the numbers",
         items=choices.items({}, ((name.upper(), *_SCALE_TEXTS[name]) for name in SCALES)),
-        default="LINEAR", update=on_edit("display"),
+        default="LINEAR", update=updates.on_edit("display"),
     )  # fmt: skip
     automatic: BoolProperty(
         name="Automatic", description="Show the numbers from 0, or from the smallest, to the largest", default=True,
-        update=on_edit("display"),
+        update=updates.on_edit("display"),
     )  # fmt: skip
     low: FloatProperty(
-        name="Low", description="The number that has the first colour", default=0.0, update=on_edit("display")
+        name="Low", description="The number that has the first colour", default=0.0, update=updates.on_edit("display")
     )
     high: FloatProperty(
-        name="High", description="The number that has the last colour", default=1.0, update=on_edit("display")
+        name="High", description="The number that has the last colour", default=1.0, update=updates.on_edit("display")
     )
     half: BoolProperty(
         name="Central Half", description="Show the middle half of each image, often called FOV; all of it is the wide FOV",
-        update=on_edit("display"),
+        update=updates.on_edit("display"),
     )  # fmt: skip
     planes: EnumProperty(
         name="Planes", description="Whose projections stand in the scene, between pinhole and ROI",
-        items=choices.items({}, _PLANES), default="ALL", update=on_edit("planes"),
+        items=choices.items({}, _PLANES), default="ALL", update=updates.on_edit("planes"),
     )  # fmt: skip
     plane_distance: FloatProperty(
         name="Distance", description="Of the planes from the pinholes, mm; 0: between pinhole and ROI", min=0.0,
-        soft_max=500.0, update=on_edit("planes"),
+        soft_max=500.0, update=updates.on_edit("planes"),
     )  # fmt: skip
     plane_at_detector: BoolProperty(
         name="At Virtual Detector", description="Put the planes where the images truly are: behind the ROI",
-        update=on_edit("planes"),
+        update=updates.on_edit("planes"),
     )  # fmt: skip
     plane_opacity: FloatProperty(
         name="Opacity", description="Of the planes and of the pictures in the cameras' views", subtype="FACTOR", min=0.0,
-        max=1.0, default=1.0, update=on_edit("planes"),
+        max=1.0, default=1.0, update=updates.on_edit("planes"),
     )  # fmt: skip
     backgrounds: BoolProperty(
         name="In Camera Views", description="Lay each projection over what its module's camera sees", default=True,
-        update=on_edit("planes"),
+        update=updates.on_edit("planes"),
     )  # fmt: skip
 
     @property

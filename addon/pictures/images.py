@@ -13,15 +13,12 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core import PinholeSystem, ProjectionRun, Views
-from ...core.memory import cores
+from ...core import PinholeSystem, ProjectionRun, Views, memory
 from ...core.progress import Progress, part_of, tell
 from ...core.runs.display import Display
 from ...core.runs.exr import exr_bytes
 from ...core.runs.mosaic import Sheet, as_seen, labels, png, sheet, smaller
-from ..blender import ids, jobs
-from ..blender.reports import Need
-from ..blender.windows import areas
+from ..blender import ids, jobs, reports, windows
 
 _KEY = "mphdrr_projection"  # custom property: marks the images that a new run replaces
 _ARRAYS = ("sources", "detector_centers", "u_steps", "v_steps")
@@ -212,7 +209,7 @@ def _mosaic(
 def _in_threads(make: Callable[[Any], bytes], pictures: NDArray[np.float32], progress: Progress | None) -> list[bytes]:
     """What `make` makes of each picture."""
     files: list[bytes] = []
-    with ThreadPoolExecutor(cores()) as pool:
+    with ThreadPoolExecutor(memory.cores()) as pool:
         for file in pool.map(make, pictures):
             files.append(file)
             tell(progress, len(files), len(pictures))
@@ -242,9 +239,7 @@ def store_difference(drawn: Sheet, numbers: list[int], unit: str, text: str) -> 
 def store_reconstruction(file: bytes) -> bpy.types.Image:
     """Make the image of a reconstruction, a PNG of it, until other projections are shown."""
     image = _store(ids.RECONSTRUCTION, file)
-    for area in areas("IMAGE_EDITOR"):
-        if area.spaces.active.image == image:
-            area.tag_redraw()
+    windows.redraw("IMAGE_EDITOR")
     return image
 
 
@@ -301,7 +296,7 @@ def show(image: bpy.types.Image, context: bpy.types.Context) -> bool:
     return shown
 
 
-PROJECTED: Need = (lambda context: ids.MOSAIC in bpy.data.images, "No projections yet: render them first")
+PROJECTED: reports.Need = (lambda context: ids.MOSAIC in bpy.data.images, "No projections yet: render them first")
 
 
 def show_below(image: bpy.types.Image, context: bpy.types.Context) -> bool:

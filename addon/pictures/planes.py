@@ -16,9 +16,8 @@ from ..blender import ids, objects
 from ..scanner import grabbing, scanner, selection
 from . import images
 
-_KEY = (
-    "mphdrr_field"  # custom property of a plane: middle and size (5,) of the virtual detector in the camera's frame, mm
-)
+_KEY = "mphdrr_field"
+"""Custom property of a plane: middle and size (5,) of the virtual detector in the camera's frame, mm."""
 _NEAR = 1e-5  # rounding
 _BETWEEN = 0.3  # of the way from the pinhole to the ROI's surface: where a plane is by default
 
@@ -84,7 +83,7 @@ def update(scene: bpy.types.Scene) -> None:
     settings = scene.mphdrr_display
     part = images.share_shown()
     for plane, shown in _wanted(scene):
-        _show(plane, shown)
+        objects.change(plane, hide_viewport=not shown)
         if plane.parent is None:
             continue
         _place(plane, settings, part)
@@ -121,11 +120,6 @@ def _backgrounds(plane: bpy.types.Object) -> list[bpy.types.CameraBackgroundImag
     return [found for found in plane.parent.data.background_images if found.image == plane.data]
 
 
-def _show(plane: bpy.types.Object, shown: bool) -> None:
-    if plane.hide_viewport == shown:  # writing the same value would make Blender evaluate the plane again
-        plane.hide_viewport = not shown
-
-
 def share_of_way(settings: bpy.types.PropertyGroup, module: bpy.types.PropertyGroup, distance: float) -> float:
     """Where a module's picture is shown: as a share of the way from its pinhole to the detector at `distance`, mm."""
     if settings.plane_at_detector:
@@ -137,7 +131,7 @@ def after_update(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None
     """Another module is active, modules were shown or hidden, or `l` was edited: planes and backgrounds follow."""
     if depsgraph.id_type_updated("SCENE") and scene == bpy.context.scene:
         for plane, shown in _wanted(scene):
-            _show(plane, shown)
+            objects.change(plane, hide_viewport=not shown)
     changed = {selection.module_of(each.id.original) for each in depsgraph.updates if each.id.id_type == "OBJECT"}
     changed.discard(None)
     if changed:

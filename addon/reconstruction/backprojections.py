@@ -5,16 +5,12 @@ from typing import Any
 
 import bpy
 
-from ...core.errors import InputError
+from ...core import Recipe, backproject_run, read_run
 from ...core.progress import Progress, stages_of
-from ...core.runs.backprojecting import backproject_run
-from ...core.runs.files import read_run
-from ...core.runs.recipe import Recipe
 from ...core.runs.reconstructing import reconstruction_grid
 from ..blender import jobs, storage
 from ..runs import rendering, runs
-from ..volumes import slices, volumes
-from ..volumes.stored_volumes import StoredVolume, store_volume
+from ..volumes import slices, stored_volumes, volumes
 from .reconstruction_properties import HOW_LABELS
 
 
@@ -23,13 +19,11 @@ def backprojecting(context: bpy.types.Context, recipe: Recipe, how: str) -> jobs
 
     `how` is one of those of `core.perspective.backprojection`. Raises InputError where no run is shown.
     """
-    scene, shown = context.scene, runs.shown(context.scene)
-    if shown is None:
-        raise InputError("nothing to back-project: render the projections first, or choose a run")
+    scene, shown = context.scene, runs.required(context.scene, "back-project")
     path, name, folder, uid = rendering.file_of(shown.file), shown.name, storage.folder(), scene.session_uid
     label, start = HOW_LABELS[how], time.perf_counter()
 
-    def work(progress: Progress) -> StoredVolume:
+    def work(progress: Progress) -> stored_volumes.StoredVolume:
         stages = stages_of(progress)
         stages("reading the run")
         run = read_run(path)
@@ -37,9 +31,9 @@ def backprojecting(context: bpy.types.Context, recipe: Recipe, how: str) -> jobs
         volume = backproject_run(run, how, grid=grid, stages=stages)
         stages("writing the voxels")
         provenance: dict[str, Any] = {"back_projection_of": name, "how": how, **recipe.tables()}
-        return store_volume(volume, folder, None, provenance)
+        return stored_volumes.store_volume(volume, folder, None, provenance)
 
-    def finish(stored: StoredVolume) -> str:
+    def finish(stored: stored_volumes.StoredVolume) -> str:
         scene = jobs.scene_again(uid, "the back-projection is")
         item = volumes.add_stored(stored, f"{name} {label}", scene.collection)
         volumes.make_active(bpy.context, item)

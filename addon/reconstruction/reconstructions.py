@@ -13,25 +13,19 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core.errors import InputError
+from ...core import InputError, ProjectionRun, Recipe, Volume, read_run, score_volume
 from ...core.figures.page import Page
 from ...core.figures.reconstructions import SIZE, SIZE_BESIDE_TRUTH, draw
 from ...core.progress import Progress, stages_of
 from ...core.reconstruction.methods import method_of
 from ...core.reconstruction.result import iterations_text
-from ...core.reconstruction.scores.summary import score_volume
-from ...core.runs.files import read_run
 from ...core.runs.mosaic import png
-from ...core.runs.recipe import Recipe
 from ...core.runs.reconstructing import reconstruct_run, reconstruction_grid
-from ...core.runs.run import ProjectionRun
 from ...core.runs.run_recipe import truth_of_run
-from ...core.volumes.volume import Volume
-from ..blender import ids, jobs, objects, plots, storage
+from ..blender import ids, jobs, objects, plots, storage, windows
 from ..pictures import images
 from ..runs import rendering, runs
-from ..volumes import volumes
-from ..volumes.stored_volumes import StoredVolume, store_volume
+from ..volumes import stored_volumes, volumes
 
 _BETWEEN = 2.0  # s at least between two pictures of a reconstruction that runs
 _PNG_LEVEL = 1  # fast
@@ -41,7 +35,7 @@ _PNG_LEVEL = 1  # fast
 class _Shown:
     """What the scene shows of a reconstruction."""
 
-    stored: StoredVolume
+    stored: stored_volumes.StoredVolume
     picture: bytes  # PNG: slices, beside the truth, and the objective
     record: dict[str, Any]  # see `ReconstructionProperties.known`
 
@@ -51,14 +45,12 @@ def reconstructing(context: bpy.types.Context, recipe: Recipe) -> jobs.Job:
 
     The volume comes into the scene with the first iteration that is shown. The object of an earlier reconstruction stays.
     """
-    scene, shown = context.scene, runs.shown(context.scene)
-    if shown is None:
-        raise InputError("nothing to reconstruct: render the projections first, or choose a run")
+    scene, shown = context.scene, runs.required(context.scene, "reconstruct")
     path, name, folder = rendering.file_of(shown.file), shown.name, storage.folder()
     method = method_of(recipe["reconstruction.method"])
     readers = _readers_of_mu(scene)
     uid, start = scene.session_uid, time.perf_counter()
-    is_watched = _is_watched()
+    is_watched = windows.has_window()
     shelf = _Shelf(scene, f"{name} {method.label}")
 
     def work(progress: Progress) -> _Shown:
@@ -76,7 +68,7 @@ def reconstructing(context: bpy.types.Context, recipe: Recipe) -> jobs.Job:
                 "name": method.objective, "objective": list(objective), "scores": list(scores), "flatters": flatters,
             }  # fmt: skip
             picture = _picture(run, volume, record, name)
-            stored = store_volume(volume, folder, None, {"reconstruction_of": name, **recipe.tables()})
+            stored = stored_volumes.store_volume(volume, folder, None, {"reconstruction_of": name, **recipe.tables()})
             shelf.files.append(stored.path)
             return _Shown(stored, picture, record)
 
@@ -152,9 +144,9 @@ class _Shelf:
         """Take everything back."""
         item = jobs.found_again(bpy.data.objects, self._item)
         if item is not None:
-            materials = [material for material in item.data.materials if material]
+            materials = list(item.data.materials)
             objects.remove_objects([item, *item.children])
-            bpy.data.batch_remove([material for material in materials if material.users == 0])
+            objects.remove_unused(materials)
         scene = jobs.found_again(bpy.data.scenes, self._scene)
         if scene is not None and self._item:
             settings = scene.mphdrr_reconstruction
@@ -193,11 +185,6 @@ def _scores(run: ProjectionRun, volume: Volume, progress: Progress | None) -> li
         score_text = f"{sphere.contrast_recovery:.1f} % contrast, {sphere.background_variability:.1f} % variability"
         lines.append((f"{sphere.diameter:g} mm sphere", score_text))
     return lines
-
-
-def _is_watched() -> bool:
-    """Whether there is a window, in which states are shown before the end."""
-    return not bpy.app.background
 
 
 def _readers_of_mu(scene: bpy.types.Scene) -> dict[str, Callable[[], Volume]]:

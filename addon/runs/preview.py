@@ -26,9 +26,7 @@ from ..blender import jobs, timers, windows
 from ..phantoms import phantoms
 from ..pictures import planes
 from ..scanner import scanner, selection
-from ..volumes import volumes
-from ..volumes.stored_volumes import moved
-from ..volumes.vdb import read_vdb
+from ..volumes import stored_volumes, vdb, volumes
 from . import preview_drawing, rendering, runs
 
 QUICK = 128
@@ -40,9 +38,6 @@ _REST = 0.3  # s without a change before the picture is made with all pixels
 _SHOWN_PIXELS = 512**2
 _MOST_CAUTIONS = 2
 _PATIENCE = 0.5  # s, after which a line says that a picture takes long
-_OF_MODULE = (
-    "numbers", "centers", "pinhole_diameter", "collimator_length", "detector_side", "detector_thickness",
-)  # fmt: skip
 
 Source = tuple[Path, NDArray[np.float64]]
 """File and pose (4, 4) of a volume, mm."""
@@ -122,8 +117,8 @@ def make(asked: Request, quick: bool, voxels: dict[Path, Volume]) -> Preview:
         del voxels[path]
     for path, _ in sources:
         if path not in voxels:
-            voxels[path] = read_vdb(path)
-    volume, *mu = (moved(voxels[path], pose) for path, pose in sources)
+            voxels[path] = vdb.read_vdb(path)
+    volume, *mu = (stored_volumes.moved(voxels[path], pose) for path, pose in sources)
     (run,) = run_recipe(quick_recipe(recipe) if quick else recipe, system, volume, mu[0] if mu else None)
     shown = run.projections
     if run.unit == "counts" and quick:  # shown per pixel of the panel's size, as the full picture and the runs are

@@ -6,13 +6,7 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import bpy
-from bpy.props import (
-    BoolProperty,
-    CollectionProperty,
-    IntProperty,
-    PointerProperty,
-    StringProperty,
-)
+from bpy.props import BoolProperty, CollectionProperty, IntProperty, PointerProperty, StringProperty
 
 from ...core.errors import InputError
 from ...core.physics.maps import MAPS

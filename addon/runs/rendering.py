@@ -13,10 +13,9 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core import ProjectionRun, Recipe, read_recipe, read_run, write_run
+from ...core import ProjectionRun, Recipe, memory, read_recipe, read_run, write_run
 from ...core.errors import InputError, warn
 from ...core.geometry.system import chosen_modules
-from ...core.memory import require
 from ...core.progress import Progress, Stages, stages_of
 from ...core.projector import Model
 from ...core.runs.display import Display
@@ -29,8 +28,7 @@ from ..phantoms import phantoms
 from ..pictures import images, planes, recoloring
 from ..scanner import following, scanner
 from ..volumes import volumes
-from . import runs
-from .projection_properties import OPENING_ANGLE, set_panel
+from . import projection_properties, runs
 
 _REST = 0.05  # s until the run that was chosen in the list is shown
 
@@ -50,7 +48,7 @@ def render_job(context: bpy.types.Context, recipe: Recipe, volume: str = "", mu:
         phantoms.require_current(chosen)
     rows, columns = recipe["detector.rows"], recipe["detector.columns"]
     # The array, means and colours of it, and the packed images, in our memory and in Blender's beside those of the last run.
-    require(16.0 * len(system) * rows * columns, f"{len(system)} images of {columns} x {rows} pixels")
+    memory.require(16.0 * len(system) * rows * columns, f"{len(system)} images of {columns} x {rows} pixels")
     recipe = recipe.updated({"volume.object": item.name, "attenuation.object": mu_item and mu_item.name})
     recipe = _with_volume(recipe, item)
     read_volume, read_mu = volumes.reader(item), mu_item and volumes.reader(mu_item)
@@ -121,10 +119,10 @@ def load_recipe(scene: bpy.types.Scene, path: Path) -> None:
 
 def _set_physics(scene: bpy.types.Scene, recipe: Recipe) -> None:
     """Set the panel, and the angle that it has from the scanner; raises InputError for what the panel cannot show."""
-    set_panel(scene.mphdrr_projections, recipe)
+    projection_properties.set_panel(scene.mphdrr_projections, recipe)
     collection = scanner.active_scanner(scene)
-    if collection is not None and OPENING_ANGLE in recipe.given:
-        collection.mphdrr_scanner.opening_angle = math.radians(recipe[OPENING_ANGLE])
+    if collection is not None and projection_properties.OPENING_ANGLE in recipe.given:
+        collection.mphdrr_scanner.opening_angle = math.radians(recipe[projection_properties.OPENING_ANGLE])
 
 
 def exporting(scene: bpy.types.Scene, filepath: str) -> jobs.Job:

@@ -19,12 +19,9 @@ from ...core.memory import readable_size
 from ...core.runs.recipe import Recipe, fitting_recipe
 from ...core.runs.run import ProjectionRun
 from ...core.runs.settings import SAMPLING, SETTINGS, Setting
-from ..blender import ids, objects, storage, timers, windows
-from ..blender.decimals import typed
+from ..blender import decimals, ids, objects, storage, timers, windows
 from ..phantoms import phantoms
-from ..scanner import following, scanner
-from ..scanner.module_values import FROM_ROI, designed, kind_of, readings
-from ..scanner.scanner_parts import modules_text
+from ..scanner import following, module_values, scanner, scanner_parts
 from ..volumes import volumes
 from .projection_properties import OPENING_ANGLE, settings_recipe
 
@@ -108,6 +105,14 @@ def shown(scene: bpy.types.Scene) -> bpy.types.PropertyGroup | None:
     """The run in the list whose images are shown; None where there is none."""
     settings = scene.mphdrr_projections
     return next((item for item in settings.runs if item.file == settings.run_file), None)
+
+
+def required(scene: bpy.types.Scene, to_do: str) -> bpy.types.PropertyGroup:
+    """The `shown` run; `InputError`, with what there was `to_do`, where there is none."""
+    item = shown(scene)
+    if item is None:
+        raise InputError(f"nothing to {to_do}: render the projections first, or choose a run")
+    return item
 
 
 def changes(scene: bpy.types.Scene, item: bpy.types.PropertyGroup | None = None) -> list[str]:
@@ -202,7 +207,7 @@ def panel_recipe(scene: bpy.types.Scene) -> Recipe:
     """What the panel asks for now."""
     collection = scanner.active_scanner(scene)
     angle = math.pi / 2 if collection is None else collection.mphdrr_scanner.opening_angle
-    more = {OPENING_ANGLE: math.degrees(typed(angle))}
+    more = {OPENING_ANGLE: math.degrees(decimals.typed(angle))}
     return settings_recipe(lambda name: getattr(scene.mphdrr_projections, name), lambda name: False, more)
 
 
@@ -230,19 +235,19 @@ def _of_modules(collection: bpy.types.Collection | None, old: Mapping[str, Any])
     if collection is None:
         yield "the scanner is gone"
         return
-    kind, found = kind_of(collection), scanner.modules(collection)
+    kind, found = module_values.kind_of(collection), scanner.modules(collection)
     count, modes = len(found), {str(o.mphdrr_module.number): o.mphdrr_module.length_mode for o in found}
     now: dict[str, dict[str, Any]] = {}
-    for _, system in readings(kind, found, objects.world_matrices(found)):
+    for _, system in module_values.readings(kind, found, objects.world_matrices(found)):
         if isinstance(system, InputError):
             yield str(system)
         else:
             now |= _values_of(system)
     changed: dict[str, dict[int, tuple[Any, Any]]] = {}  # by column, then by module
-    follow = {column.name for column in designed(kind)}
+    follow = {column.name for column in module_values.designed(kind)}
     for number in old["modules"].keys() & now.keys():
         pairs = _changed(old["modules"][number], now[number])
-        if modes[number] == FROM_ROI and len(pairs) > 1:
+        if modes[number] == module_values.FROM_ROI and len(pairs) > 1:
             pairs = {name: pair for name, pair in pairs.items() if name not in follow}
         for name, pair in pairs.items():
             changed.setdefault(name, {})[int(number)] = pair
@@ -291,7 +296,7 @@ def _equal(old: Any, new: Any) -> bool:
 def _modules(numbers: list[int], count: int) -> str:
     if len(numbers) == count > 1:
         return "all modules"
-    return ids.module_name(numbers[0], count) if len(numbers) == 1 else modules_text(numbers)
+    return ids.module_name(numbers[0], count) if len(numbers) == 1 else scanner_parts.modules_text(numbers)
 
 
 def _found(scene: bpy.types.Scene, old: Mapping[str, Any] | None) -> bpy.types.Object | None:

@@ -35,9 +35,8 @@ def reshape_mesh(mesh: bpy.types.Mesh, solid: Solid) -> None:
     """Give a mesh the shape of `solid`, in place: undo needs the same datablock."""
     vertices, faces = solid
     if len(mesh.vertices) == len(vertices) and len(mesh.polygons) == len(faces):
-        mesh.attributes["position"].data.foreach_set(
-            "vector", vertices.astype(np.float32).ravel()
-        )  # 30 times as fast as `vertices`
+        # 30 times as fast as by `vertices`:
+        mesh.attributes["position"].data.foreach_set("vector", vertices.astype(np.float32).ravel())
         mesh.update()
     else:  # it is new, or the user has edited it
         mesh.clear_geometry()

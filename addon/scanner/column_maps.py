@@ -10,10 +10,8 @@ from pathlib import Path
 import bpy
 from bpy.props import BoolProperty, CollectionProperty, EnumProperty, IntProperty, StringProperty
 
-from ...core.errors import InputError
+from ...core import InputError, PinholeSystem, recording
 from ...core.geometry.columns import ANGLE_UNITS, LENGTH_UNITS
-from ...core.geometry.system import PinholeSystem
-from ...core.recording import recorded_warnings
 from ...core.workbook import ColumnMap, MappedColumn, MappedTable, draft_column_map, preview_workbook, read_system
 from ..blender import choices
 
@@ -219,7 +217,7 @@ def update(form: ColumnMapProperties) -> None:
     try:
         for quantity in form.quantities:
             quantity.seen = _seen(form, quantity, workbook)
-        with recorded_warnings() as warned:
+        with recording.recorded_warnings() as warned:
             form.n_modules, rows = _preview(workbook, column_map(form))
         form.preview, form.remarks = json.dumps(rows), json.dumps(list(warned))
     except InputError as error:

@@ -9,8 +9,7 @@ from bpy.props import EnumProperty, FloatProperty, IntProperty, StringProperty
 
 from ...core.geometry.columns import Column
 from ...core.geometry.scanner import SCANNERS
-from ..blender import choices
-from ..blender.decimals import typed
+from ..blender import choices, decimals
 
 _BLANK = "BLANK"  # how a choice that may be blank is called in an enumeration
 _UNITS = {"length": ", in mm"}
@@ -69,4 +68,4 @@ def value_of(column: Column, shown: Any, known: Any) -> Any:
         return shown
     if known is not None and np.float32(known) == shown:
         return known
-    return math.radians(typed(math.degrees(shown))) if column.kind == "angle" else typed(shown)
+    return math.radians(decimals.typed(math.degrees(shown))) if column.kind == "angle" else decimals.typed(shown)

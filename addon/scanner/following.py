@@ -15,7 +15,6 @@ from ...core.geometry.module_parts import ModulePart
 from ...core.geometry.scanner import SCANNERS, Scanner
 from ..blender import objects
 from . import cameras, collimators, pinholes
-from .collimators import PARTS
 from .module_values import TYPED, Kind, aim_of, designed, kind_of, readings, together
 
 _KEY = "mphdrr_solid"  # custom property of a mesh: the values that it was built from
@@ -54,7 +53,7 @@ def parts_of(collection: bpy.types.Collection, found: Sequence[bpy.types.Object]
     items = found[0].children if len(found) == 1 else collection.all_objects
     parts: _Parts = {camera: [] for camera in found}
     for item in items:
-        if item.mphdrr_module.part in PARTS and item.parent in parts:
+        if item.mphdrr_module.part in collimators.PARTS and item.parent in parts:
             parts[item.parent].append(item)
     return parts
 

@@ -10,6 +10,7 @@ from typing import Any
 
 import bpy
 
+from ..blender import timers
 from . import following, grabbing, module_edits, scanner
 
 _INTERVAL = 0.2  # s between two looks whether a tool is still running
@@ -95,12 +96,6 @@ def after_load(*_: Any) -> None:
     after_undo()
 
 
-def stop() -> None:
-    """Forget what waits: the extension is disabled."""
-    if bpy.app.timers.is_registered(_settle):
-        bpy.app.timers.unregister(_settle)
-
-
 def _local(collections: Iterable[bpy.types.Collection]) -> list[bpy.types.Collection]:
     """The scanners that are not linked from another file."""
     return [c for c in collections if c.mphdrr_scanner.is_scanner and c.library is None]
@@ -124,8 +119,8 @@ def _look_for_copies(collection: bpy.types.Collection) -> None:
 
 
 def _settle_later() -> None:
-    if not bpy.app.background and not bpy.app.timers.is_registered(_settle):
-        bpy.app.timers.register(_settle, first_interval=_INTERVAL)
+    if not bpy.app.background:
+        timers.soon(_settle, _INTERVAL)
 
 
 def _settle() -> float | None:

@@ -5,10 +5,8 @@ from typing import Any
 
 import bpy
 
-from ...core.geometry.grid import Grid
-from ...core.memory import require
+from ...core import Grid, Progress, memory
 from ...core.physics.maps import MAPS, within_roi
-from ...core.progress import Progress
 from ..blender import choices, jobs, storage
 from ..volumes import slices, volume_materials, volumes
 from ..volumes.stored_volumes import StoredVolume, store_volume
@@ -40,7 +38,7 @@ def mapping(
     collection = collection or scanner.required_scanner(scene)
     system = scanner.read_pinholes(collection)
     grid = Grid.centered((voxels,) * 3, (side or 2 * float(system.roi_radius.max())) / voxels)
-    require(_BYTES * grid.n_voxels, f"a map of {voxels}^3 voxels")
+    memory.require(_BYTES * grid.n_voxels, f"a map of {voxels}^3 voxels")
     name, folder, owner = _name(quantity), storage.folder(), collection.name
     recipe = json.dumps({"voxels": voxels, "side": side, "only_roi": only_roi})
     provenance: dict[str, Any] = {"map": quantity, "modules": len(system), "scanner": collection.name}

@@ -9,17 +9,12 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core.errors import InputError
+from ...core import InputError, PinholeSystem, ring_order
 from ...core.geometry.frames import affine_matrix, rotations
 from ...core.geometry.module_parts import ModulePart
-from ...core.geometry.ring_fits import ring_order
 from ...core.geometry.scanner import Scanner
-from ...core.geometry.system import PinholeSystem
-from ..blender import ids, objects
-from ..blender.updates import FUNCTIONS
-from . import cameras, collimators, following, pinholes, scanner
-from .collimators import PARTS
-from .module_values import imported_module, kind_of, remember, with_design
+from ..blender import ids, objects, updates
+from . import cameras, collimators, following, module_values, pinholes, scanner
 from .scanner_parts import clear, new_part, parts_and_others
 
 _OURS = re.compile(r"(Module|Collimator|Crystal) \d+(\.\d+)?")  # a name that the extension gave
@@ -42,7 +37,7 @@ def orphan_parts(collection: bpy.types.Collection) -> list[bpy.types.Object]:
     return [
         item
         for item in collection.all_objects
-        if item.mphdrr_module.part in PARTS
+        if item.mphdrr_module.part in collimators.PARTS
         and not (item.parent is not None and item.parent.mphdrr_module.is_module and item.parent.users_collection)
     ]
 
@@ -51,7 +46,7 @@ def bare_cameras(collection: bpy.types.Collection) -> list[bpy.types.Object]:
     """Modules without parts, of a kind that has some: copies whose original was deleted."""
     parts = following.parts_of(collection, scanner.modules(collection))
     bare = [camera for camera, own in parts.items() if not own]
-    return bare if bare and kind_of(collection).parts is not Scanner.parts else []
+    return bare if bare and module_values.kind_of(collection).parts is not Scanner.parts else []
 
 
 def untidy_text(collection: bpy.types.Collection) -> str:
@@ -93,7 +88,7 @@ def adopt(collection: bpy.types.Collection, camera: bpy.types.Object, module: Sc
     if not following.parts_of(collection, [camera])[camera]:
         _add_parts(collection, camera)
     camera.mphdrr_module.number = number
-    remember([camera], module or _read(collection, camera))
+    module_values.remember([camera], module or _read(collection, camera))
     camera.mphdrr_module.number, camera.mphdrr_module.added = number, True
     camera.mphdrr_module.index = max(o.mphdrr_module.index for o in found) + 1
     camera.name = ids.module_name(number, len(found) + 1)
@@ -111,12 +106,12 @@ def _read(collection: bpy.types.Collection, camera: bpy.types.Object) -> Scanner
     try:
         return scanner.read_module(collection, camera)
     except InputError:
-        return imported_module(kind_of(collection), camera)
+        return module_values.imported_module(module_values.kind_of(collection), camera)
 
 
 def _solids(collection: bpy.types.Collection, camera: bpy.types.Object) -> Sequence[ModulePart]:
     """A module's parts; raises InputError where they cannot be built."""
-    construction = pinholes.construction(collection.mphdrr_scanner, kind_of(collection))
+    construction = pinholes.construction(collection.mphdrr_scanner, module_values.kind_of(collection))
     return _read(collection, camera).parts(construction)
 
 
@@ -153,7 +148,7 @@ def duplicate(
                     "choose another angle or count"
                 )
             taken.append(pose[:3, 3])
-            copies.append((camera, with_design(camera, module.at_poses(pose[None]))))
+            copies.append((camera, module_values.with_design(camera, module.at_poses(pose[None]))))
     made = []
     for camera, module in copies:
         copy = camera.copy()
@@ -212,9 +207,9 @@ def remove(collection: bpy.types.Collection, modules: Sequence[bpy.types.Object]
     if len(modules) >= len(scanner.modules(collection)):
         raise InputError("a scanner needs at least one module: keep one, or press Remove Scanner")
     for scene in bpy.data.scenes:
-        FUNCTIONS["modules_removed"](scene, list(modules))
+        updates.FUNCTIONS["modules_removed"](scene, list(modules))
     children = [child for camera in modules for child in camera.children]
-    parts = [child for child in children if child.mphdrr_module.part in (*PARTS, "PLANE")]
+    parts = [child for child in children if child.mphdrr_module.part in (*collimators.PARTS, "PLANE")]
     for child in children:
         if child not in parts:
             objects.unparent(child)
@@ -224,13 +219,12 @@ def remove(collection: bpy.types.Collection, modules: Sequence[bpy.types.Object]
 
 def remove_scanner(scene: bpy.types.Scene, collection: bpy.types.Collection) -> None:
     """Remove a scanner, with its projections in the scene; the user's objects in it move to the scene's collection."""
-    FUNCTIONS["modules_removed"](scene, scanner.modules(collection))
+    updates.FUNCTIONS["modules_removed"](scene, scanner.modules(collection))
     _, others = parts_and_others(collection)
     objects.remove_objects([item for item in others if item.mphdrr_module.part != "NONE"])  # copies
     clear(scene, collection, {})
     bpy.data.collections.remove(collection)
-    materials = [bpy.data.materials.get(name) for name, _ in collimators.LOOKS.values()]
-    bpy.data.batch_remove([material for material in materials if material is not None and material.users == 0])
+    objects.remove_unused(bpy.data.materials.get(name) for name, _ in collimators.LOOKS.values())
 
 
 def renumber(collection: bpy.types.Collection, order: Literal["RINGS", "LIST"] = "RINGS") -> int:
@@ -274,5 +268,5 @@ def make_single_users(collection: bpy.types.Collection) -> None:
     """Give every module a camera and meshes of its own, which can be reshaped."""
     for item in collection.all_objects:
         module = item.mphdrr_module
-        if (module.is_module or module.part in PARTS) and item.data.users > 1:
+        if (module.is_module or module.part in collimators.PARTS) and item.data.users > 1:
             item.data = item.data.copy()

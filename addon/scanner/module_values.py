@@ -15,13 +15,11 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core.errors import InputError
+from ...core import InputError, SystemSource
 from ...core.geometry.columns import Column
 from ...core.geometry.frames import module_poses
 from ...core.geometry.scanner import Scanner, scanner_kind
-from ...core.system_source import SystemSource
-from ..blender import objects
-from ..blender.decimals import typed
+from ..blender import decimals, objects
 from . import cameras, columns
 
 FROM_ROI, TYPED = "FROM_ROI", "TYPED"  # `mphdrr_module.length_mode`
@@ -164,7 +162,7 @@ def _poses(
     place, old = now[:, :3, 3], was[:, :3, 3]
     for m, axis in np.argwhere(place.astype(np.float32) != old.astype(np.float32)).tolist():
         if cameras_[m].parent is None and not len(cameras_[m].constraints):
-            place[m, axis] = typed(place[m, axis])
+            place[m, axis] = decimals.typed(place[m, axis])
     rounding = 4 * np.spacing(np.abs(old).max(axis=1).astype(np.float32))
     stays = np.abs(place - old) <= rounding[:, None]
     turned = np.abs(now[:, :3, :3] - was[:, :3, :3]).max(axis=(1, 2)) > _ROUNDING

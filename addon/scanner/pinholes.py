@@ -8,20 +8,17 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core.errors import InputError
+from ...core import InputError, PinholeSystem, isocentre_performance, resolution, sensitivity
 from ...core.geometry import checks
 from ...core.geometry.collimator import Construction, EdgePlace
 from ...core.geometry.scanner import Scanner
-from ...core.geometry.system import PinholeSystem
-from ...core.physics.performance import isocentre_performance, resolution, sensitivity
 from ..blender.decimals import typed
-from . import collimators
-from .module_values import Kind
+from . import collimators, module_values
 
 _READOUTS = ("sensitivity", "resolution", "magnification", "roi_seen")
 
 
-def has_pinholes(kind: Kind) -> bool:
+def has_pinholes(kind: module_values.Kind) -> bool:
     """Whether scanners of a kind have pinholes."""
     return issubclass(kind, PinholeSystem)
 
@@ -37,7 +34,7 @@ def settings(scanner: bpy.types.PropertyGroup) -> tuple[float | str, ...]:
     return *construction_values(scanner), typed(scanner.intrinsic_fwhm)
 
 
-def construction(scanner: bpy.types.PropertyGroup, kind: Kind = PinholeSystem) -> Construction | None:
+def construction(scanner: bpy.types.PropertyGroup, kind: module_values.Kind = PinholeSystem) -> Construction | None:
     """How the scanner's collimators are built, None for a kind without; raises `InputError` where they cannot be."""
     return Construction(*construction_values(scanner)) if has_pinholes(kind) else None
 

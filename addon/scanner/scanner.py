@@ -13,10 +13,9 @@ import bpy
 import numpy as np
 from mathutils import Quaternion
 
-from ...core.errors import InputError
+from ...core import InputError, PinholeSystem
 from ...core.geometry.collimator import Construction
 from ...core.geometry.scanner import SCANNERS, Scanner
-from ...core.geometry.system import PinholeSystem
 from ...core.workbook import ColumnMap, QuantityCells, SystemSource
 from ..blender import ids, objects
 from . import cameras, collimators, following, framing, pinholes
@@ -285,7 +284,4 @@ def show_modules(collection: bpy.types.Collection, first: int, last: int, mode: 
 
 def _set_hidden(items: Iterable[bpy.types.Object], hide: bool) -> None:
     for item in items:
-        if item.hide_viewport != hide:  # writing the same value would make Blender evaluate the object again
-            item.hide_viewport = hide
-        if item.hide_render != hide:
-            item.hide_render = hide
+        objects.change(item, hide_viewport=hide, hide_render=hide)

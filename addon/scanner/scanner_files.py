@@ -9,16 +9,13 @@ from typing import Any
 import bpy
 import numpy as np
 
-from ...core import workbook
+from ...core import recording, workbook
 from ...core.errors import InputError, warn
 from ...core.exchange import FORMATS, write_geometry
 from ...core.geometry.scanner import Detector, Scanner, first
 from ...core.progress import Progress, stages_of
-from ...core.recording import recorded_warnings
-from ..blender import jobs, storage
-from ..blender.decimals import typed
-from . import pinholes, scanner
-from .module_values import kind_of
+from ..blender import decimals, jobs, storage
+from . import module_values, pinholes, scanner
 
 WORKBOOK_SUFFIXES = (".xlsx", ".xlsm")
 
@@ -38,7 +35,7 @@ def exporting_scanner(collection: bpy.types.Collection, path: Path, use_template
     def work(progress: Progress) -> Scanner:
         stages_of(progress)("writing the workbook")
         own = workbook.write_system(system, path, template, columns).columns
-        with recorded_warnings():  # the writer has already warned of the template's doubts
+        with recording.recorded_warnings():  # the writer has already warned of the template's doubts
             written = workbook.read_scanner(path, system.kind, own)
         different = _difference(system, written)
         if different:
@@ -70,10 +67,10 @@ def exporting_for_program(
     `path` is a new folder for formats of several files; the images described are `system.views(shape, detector, ...)`.
     Raises InputError where the format cannot express the scanner.
     """
-    built = pinholes.construction(collection.mphdrr_scanner, kind_of(collection))
+    built = pinholes.construction(collection.mphdrr_scanner, module_values.kind_of(collection))
     options = {} if built is None else asdict(built)
     if built is not None:
-        options["opening_degrees"] = typed(math.degrees(options.pop("opening_angle")))
+        options["opening_degrees"] = decimals.typed(math.degrees(options.pop("opening_angle")))
     system: Any = scanner.read_scanner(collection)  # of a kind that the format refuses or takes
     views = system.views(shape, detector, magnification=magnification)
     known = {name: value for name, value in options.items() if name in FORMATS[format].options}

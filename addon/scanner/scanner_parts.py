@@ -10,8 +10,7 @@ from ...core.errors import several
 from ...core.geometry.module_parts import ModulePart
 from ...core.geometry.scanner import Scanner
 from ..blender import ids, objects
-from . import cameras, collimators, pinholes
-from .module_values import changes, write_modules
+from . import cameras, collimators, module_values, pinholes
 
 
 class NewScanner:
@@ -28,7 +27,7 @@ class NewScanner:
             self.roi = self._make_roi(system)
         except BaseException:
             bpy.data.batch_remove([datablock for datablock, _ in self._named])
-            bpy.data.batch_remove([m for m in self._materials.values() if m.users == 0])
+            objects.remove_unused(self._materials.values())
             raise
 
     def _make_cameras(self, system: Scanner) -> None:
@@ -48,7 +47,7 @@ class NewScanner:
             objects.set_world_matrix(camera, matrix)
             camera.lock_scale = (True, True, True)  # or its collimator would grow with it
             self.rings[ring].objects.link(camera)
-        write_modules(list(self.cameras.values()), system)
+        module_values.write_modules(list(self.cameras.values()), system)
 
     def _make_parts(self, system: Scanner, parts: Sequence[ModulePart]) -> None:
         for part in parts:
@@ -94,7 +93,7 @@ def losses(collection: bpy.types.Collection) -> list[str]:
     parts, others = parts_and_others(collection)
     found = [o for o in parts if o.mphdrr_module.is_module]
     added = [o.mphdrr_module.added for o in found]
-    moved, edited = changes(found)
+    moved, edited = module_values.changes(found)
     by_others = [o.animation_data is not None or len(o.constraints) > 0 for o in found]
     lost = []
     for what, flags in (
@@ -141,14 +140,14 @@ def clear(scene: bpy.types.Scene, collection: bpy.types.Collection, replacements
         if item.parent in ours and item not in ours and new_of.get(item.parent) is None:
             objects.unparent(item)
 
-    datas = {o.data for o in parts if o.data is not None}
+    datas = {o.data for o in parts}
     bpy.data.batch_remove([o for o in parts if o not in new_of])
     rings = set(homes[1:])
     for camera, users in bpy.data.user_map(subset=set(new_of)).items():
         if new_of[camera] is not None and users - rings:
             camera.user_remap(new_of[camera])
     bpy.data.batch_remove([*new_of, *rings])
-    bpy.data.batch_remove([data for data in datas if data.users == 0])
+    objects.remove_unused(datas)
 
 
 def parts_and_others(collection: bpy.types.Collection) -> tuple[list[bpy.types.Object], list[bpy.types.Object]]:

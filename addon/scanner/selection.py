@@ -4,11 +4,10 @@ from collections.abc import Iterable
 
 import bpy
 
-from ..blender import windows
-from ..blender.reports import Need, Reported, needs
+from ..blender import reports, windows
 from . import following, scanner
 
-SCANNER: Need = (
+SCANNER: reports.Need = (
     lambda context: scanner.active_scanner(context.scene) is not None,
     "No scanner in the scene: import a geometry first",
 )
@@ -105,10 +104,10 @@ def select_active(scene: bpy.types.Scene) -> None:
         layer.objects.active = camera
 
 
-class OnScanner(Reported):
+class OnScanner(reports.Reported):
     """Mix into an operator that works on the scanner of the panels."""
 
-    poll = needs(SCANNER)
+    poll = reports.needs(SCANNER)
 
     def act(self, context: bpy.types.Context) -> str:
         """Do the work on the scanner."""
@@ -122,4 +121,4 @@ class OnScanner(Reported):
 class OnModules(OnScanner):
     """Mix into an operator that works on the active or selected modules."""
 
-    poll = needs(SCANNER, (selected_modules, "No module is selected: select a module's camera"))
+    poll = reports.needs(SCANNER, (selected_modules, "No module is selected: select a module's camera"))

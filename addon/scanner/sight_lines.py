@@ -7,8 +7,7 @@ from numpy.typing import NDArray
 
 from ...core.geometry.system import PinholeSystem
 from ..blender import objects, windows
-from . import cameras, following, scanner, selection
-from .module_values import kind_of
+from . import cameras, following, module_values, scanner, selection
 
 # By the setting: the lines' colour, and which of the points of `lines` they join.
 _DRAWN = {
@@ -34,7 +33,7 @@ def lines(context: bpy.types.Context) -> dict[str, NDArray[np.float64]]:
     chosen = following.modules(collection) if state.sight_all else [active] if active else []
     shown = [camera for camera in chosen if camera.visible_get()]
     # A pinhole's detector is drawn magnified; that of another kind stands where it is.
-    scale = scene.mphdrr_projections.magnification if kind_of(collection) is PinholeSystem else 1.0
+    scale = scene.mphdrr_projections.magnification if module_values.kind_of(collection) is PinholeSystem else 1.0
     fields = scale * np.array([cameras.field_of(o.data) for o in shown]).reshape(-1, 5)
     local = np.zeros((len(shown), 6, 3))  # the source, the detector's corners and its middle
     local[:, 1:] = (fields[:, :3] * [1, 1, -1])[:, None]

@@ -9,10 +9,8 @@ from functools import partial
 import bpy
 from mathutils import Vector
 
-from ..blender import compat
-from ..blender.objects import link_beside, remove_objects
+from ..blender import compat, objects
 from . import volume_materials
-from .volume_materials import Cut, change
 
 _KEY = "mphdrr_surface"  # custom property of a surface's object
 # Exponent and gain of the extinction; where a surface is drawn, the volume itself is not.
@@ -32,7 +30,7 @@ def choose(item: bpy.types.Object) -> None:
     settings.surface = settings.display_low + share * (settings.display_high - settings.display_low)
 
 
-def show(item: bpy.types.Object, cut: Cut | None) -> None:
+def show(item: bpy.types.Object, cut: volume_materials.Cut | None) -> None:
     """Draw a volume in its look and display range, cut open or whole."""
     settings = item.mphdrr_volume
     factor = volume_materials.shown_unit(settings.quantity)[1]
@@ -49,12 +47,12 @@ def show(item: bpy.types.Object, cut: Cut | None) -> None:
         remove_surface(item)
         return
     surface = surface_of(item) or _new_surface(item)
-    change(surface, location=_shift(item))
+    objects.change(surface, location=_shift(item))
     made, opened = surface.modifiers
     voxels = "GRID" if max(settings.shape) <= _FINE else "VOXEL_AMOUNT"
-    change(made, grid_name=settings.quantity, threshold=settings.surface / factor, resolution_mode=voxels)
+    objects.change(made, grid_name=settings.quantity, threshold=settings.surface / factor, resolution_mode=voxels)
     volume_materials.set_cut(opened.node_group, cut)
-    change(opened, show_viewport=cut is not None, show_render=cut is not None)
+    objects.change(opened, show_viewport=cut is not None, show_render=cut is not None)
 
 
 def surface_of(item: bpy.types.Object) -> bpy.types.Object | None:
@@ -67,8 +65,8 @@ def remove_surface(item: bpy.types.Object) -> None:
     surface = surface_of(item)
     if surface is not None:
         rest = [surface.modifiers[1].node_group, *surface.data.materials]
-        remove_objects([surface])
-        bpy.data.batch_remove([datablock for datablock in rest if datablock is not None and datablock.users == 0])
+        objects.remove_objects([surface])
+        objects.remove_unused(rest)
 
 
 def _shift(item: bpy.types.Object) -> Vector:
@@ -90,7 +88,7 @@ def _new_surface(item: bpy.types.Object) -> bpy.types.Object:
     made = surface.modifiers.new("Surface", "VOLUME_TO_MESH")
     made.object, made.use_smooth_shade, made.voxel_amount = item, True, _FINE
     surface.modifiers.new("Cut", "NODES").node_group = _cutting(name)
-    link_beside(surface, item)
+    objects.link_beside(surface, item)
     return surface
 
 

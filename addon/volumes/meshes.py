@@ -7,16 +7,13 @@ import numpy as np
 from mathutils import Matrix
 from numpy.typing import NDArray
 
-from ...core import Progress, volume_to_mesh, voxelize_mesh
+from ...core import Progress, memory, volume_to_mesh, voxelize_mesh
 from ...core.errors import InputError, naming
 from ...core.geometry.grid import grid_around
-from ...core.memory import require
 from ...core.volumes.meshes.mesh import Mesh, require_closed
 from ...core.volumes.volume import UNITS, Volume
-from ..blender import jobs
-from ..blender.objects import world_matrix
-from . import volume_materials, volumes
-from .stored_volumes import StoredVolume
+from ..blender import jobs, objects
+from . import stored_volumes, volume_materials, volumes
 
 _BYTES = 40.0  # a voxel, while the volume is made and put into the scene
 
@@ -43,14 +40,14 @@ def voxelizing(
     spacing = voxel_size or float(np.ptp(vertices, axis=0).max()) / max(1, voxels - 2)
     grid = grid_around(vertices, spacing)
     shape = " x ".join(map(str, grid.shape))
-    require(_BYTES * grid.n_voxels, f"a volume of {shape} voxels")
+    memory.require(_BYTES * grid.n_voxels, f"a volume of {shape} voxels")
     name = name or f"{items[0].name} {quantity}"
     provenance = {"meshes": [item.name for item in items], "values": values}
 
     def make(progress: Progress) -> Volume:
         return voxelize_mesh(solids, grid, values, quantity, progress)
 
-    def finish(item: bpy.types.Object, stored: StoredVolume) -> str:
+    def finish(item: bpy.types.Object, stored: stored_volumes.StoredVolume) -> str:
         content = float(stored.volume.array.sum(dtype=np.float64)) * grid.voxel_volume
         total = f"{content * 1e-3:.4g} kBq" if quantity == "activity" else f"{content:.4g} {UNITS[quantity]} mm^3"
         return f"Added {name!r}: {shape} voxels of {grid.spacing[0]:.3g} mm, {total} in all"
@@ -91,7 +88,7 @@ def meshes_of(items: Sequence[bpy.types.Object], depsgraph: bpy.types.Depsgraph)
             mesh.loop_triangles.foreach_get("vertices", faces.ravel())
         finally:
             evaluated.to_mesh_clear()
-        pose = world_matrix(item)
+        pose = objects.world_matrix(item)
         if np.linalg.det(pose[:3, :3]) < 0:  # a mirrored object shows the other side of its faces
             faces = faces[:, ::-1]
         with naming(repr(item.name)):

@@ -15,8 +15,7 @@ from mathutils import Vector
 from numpy.typing import NDArray
 
 from ...core import InputError, Volume
-from ..blender.compat import add_node, blank_material
-from ..blender.objects import link_beside, remove_objects
+from ..blender import compat, objects
 from . import looks, vdb, volume_materials, volumes
 
 _PLANES = ("Sagittal", "Coronal", "Axial")  # across world x, y, z
@@ -53,14 +52,11 @@ def remove_slices(item: bpy.types.Object) -> None:
     """Remove a volume's planes, with their meshes, materials and images; the volume is whole again."""
     for plane in planes_of(item):
         materials = list(plane.data.materials)
-        remove_objects([plane])
-        for material in materials:
-            if material is None or material.users:
-                continue
-            image = material.node_tree.nodes["Slice"].image
-            bpy.data.materials.remove(material)
-            if image is not None and image.users == 0:
-                bpy.data.images.remove(image)
+        trees = [material.node_tree for material in materials if material and material.node_tree]
+        pictures = [tree.nodes["Slice"].image for tree in trees if "Slice" in tree.nodes]
+        objects.remove_objects([plane])
+        objects.remove_unused(materials)
+        objects.remove_unused(pictures)
     looks.show(item, None)
 
 
@@ -220,20 +216,20 @@ def _plane(item: bpy.types.Object, volume: Volume, axis: int, name: str) -> bpy.
     plane = bpy.data.objects.new(name, mesh)
     plane[_KEY], plane[_LATTICE] = axis, _lattice(volume)
     plane.parent = item
-    link_beside(plane, item)
+    objects.link_beside(plane, item)
     return plane
 
 
 def _material(name: str, image: bpy.types.Image) -> bpy.types.Material:
     """A picture that shines by itself, seen from both sides, in colours that no light changes."""
-    material = blank_material(name)
+    material = compat.blank_material(name)
     tree, shown = material.node_tree, {"image": image, "interpolation": "Closest", "extension": "EXTEND"}
-    texture = add_node(tree, "ShaderNodeTexImage", (0.0, 0.0), name="Slice", **shown)
-    emission = add_node(tree, "ShaderNodeEmission", (300.0, 0.0), {"Color": texture.outputs["Color"]})
-    nothing = add_node(tree, "ShaderNodeBsdfTransparent", (300.0, -150.0))
+    texture = compat.add_node(tree, "ShaderNodeTexImage", (0.0, 0.0), name="Slice", **shown)
+    emission = compat.add_node(tree, "ShaderNodeEmission", (300.0, 0.0), {"Color": texture.outputs["Color"]})
+    nothing = compat.add_node(tree, "ShaderNodeBsdfTransparent", (300.0, -150.0))
     mixed = {0: texture.outputs["Alpha"], 1: nothing.outputs[0], 2: emission.outputs[0]}
-    mix = add_node(tree, "ShaderNodeMixShader", (500.0, 0.0), mixed)
-    add_node(tree, "ShaderNodeOutputMaterial", (700.0, 0.0), {"Surface": mix.outputs[0]})
+    mix = compat.add_node(tree, "ShaderNodeMixShader", (500.0, 0.0), mixed)
+    compat.add_node(tree, "ShaderNodeOutputMaterial", (700.0, 0.0), {"Surface": mix.outputs[0]})
     return material
 
 

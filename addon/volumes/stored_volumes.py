@@ -13,8 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from ...core import Grid, InputError, Volume
 from ...core.geometry.frames import affine_matrix, checked_affine
 from ..blender import compat, ids
-from . import volume_materials
-from .vdb import BACKGROUND, write_vdb
+from . import vdb, volume_materials
 
 MAX_SHOWN_VOXELS = 256**3
 """More voxels than this that are not empty are shown as a coarser copy: Blender's window would hang on them."""
@@ -80,7 +79,7 @@ def write_states(states: Sequence[Volume], folder: Path, provenance: dict[str, A
         paths = [folder / f"{stem}{f'_{k:04d}' if len(states) > 1 else ''}.vdb" for k in range(1, len(states) + 1)]
         for state, path in zip(states, paths, strict=True):
             if not path.exists():
-                write_vdb(state, path, provenance, smoke_above=smoke_above, center_shift=compat.VDB_CENTER_SHIFT)
+                vdb.write_vdb(state, path, provenance, smoke_above=smoke_above, center_shift=compat.VDB_CENTER_SHIFT)
         return paths[0]
 
     if shown[0] is states[0]:
@@ -106,7 +105,7 @@ def coarser(volume: Volume) -> Volume:
 
 def _empty(volume: Volume) -> float:
     """The value of voxels that are not drawn."""
-    return BACKGROUND.get(volume.quantity, 0.0)
+    return vdb.BACKGROUND.get(volume.quantity, 0.0)
 
 
 def _extent(volume: Volume) -> float:

@@ -6,13 +6,11 @@ from typing import Any
 
 import bpy
 
-from ...core import Volume, centered, hu_to_mu
-from ...core.memory import require
+from ...core import Volume, centered, hu_to_mu, memory
 from ...core.progress import Progress, part_of
 from ...core.volumes.volume_files import READ_FORMATS, read_volume
 from ..blender import jobs, storage
-from . import vdb, volumes
-from .stored_volumes import StoredVolume
+from . import stored_volumes, vdb, volumes
 
 READ_ENDINGS = (*READ_FORMATS, ".vdb")
 """Endings of the names of files that can be read as volumes."""
@@ -58,7 +56,7 @@ def importing(
                 states.append(read_volume(path, quantity, progress=part_of(progress, k, count)))
             if k == 0 and count > 1:
                 shape = " x ".join(map(str, states[0].grid.shape))
-                require(4.0 * (count - 1) * states[0].grid.n_voxels, f"{count} volumes of {shape} voxels")
+                memory.require(4.0 * (count - 1) * states[0].grid.n_voxels, f"{count} volumes of {shape} voxels")
         provenance["read_as"] = states[0].quantity
         if energy is not None:
             states = [hu_to_mu(volume, energy) for volume in states]
@@ -69,7 +67,7 @@ def importing(
             states = [centered(volume, volume.grid.center - middle) for volume in states]
         return states
 
-    def finish(item: bpy.types.Object, stored: StoredVolume) -> str:
+    def finish(item: bpy.types.Object, stored: stored_volumes.StoredVolume) -> str:
         if item.data.is_sequence:
             item.data.frame_start = frame_start
         volume, states = stored.volume, f"{count} states of " if count > 1 else ""
@@ -96,7 +94,7 @@ def converting(item: bpy.types.Object, energy: float) -> jobs.Job:
     readers = [volumes.reader(item, path) for path in storage.files_of_states(item.data)]
     count = len(readers)
     n_x, n_y, n_z = item.mphdrr_volume.shape
-    require(8.0 * count * n_x * n_y * n_z, f"the attenuation of {count * n_x * n_y * n_z} voxels")
+    memory.require(8.0 * count * n_x * n_y * n_z, f"the attenuation of {count * n_x * n_y * n_z} voxels")
     provenance: dict[str, Any] = {"ct": item.name, "energy_keV": energy}
     frame_start, sequence_mode = item.data.frame_start, item.data.sequence_mode
 
@@ -107,7 +105,7 @@ def converting(item: bpy.types.Object, energy: float) -> jobs.Job:
             states.append(hu_to_mu(read(), energy))
         return states
 
-    def finish(made: bpy.types.Object, stored: StoredVolume) -> str:
+    def finish(made: bpy.types.Object, stored: stored_volumes.StoredVolume) -> str:
         made.data.frame_start, made.data.sequence_mode = frame_start, sequence_mode
         return f"Added {made.name!r}: {volumes.values_text(stored)} at {energy:g} keV"
 

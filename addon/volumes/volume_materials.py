@@ -8,9 +8,9 @@ from collections.abc import Sequence
 from typing import Any
 
 import bpy
-import numpy as np
 
 from ...core.volumes.volume import UNITS
+from ..blender import objects
 from ..blender.compat import add_math, add_node, blank_material
 
 # Positions and linear RGB, evenly brighter.
@@ -99,8 +99,8 @@ def new_material(name: str, quantity: str, size: float) -> bpy.types.Material:
 def set_range(material: bpy.types.Material, low: float, high: float) -> None:
     """Spread the colours from the value `low` to `high`; a material that the user made is left alone."""
     if material.node_tree and (node := material.node_tree.nodes.get(_RANGE)):
-        change(node.inputs["From Min"], default_value=low)
-        change(node.inputs["From Max"], default_value=high)
+        objects.change(node.inputs["From Min"], default_value=low)
+        objects.change(node.inputs["From Max"], default_value=high)
 
 
 def in_front(tree: bpy.types.NodeTree, place: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
@@ -120,24 +120,15 @@ def set_cut(tree: bpy.types.NodeTree, cut: Cut | None) -> None:
     for axis, (normal, limit) in enumerate(cut or [((0.0, 0.0, 0.0), _FAR)] * 3):
         along, beyond = tree.nodes.get(f"{_CUT} {axis} along"), tree.nodes.get(f"{_CUT} {axis}")
         if along is not None and beyond is not None:  # a tree of an earlier version, or of the user's, has none
-            change(along.inputs[1], default_value=normal)
-            change(beyond.inputs[1], default_value=limit)
+            objects.change(along.inputs[1], default_value=normal)
+            objects.change(beyond.inputs[1], default_value=limit)
 
 
 def set_opacity(material: bpy.types.Material, exponent: float, gain: float) -> None:
     """Make extinction follow a power of the relative values, times a gain."""
     for name, value in ((_EXPONENT, exponent), (_GAIN, gain)):
         if material.node_tree and (node := material.node_tree.nodes.get(name)):
-            change(node.inputs[1], default_value=value)
-
-
-def change(owner: Any, **values: Any) -> None:
-    """Set properties that have other values: setting one has the scene calculated and drawn again."""
-    for name, value in values.items():
-        now = getattr(owner, name)
-        same = now == value if isinstance(value, str | bool) else np.allclose(now, value, rtol=1e-6, atol=0)  # float32
-        if not same:
-            setattr(owner, name, value)
+            objects.change(node.inputs[1], default_value=value)
 
 
 def resize(material: bpy.types.Material, old: float, new: float) -> None:
@@ -151,7 +142,7 @@ def set_display(data: bpy.types.Volume, low: float, high: float, size: float, ga
     density = max(gain * _SMOKE / size / (high - low), _THINNEST)
     # Blender knows no density of 0, only very thin smoke: of that, no more than a slice at the edge.
     hidden = {"use_slice": not gain, "slice_axis": "X", "slice_depth": 0.0}
-    change(data.display, density=density, **hidden, wireframe_type="NONE", interpolation_method="LINEAR")
+    objects.change(data.display, density=density, **hidden, wireframe_type="NONE", interpolation_method="LINEAR")
 
 
 def show_in_eevee(scene: bpy.types.Scene) -> None:

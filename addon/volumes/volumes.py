@@ -14,16 +14,12 @@ import numpy as np
 from mathutils import Matrix
 from numpy.typing import ArrayLike, NDArray
 
-from ...core import InputError, Volume
+from ...core import InputError, Volume, memory
 from ...core.geometry.frames import checked_affine
-from ...core.memory import readable_size
 from ...core.progress import Progress, stages_of
-from ..blender import compat, ids, jobs, storage
-from ..blender.objects import world_matrix
-from ..blender.reports import Need
-from . import volume_materials
+from ..blender import compat, ids, jobs, objects, reports, storage
+from . import vdb, volume_materials
 from .stored_volumes import StoredVolume, moved, store_volume, write_states
-from .vdb import SMOKE, read_vdb
 
 
 def add_volume(
@@ -104,10 +100,10 @@ def replace_stored(item: bpy.types.Object, stored: StoredVolume) -> None:
     item.data = data = _volume_data(stored, item.name)
     _describe(item, stored)
     if old.users == 0:
-        name, materials = old.name, {material for material in old.materials if material}
+        name, materials = old.name, set(old.materials)
         bpy.data.volumes.remove(old)
         data.name = name
-        bpy.data.batch_remove([material for material in materials if material.users == 0])
+        objects.remove_unused(materials)
 
 
 def make_active(context: bpy.types.Context, item: bpy.types.Object) -> None:
@@ -132,7 +128,7 @@ def reader(item: bpy.types.Object, path: Path | None = None) -> Callable[[], Vol
     `path` is the file of a state (`storage.files_of_states`); default: of the one at the current frame.
     """
     path, pose = source(item, path)
-    return lambda: moved(read_vdb(path), pose)
+    return lambda: moved(vdb.read_vdb(path), pose)
 
 
 def source(item: bpy.types.Object, path: Path | None = None) -> tuple[Path, NDArray[np.float64]]:
@@ -177,7 +173,7 @@ def file_state(item: bpy.types.Object) -> str:
         return "missing"
     shown = ", coarser copy shown" if ids.PREVIEW in item.data.filepath else ""
     kept = "" if bpy.data.filepath else ", until saved"
-    return readable_size(size) + shown + kept
+    return memory.readable_size(size) + shown + kept
 
 
 def pose_of_object(item: bpy.types.Object) -> NDArray[np.float64]:
@@ -185,7 +181,7 @@ def pose_of_object(item: bpy.types.Object) -> NDArray[np.float64]:
 
     Blender keeps float32; the float64 pose that the object was given counts as long as it still rounds to Blender's.
     """
-    shown = world_matrix(item)
+    shown = objects.world_matrix(item)
     exact = item.mphdrr_volume.exact_pose
     if exact:
         pose = np.array(json.loads(exact))
@@ -211,7 +207,7 @@ def quantity_of(item: bpy.types.Object) -> str:
     return str(item.mphdrr_volume.quantity)
 
 
-ACTIVE: Need = (lambda context: is_volume(context.object), "No volume is active: select one first")
+ACTIVE: reports.Need = (lambda context: is_volume(context.object), "No volume is active: select one first")
 
 
 def volume_objects(scene: bpy.types.Scene) -> list[bpy.types.Object]:
@@ -238,7 +234,7 @@ def after_load(*_: Any) -> None:
         if settings.center_shift != compat.VDB_CENTER_SHIFT and item.data not in missing:
             settings.content = content_of(item)
             try:
-                states = [read_vdb(path) for path in storage.files_of_states(item.data)]
+                states = [vdb.read_vdb(path) for path in storage.files_of_states(item.data)]
                 item.data.filepath = storage.stored_path(write_states(states, storage.folder()))
                 settings.center_shift = compat.VDB_CENTER_SHIFT
                 settings.display_high = settings.display_high  # which draws it: its surface was elsewhere, too
@@ -279,7 +275,7 @@ def _show(data: bpy.types.Volume, stored: StoredVolume) -> None:
         data.is_sequence, data.filepath = before
         raise InputError(f"{stored.path}: {error}")
     # What the solid viewport draws.
-    data.grids.active_index = data.grids.find(SMOKE if SMOKE in data.grids else stored.volume.quantity)
+    data.grids.active_index = data.grids.find(vdb.SMOKE if vdb.SMOKE in data.grids else stored.volume.quantity)
     if len(stored.states) > 1:  # set after loading, which would look for frame 0 until the scene is evaluated
         data.is_sequence, data.frame_duration = True, len(stored.states)
 

@@ -6,7 +6,7 @@ import bpy
 import numpy as np
 import pytest
 
-from mphdrr.addon.blender import storage
+from mphdrr.addon.blender import storage, windows
 from mphdrr.addon.phantoms import live_phantoms, phantoms
 from mphdrr.addon.volumes import slices, volumes
 from mphdrr.core.errors import InputError
@@ -22,7 +22,7 @@ def item():
 @pytest.fixture
 def window(monkeypatch):
     """A window in which every phantom is too large to be made at every edit."""
-    monkeypatch.setattr(live_phantoms, "_has_window", lambda: True)
+    monkeypatch.setattr(windows, "has_window", lambda: True)
     monkeypatch.setattr(live_phantoms, "QUICK_VOXELS", 0)
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
 from unittest.mock import MagicMock
 
 import bpy
@@ -62,6 +64,22 @@ def test_a_word_finds_several_commands_in_the_3d_view(scene, word):
     draw = registration.MENUS[[menu for menu, _ in registration.MENUS].index(bpy.types.VIEW3D_MT_object)][1]
     paths = [path for each in entries(draw, "Object").values() for path in each]
     assert sum(word in path.lower() for path in paths) >= 5
+
+
+def test_every_operator_and_panel_that_the_code_names_exists():
+    top = Path(registration.__file__).parents[1]
+    texts = [
+        path.read_text(encoding="utf-8")
+        for room in ("addon", "operators", "panels")
+        for path in (top / room).rglob("*.py")
+    ]
+    named = {name for text in texts for name in re.findall(r'"mphdrr\.(\w+)"', text)} - {
+        "add_"
+    }  # and a kind of phantom
+    assert len(named) > 55
+    assert not [name for name in named if f"MPHDRR_OT_{name}" not in CLASSES]
+    others = {name for text in texts for name in re.findall(r'"(MPHDRR_(?:PT|MT|UL)_\w+)"', text)}
+    assert others and others <= CLASSES.keys()
 
 
 def test_labels_follow_from_the_names_of_classes_unless_these_say_another():

@@ -61,7 +61,7 @@ def test_what_moves_is_asked_for_anew_and_voxels_are_read_once(scanned, scene, m
     voxels = {}
     before = preview.request(bpy.context)
     preview.make(before, True, voxels)
-    monkeypatch.setattr(preview, "read_vdb", None)  # nothing is read again
+    monkeypatch.setattr(preview.vdb, "read_vdb", None)  # nothing is read again
     assert preview.request(bpy.context).same_as(before)
     edits = (
         lambda: setattr(camera.location, "x", camera.location.x + 1),

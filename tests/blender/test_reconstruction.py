@@ -11,7 +11,7 @@ import pytest
 
 import mphdrr.core as mph
 from mphdrr.addon import registration
-from mphdrr.addon.blender import ids, jobs, plots, storage
+from mphdrr.addon.blender import ids, jobs, plots, storage, windows
 from mphdrr.addon.reconstruction import reconstructions
 from mphdrr.addon.reconstruction.reconstruction_properties import PROPERTIES, drawn, settings_recipe
 from mphdrr.addon.scanner import scanner
@@ -168,7 +168,7 @@ def job_of(scene) -> jobs.Job:
 def test_it_is_shown_while_it_runs_and_cancelled_without_a_trace(render, scene, monkeypatch):
     before = state()
     monkeypatch.setattr(reconstructions, "_BETWEEN", -1.0)
-    monkeypatch.setattr(reconstructions, "_is_watched", lambda: True)
+    monkeypatch.setattr(windows, "has_window", lambda: True)
     job, seen = job_of(scene), []
 
     def progress(done: int, total: int) -> None:
@@ -187,7 +187,7 @@ def test_it_is_shown_while_it_runs_and_cancelled_without_a_trace(render, scene, 
 
 def test_finish_now_keeps_what_there_is(render, scene, monkeypatch):
     monkeypatch.setattr(reconstructions, "_BETWEEN", -1.0)
-    monkeypatch.setattr(reconstructions, "_is_watched", lambda: True)
+    monkeypatch.setattr(windows, "has_window", lambda: True)
     files = set(storage.folder().iterdir())
     job = job_of(scene)
 

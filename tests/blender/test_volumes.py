@@ -10,7 +10,7 @@ import pytest
 from mathutils import Matrix
 
 from mphdrr.addon.blender import compat, storage
-from mphdrr.addon.volumes import looks, stored_volumes, volume_materials, volumes
+from mphdrr.addon.volumes import looks, stored_volumes, vdb, volume_materials, volumes
 from mphdrr.core.errors import InputError
 from mphdrr.core.geometry.frames import euler_pose
 from mphdrr.core.geometry.grid import Grid
@@ -95,7 +95,7 @@ def test_large_volume_is_shown_coarser_but_kept_whole(monkeypatch):
     item = volumes.add_volume(volume, "Large")
     assert item.data.filepath.endswith(".preview.vdb")
     assert np.array_equal(volumes.volume_from_object(item).array, array)
-    shown = volumes.read_vdb(Path(item.data.filepath))
+    shown = vdb.read_vdb(Path(item.data.filepath))
     assert shown.grid.shape == (16, 16, 17)
     np.testing.assert_allclose(shown.array.sum() * 8, array.sum(), rtol=1e-5)
     # The first block's centre is the corner between its eight voxels.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,6 +11,8 @@ import pytest
 from mphdrr.core.events import export_events
 
 torch = pytest.importorskip("torch", reason="no torch")
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
 
 
 @pytest.fixture(scope="module")
@@ -79,6 +82,29 @@ def test_pytorch_3dunet_trains_a_step_on_them(unet3d, event_set, tmp_path):
         loss.backward()
         optimizer.step()
     assert losses[-1] < losses[0]
+
+
+def test_pytorch_3dunet_trains_by_our_configuration_and_keeps_the_activity(unet3d, event_set, tmp_path):
+    """With its own trainer: `examples/learning/pytorch-3dunet.yml` but for sizes and folders."""
+    import yaml
+    from pytorch3dunet.unet3d.trainer import create_trainer
+
+    export_events(event_set, tmp_path, "3dunet", models="counts", noise="own", raw="backprojection")
+    config = yaml.safe_load((EXAMPLES / "learning/pytorch-3dunet.yml").read_text())
+    config["device"] = "cpu"
+    config["model"]["f_maps"] = [4, 8]
+    config["trainer"] |= {"checkpoint_dir": str(tmp_path / "training"), "max_num_iterations": 4, "validate_after_iters": 2}
+    shape = list(event_set[0].truth.array.shape[::-1])
+    for name, folder in (("train", "train"), ("val", "test")):
+        part = config["loaders"][name]
+        part["file_paths"] = [str(tmp_path / folder)]
+        part["slice_builder"] |= {"patch_shape": shape, "stride_shape": shape}
+    loaders = unet3d.get_train_loaders(config)
+    most = config["loaders"]["train"]["transformer"]["label"][0]["max_value"]
+    truths = {round(float(event.truth.array.max()), 3) for event in event_set.split("train")}
+    assert {round(float(label.max()) * most, 3) for _, label in loaders["train"]} == truths
+    create_trainer(config).fit()
+    assert (tmp_path / "training/last_checkpoint.pytorch").exists()
 
 
 def test_webdataset_loads_shards(wds, event_set, tmp_path):

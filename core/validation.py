@@ -25,8 +25,11 @@ def real_array(
     raw = real_numbers(value, name)
     if raw.size > _MANY:
         require(raw.size * np.dtype(dtype).itemsize, f"{name} of {shape_text(raw.shape)} numbers")
-    with np.errstate(over="ignore"):  # what overflows is refused below
-        array = np.array(raw, dtype=dtype, order="C")
+    if raw.dtype == dtype:
+        array = np.array(raw, order="C")
+    else:
+        with np.errstate(over="ignore"):  # what overflows is refused below
+            array = np.array(raw, dtype=dtype, order="C")
     if shape is not None and batch:
         shape = batch_shape(shape, array.shape)
     if shape is not None and (
@@ -80,18 +83,20 @@ def batch_shape(shape: tuple[Any, ...], given: tuple[int, ...]) -> tuple[Any, ..
 
 def require_finite(array: NDArray[Any], name: str, given: NDArray[Any] | None = None) -> None:
     """Raise `InputError` naming the first index at which `array` is not finite; it was made of the numbers `given`."""
-    # A finite sum proves that all numbers are, in one pass without a mask. The sum of finite numbers may still
-    # overflow.
-    with np.errstate(over="ignore", invalid="ignore"):
-        if np.isfinite(array.sum()):
-            return
-    bad = np.argwhere(~np.isfinite(array))
-    if len(bad):
-        index = tuple(int(i) for i in bad[0])
-        where = f" at index {index if len(index) != 1 else index[0]}" if index else ""
-        value = (array if given is None else given)[index]
-        as_kept = f" in {array.dtype}" if np.isfinite(value) else ""
-        raise InputError(f"{name}: {value} is not a finite number{as_kept}{where}")
+    if array.size > _MANY:
+        # A finite sum proves that all numbers are, in one pass without a mask. The sum of finite numbers may still
+        # overflow.
+        with np.errstate(over="ignore", invalid="ignore"):
+            if np.isfinite(array.sum()):
+                return
+    finite = np.isfinite(array)
+    if finite.all():
+        return
+    index = tuple(int(i) for i in np.argwhere(~finite)[0])
+    where = f" at index {index if len(index) != 1 else index[0]}" if index else ""
+    value = (array if given is None else given)[index]
+    as_kept = f" in {array.dtype}" if np.isfinite(value) else ""
+    raise InputError(f"{name}: {value} is not a finite number{as_kept}{where}")
 
 
 def instance(value: object, kind: type, name: str) -> None:

@@ -16,7 +16,7 @@ from ..blender import choices
 from ..blender.setting_properties import drawn_of, properties_of, values_of
 from ..volumes import volumes
 
-_BY_COMMAND_LINE = ("anatomy", "stop_change", "stop_noise", "stop_region", "stop_seconds")
+_BY_COMMAND_LINE = ("anatomy", "allow", "stop_change", "stop_noise", "stop_region", "stop_seconds")
 """Settings that the panel does not have: of files, and of ends that Finish Now is for."""
 
 PROPERTIES = {

@@ -68,7 +68,7 @@ class Trained(pl.LightningModule):
         self.spent, self._begun = 0.0, time.monotonic()
 
     def training_step(self, batch: Sample) -> Tensor:
-        """The loss of a batch. Random numbers depend on the step alone: a training that was stopped goes on with the same."""
+        """The loss of a batch. Random numbers depend on the step alone, so that a stopped training goes on with the same."""
         torch.manual_seed(_mixed(self.recipe["training.seed"], self.global_step))
         estimates = self.network(self.told(), batch)
         self._losses.append(nrmse(estimates[-1].detach()[:, 0].float(), batch.truth))

@@ -17,6 +17,8 @@ _PUBLIC = {
     "with_judgement": "model_file",
     "read_recipe": "recipe",
     "train": "training",
+    "read_judge_recipe": "judging.recipe",
+    "judge": "judging.judge",
 }
 
 

@@ -1,11 +1,12 @@
-"""``mphdrr learn new|train``: networks that reconstruct, trained on event sets."""
+"""``mphdrr learn new|train|judge``: networks that reconstruct, trained on event sets, judged on others."""
 
 import argparse
-from pathlib import Path
 
 from .. import learning
 from ..errors import InputError
 from ..files import replacing
+from ..learning.judging.judge import judge
+from ..learning.judging.recipe import read_judge_recipe
 from ..learning.networks import NETWORKS
 from ..learning.recipe import template_text
 from ..progress import Progress
@@ -29,6 +30,13 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     train.add_argument("-o", "--output", metavar="MODEL", required=True, help=text)
     train.add_argument("--workers", type=int, default=1, metavar="N", help="processes that prepare samples")
     train.add_argument("--quiet", action="store_true", help="say nothing on standard error but warnings")
+    judge = add_run(actions, "judge", _judge)
+    judge.add_argument("recipe", metavar="RECIPE", help="recipe of the judge (.toml): tests, baselines and models")
+    text = "for the table, the picture and the scores that are kept"
+    judge.add_argument("-o", "--output", metavar="FOLDER", required=True, help=text)
+    text = "also write its rows of the table into each model's file"
+    judge.add_argument("--into-models", action="store_true", help=text)
+    judge.add_argument("--quiet", action="store_true", help="say nothing on standard error but warnings")
 
 
 def _new(arguments: argparse.Namespace) -> None:
@@ -64,6 +72,21 @@ def _train(arguments: argparse.Namespace) -> None:
         raise
     last = model.contents.curve[-1]
     print(f"{path}: {model.label}, {last['step']} steps, NRMSE {last['validation']:.3f} of the validation")
+
+
+def _judge(arguments: argparse.Namespace) -> None:
+    """Judge models beside tuned baselines: one table and one picture; the same command goes on with what was interrupted.
+
+    mphdrr learn judge judge.toml -o judgement
+    """
+    recipe = read_judge_recipe(arguments.recipe)
+    models = {name: learning.read_model(path) for name, path in recipe.models.items()}
+    methods = [model.judged(name) for name, model in models.items()]
+    found = judge(recipe, arguments.output, methods, _stage("judging", arguments.quiet))
+    for name, model in models.items() if arguments.into_models else ():
+        rows = [row for row in found.rows if row["method"] == name]
+        learning.with_judgement(model.path, {**found.record, "rows": rows})
+    print(f"{arguments.output}: {len(found.rows)} rows in judgement.md, .json and .png")
 
 
 def _stage(words: str, is_quiet: bool) -> Progress | None:

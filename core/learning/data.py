@@ -202,7 +202,7 @@ def prepared(
     folder = ensure_folder(beside / f"samples-{source.fingerprint[:16]}")
     remove_leftovers(folder)
     there = {path.name for path in folder.glob("*.npy")}
-    missing = [draw for draw in sum(draws, []) if _path(folder, draw).name not in there]
+    missing = [draw for each in draws for draw in each if _path(folder, draw).name not in there]
     _check_disk(folder, len(missing) * source.kind.itemsize)
     several = {} if workers == 1 else {"num_workers": workers, "multiprocessing_context": "spawn"}
     making = DataLoader(_Making(source, folder, missing), batch_size=None, **several)

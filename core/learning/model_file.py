@@ -1,13 +1,14 @@
 """Model files (.pt): a network's weights, and what it was trained on, for and how well; reading one runs none of it.
 
-The file is one of `torch.save`, so a zip, whose comment holds the SHA-256 of all bytes before the digest. Of what is in it only
-tensors, texts and numbers are read.
+The file is one of `torch.save`, so a zip, whose comment holds the SHA-256 of all bytes before the digest. Only tensors,
+texts and numbers in it are read.
 """
 
 import hashlib
 import io
 import json
 import os
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -18,7 +19,7 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike
 
-from ..errors import InputError, naming, reading, warn
+from ..errors import InputError, InputWarning, naming, reading, warn
 from ..files import read_bytes, require_ending, write_bytes
 from ..geometry.grid import Grid
 from ..progress import Progress, tell
@@ -30,6 +31,7 @@ from ..runs.reconstructing import reconstruct_run
 from ..runs.run import ProjectionRun, versions
 from ..validation import one_of
 from ..volumes.volume import Volume
+from .judging.methods import JudgedMethod
 from .networks import NETWORKS
 from .recipe import TrainingRecipe, parsed
 from .setup import Setup
@@ -42,6 +44,8 @@ ALLOWED = ("scanner", "grid", "physics")
 """What may be allowed to differ from what a network was trained for."""
 _NO_PHYSICS = ("time", "background")
 """Entries of a model's record that may differ: a network is given counts and background of each scan."""
+_KEPT = 4
+"""Setups that a network keeps."""
 _FAR = 2.0  # times fewer or more counts than any that it was trained on
 
 
@@ -56,7 +60,9 @@ class Contents:
     affine: Sequence[Sequence[float]]
     physics: str  # `Setup.physics`
     counts: Sequence[float]  # fewest and most of a scan that it was trained on
-    trained_on: Mapping[str, Any]  # hashes of events and samples, their model, levels and number
+    trained_on: Mapping[
+        str, Any
+    ]  # events by their recipes' hashes; name of the set, hash, model, levels, number of samples
     curve: Sequence[Mapping[str, float]]
     judgement: Mapping[str, Any] | None = None
     versions: Mapping[str, str] = field(default_factory=versions)
@@ -187,15 +193,38 @@ class TrainedNetwork:
         text = NETWORKS[self.recipe["network.kind"]].text
         return Method(self.label, text, self.reconstruct, objective="", grid=self.contents.grid)
 
+    @cached_property
+    def fingerprint(self) -> str:
+        """SHA-256 of all that its volumes depend on: another one than that of its file once that holds a judge's table."""
+        told = hashlib.sha256(repr((self.contents.recipe, self.contents.scanner, self.contents.physics)).encode())
+        for name, values in sorted(self.contents.weights.items()):
+            told.update(name.encode() + values.numpy().tobytes())
+        return told.hexdigest()
+
+    def judged(self, name: str) -> JudgedMethod:
+        """It under a name in the judge's table; scanners and physics that it was not trained for are judged, too."""
+
+        def volume(run: ProjectionRun) -> Volume:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", InputWarning)
+                return self(run, ("scanner", "physics"))
+
+        return JudgedMethod(name, volume, self.fingerprint, self.contents.trained_on["events"])
+
     def setup(self, A: Projector) -> Setup:
-        """What it is told of a scanner, kept for the next scans by the same operator."""
-        known = vars(self).get("_known")
-        if known is None or known[0] is not A:
-            recipe = self.recipe
-            made = Setup(A, recipe["osem.subsets"], recipe["osem.after"], recipe["network.permuted"])
-            known = vars(self)["_known"] = A, made
-        found: Setup = known[1]
-        return found
+        """What it is told of a scanner, kept for the next scans by it."""
+        recipe = self.recipe
+        made = Setup(A, recipe["osem.subsets"], recipe["osem.after"], recipe["network.permuted"])
+        if getattr(A.model, "mu", None) is not None:  # of which the record has the grid alone
+            return made
+        key = made.scanner, made.physics, A.grid.shape, A.grid.affine.tobytes()
+        if key not in self._setups and len(self._setups) >= _KEPT:
+            self._setups.clear()
+        return self._setups.setdefault(key, made)
+
+    @cached_property
+    def _setups(self) -> dict[Any, Setup]:
+        return {}
 
     def reconstruct(
         self,
@@ -256,8 +285,8 @@ class TrainedNetwork:
 
 def read_model(path: str | os.PathLike[str]) -> TrainedNetwork:
     """The network of a model file; `InputError`, in one line, where the file is damaged or holds anything but data."""
-    path = Path(path)
-    return TrainedNetwork(path, *reversed(_read(path)))
+    contents, digest = _read(Path(path))
+    return TrainedNetwork(Path(path), digest, contents)
 
 
 def with_judgement(path: str | os.PathLike[str], judgement: Mapping[str, Any]) -> TrainedNetwork:

@@ -31,6 +31,7 @@ from ..errors import InputError, reading
 from ..files import ensure_folder, read_text, write_bytes
 from ..progress import Progress, Stages
 from .data import Samples, Source, counts_of, prepared
+from .judging.sets import events_by_recipe, set_fingerprint
 from .model_file import Contents, TrainedNetwork, read_model, write_model
 from .networks import NETWORKS
 from .recipe import TrainingRecipe
@@ -158,7 +159,7 @@ class _Watch(Callback):
         if self.progress is not None and trainer.is_global_zero:
             self.progress(trainer.global_step, self.steps)
 
-    def on_train_epoch_end(self, trainer: pl.Trainer, pl_module: Any) -> None:
+    def on_save_checkpoint(self, trainer: pl.Trainer, pl_module: Any, checkpoint: dict[str, Any]) -> None:
         """One round is done."""
         if trainer.is_global_zero:
             write_bytes(self.folder / "curve.json", json.dumps(pl_module.curve, indent=1).encode())
@@ -355,9 +356,10 @@ def _contents(recipe: TrainingRecipe, source: Source, samples: Samples, last: Pa
     kept, prefix = torch.load(last, map_location="cpu", weights_only=True), "network."
     weights = {name.removeprefix(prefix): values for name, values in kept["state_dict"].items()}
     counts = counts_of(samples)
+    seen = source.events.split(recipe["data.train"]) + source.events.split(recipe["data.validation"])
     trained_on = {
-        "events": source.events.recipe.fingerprint, "samples": source.fingerprint, "model": source.model,
-        "levels": list(source.levels), "count": len(samples),
+        "events": events_by_recipe(seen), "set": set_fingerprint(seen), "samples": source.fingerprint,
+        "model": source.model, "levels": list(source.levels), "count": len(samples),
     }  # fmt: skip
     return Contents.of(
         weights, recipe, source.setup, (float(counts.min()), float(counts.max())), trained_on, kept["curve"]

@@ -262,7 +262,8 @@ class TrainedNetwork:
             "method": self.label, "network": self.recipe["network.kind"], "file": str(self.path), "sha256": self.sha256,
             "allow": list(allow), "flatters": doubts, "stopped": "iterations",
         }  # fmt: skip
-        return Reconstruction(Volume(found.float().numpy(), A.grid), np.zeros(0), known)
+        note = ". ".join([f"Reconstructed by a {self.label[0].lower()}{self.label[1:]}, sha256 {self.sha256}", *doubts])
+        return Reconstruction(Volume(found.float().numpy(), A.grid, note=note), np.zeros(0), known)
 
     def _allowed(self, setup: Setup, allow: Sequence[str]) -> list[str]:
         """Words on what differs and is allowed; `InputError` where it is not."""

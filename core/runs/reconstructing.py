@@ -114,7 +114,7 @@ def reconstruct_run(
     found = method.function(A, line_integrals(run, recipe), **given)
     volume = found.volume
     if run.volume is not None:  # a radiograph's is not of activity
-        volume = Volume(volume.array, grid, run.volume.quantity)
+        volume = Volume(volume.array, grid, run.volume.quantity, volume.note)
     flatters = [*found.settings.get("flatters", ()), *flatters]
     return replace(found, volume=volume, settings={**found.settings, "recipe": recipe.tables(), "flatters": flatters})
 

@@ -13,6 +13,7 @@ import zipfile
 from dataclasses import replace
 from pathlib import Path
 
+import nibabel
 import numpy as np
 import pytest
 
@@ -210,6 +211,9 @@ def test_the_command_line_reconstructs_with_a_model_and_says_so(folder, model, r
     assert "Network model.pt (Toy), 8 x 8 x 8 voxels, largest " in out.out
     assert "Network model.pt (Toy) of " in (tmp_path / "p.svg").read_text(encoding="utf-8")
     np.testing.assert_allclose(mph.read_volume(tmp_path / "v.nii.gz").array, model(run).array, rtol=1e-6)
+    said = f"Reconstructed by a network model.pt (Toy), sha256 {model.sha256}"
+    assert nibabel.load(tmp_path / "v.nii.gz").header.extensions[0].text == said
+    assert model(run).note == said
     kept = mph.read_reconstruction(tmp_path / "s.h5").settings
     assert kept["sha256"] == model.sha256 and kept["network"] == "toy" and kept["allow"] == []
     assert kept["method"] == "Network model.pt (Toy)"

@@ -91,7 +91,7 @@ class _Judging:
     def judgement(self) -> Judgement:
         """Do all that is not done yet."""
         rows: list[Row] = []
-        pictures = []
+        pictures: list[tuple[str, list[tuple[str, Volume]]]] = []
         for tested in self.tests:
             for level in tested.test["levels"]:
                 rows += self._rows(tested, level)

@@ -48,7 +48,7 @@ _ROWS = by_key((
     Setting("baselines.fwhm", float, (0.0, 2.4, 3.6, 4.8, 6.5, 8.0, 10.0), "Widths of the filter after it to choose from",
             unit="mm", least=0, sizes=()),
     Setting("baselines.iterations", int, 15, "Of BSREM", least=1),
-    Setting("baselines.weights", float, (0.003, 0.01, 0.03, 0.1, 0.3, 1.0), "Of BSREM's prior to choose from; it has "
+    Setting("baselines.weights", float, (0.0003, 0.001, 0.003, 0.01, 0.03, 0.1), "Of BSREM's prior to choose from; it has "
             "relative differences", above=0, sizes=()),
     Setting("baselines.families", str, ("osem", "bsrem"), "Which there are", words=named(("osem", "bsrem")), sizes=()),
     Setting("judge.seed", int, 0, "Of the bootstrap", least=0),

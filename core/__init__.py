@@ -37,6 +37,7 @@ from .phantoms.defrise import DefrisePhantom
 from .phantoms.derenzo import DerenzoPhantom, DerenzoRods
 from .phantoms.jaszczak import JaszczakPhantom
 from .phantoms.language import read_phantom, write_phantom
+from .phantoms.mixture import MixturePhantom
 from .phantoms.nema import NemaBody
 from .phantoms.phantom import Phantom, PhantomMesh, ShapePhantom
 from .phantoms.points import PointGrid

@@ -58,14 +58,17 @@ class MixturePhantom(Phantom):
         kind = ("ellipsoid", "cylinder", "box")[rng.integers(3)]
         activity = rng.uniform(self.activity_from, self.activity_to)
         direction, share = rng.normal(size=3), rng.random() ** (1 / 3)
-        euler = rng.uniform(0, 2 * np.pi), np.arccos(rng.uniform(-1, 1)), rng.uniform(0, 2 * np.pi)
+        degrees = rng.uniform(0, 360), math.degrees(math.acos(rng.uniform(-1, 1))), rng.uniform(0, 360)
         is_cold = rng.random() < _COLD
         reach = radii[0] if self.look == "lumps" else float(np.linalg.norm(radii))
         place = direction / np.linalg.norm(direction) * share * max(0.0, self.radius - reach)
         common: dict[str, Any] = {"position": place, "mu": self.mu}
         if self.look == "lumps":
             return Ellipsoid(radii=[radii[0]] * 3, activity=activity, mode="add", **common)
-        common |= {"euler": euler, "activity": 0.0 if is_cold else activity}
+        common |= {
+            "euler": tuple(map(math.radians, degrees)),  # which text in degrees gives back
+            "activity": 0.0 if is_cold else activity,
+        }
         if kind == "ellipsoid":
             return Ellipsoid(radii=radii, **common)
         if kind == "cylinder":

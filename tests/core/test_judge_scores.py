@@ -46,3 +46,15 @@ def test_rods_of_the_truth_have_all_of_their_contrast_and_empty_places_none():
     water = mph.DerenzoPhantom(36.0, (11.0, 0, 0, 0, 0, 0), 30.0, activity=20.0, cylinder_radius=40.0, background=20.0)
     empty = water.voxelize(truth.grid, pose)
     np.testing.assert_allclose(rod_contrasts(empty, phantom, pose, phantom.rods()), 0, atol=0.01)
+
+
+@pytest.mark.parametrize("look", ["solids", "lumps"])
+def test_mixtures_follow_from_their_seed_and_stay_in_their_ball(look):
+    grid = mph.Grid.centered((24, 24, 24), 5.0)
+    one, again, other = (
+        mph.MixturePhantom(seed=seed, number=30, radius=40, look=look).voxelize(grid).array for seed in (1, 1, 2)
+    )
+    np.testing.assert_array_equal(one, again)
+    assert not np.array_equal(one, other)
+    distance = np.linalg.norm(np.moveaxis(np.indices(grid.shape), 0, -1) * 5.0 + grid.affine[:3, 3], axis=-1)
+    assert one.any() and not one[distance > 40 + 5].any()

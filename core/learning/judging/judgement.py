@@ -7,6 +7,9 @@ from typing import Any
 
 from ...volumes.volume import Volume
 
+BASELINE, ORACLE, METHOD = "baseline", "tuned on the set", "method"
+"""Kinds of rows."""
+
 
 @dataclass(frozen=True, eq=False)
 class Judgement:

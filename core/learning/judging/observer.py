@@ -1,4 +1,4 @@
-"""The channelised Hotelling observer: how well the best linear observer of a few channels tells two kinds of images apart."""
+"""The channelised Hotelling observer: how well the best linear observer of a few channels sees a signal."""
 
 from __future__ import annotations
 

@@ -6,6 +6,7 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -18,18 +19,15 @@ from ...geometry.grid import Grid
 from ...runs.recipe import Values
 from ...runs.settings import Setting, named
 from ...toml import read_toml
-from .methods import Bsrem, Family, Osem
+from .methods import Family
 
 VERSION = 1
 
-_EVENTS = (
+_TEST = by_key((
     Setting("events", str, None, "Folder of the set", is_path=True),
     Setting("split", str, None, "Its split that counts", "all events"),
     Setting("model", str, "emission", "Which of its images"),
     Setting("count", int, None, "How many events, the first ones", "all", least=1),
-)
-_TEST = by_key((
-    *_EVENTS,
     Setting("name", str, None, "What the table calls it"),
     Setting("scoring", str, "volumes", "What is scored besides the voxels",
             words=named(("volumes", "rods", "pairs", "defect"))),
@@ -42,7 +40,6 @@ _TEST = by_key((
     Setting("channel_width", float, 30.0, "Of the observer's channels", unit="mm", above=0),
 ))  # fmt: skip
 _ROWS = by_key((
-    *(Setting(**{**vars(row), "key": f"validation.{row.key}"}) for row in _EVENTS),
     like("grid.voxels", "phantom.voxels"),
     like("grid.spacing", "phantom.spacing"),
     like("grid.center", "phantom.position", text="Middle of the volumes, x y z"),
@@ -51,12 +48,12 @@ _ROWS = by_key((
     Setting("baselines.fwhm", float, (0.0, 2.4, 3.6, 4.8, 6.5, 8.0, 10.0), "Widths of the filter after it to choose from",
             unit="mm", least=0, sizes=()),
     Setting("baselines.iterations", int, 15, "Of BSREM", least=1),
-    Setting("baselines.weights", float, (0.003, 0.01, 0.03, 0.1, 0.3, 1.0), "Of BSREM's prior to choose from; it has "
+    Setting("baselines.weights", float, (0.0003, 0.001, 0.003, 0.01, 0.03, 0.1), "Of BSREM's prior to choose from; it has "
             "relative differences", above=0, sizes=()),
-    Setting("baselines.families", str, ("osem", "bsrem"), "Which there are", sizes=()),
+    Setting("baselines.families", str, ("osem", "bsrem"), "Which there are", words=named(("osem", "bsrem")), sizes=()),
     Setting("judge.seed", int, 0, "Of the bootstrap", least=0),
 ))  # fmt: skip
-_TABLES = ("grid", "validation", "baselines", "judge")
+_TABLES = ("grid", "baselines", "judge")
 
 
 class _Settings(Values):
@@ -86,13 +83,13 @@ class JudgeRecipe:
     folder: Path = Path()
 
     def __post_init__(self) -> None:
-        known = ("version", "tests", "models", *_TABLES)
+        known = ("version", "tests", "models", "validation", *_TABLES)
         if self.values.get("version") != VERSION:
             raise InputError(f"version: expected {VERSION}, got {self.values.get('version')!r}")
         for key in self.values:
             if key not in known:
                 raise InputError(f"{key}: no such entry; expected {', '.join(known)}")
-        _ = self.settings, self.grid, self.tests, self.models, self.families
+        _ = self.settings, self.grid, self.tests, self.validation, self.models, self.families
 
     def __getitem__(self, key: str) -> Any:
         """The value of a setting, such as "baselines.subsets", or its default."""
@@ -116,16 +113,16 @@ class JudgeRecipe:
         entries = self.values.get("tests")
         if not isinstance(entries, list) or not entries or not all(isinstance(entry, dict) for entry in entries):
             raise InputError("tests: expected one [[tests]] or more")
-        found = []
-        for number, entry in enumerate(entries, 1):
-            with naming(f"tests: {entry.get('name', number)}"):
-                found.append(Test(flat(entry, _TEST)))
-                plain_name(found[-1]["name"], "name")
-                required(found[-1]["events"], "events", "name the folder of the set")
-        names = [test["name"] for test in found]
+        found = [self._test(entry, f"tests: {entry.get('name', number)}") for number, entry in enumerate(entries, 1)]
+        names = [plain_name(test["name"], "tests: name") for test in found]
         if len(set(names)) < len(names):
             raise InputError(f"tests: expected different names, got {', '.join(names)}")
         return found
+
+    @cached_property
+    def validation(self) -> Test:
+        """The events that baselines are tuned on."""
+        return self._test({"name": "validation", **table(self.values, "validation")}, "validation")
 
     @cached_property
     def models(self) -> dict[str, Path]:
@@ -139,35 +136,25 @@ class JudgeRecipe:
     @cached_property
     def families(self) -> list[Family]:
         """The baselines of which one each is chosen on the validation data."""
-        subsets = self["baselines.subsets"]
-        known: dict[str, Family] = {
-            "osem": Osem(self.grid, subsets, tuple(sorted(self["baselines.stops"])), self["baselines.fwhm"]),
-            "bsrem": Bsrem(self.grid, subsets, self["baselines.iterations"], self["baselines.weights"]),
-        }
-        if unknown := set(self["baselines.families"]) - set(known):
-            raise InputError(f"baselines.families: expected {', '.join(known)}, got {', '.join(sorted(unknown))}")
-        return [known[name] for name in self["baselines.families"]]
-
-    @cached_property
-    def validation(self) -> EventSet:
-        """The events that baselines are tuned on."""
-        return self._events(self.settings, "validation.")
+        stops, widths, weights = (self[f"baselines.{name}"] for name in ("stops", "fwhm", "weights"))
+        known = {"osem": (max(stops), tuple(product(stops, widths))),
+                 "bsrem": (self["baselines.iterations"], tuple((weight,) for weight in weights))}  # fmt: skip
+        names, subsets = self["baselines.families"], self["baselines.subsets"]
+        return [Family(name, self.grid, known[name][0], subsets, known[name][1]) for name in names]
 
     def events(self, test: Test) -> EventSet:
-        """The events of a test."""
-        return self._events(test, "")
-
-    def path(self, name: str) -> Path:
-        """Where a file that the recipe names is."""
-        return self.folder / name
-
-    def _events(self, values: Values, before: str) -> EventSet:
-        folder = required(values[f"{before}events"], f"{before}events", "name the folder of the set")
-        events, split = EventSet(self.path(folder)), values[f"{before}split"]
+        """The events of a test, or of the validation data."""
+        events, split = EventSet(self.folder / test["events"]), test["split"]
         events = events if split is None else events.split(split)
         if not len(events):
-            raise InputError(f"{before}events: {self.path(folder)} holds no events")
-        return events[: values[f"{before}count"]]
+            raise InputError(f"events: {self.folder / test['events']} holds none")
+        return events[: test["count"]]
+
+    def _test(self, entry: dict[str, Any], name: str) -> Test:
+        with naming(name):
+            found = Test(flat(entry, _TEST))
+            required(found["events"], "events", "name the folder of the set")
+            return found
 
 
 def read_judge_recipe(path: str | os.PathLike[str]) -> JudgeRecipe:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -36,10 +35,6 @@ class Records:
         """Keep scores: on return they are on the disk."""
         self._rows[key] = {**dict(zip(_KEY, key, strict=True)), **scores}
         write_bytes(self.path, "".join(f"{json.dumps(row)}\n" for row in self._rows.values()).encode())
-
-    def rows(self, keys: Iterable[Key]) -> list[dict[str, Any]]:
-        """The scores of these."""
-        return [self._rows[key] for key in keys]
 
 
 def read_json(path: Path) -> dict[str, Any]:

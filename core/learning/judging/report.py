@@ -13,11 +13,11 @@ from ...figures.parts import FAINT, INK, Axes, heading, number
 from ...files import write_bytes
 from ...runs.display import Display
 from ...volumes.volume import Volume
-from .judgement import Judgement
+from .judgement import BASELINE, METHOD, ORACLE, Judgement
 from .records import write_json
 
 _WIDTH, _ROW, _LINE = 1800, 330, 26  # pixels: the page, a row of slices, a ratio
-_COLORS = {"baseline": FAINT, "tuned on the set": "#a06c10", "method": "#b8433a"}
+_COLORS = {BASELINE: FAINT, ORACLE: "#a06c10", METHOD: "#b8433a"}
 
 Row = dict[str, Any]
 
@@ -54,11 +54,11 @@ _COLUMNS: tuple[tuple[str, str, Callable[[Row], str]], ...] = (
     ("s", "seconds", _plain("seconds", ".2f")),
     ("MB", "megabytes", _plain("megabytes", ".0f")),
 )
-_LEGEND = """NRMSE: root mean square error by the truth's root mean square. SSIM: in three dimensions, a Gaussian window of 1.5
-voxels, 11 wide; range: the truth's. Bias, SD: over draws of noise, root mean squares by the truth's. Contrast: 1 is the
+_LEGEND = """NRMSE: root mean square error by the truth's root mean square. SSIM: in three dimensions, a Gaussian window of
+1.5 voxels, 11 wide; range: the truth's. Bias, SD: over draws of noise, root mean squares by the truth's. Contrast: 1 is the
 truth's. Rods seen, false rods: shares of sites with and without a rod where more than half of its contrast is (Wilson). AUC:
-channelised Hotelling observer, 5 Laguerre-Gauss channels, ten folds. Deviance: of the counts from the volume's images, by its
-mean for true means: 1 is right. Intervals are of 95 %; ratios are of mean NRMSE on the same events (paired bootstrap).
+channelised Hotelling observer, 5 Laguerre-Gauss channels, ten folds. Deviance: of the counts from the volume's images, by
+its mean for true means: 1 is right. Intervals are of 95 %; ratios are of mean NRMSE on the same events (paired bootstrap).
 """
 
 
@@ -75,8 +75,9 @@ def markdown(found: Judgement) -> str:
     heads = ["test", "counts", "method", *(head for head, _, _ in columns)]
     lines = [f"| {' | '.join(heads)} |", "|---" * len(heads) + "|"]
     for row in found.rows:
-        cells = [row["test"], f"{row['level']:g}", row["method"]]
-        cells += [text(row) if name in row else "" for _, name, text in columns]
+        name = row["method"] + (f", {ORACLE}" if row["kind"] == ORACLE else "")
+        cells = [row["test"], f"{row['level']:g}", name]
+        cells += [text(row) if key in row else "" for _, key, text in columns]
         lines.append(f"| {' | '.join(cells)} |")
     sets = [f"- {name}: {test['events']} events, set {test['set']}" for name, test in found.tests.items()]
     sets += [f"- {name}: methods are told {test['believed']}" for name, test in found.tests.items() if test["believed"]]
@@ -86,7 +87,7 @@ def markdown(found: Judgement) -> str:
 
 def picture(found: Judgement) -> Page:
     """Slices of truth, best baseline and methods, and the ratios of NRMSE with their intervals."""
-    ratios = [row for row in found.rows if "best_baseline" in row and row["kind"] != "baseline"]
+    ratios = [row for row in found.rows if "best_baseline" in row and row["kind"] != BASELINE]
     page = Page(_WIDTH, 120 + _ROW * len(found.pictures) + (120 + _LINE * len(ratios) if ratios else 0))
     top = heading(page, "Judgement", ["Middle slices across z; NRMSE by that of the best baseline, 95 % intervals"])
     for title, volumes in found.pictures:

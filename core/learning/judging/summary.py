@@ -37,10 +37,10 @@ def means_of(rows: Rows, drawn: Rows = ()) -> dict[str, Any]:
     if without:
         found["false_rods"] = wilson(sum(row["site"] > PRESENT for row in without), len(without))
         found["sites"] = len(without)
-    outputs = [[row["channels"] for row in rows if row.get("defect") is has] for has in (False, True)]
-    if all(outputs):
+    absent, present = ([row["channels"] for row in rows if row.get("defect") is has] for has in (False, True))
+    if absent and present:
         try:
-            observed = observe(*outputs)
+            observed = observe(absent, present)
         except InputError as error:
             found["note"] = str(error)
         else:
@@ -50,13 +50,14 @@ def means_of(rows: Rows, drawn: Rows = ()) -> dict[str, Any]:
 
 def compared(rows: Rows, others: Rows, seed: int) -> dict[str, Any]:
     """How a method does beside another on the same events, in the same order: paired bootstrap intervals."""
-    pairs = [[float(row["nrmse"]) for row in each] for each in (rows, others)]
-    found: dict[str, Any] = {"ratio": ratio_of_means(*pairs, seed=seed)}
-    flags = [
-        [float(row["site"] > PRESENT) for row in each if row.get("site_has_rod") is False] for each in (rows, others)
-    ]
-    if flags[0]:
-        found["false_rods_more"] = difference_of_means(*flags, seed=seed)
+    own, other = (np.array([row["nrmse"] for row in each]) for each in (rows, others))
+    found: dict[str, Any] = {"ratio": ratio_of_means(own, other, seed)}
+    own, other = (
+        np.array([float(row["site"] > PRESENT) for row in each if row.get("site_has_rod") is False])
+        for each in (rows, others)
+    )
+    if len(own):
+        found["false_rods_more"] = difference_of_means(own, other, seed)
     return found
 
 

@@ -41,7 +41,7 @@ _ON_THE_WAY = 0.3  # weight of estimates before the last
 _ROUNDS, _LONGEST = 20, 200  # rounds of a training, if they are not longer than so many steps
 _VALIDATED = 32  # samples at the end of each round
 _MEASURED = 0.05  # share of the time in which steps are measured
-_LEAST_MEASURED = 3  # steps
+_LEAST_MEASURED = 8  # steps
 
 
 def nrmse(estimate: Tensor, truth: Tensor) -> Tensor:
@@ -285,21 +285,21 @@ def _fitting(recipe: TrainingRecipe, network: torch.nn.Module, setup: Setup, bat
         loss_of(forward(), batch.truth).backward()
         optimizer.step()
 
-    def passed(since: float) -> float:
+    def seconds_of(work: Callable[[], object]) -> float:
+        started = time.monotonic()
+        work()
         if device.type == "cuda":
             torch.cuda.synchronize()
-        return time.monotonic() - since
+        return time.monotonic() - started
 
-    step()  # the first one makes what the others have
-    started, done = time.monotonic(), 0
-    while done < _LEAST_MEASURED or passed(begun) < _MEASURED * recipe["training.seconds"]:
-        step()
-        done += 1
-    each, started = passed(started) / done, time.monotonic()
+    times: list[float] = []
+    while len(times) < _LEAST_MEASURED or time.monotonic() - begun < _MEASURED * recipe["training.seconds"]:
+        times.append(seconds_of(step))
+    each = float(np.median(times[len(times) // 2 :]))  # the first ones make what the others have
     with torch.no_grad():
         forward()
-    validation = passed(started) * min(validated, _VALIDATED) / len(batch.truth)
-    left = recipe["training.seconds"] - passed(begun)
+        validation = seconds_of(forward) * min(validated, _VALIDATED) / len(batch.truth)
+    left = recipe["training.seconds"] - (time.monotonic() - begun)
     steps = (left - _ROUNDS * validation) / each
     return max(1, int(min(steps, left / (each + validation / _LONGEST)) if steps > _ROUNDS * _LONGEST else steps))
 

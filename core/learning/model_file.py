@@ -59,6 +59,7 @@ class Contents:
     shape: Sequence[int]  # of the grid
     affine: Sequence[Sequence[float]]
     physics: str  # `Setup.physics`
+    fixed: Mapping[str, Any]  # the network's arguments that followed from the setup
     counts: Sequence[float]  # fewest and most of a scan that it was trained on
     trained_on: Mapping[
         str, Any
@@ -79,8 +80,10 @@ class Contents:
     ) -> "Contents":
         """Those of a network that was trained with a setup."""
         grid = setup.A.grid
-        affine = grid.affine.tolist()
-        return cls(weights, recipe.text, setup.scanner, grid.shape, affine, setup.physics, counts, trained_on, curve)
+        network: Any = NETWORKS[recipe["network.kind"]].load()
+        fixed = network.fixed(setup)
+        return cls(weights, recipe.text, setup.scanner, grid.shape, grid.affine.tolist(), setup.physics, fixed, counts,
+                   trained_on, curve)  # fmt: skip
 
     @cached_property
     def grid(self) -> Grid:
@@ -177,8 +180,9 @@ class TrainedNetwork:
     @cached_property
     def network(self) -> torch.nn.Module:
         """The network itself."""
-        network: torch.nn.Module = NETWORKS[self.recipe["network.kind"]].load()(**self.recipe.network)
+        fixed = {key: tuple(v) if isinstance(v, list) else v for key, v in self.contents.fixed.items()}
         with reading(self.path, "weights of this version's network"):
+            network: torch.nn.Module = NETWORKS[self.recipe["network.kind"]].load()(**self.recipe.network, **fixed)
             network.load_state_dict(dict(self.contents.weights))
         return network.eval()
 

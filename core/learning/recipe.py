@@ -63,9 +63,14 @@ TABLES = tuple(dict.fromkeys(key.partition(".")[0] for key in _ROWS))
 
 @functools.cache
 def network_settings(kind: str) -> Mapping[str, Setting]:
-    """A network's own settings, which are the arguments of its class; `InputError` where torch or MONAI is missing."""
+    """A network's own settings: the arguments of its class, but those that follow from a setup, which only have names.
+
+    `InputError` where torch or MONAI is missing.
+    """
     found = {}
     for name, argument in inspect.signature(NETWORKS[kind].load()).parameters.items():
+        if argument.kind is argument.KEYWORD_ONLY:
+            continue
         several = isinstance(argument.default, tuple)
         one = argument.default[0] if several else argument.default
         sizes = () if several else None

@@ -219,7 +219,8 @@ def train(
 def _begun(recipe: TrainingRecipe, source: Source) -> torch.nn.Module:
     """The network with its first weights, those of another model where the recipe names one."""
     pl.seed_everything(recipe["training.seed"], verbose=False)
-    network: torch.nn.Module = NETWORKS[recipe["network.kind"]].load()(**recipe.network)
+    cls: Any = NETWORKS[recipe["network.kind"]].load()
+    network: torch.nn.Module = cls(**recipe.network, **cls.fixed(source.setup))
     if recipe["network.weights_from"] is not None:
         known, own = read_model(recipe.path("network.weights_from")).contents.weights, network.state_dict()
         taken = {name: values for name, values in known.items() if name in own and own[name].shape == values.shape}

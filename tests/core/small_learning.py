@@ -47,11 +47,17 @@ accelerator = "cpu"
 class Toy(nn.Module):
     """Corrects OSEM's last volume by a convolution."""
 
-    def __init__(self, channels: int = 2, kernels: tuple[int, ...] = (3,), leaky: bool = True) -> None:
+    def __init__(
+        self, channels: int = 2, kernels: tuple[int, ...] = (3,), leaky: bool = True, *, volumes: int = 1
+    ) -> None:
         super().__init__()
-        self.first = nn.Conv3d(2, channels, kernels[0], padding=kernels[0] // 2)
+        self.first = nn.Conv3d(volumes, channels, kernels[0], padding=kernels[0] // 2)
         self.last = nn.Conv3d(channels, 1, 3, padding=1)
         self.leaky = leaky
+
+    @classmethod
+    def fixed(cls, setup) -> dict[str, int]:
+        return {"volumes": len(setup.after)}
 
     def forward(self, setup, sample) -> list[torch.Tensor]:
         middle = nn.functional.leaky_relu(self.first(sample.osem), 0.1 if self.leaky else 0.0)

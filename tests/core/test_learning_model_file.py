@@ -274,7 +274,7 @@ print(main(["learn", "train", "r.toml", "-o", "out/m.pt"]), file=sys.stderr)
 
 def test_contents_are_all_there_is(model):
     assert {*Contents.__annotations__} == {
-        "weights", "recipe", "scanner", "shape", "affine", "physics", "counts", "trained_on", "curve", "judgement",
+        "weights", "recipe", "scanner", "shape", "affine", "physics", "fixed", "counts", "trained_on", "curve", "judgement",
         "versions",
     }  # fmt: skip
     assert method_of(str(model.path)).grid == model.contents.grid

@@ -11,7 +11,7 @@ Everything imported here is the public interface. Arguments that cannot be used 
 
 import types
 
-from . import events
+from . import events, learning
 from .errors import InputError, InputWarning
 from .exchange import read_geometry, write_geometry
 from .geometry.checks import GeometryReport, check_geometry
@@ -37,6 +37,7 @@ from .phantoms.defrise import DefrisePhantom
 from .phantoms.derenzo import DerenzoPhantom, DerenzoRods
 from .phantoms.jaszczak import JaszczakPhantom
 from .phantoms.language import read_phantom, write_phantom
+from .phantoms.mixture import MixturePhantom
 from .phantoms.nema import NemaBody
 from .phantoms.phantom import Phantom, PhantomMesh, ShapePhantom
 from .phantoms.points import PointGrid

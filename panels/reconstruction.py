@@ -8,7 +8,7 @@ from ..addon.reconstruction.reconstruction_properties import drawn
 from ..addon.runs import runs
 from .sidebar import Folded, Sidebar, draw_hint, draw_text
 
-_MAIN = ("method", "iterations", "subsets", "voxels", "spacing")
+_MAIN = ("method", "method_file", "iterations", "subsets", "voxels", "spacing")
 """Settings that the panel itself shows; the others stand under Model and Prior."""
 _PLOT = 6.0  # of a button's heights
 

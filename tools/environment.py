@@ -34,6 +34,9 @@ DIFFDRR_IMPORTS = ("einops", "fastcore", "pandas<3.1", "torchio")
 ADAPTED = ("deepinv==0.5.0", "pytomography==3.4.0", "pytorch3dunet==1.9.6", "rt-utils==1.2.7")
 ADAPTED_IMPORTS = ("fft-conv-pytorch", "natsort", "pandas", "requests", "scikit-image", "scipy", "torchvision", "tqdm")
 
+# For tests/core/test_learning_*.py: the extra "learning", which goes where torch goes.
+LEARNING = ("lightning>=2.6", "monai>=1.4", "tensorboard>=2.14")
+
 # System library that bpy loads -> the Debian package that contains it.
 LIBRARIES = {
     "libX11.so.6": "libx11-6",
@@ -161,6 +164,10 @@ def make(venv: Path, name: str, extras: set[str], torch: str | None) -> None:
         raise SystemExit("pip could not install what mphDRR needs: see its messages above")
     if wanted["torch"] and "dev" in wanted["extras"] and not add_diffdrr(venv):
         print(f"{DIFFDRR} could not be installed: going on without it, its tests are skipped", flush=True)
+    if wanted["torch"] and "dev" in wanted["extras"] and not pip(venv, "install", *LEARNING, wanted["torch"]):
+        print(
+            f"{', '.join(LEARNING)} could not be installed: going on without them, their tests are skipped", flush=True
+        )
     if wanted["torch"] and "peers" in wanted["extras"] and not add_adapted(venv, wanted["torch"]):
         print(f"{', '.join(ADAPTED)} could not be installed: going on without them", flush=True)
     source = venv / "src"  # where mypy finds the repo root by the package's name

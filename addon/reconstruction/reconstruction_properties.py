@@ -10,13 +10,14 @@ import bpy
 from bpy.props import EnumProperty, PointerProperty, StringProperty
 
 from ...core.perspective.backprojection import HOW
+from ...core.reconstruction.methods import METHOD_FILES
 from ...core.runs.recipe import Recipe, fitting_recipe
 from ...core.runs.settings import SETTINGS
 from ..blender import choices
 from ..blender.setting_properties import drawn_of, properties_of, values_of
 from ..volumes import volumes
 
-_BY_COMMAND_LINE = ("anatomy", "stop_change", "stop_noise", "stop_region", "stop_seconds")
+_BY_COMMAND_LINE = ("anatomy", "allow", "stop_change", "stop_noise", "stop_region", "stop_seconds")
 """Settings that the panel does not have: of files, and of ends that Finish Now is for."""
 
 PROPERTIES = {
@@ -41,7 +42,14 @@ class ReconstructionSettings:
     """How to reconstruct; mixed into the scene's properties (the panel) and into the operator (scripts)."""
 
 
+_FILES = ", ".join(METHOD_FILES)
 ReconstructionSettings.__annotations__ = properties_of(PROPERTIES)
+ReconstructionSettings.__annotations__["method_file"] = StringProperty(
+    name="Method File", description=f"A trained network ({_FILES}) instead of the method; it has voxels of its own",
+    subtype="FILE_PATH",
+)  # fmt: skip
+_OF_FILES = ("ignore_attenuation", "ignore_blur", "hole", "aperture_points", "pixel_points")
+"""Settings that matter to methods in files: of the model alone."""
 
 
 _PUT_TOGETHER = EnumProperty(
@@ -71,12 +79,18 @@ def settings_recipe(get: Callable[[str], Any], is_given: Callable[[str], bool]) 
     """
     values = values_of(PROPERTIES, get)
     given = [s.key for name, s in PROPERTIES.items() if is_given(name) and values[s.key] != s.default]
+    if file := get("method_file"):
+        kept = {*given, *(PROPERTIES[name].key for name in _OF_FILES)} - {"reconstruction.method"}
+        values = {key: value for key, value in values.items() if key in kept}
+        values["reconstruction.method"] = bpy.path.abspath(file)
     return fitting_recipe(values, given)
 
 
 def drawn(settings: ReconstructionProperties) -> Iterator[tuple[str, bool]]:
     """The properties that the chosen method and prior have, each with whether it has an effect."""
-    return drawn_of(PROPERTIES, settings, lambda need: True)
+    shown = {name: PROPERTIES[name] for name in _OF_FILES} if settings.method_file else PROPERTIES
+    yield from drawn_of(shown, settings, lambda need: True)
+    yield "method_file", True
 
 
 class ReconstructionProperties(ReconstructionSettings, bpy.types.PropertyGroup):

@@ -57,11 +57,10 @@ def reconstructing(context: bpy.types.Context, recipe: Recipe) -> jobs.Job:
         stages = stages_of(progress)
         stages("reading the run")
         run = read_run(path)
-        reconstruction_grid(run, recipe)  # refuses what cannot be, before the work begins
+        grid = reconstruction_grid(run, recipe, method)  # refuses what cannot be, before the work begins
         last = 0.0
 
         def shown_of(values: NDArray[Any], objective: Sequence[float], scores: Any = (), flatters: Any = ()) -> _Shown:
-            grid = reconstruction_grid(run, recipe)
             volume = Volume(values, grid, "activity" if run.volume is None else run.volume.quantity)
             record = {
                 "title": ", ".join(filter(None, (method.label, iterations_text(len(objective))))),

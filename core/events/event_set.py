@@ -17,6 +17,7 @@ from ..errors import InputError
 from ..files import AnyPath
 from ..geometry.scanner import Scanner
 from ..geometry.views import Views
+from ..physics.isotopes import isotope
 from ..physics.noise import draw_counts
 from ..runs.recipe import Recipe, recorded_recipe
 from ..runs.run import ProjectionRun
@@ -224,9 +225,10 @@ class Event:
         """The views of the parallel projections."""
         return radon_views(self._folder.recipe, count)
 
-    def run(self, model: str, noise_seed: int | None = None) -> ProjectionRun:
+    def run(self, model: str, noise_seed: int | None = None, level: float = 1.0) -> ProjectionRun:
         """The images of a model as a projection run, with truth, scanner and recipe: to show, write or reconstruct.
 
+        `level` is the share of the decays, and of the background, that are counted; the recipe's time is shortened to it.
         The recipe is left out where what attenuates is a phantom that no recipe of projections describes: with a factor of
         its activity, the mean of several gates, or a volume.
         """
@@ -234,12 +236,13 @@ class Event:
         if model not in models:
             raise InputError(f"{model!r}: no such model; there are {', '.join(models) or 'none'}")
         settings: dict[str, Any] = {"model": model, "event": self.number, "volume": self.name}
-        record = self._record(models[model])
+        recipe = models[model] if level == 1.0 else _at_level(models[model], positive(level, "level"))
+        record = self._record(recipe)
         if record is not None:
             settings["recipe"] = record.tables()
-        background, unit = recipe_model(models[model], self.system).background, self.unit(model)
+        background, unit = recipe_model(recipe, self.system).background, self.unit(model)
         return ProjectionRun(
-            self.images(model, noise_seed), self.system, self.views, self.truth, unit=unit, settings=settings,
+            self.images(model, noise_seed, level), self.system, self.views, self.truth, unit=unit, settings=settings,
             seed=noise_seed, background=background,
         )  # fmt: skip
 
@@ -274,6 +277,15 @@ class Event:
         if shape is not None and file[name].shape != shape:
             raise InputError(f"{name} of shape {file[name].shape}, the recipe says {shape}")
         return file[name]
+
+
+def _at_level(recipe: Recipe, level: float) -> Recipe:
+    """The recipe of a model whose images are a share of the counts of another's."""
+    changes = {key: level * recipe[key] for key in ("model.photons", "model.background") if recipe[key]}
+    if recipe["model.kind"] == "emission":
+        time, name = recipe["model.time"], recipe["model.isotope"]
+        changes["model.time"] = level * time if name is None else isotope(name).duration(level, time)
+    return recipe.updated(changes)
 
 
 class EventSet:

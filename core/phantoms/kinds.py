@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 from .defrise import DefrisePhantom
 from .derenzo import DerenzoPhantom
 from .jaszczak import JaszczakPhantom
+from .mixture import MixturePhantom
 from .nema import NemaBody
 from .points import PointGrid
 from .shepp_logan import SheppLogan
@@ -35,5 +36,6 @@ KINDS = (
     Kind("defrise", DefrisePhantom, "Defrise", "a Defrise phantom: hot disks", "--disks 7 --spacing-of-disks 12"),
     Kind("shepp-logan", SheppLogan, "Shepp-Logan Head", "the 3-D Shepp-Logan head", "--contrast original"),
     Kind("points", PointGrid, "Point Grid", "a grid of point sources", "--counts 3 3 3 --spacing-of-points 30 30 30"),
+    Kind("mixture", MixturePhantom, "Mixture", "random shapes, other ones for each seed", "--number 12"),
     Kind("torso", CardiacTorso, "Cardiac Torso", "a cardiac torso", "--defect-severity 0.5 --defect-angle-degrees 90"),
 )

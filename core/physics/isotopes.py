@@ -37,6 +37,11 @@ class Isotope:
         rate = math.log(2) / self.half_life
         return -math.expm1(-rate * positive(duration, "duration", "s")) / rate
 
+    def duration(self, share: float, whole: float) -> float:
+        """The time, s, from the start, in which a `share` of the decays of a `whole` duration, s, happens."""
+        rate = math.log(2) / self.half_life
+        return -math.log1p(share * math.expm1(-rate * positive(whole, "duration", "s"))) / rate
+
 
 def _read(line: str) -> Isotope:
     """A line of the table: name, half-life and its unit, then energy and photons per decay of each line."""

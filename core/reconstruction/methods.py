@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from ..errors import naming
+from ..geometry.grid import Grid
 from .bsrem import bsrem
 from .expectation import mlem, osem
 from .least_squares import cgls, sirt
@@ -52,6 +53,7 @@ class Method(Choice):
     function: Callable[..., Reconstruction]
     of_counts: bool = True  # whether it needs counts; else it takes any images
     objective: str = "log-likelihood"  # what `Reconstruction.objective` is; "" where there is none
+    grid: Grid | None = None  # the voxels that it has, where it takes no others
 
     first = 2
 

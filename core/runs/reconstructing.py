@@ -92,7 +92,7 @@ def reconstruct_run(
             f"reconstruction.method: {recipe['reconstruction.method']} needs a run of counts, not of line integrals; for "
             f"these images: {others}"
         )
-    grid = reconstruction_grid(run, recipe)
+    grid = reconstruction_grid(run, recipe, method)
     require(22.0 * grid.n_voxels, "a reconstruction of {} x {} x {} voxels".format(*grid.shape))
     rules = _rules(recipe, grid)
     for name, value in (("start", start), ("stop", rules)):
@@ -114,7 +114,8 @@ def reconstruct_run(
     found = method.function(A, line_integrals(run, recipe), **given)
     volume = found.volume
     if run.volume is not None:  # a radiograph's is not of activity
-        volume = Volume(volume.array, grid, run.volume.quantity)
+        volume = Volume(volume.array, grid, run.volume.quantity, volume.note)
+    flatters = [*found.settings.get("flatters", ()), *flatters]
     return replace(found, volume=volume, settings={**found.settings, "recipe": recipe.tables(), "flatters": flatters})
 
 
@@ -209,8 +210,11 @@ def _compare_with_record(run: ProjectionRun, recipe: Recipe, has_mu: bool) -> No
         warn(f"the run's record says of its model: {'; '.join(different)} as in the model that is given", 3)
 
 
-def reconstruction_grid(run: ProjectionRun, recipe: Recipe) -> Grid:
-    """The voxels that a recipe asks for: by default a cube around the run's ROI, of 64 voxels along each side."""
+def reconstruction_grid(run: ProjectionRun, recipe: Recipe, method: Method | None = None) -> Grid:
+    """The voxels that a recipe asks for: by default the method's, or a cube around the run's ROI, 64 along each side."""
+    is_given = any(f"reconstruction.{name}" in recipe.given for name in ("voxels", "spacing", "center"))
+    if method is not None and method.grid is not None and not is_given:
+        return method.grid
     n_x, n_y, n_z = np.broadcast_to(recipe["reconstruction.voxels"], 3).tolist()
     spacing = recipe["reconstruction.spacing"] or 2 * run.system.region_radius() / np.array([n_x, n_y, n_z])
     return Grid.centered((n_x, n_y, n_z), np.broadcast_to(spacing, 3), recipe["reconstruction.center"])

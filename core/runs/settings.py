@@ -328,6 +328,8 @@ _DECLARED = (
     Setting("reconstruction.spacing", float, None, "Voxel size, one or three", "the voxels cover the ROI", unit="mm",
             above=0, slider=10, sizes=(1, 3), label="Voxel Size (mm)"),
     Setting("reconstruction.center", float, (0.0, 0.0, 0.0), "Middle of the volume, x y z", unit="mm", sizes=(3,)),
+    Setting("reconstruction.allow", str, None, "What may differ from what a network was trained for",
+            words=named(("scanner", "grid", "physics")), sizes=(), needs=("reconstruction.method=FILE.pt",)),
     Setting("reconstruction.hole", str, "auto", "How the hole's blur is modelled: auto is by depth, where the run's "
             "model allows it and no points are given", label="Hole's Blur", needs=(_METHOD_OF_COUNTS,), words={
         "auto": ("Automatic", "By depth, where the run's model allows it and no points are given; else by rays"),

@@ -47,6 +47,8 @@ class Volume:
     array: Floats32
     grid: Grid
     quantity: str = "activity"
+    note: str = ""
+    """What who sees it should know, such as that a network made it: files that are written of it say so."""
 
     def __post_init__(self) -> None:
         instance(self.grid, Grid, "volume")

@@ -17,7 +17,7 @@ from mphdrr.addon.reconstruction.reconstruction_properties import PROPERTIES, dr
 from mphdrr.addon.scanner import scanner
 from mphdrr.addon.volumes import volumes
 from mphdrr.core.progress import Cancelled
-from mphdrr.core.reconstruction.methods import METHODS
+from mphdrr.core.reconstruction.methods import METHOD_FILES, METHODS, Method
 from mphdrr.core.runs.files import read_run
 from mphdrr.core.runs.run_recipe import truth_of_run
 from mphdrr.core.runs.settings import SETTINGS
@@ -130,10 +130,51 @@ def test_a_methods_own_settings_are_in_the_panel(render, scene):
     np.testing.assert_allclose(volumes.volume_from_object(reconstructed()).array, expected, rtol=1e-5, atol=1e-6)
 
 
+def test_a_file_can_be_the_method_and_the_result_says_so(render, scene, monkeypatch, tmp_path):
+    """A network brings its own voxels; the panel's settings of other methods do not count."""
+    grid = mph.Grid.centered((6, 7, 8), 12.0)
+
+    def read(path):
+        def even(A, images, progress=None):
+            known = {"method": "Network", "flatters": ["it was trained for another scanner"]}
+            return mph.Reconstruction(mph.Volume(np.full(A.shape_in, 2.0), A.grid), np.zeros(0), known)
+
+        return Method(f"Network {path.name} (Toy)", "The same everywhere", even, objective="", grid=grid)
+
+    monkeypatch.setitem(METHOD_FILES, ".toy", read)
+    (tmp_path / "model.toy").touch()
+    panel = scene.mphdrr_reconstruction
+    panel.method, panel.prior, panel.weight, panel.iterations, panel.voxels = "BSREM", "QUADRATIC", 0.5, 4, 10
+    panel.method_file = str(tmp_path / "model.toy")
+    assert set(dict(drawn(panel))) == {"ignore_attenuation", "ignore_blur", "hole", "aperture_points", "pixel_points",
+                                       "method_file"}  # fmt: skip
+    assert bpy.ops.mphdrr.reconstruct() == {"FINISHED"}
+    known, found = panel.known, volumes.volume_from_object(reconstructed())
+    assert known["title"] == "Network model.toy (Toy)" and known["flatters"][0] == "it was trained for another scanner"
+    assert reconstructed().name.endswith("Network model.toy (Toy)") and known["objective"] == []
+    assert found.grid.shape == grid.shape and (found.array == 2).all()
+    np.testing.assert_allclose(found.grid.affine, grid.affine, atol=1e-6)
+    with pytest.raises(RuntimeError, match="does not take it"):
+        bpy.ops.mphdrr.reconstruct(iterations=3)
+    panel.method_file = str(tmp_path / "model.txt")
+    with pytest.raises(RuntimeError, match=r"or a file \(\.pt, \.toy\)"):
+        bpy.ops.mphdrr.reconstruct()
+    panel.method_file = ""
+    assert bpy.ops.mphdrr.reconstruct(method_file="", iterations=1) == {"FINISHED"}
+    assert panel.known["title"] == "BSREM, 1 iteration"
+
+
 def test_every_setting_is_in_the_panel_or_left_to_files(scene):
     panel = scene.mphdrr_reconstruction
     all_names = {key.partition(".")[2] for key in SETTINGS if key.startswith("reconstruction.")}
-    assert all_names - set(PROPERTIES) == {"anatomy", "stop_change", "stop_noise", "stop_region", "stop_seconds"}
+    assert all_names - set(PROPERTIES) == {
+        "allow",
+        "anatomy",
+        "stop_change",
+        "stop_noise",
+        "stop_region",
+        "stop_seconds",
+    }
     recipe = settings_recipe(lambda name: getattr(panel, name), lambda name: False)
     assert all(recipe[setting.key] == setting.default for setting in PROPERTIES.values())
     assert "weight" not in dict(drawn(panel)) and "subsets" in dict(drawn(panel))

@@ -39,6 +39,7 @@ NUMPY = ["--size", "9", "9", "--backend", "numpy"]
         ("jaszczak --rod-diameters 5 6 7 8 9 0", mph.JaszczakPhantom(rod_diameters=(5, 6, 7, 8, 9, 0))),
         ("defrise --disks 3 --spacing-of-disks 30", mph.DefrisePhantom(3, spacing=30)),
         ("shepp-logan --contrast original", mph.SheppLogan(contrast="original")),
+        ("mixture --seed 4 --number 3 --look lumps", mph.MixturePhantom(seed=4, number=3, look="lumps")),
         ("points --counts 1 2 3 --spacing-of-points 9 8 7", mph.PointGrid((1, 2, 3), (9, 8, 7))),
         ("torso --phase 0.35 --defect-severity 1", mph.CardiacTorso(phase=0.35, defect_severity=1)),
         (

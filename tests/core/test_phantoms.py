@@ -45,6 +45,7 @@ KINDS = [
     mph.DefrisePhantom(),
     mph.SheppLogan(),
     mph.PointGrid((3, 2, 4), (15, 20, 25), 1.5),
+    mph.MixturePhantom(seed=3, number=6, radius=35),
     mph.CardiacTorso(phase=0.2, defect_severity=0.7, defect_width_degrees=200),
     PAINTING,
 ]

@@ -49,6 +49,23 @@ def test_every_format_gives_back_all_of_a_volume(tmp_path, rng, name):
     assert [p.name for p in tmp_path.iterdir()] == [name]
 
 
+@pytest.mark.parametrize("name", ["v.npz", "v.nrrd", "v.h5", "v.nii"])
+def test_a_files_note_says_what_the_volumes_does(tmp_path, name):
+    volume = mph.Volume(np.ones((3, 4, 5)), mph.Grid.centered((3, 4, 5), 1.0), note="Reconstructed by a network")
+    mph.write_volume(volume, tmp_path / name)
+    assert np.array_equal(mph.read_volume(tmp_path / name).array, volume.array)
+    if name == "v.npz":
+        note = str(np.load(tmp_path / name)["note"])
+    elif name == "v.nrrd":
+        note = pytest.importorskip("nrrd").read_header(str(tmp_path / name))["note"]
+    elif name == "v.h5":
+        with pytest.importorskip("h5py").File(tmp_path / name) as file:
+            note = file["array"].attrs["note"]
+    else:
+        note = pytest.importorskip("nibabel").load(tmp_path / name).header.extensions[0].text
+    assert note == volume.note
+
+
 def test_a_runs_volume_is_read_from_its_file(tmp_path, system, ct):
     run = mph.project_run(system[:1], mph.hu_to_mu(ct), shape=(4, 4), backend="numpy")
     mph.write_run(run, tmp_path / "run.h5")

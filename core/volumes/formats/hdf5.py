@@ -43,7 +43,7 @@ def write(volume: Volume, temporary: Path) -> None:
 def fill(volume: Volume, file: Any) -> None:
     """Put the volume into the root of an ``h5py.File``, open for writing."""
     array = file.create_dataset("array", data=volume.array, compression="gzip", compression_opts=1, shuffle=True)
-    array.attrs.update(quantity=volume.quantity, unit=volume.unit)
+    array.attrs.update(quantity=volume.quantity, unit=volume.unit, **({"note": volume.note} if volume.note else {}))
     file.create_dataset("affine", data=volume.grid.affine).attrs.update(
         unit="mm", description="index to world, on column vectors; an integer index is a voxel's centre"
     )

@@ -87,4 +87,6 @@ def write(volume: Volume, temporary: Path) -> None:
     image.header.set_xyzt_units("mm")
     image.header.set_intent("none", name=volume.quantity)
     image.header["descrip"] = json.dumps({"quantity": volume.quantity, "unit": volume.unit}).encode()[:79]
+    if volume.note:
+        image.header.extensions.append(nibabel.nifti1.Nifti1Extension("comment", volume.note.encode()))
     nibabel.save(image, temporary)

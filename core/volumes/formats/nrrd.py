@@ -91,6 +91,8 @@ def write(volume: Volume, temporary: Path) -> None:
         "quantity": volume.quantity,
         "unit": volume.unit,
     }
+    if volume.note:
+        header["note"] = volume.note
     nrrd.write(str(temporary), volume.array, header, compression_level=1)
 
 

@@ -27,6 +27,7 @@ def read(path: Path) -> Contents:
 def write(volume: Volume, temporary: Path) -> None:
     """Write .npz."""
     arrays = {"array": volume.array, "affine": volume.grid.affine, "quantity": volume.quantity, "unit": volume.unit}
+    arrays |= {"note": volume.note} if volume.note else {}
     temporary.write_bytes(packed(arrays))
 
 

@@ -1,0 +1,93 @@
+"""``mphdrr learn new|train|judge``: networks that reconstruct, trained on event sets, judged on others."""
+
+import argparse
+
+from .. import learning
+from ..errors import InputError
+from ..files import replacing
+from ..learning.judging.judge import judge
+from ..learning.judging.recipe import read_judge_recipe
+from ..learning.networks import NETWORKS
+from ..learning.recipe import template_text
+from ..progress import Progress
+from .options import add_command, add_run, output_path, progress_bar, say
+
+
+def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
+    """Add the command."""
+    example = "mphdrr learn new -o training.toml\nexample: mphdrr learn train training.toml -o model.pt"
+    parser = add_command(subparsers, "learn", "train networks that reconstruct", example)
+    actions = parser.add_subparsers(metavar="ACTION", required=True)
+    new = add_run(actions, "new", _new)
+    names = "\n".join(f"  {name:<13}{kind.label}: {kind.text}" for name, kind in NETWORKS.items())
+    new.epilog = f"networks:\n{names}\n{new.epilog}"
+    text = "network to begin with; see the list below"
+    new.add_argument("--like", choices=tuple(NETWORKS), default="after-osem", metavar="NAME", help=text)
+    new.add_argument("-o", "--output", metavar="FILE", help="a new file (.toml); default: standard output")
+    train = add_run(actions, "train", _train)
+    train.add_argument("recipe", metavar="RECIPE", help="recipe of the training (.toml)")
+    text = "the model file (.pt); samples and checkpoints are kept beside it"
+    train.add_argument("-o", "--output", metavar="MODEL", required=True, help=text)
+    train.add_argument("--workers", type=int, default=1, metavar="N", help="processes that prepare samples")
+    train.add_argument("--quiet", action="store_true", help="say nothing on standard error but warnings")
+    judge = add_run(actions, "judge", _judge)
+    judge.add_argument("recipe", metavar="RECIPE", help="recipe of the judge (.toml): tests, baselines and models")
+    text = "for the table, the picture and the scores that are kept"
+    judge.add_argument("-o", "--output", metavar="FOLDER", required=True, help=text)
+    text = "also write its rows of the table into each model's file"
+    judge.add_argument("--into-models", action="store_true", help=text)
+    judge.add_argument("--quiet", action="store_true", help="say nothing on standard error but warnings")
+
+
+def _new(arguments: argparse.Namespace) -> None:
+    """Write a commented recipe of a training to begin with.
+
+    mphdrr learn new --like unrolled -o training.toml
+    """
+    text = template_text(arguments.like)
+    if arguments.output is None:
+        print(text, end="")
+        return
+    path = output_path(arguments.output, (".toml",))
+    if path.exists():  # recipes are edited by hand
+        raise InputError(f"{path}: it exists; choose another name, or remove it first")
+    with replacing(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+    print(f"{path}: edit it, then: mphdrr learn train {path} -o model.pt")
+
+
+def _train(arguments: argparse.Namespace) -> None:
+    """Train a network by a recipe and write its model file; the same command goes on with what was interrupted.
+
+    mphdrr learn train training.toml -o model.pt mphdrr reconstruct run.h5 --method model.pt -o volume.nii.gz
+    """
+    if arguments.workers < 1:
+        raise InputError(f"--workers: expected 1 or more, got {arguments.workers}")
+    path = output_path(arguments.output, (".pt",))
+    recipe = learning.read_recipe(arguments.recipe)
+    try:
+        model = learning.train(recipe, path, arguments.workers, lambda words: _stage(words, arguments.quiet))
+    except KeyboardInterrupt:
+        say(f"{path}: samples and the last checkpoint are kept; the same command goes on")
+        raise
+    last = model.contents.curve[-1]
+    print(f"{path}: {model.label}, {last['step']} steps, NRMSE {last['validation']:.3f} of the validation")
+
+
+def _judge(arguments: argparse.Namespace) -> None:
+    """Judge models beside tuned baselines: one table and one picture; the same command goes on with what was interrupted.
+
+    mphdrr learn judge judge.toml -o judgement
+    """
+    recipe = read_judge_recipe(arguments.recipe)
+    models = {name: learning.read_model(path) for name, path in recipe.models.items()}
+    methods = [model.judged(name) for name, model in models.items()]
+    found = judge(recipe, arguments.output, methods, _stage("judging", arguments.quiet))
+    for name, model in models.items() if arguments.into_models else ():
+        rows = [row for row in found.rows if row["method"] == name]
+        learning.with_judgement(model.path, {**found.record, "rows": rows})
+    print(f"{arguments.output}: {len(found.rows)} rows in judgement.md, .json and .png")
+
+
+def _stage(words: str, is_quiet: bool) -> Progress | None:
+    return None if is_quiet else progress_bar(words)

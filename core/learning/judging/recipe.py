@@ -1,0 +1,163 @@
+"""Recipes of the judge: tests, validation data, baselines and models, in TOML."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...errors import InputError, naming
+from ...events.entries import by_key, flat, like, plain_name, required, table
+from ...events.event_set import EventSet
+from ...geometry.grid import Grid
+from ...runs.recipe import Values
+from ...runs.settings import Setting, named
+from ...toml import read_toml
+from .methods import Family
+
+VERSION = 1
+
+_TEST = by_key((
+    Setting("events", str, None, "Folder of the set", is_path=True),
+    Setting("split", str, None, "Its split that counts", "all events"),
+    Setting("model", str, "emission", "Which of its images"),
+    Setting("count", int, None, "How many events, the first ones", "all", least=1),
+    Setting("name", str, None, "What the table calls it"),
+    Setting("scoring", str, "volumes", "What is scored besides the voxels",
+            words=named(("volumes", "rods", "pairs", "defect"))),
+    Setting("levels", float, (1.0,), "Shares of the acquisition time", above=0, sizes=()),
+    Setting("believed", str, None, "Workbook of the geometry that methods are told", "that which made the images",
+            is_path=True),
+    Setting("tuned_on_itself", bool, False, "Also judge baselines that are tuned on the test's own events"),
+    Setting("draws", int, 0, "Draws of noise of which bias and standard deviation are taken; 0: neither", least=0),
+    Setting("drawn_events", int, 3, "Events, the first ones, that bias and deviation are of", least=1),
+    Setting("channel_width", float, 30.0, "Of the observer's channels", unit="mm", above=0),
+))  # fmt: skip
+_ROWS = by_key((
+    like("grid.voxels", "phantom.voxels"),
+    like("grid.spacing", "phantom.spacing"),
+    like("grid.center", "phantom.position", text="Middle of the volumes, x y z"),
+    Setting("baselines.subsets", int, 5, "Of OSEM and BSREM", least=1),
+    Setting("baselines.stops", int, (2, 4, 8, 12, 16, 24), "Iterations of OSEM to choose from", least=1, sizes=()),
+    Setting("baselines.fwhm", float, (0.0, 2.4, 3.6, 4.8, 6.5, 8.0, 10.0), "Widths of the filter after it to choose from",
+            unit="mm", least=0, sizes=()),
+    Setting("baselines.iterations", int, 15, "Of BSREM", least=1),
+    Setting("baselines.weights", float, (0.0003, 0.001, 0.003, 0.01, 0.03, 0.1), "Of BSREM's prior to choose from; it has "
+            "relative differences", above=0, sizes=()),
+    Setting("baselines.families", str, ("osem", "bsrem"), "Which there are", words=named(("osem", "bsrem")), sizes=()),
+    Setting("judge.seed", int, 0, "Of the bootstrap", least=0),
+))  # fmt: skip
+_TABLES = ("grid", "baselines", "judge")
+
+
+class _Settings(Values):
+    rows = _ROWS  # type: ignore[assignment]
+
+
+class Test(Values):
+    """A test: events, and what is scored of them."""
+
+    rows = _TEST  # type: ignore[assignment]
+    __test__ = False  # for pytest
+
+
+@dataclass(frozen=True)
+class JudgeRecipe:
+    """What the judge does; `InputError` names the entry that cannot be understood.
+
+    Parameters
+    ----------
+    values
+        The recipe's tables.
+    folder
+        The paths in the recipe are relative to it.
+    """
+
+    values: Mapping[str, Any]
+    folder: Path = Path()
+
+    def __post_init__(self) -> None:
+        known = ("version", "tests", "models", "validation", *_TABLES)
+        if self.values.get("version") != VERSION:
+            raise InputError(f"version: expected {VERSION}, got {self.values.get('version')!r}")
+        for key in self.values:
+            if key not in known:
+                raise InputError(f"{key}: no such entry; expected {', '.join(known)}")
+        _ = self.settings, self.grid, self.tests, self.validation, self.models, self.families
+
+    def __getitem__(self, key: str) -> Any:
+        """The value of a setting, such as "baselines.subsets", or its default."""
+        return self.settings[key]
+
+    @cached_property
+    def settings(self) -> Values:
+        """The values of the tables but tests and models."""
+        return _Settings(flat({name: table(self.values, name) for name in _TABLES}, _ROWS, *_TABLES))
+
+    @cached_property
+    def grid(self) -> Grid:
+        """The voxels that all methods give."""
+        spacing = required(self["grid.spacing"], "grid.spacing", "give the voxel size in mm")
+        n_x, n_y, n_z = np.broadcast_to(self["grid.voxels"], 3).tolist()
+        return Grid.centered((n_x, n_y, n_z), np.broadcast_to(spacing, 3), self["grid.center"])
+
+    @cached_property
+    def tests(self) -> list[Test]:
+        """The tests."""
+        entries = self.values.get("tests")
+        if not isinstance(entries, list) or not entries or not all(isinstance(entry, dict) for entry in entries):
+            raise InputError("tests: expected one [[tests]] or more")
+        found = [self._test(entry, f"tests: {entry.get('name', number)}") for number, entry in enumerate(entries, 1)]
+        names = [plain_name(test["name"], "tests: name") for test in found]
+        if len(set(names)) < len(names):
+            raise InputError(f"tests: expected different names, got {', '.join(names)}")
+        return found
+
+    @cached_property
+    def validation(self) -> Test:
+        """The events that baselines are tuned on."""
+        return self._test({"name": "validation", **table(self.values, "validation")}, "validation")
+
+    @cached_property
+    def models(self) -> dict[str, Path]:
+        """The models' files by the names that the table gives them."""
+        models = table(self.values, "models")
+        for name, file in models.items():
+            if not isinstance(file, str) or not file:
+                raise InputError(f"models.{name}: expected a file's name, got {file!r}")
+        return {name: self.folder / file for name, file in models.items()}
+
+    @cached_property
+    def families(self) -> list[Family]:
+        """The baselines of which one each is chosen on the validation data."""
+        stops, widths, weights = (self[f"baselines.{name}"] for name in ("stops", "fwhm", "weights"))
+        known = {"osem": (max(stops), tuple(product(stops, widths))),
+                 "bsrem": (self["baselines.iterations"], tuple((weight,) for weight in weights))}  # fmt: skip
+        names, subsets = self["baselines.families"], self["baselines.subsets"]
+        return [Family(name, self.grid, known[name][0], subsets, known[name][1]) for name in names]
+
+    def events(self, test: Test) -> EventSet:
+        """The events of a test, or of the validation data."""
+        events, split = EventSet(self.folder / test["events"]), test["split"]
+        events = events if split is None else events.split(split)
+        if not len(events):
+            raise InputError(f"events: {self.folder / test['events']} holds none")
+        return events[: test["count"]]
+
+    def _test(self, entry: dict[str, Any], name: str) -> Test:
+        with naming(name):
+            found = Test(flat(entry, _TEST))
+            required(found["events"], "events", "name the folder of the set")
+            return found
+
+
+def read_judge_recipe(path: str | os.PathLike[str]) -> JudgeRecipe:
+    """The judge's recipe in a TOML file; paths in it are relative to its folder. `InputError` names the entry."""
+    with naming(path):
+        return JudgeRecipe(read_toml(path), Path(path).absolute().parent)

@@ -1,0 +1,51 @@
+"""What the judge has done so far: every single event's scores, in files that are whole at any time."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from ...errors import reading
+from ...files import read_text, write_bytes
+
+Key = tuple[str, int, float, int]
+"""A recipe's fingerprint and the event's number in it, the level, and the draw of noise; -1 for several draws."""
+_KEY = ("recipe", "event", "level", "draw")
+
+
+class Records:
+    """The scores of one method in one test: a line of JSON for each event, level and draw."""
+
+    def __init__(self, path: Path) -> None:
+        self.path, self._rows = path, dict[Key, dict[str, Any]]()
+        if path.exists():
+            with reading(path, "scores"):
+                for line in read_text(path).splitlines():
+                    row = json.loads(line)
+                    self._rows[tuple(row[name] for name in _KEY)] = row  # type: ignore[index]
+
+    def __contains__(self, key: Key) -> bool:
+        return key in self._rows
+
+    def __getitem__(self, key: Key) -> dict[str, Any]:
+        return self._rows[key]
+
+    def add(self, key: Key, scores: dict[str, Any]) -> None:
+        """Keep scores: on return they are on the disk."""
+        self._rows[key] = {**dict(zip(_KEY, key, strict=True)), **scores}
+        write_bytes(self.path, "".join(f"{json.dumps(row)}\n" for row in self._rows.values()).encode())
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """What a file holds, nothing where there is none."""
+    if not path.exists():
+        return {}
+    with reading(path, "JSON"):
+        found: dict[str, Any] = json.loads(read_text(path))
+        return found
+
+
+def write_json(path: Path, values: Any) -> None:
+    """Write what JSON can hold."""
+    write_bytes(path, (json.dumps(values, indent=1) + "\n").encode())

@@ -1,0 +1,97 @@
+"""What a network is told of the scanner: exact operators of one geometry, grid and model."""
+
+import hashlib
+import json
+from collections.abc import Sequence
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ..errors import InputError
+from ..perspective.perspective_maps import PerspectiveMaps
+from ..projector import Projector
+from ..reconstruction.snapshots import Snapshots
+
+
+class Sample(NamedTuple):
+    """A batch of B scans by one scanner, as tensors. Volumes are in units of each scan's `scale`."""
+
+    counts: torch.Tensor
+    """Measured counts (B, M, n_v, n_u)."""
+    background: torch.Tensor
+    """Counts expected besides those of the volume, of the same shape."""
+    osem: torch.Tensor
+    """Volumes (B, S, n_x, n_y, n_z) by OSEM after `Setup.after` iterations, divided by `scale`."""
+    scale: torch.Tensor
+    """(B,): root mean square of the middle one of these volumes, such as kBq/mL."""
+    truth: torch.Tensor
+    """What is to be found (B, n_x, n_y, n_z), divided by `scale`; zeros where nobody knows it."""
+
+
+class Setup:
+    """Operators of one scanner, grid and model, made once and used for all scans by it.
+
+    Parameters
+    ----------
+    A : Projector
+        Of emission.
+    subsets : int
+        Of OSEM.
+    after : sequence of int
+        Iterations of OSEM whose volumes networks get.
+    permuted : int, optional
+        The poses are permuted among the modules by this seed: for the ablation that asks what true poses are worth.
+
+    Attributes
+    ----------
+    A : Projector
+    sensitivity : tensor (n_x, n_y, n_z)
+        Counts that one unit of activity in each voxel gives.
+    """
+
+    def __init__(self, A: Projector, subsets: int, after: Sequence[int] = (2, 8, 16), permuted: int | None = None):
+        if A.model.takes != ("activity",):
+            raise InputError(f"learned reconstruction: expected a projector of emission, got one of {A.model.name}")
+        if permuted is not None:
+            order = np.random.default_rng(permuted).permutation(len(A.views))
+            A = Projector(A.grid, A.views[order], A.model.of_views(order), A.backend, A.threads)
+        self.A, self.subsets, self.after = A, subsets, tuple(after)
+
+    @cached_property
+    def sensitivity(self) -> torch.Tensor:
+        return self.A.T(torch.ones(self.A.shape_out))
+
+    @cached_property
+    def maps(self) -> PerspectiveMaps:
+        """Maps between the grid and the coordinates (u, v, k) of each view."""
+        return PerspectiveMaps(self.A.views, self.A.grid)
+
+    @cached_property
+    def _snapshots(self) -> Snapshots:
+        return Snapshots(self.A, self.subsets)
+
+    def sample(
+        self, counts: NDArray[np.float32], background: NDArray[np.float32], truth: NDArray[np.float32]
+    ) -> Sample:
+        """A batch of one: counts and background (M, n_v, n_u), the truth (n_x, n_y, n_z) on the grid."""
+        osem = self._snapshots(counts, self.after, background)
+        scale = float(np.sqrt(np.mean(np.square(osem[len(osem) // 2])))) or 1.0
+        arrays = (counts, background, osem / scale, scale, truth / scale)
+        return Sample(*(torch.as_tensor(np.asarray(array, np.float32))[None] for array in arrays))
+
+    @cached_property
+    def scanner(self) -> str:
+        """SHA-256 of the views, to 1e-6 mm: what a model was trained for, and what it is told now."""
+        views = self.A.views
+        numbers = np.concatenate(
+            [np.ravel(a) for a in (views.sources, views.detector_centers, views.u_steps, views.v_steps)]
+        )
+        return hashlib.sha256(np.round(numbers, 6).tobytes() + repr(views.shape).encode()).hexdigest()
+
+    @cached_property
+    def physics(self) -> str:
+        """The model's record as JSON."""
+        return json.dumps(self.A.model.record(), sort_keys=True, default=str)

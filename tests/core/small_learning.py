@@ -1,0 +1,89 @@
+"""A small training for tests: a network of one convolution after OSEM, and a set of small events."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+from torch import nn
+
+from mphdrr.core.events import make
+from mphdrr.core.learning.networks import NETWORKS, Kind
+from mphdrr.core.learning.recipe import TrainingRecipe, read_recipe
+
+from .small_events import TEXT, small_recipe
+
+EVENTS = 8
+RECIPE = """
+version = 1
+
+[data]
+events = "set"
+levels = [1.0, 0.5]
+draws = 2
+train = "train"
+validation = "test"
+
+[grid]
+voxels = 8
+spacing = 12.0
+
+[osem]
+subsets = 2
+after = [1, 2]
+
+[network]
+kind = "toy"
+
+[training]
+steps = 6
+batch = 2
+precision = "32"
+threads = 1
+accelerator = "cpu"
+"""
+
+
+class Toy(nn.Module):
+    """Corrects OSEM's last volume by a convolution."""
+
+    def __init__(
+        self, channels: int = 2, kernels: tuple[int, ...] = (3,), leaky: bool = True, *, volumes: int = 1
+    ) -> None:
+        super().__init__()
+        self.first = nn.Conv3d(volumes, channels, kernels[0], padding=kernels[0] // 2)
+        self.last = nn.Conv3d(channels, 1, 3, padding=1)
+        self.leaky = leaky
+
+    @classmethod
+    def fixed(cls, setup) -> dict[str, int]:
+        return {"volumes": len(setup.after)}
+
+    def forward(self, setup, sample) -> list[torch.Tensor]:
+        middle = nn.functional.leaky_relu(self.first(sample.osem), 0.1 if self.leaky else 0.0)
+        noise = 1e-3 * torch.randn(1) if self.training else 0.0
+        found = sample.osem[:, -1:] + self.last(middle) + noise
+        return [found, 0.5 * (found + sample.osem[:, :1])]
+
+
+class ToyKind(Kind):
+    """The row of `NETWORKS`."""
+
+    def load(self) -> type:
+        return Toy
+
+
+TOY = ToyKind("Toy", "One convolution", "toy")
+
+
+def add_toy() -> None:
+    """Put it into the table of networks, for a process of its own."""
+    NETWORKS["toy"] = TOY  # type: ignore[index]
+
+
+def small_training(folder: Path, text: str = RECIPE, events: str = TEXT) -> TrainingRecipe:
+    """The recipe of a training in a folder, with its set of events."""
+    if not (folder / "set").exists():
+        make(small_recipe(folder, events), folder / "set", EVENTS)
+    (folder / "training.toml").write_text(text, encoding="utf-8")
+    return read_recipe(folder / "training.toml")

@@ -1,0 +1,186 @@
+"""The judge goes on where it stopped, judges fairly, and refuses what would flatter."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+import mphdrr.core as mph
+from mphdrr.core.learning.judging.judge import judge, judge_recipe
+from mphdrr.core.learning.judging.methods import Family, JudgedMethod, smoothed
+from mphdrr.core.learning.judging.sets import SETS, events_by_recipe, set_fingerprint, set_text
+
+from .conftest import WORKBOOK
+from .small_events import TEXT, small_recipe
+
+RODS = TEXT[: TEXT.index('[[phantoms]]\nkind = "points"')] + TEXT[TEXT.index("[models.lines]") :]
+JUDGE = """
+version = 1
+[grid]
+voxels = 12
+spacing = 8.0
+[validation]
+events = "validation"
+[baselines]
+subsets = 2
+stops = [1, 3]
+fwhm = [0, 10]
+families = ["osem"]
+[[tests]]
+name = "rods"
+events = "rods"
+scoring = "rods"
+levels = [1.0, 0.25]
+draws = 3
+drawn_events = 1
+tuned_on_itself = true
+"""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A folder with a judge's recipe and its sets."""
+    path = tmp_path_factory.mktemp("judge")
+    for name, seed in (("rods", 5), ("validation", 6)):
+        recipe = small_recipe(path / "recipes" / name, RODS.replace("seed = 5", f"seed = {seed}"))
+        mph.events.make(recipe, path / name, 3)
+    (path / "judge.toml").write_text(JUDGE)
+    return path
+
+
+def truth(run):
+    """A method that knows the truth."""
+    return mph.resample(run.volume, mph.Grid.centered((12,) * 3, 8.0), "mean")
+
+
+def halved(run):
+    """A method that gives half of the truth."""
+    volume = truth(run)
+    return mph.Volume(volume.array / 2, volume.grid, volume.quantity)
+
+
+METHODS = [JudgedMethod("truth", truth, "truth-1"), JudgedMethod("half", halved, "half-1")]
+
+
+def test_the_truth_has_no_error_and_half_of_it_half(folder, tmp_path):
+    found = judge(judge_recipe(folder / "judge.toml"), tmp_path, METHODS)
+    rows = {(row["method"], row["level"]): row for row in found.rows}
+    assert len(found.rows) == 2 * 4
+    for level in (1.0, 0.25):
+        assert rows["truth", level]["nrmse"] == 0 and rows["truth", level]["ssim"] == 1
+        assert rows["half", level]["nrmse"] == pytest.approx(0.5)
+        assert rows["half", level]["bias"] == pytest.approx(0.5) and rows["half", level]["deviation"] == 0
+        assert rows["half", level]["contrast"] == pytest.approx(rows["truth", level]["contrast"] / 2)
+        assert rows["half", level]["deviance"] > rows["truth", level]["deviance"] > 0
+        tuned = next(row for row in found.rows if row["kind"] == "baseline" and row["level"] == level)
+        assert tuned["best_baseline"]["ratio"] == (1, 1, 1) and tuned["best_on_itself"]["ratio"].value >= 1
+        half = 0.5 / tuned["nrmse"]
+        assert rows["half", level]["best_baseline"]["ratio"].value == pytest.approx(half)
+    assert "3 events, fewer than 50" in rows["half", 1.0]["notes"][0]
+    assert json.loads((tmp_path / "judgement.json").read_text())["tests"]["rods"]["events"] == 3
+    table = (tmp_path / "judgement.md").read_text()
+    assert table.count("| rods | 0.25 |") == 4 and "by the best tuned on the set" in table
+    assert (tmp_path / "judgement.png").stat().st_size > 10_000
+
+
+def test_interrupted_work_goes_on_where_it_stopped(folder, tmp_path):
+    asked, recipe = [], judge_recipe(folder / "judge.toml")
+
+    def counted(run):
+        asked.append(run.settings["event"])
+        return halved(run)
+
+    def stop(done, total):
+        if done >= total - 2:
+            raise mph.Cancelled
+
+    methods = [JudgedMethod("counted", counted, "counted-1")]
+    with pytest.raises(mph.Cancelled):
+        judge(recipe, tmp_path, methods, stop)
+    first = len(asked)
+    told = []
+    found = judge(recipe, tmp_path, methods, lambda done, total: told.append((done, total)))
+    assert (
+        first > 0 and len(asked) == 6 + 2 * 3 + 1
+    )  # each event and level, three draws of one event twice, one picture
+    assert told[-1] == (3 * 6, 3 * 6)
+    again = judge(recipe, tmp_path, methods)
+    assert len(asked) == 6 + 2 * 3 + 2  # the picture alone
+    assert again.rows == found.rows and again.tuning == found.tuning
+
+
+def test_a_method_that_was_trained_on_the_test_is_refused(folder, tmp_path):
+    events = mph.events.EventSet(folder / "rods")
+    trained = JudgedMethod("net", halved, "net-1", events_by_recipe(events[1:2]))
+    with pytest.raises(mph.InputError, match="net: it was trained on events of the test rods: 1"):
+        judge(judge_recipe(folder / "judge.toml"), tmp_path, [trained])
+    assert set_fingerprint(events) != set_fingerprint(events[:2])
+    other = JudgedMethod("net", halved, "net-1", events_by_recipe(mph.events.EventSet(folder / "validation")))
+    assert judge(judge_recipe(folder / "judge.toml"), tmp_path, [other]).rows
+
+
+def test_methods_are_told_the_geometry_that_is_believed(folder, tmp_path):
+    system = mph.events.EventSet(folder / "rods").system
+    moved = mph.write_system(mph.read_system(WORKBOOK)[:24], tmp_path / "believed.xlsx")
+    assert moved is not None and len(system) == 8
+    text = (folder / "judge.toml").read_text().replace('scoring = "rods"', f'believed = "{tmp_path / "believed.xlsx"}"')
+    text = text.replace("[1.0, 0.25]", "[1.0]").replace("draws = 3", "draws = 0")
+    (folder / "believed.toml").write_text(text)
+    told = []
+
+    def method(run):
+        told.append(run)
+        return halved(run)
+
+    judge(judge_recipe(folder / "believed.toml"), tmp_path / "found", [JudgedMethod("told", method, "told-1")])
+    assert {run.workbook for run in told} == {"believed.xlsx"}
+    assert all(run.recipe["system.file"].endswith("believed.xlsx") and len(run.system) == 8 for run in told)
+
+
+def test_one_reconstruction_gives_all_stops_and_filters(folder):
+    (event, *_) = mph.events.EventSet(folder / "rods")
+    grid = mph.Grid.centered((12,) * 3, 8.0)
+    family = Family("osem", grid, 3, 2, ((1, 0.0), (1, 10.0), (3, 0.0), (3, 10.0)))
+    run = event.run("emission", 1)
+    every = dict(zip(family.choices, family.volumes(run), strict=True))
+    for choice, volume in every.items():
+        np.testing.assert_array_equal(family.method(choice).function(run).array, volume.array)
+    assert family.method((3, 10.0)).name == "osem 3 x 2, 10 mm"
+    assert family.method((3, 10.0)).fingerprint != family.method((1, 10.0)).fingerprint
+    blob = np.zeros((12, 12, 12), np.float32)
+    blob[6, 6, 6] = 1
+    wide = smoothed(blob, grid, 20.0)
+    assert wide.sum() == pytest.approx(1, abs=0.02) and wide[6, 6, 7] / wide[6, 6, 6] == pytest.approx(0.66, abs=0.05)
+
+
+@pytest.mark.parametrize(("old", "new", "message"), [
+    ("version = 1", "version = 2", "version"),
+    ('scoring = "rods"', 'scoring = "words"', "scoring: expected one of volumes"),
+    ('events = "rods"', "", "events: missing"),
+    ("spacing = 8.0", "", "grid.spacing: missing"),
+    ("subsets = 2", "subset = 2", "baselines.subset: no such setting"),
+    ('families = ["osem"]', 'families = ["fbp"]', "families: expected one of osem, bsrem"),
+])  # fmt: skip
+def test_entries_that_cannot_be_understood_are_named(folder, old, new, message):
+    (folder / "wrong.toml").write_text(JUDGE.replace(old, new))
+    with pytest.raises(mph.InputError, match=message) as refused:
+        judge_recipe(folder / "wrong.toml")
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("name", SETS)
+def test_every_set_reads_plans_and_stays_in_its_volume(name, tmp_path):
+    (tmp_path / "set.toml").write_text(set_text(name, WORKBOOK), encoding="utf-8")
+    recipe = mph.events.read_recipe(tmp_path / "set.toml")
+    half = recipe.grid.spacing * recipe.grid.shape / 2
+    for number in range(20):
+        event = mph.events.plan(recipe, number)
+        if name != "cardiac":  # the torso is larger than any volume of the heart
+            points = np.concatenate([shape.position + np.zeros((1, 3)) for shape in event.phantom.shapes])
+            assert np.all(np.linalg.norm(points, axis=1) < half.max())
+
+
+def test_no_set_has_the_seed_of_another():
+    assert len({mph.events.EventRecipe(set_text(name)).seed for name in SETS}) == len(SETS)

@@ -1,0 +1,319 @@
+"""Model files: sealed, without code, and refused where they do not fit; networks as methods of reconstruction."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import pickle
+import subprocess
+import sys
+import warnings
+import zipfile
+from dataclasses import replace
+from pathlib import Path
+
+import nibabel
+import numpy as np
+import pytest
+
+pytest.importorskip(
+    "lightning", reason="networks are trained with the extra learning, for which there is no torch here"
+)
+import torch
+
+import mphdrr.core as mph
+from mphdrr.core.cli import main
+from mphdrr.core.events import EventSet
+from mphdrr.core.learning.judging.sets import events_by_recipe
+from mphdrr.core.learning.model_file import Contents, read_model, sealed, write_model
+from mphdrr.core.learning.networks import NETWORKS
+from mphdrr.core.reconstruction.methods import method_of
+
+from .small_events import TEXT, small_recipe
+from .small_learning import TOY, small_training
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    """A trained model and the events it was trained on."""
+    folder = tmp_path_factory.mktemp("learned")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(NETWORKS, "toy", TOY)
+        mph.learning.train(small_training(folder), folder / "model.pt")
+    return folder
+
+
+@pytest.fixture
+def model(folder, monkeypatch):
+    monkeypatch.setitem(NETWORKS, "toy", TOY)
+    return mph.learning.read_model(folder / "model.pt")
+
+
+@pytest.fixture
+def run(folder) -> mph.ProjectionRun:
+    return EventSet(folder / "set")[0].run("emission", noise_seed=3)
+
+
+def refused(capsys, *arguments: object) -> str:
+    assert main(["reconstruct", *map(str, arguments)]) == 1
+    line = capsys.readouterr().err.splitlines()[-1]
+    return line.removeprefix("mphdrr: ")
+
+
+def with_fewer_modules(run: mph.ProjectionRun) -> mph.ProjectionRun:
+    """A run of another scanner: the last two modules are left out."""
+    which = np.arange(len(run.system) - 2)
+    return replace(run, projections=run.projections[which], system=run.system[which], views=run.views[which])
+
+
+class Harmful:
+    """What makes a folder when it is unpickled."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self):
+        return os.mkdir, (str(self.path),)
+
+
+def test_every_changed_byte_is_refused(folder, model, tmp_path):
+    data, path = (folder / "model.pt").read_bytes(), tmp_path / "m.pt"
+    places = np.random.default_rng(0).integers(0, len(data), 200).tolist()
+    for place in [*places, *range(len(data) - 110, len(data))]:
+        path.write_bytes(data[:place] + bytes([data[place] ^ 1 << place % 8]) + data[place + 1 :])
+        with pytest.raises(
+            mph.InputError, match=r"m\.pt: (damaged: its bytes are not those|no model file of mphDRR, or cut)"
+        ):
+            read_model(path)
+    for size in (0, 10, len(data) // 2, len(data) - 1):
+        path.write_bytes(data[:size])
+        with pytest.raises(mph.InputError, match=r"m\.pt: no model file of mphDRR, or cut: its seal is missing"):
+            read_model(path)
+    path.write_bytes(data + b" ")
+    with pytest.raises(mph.InputError):
+        read_model(path)
+
+
+def test_a_pickled_object_is_refused_and_not_run(folder, model, tmp_path):
+    known = torch.load(folder / "model.pt", weights_only=True)
+    for number, content in enumerate((Harmful(tmp_path / "harm"), {**known, "about": Harmful(tmp_path / "harm")})):
+        memory, path = io.BytesIO(), tmp_path / f"{number}.pt"
+        torch.save(content, memory)
+        path.write_bytes(memory.getvalue())
+        with pytest.raises(mph.InputError, match="its seal is missing"):
+            read_model(path)
+        path.write_bytes(sealed(memory.getvalue()))  # by one who knows how
+        with pytest.raises(mph.InputError) as refusal:
+            read_model(path)
+        assert "it holds more than numbers and texts, nothing of which was run" in str(refusal.value)
+        assert "\n" not in str(refusal.value)
+    (tmp_path / "plain.pt").write_bytes(pickle.dumps(Harmful(tmp_path / "harm")))
+    with pytest.raises(mph.InputError):
+        read_model(tmp_path / "plain.pt")
+    assert not (tmp_path / "harm").exists()
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"version": 2}, "format 2; this mphDRR reads 1, a newer one may read it"),
+        ({"format": "another"}, "no model file of mphDRR"),
+        ({"about": "{}"}, "cannot be read as a model file"),
+        ({"about": "[1]"}, "cannot be read as a model file"),
+    ],
+)
+def test_other_formats_are_refused_in_a_line(folder, model, tmp_path, changes, words):
+    memory = io.BytesIO()
+    torch.save({**torch.load(folder / "model.pt", weights_only=True), **changes}, memory)
+    (tmp_path / "m.pt").write_bytes(sealed(memory.getvalue()))
+    with pytest.raises(mph.InputError, match=words):
+        read_model(tmp_path / "m.pt")
+
+
+def test_weights_of_another_network_are_refused(model, tmp_path):
+    weights = {**model.contents.weights, "more.weight": torch.zeros(3)}
+    write_model(replace(model.contents, weights=weights), tmp_path / "m.pt")
+    with pytest.raises(mph.InputError, match="cannot be read as weights of this version's network"):
+        _ = read_model(tmp_path / "m.pt").network
+
+
+def test_a_file_holds_what_the_network_was_trained_on_and_is_a_zip_for_torch(folder, model):
+    contents, events = model.contents, EventSet(folder / "set")
+    assert contents.trained_on["events"] == events_by_recipe(events.split("train") + events.split("test"))
+    assert contents.trained_on["levels"] == [1.0, 0.5] and contents.trained_on["model"] == "emission"
+    assert contents.recipe == (folder / "training.toml").read_text(encoding="utf-8")
+    assert contents.curve[-1]["step"] == 6 and {"mphdrr", "torch"} <= contents.versions.keys()
+    assert contents.counts[0] < contents.counts[1]
+    assert zipfile.ZipFile(folder / "model.pt").comment.startswith(b"mphDRR sha256 ")
+    assert torch.load(folder / "model.pt", weights_only=True)["weights"].keys() == contents.weights.keys()
+
+
+def test_a_judgement_is_kept_without_a_change_of_what_the_network_does(folder, model, tmp_path):
+    (tmp_path / "m.pt").write_bytes((folder / "model.pt").read_bytes())
+    judged = mph.learning.with_judgement(tmp_path / "m.pt", {"rows": [{"nrmse": 0.5}]})
+    assert judged.contents.judgement == {"rows": [{"nrmse": 0.5}]} and model.contents.judgement is None
+    assert judged.sha256 != model.sha256 and judged.fingerprint == model.fingerprint
+    assert mph.learning.read_model(tmp_path / "m.pt").contents.judgement == judged.contents.judgement
+
+
+def test_the_network_is_what_was_trained(folder, model, run):
+    volume = model(run)
+    assert volume.grid == model.contents.grid and volume.quantity == "activity"
+    event = EventSet(folder / "set")[0]
+    truth = mph.resample(event.truth, volume.grid, "mean")
+    assert mph.nrmse(volume, truth) < 1
+    double = replace(
+        run, projections=2 * run.projections, background=2 * run.background
+    )  # twice the counts, twice the activity
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", mph.InputWarning)
+        assert np.corrcoef(model(double).array.ravel(), volume.array.ravel())[0, 1] > 0.99
+
+
+def test_another_scanner_grid_or_physics_is_refused_or_allowed_by_name(folder, model, run):
+    other = with_fewer_modules(run)
+    with pytest.raises(mph.InputError) as refusal:
+        model(other)
+    said = f"{folder / 'model.pt'}: trained for another scanner; --allow scanner takes it anyway"
+    assert str(refusal.value) == said
+    with pytest.warns(mph.InputWarning, match=r"model\.pt was trained for another scanner, which was allowed"):
+        assert model(other, allow=("scanner",)).grid == model.contents.grid
+    recipe = run.recipe.updated({"reconstruction.method": str(folder / "model.pt"), "reconstruction.spacing": 11.0})
+    with pytest.raises(mph.InputError, match="trained for another grid; --allow grid takes it anyway"):
+        mph.reconstruct_run(run, recipe)
+    allowed = recipe.updated({"reconstruction.allow": ("grid",), "reconstruction.voxels": 10})
+    with pytest.warns(mph.InputWarning):
+        found = mph.reconstruct_run(run, allowed)
+    assert found.volume.array.shape == (10, 10, 10)
+    assert found.settings["allow"] == ["grid"]
+    assert "model.pt was trained for another grid, which was allowed" in found.settings["flatters"]
+    blurred = run.recipe.updated({"model.intrinsic_fwhm": 3.0, "model.time": 50.0, "model.background": 0.5})
+    with pytest.raises(mph.InputError, match="trained for another physics; --allow physics takes it anyway"):
+        mph.reconstruct_run(run, blurred.updated({"reconstruction.method": str(folder / "model.pt")}))
+    with pytest.raises(mph.InputError, match="expected one of scanner, grid, physics, got 'time'"):
+        model(run, allow=("time",))
+
+
+def test_another_time_is_no_other_physics_but_far_fewer_counts_are_said(model, run):
+    short = run.recipe.updated({"model.time": 10.0, "model.background": 0.025})
+    settings = {**run.settings, "recipe": short.tables()}
+    few = replace(run, projections=np.floor(run.projections / 10), background=run.background / 10, settings=settings)
+    with pytest.warns(mph.InputWarning, match=r"model\.pt was trained on .* counts, this scan has "):
+        model(few)
+
+
+def test_the_command_line_reconstructs_with_a_model_and_says_so(folder, model, run, tmp_path, capsys):
+    mph.write_run(run, tmp_path / "run.npz")
+    command = [tmp_path / "run.npz", "--method", folder / "model.pt"]
+    more = ["-o", tmp_path / "v.nii.gz", "--picture", tmp_path / "p.svg", "--save-state", tmp_path / "s.h5"]
+    assert main(["reconstruct", *map(str, [*command, *more])]) == 0
+    out = capsys.readouterr()
+    assert "Network model.pt (Toy), 8 x 8 x 8 voxels, largest " in out.out
+    assert "Network model.pt (Toy) of " in (tmp_path / "p.svg").read_text(encoding="utf-8")
+    np.testing.assert_allclose(mph.read_volume(tmp_path / "v.nii.gz").array, model(run).array, rtol=1e-6)
+    said = f"Reconstructed by a network model.pt (Toy), sha256 {model.sha256}"
+    assert nibabel.load(tmp_path / "v.nii.gz").header.extensions[0].text == said
+    assert model(run).note == said
+    kept = mph.read_reconstruction(tmp_path / "s.h5").settings
+    assert kept["sha256"] == model.sha256 and kept["network"] == "toy" and kept["allow"] == []
+    assert kept["method"] == "Network model.pt (Toy)"
+    said = refused(capsys, *command, "--voxels", "12", "-o", tmp_path / "no.nii")
+    assert said == f"{folder / 'model.pt'}: trained for another grid; --allow grid takes it anyway"
+    assert "Network model.pt (Toy) does not take it" in refused(
+        capsys, *command, "--subsets", "2", "-o", tmp_path / "no.nii"
+    )
+    said = refused(capsys, tmp_path / "run.npz", "--allow", "grid", "-o", tmp_path / "no.nii")
+    assert said == "reconstruction.allow (--allow) needs reconstruction.method = FILE.pt"
+    assert refused(capsys, tmp_path / "run.npz", "--method", "none.pt", "-o", tmp_path / "no.nii").endswith(
+        "none.pt: no such file"
+    )
+    assert not (tmp_path / "no.nii").exists()
+
+
+def test_a_model_is_judged_under_a_name_without_warnings(model, run):
+    method = model.judged("toy")
+    assert method.name == "toy" and method.trained_on == model.contents.trained_on["events"]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", mph.InputWarning)
+        found = method.function(with_fewer_modules(run))
+    assert found.grid == model.contents.grid
+
+
+def test_operators_are_kept_for_the_next_scan_by_the_same_scanner(folder, model):
+    runs = [event.run("emission", noise_seed=1) for event in EventSet(folder / "set")[:3]]
+    network = mph.learning.read_model(folder / "model.pt")
+    for run in runs:
+        network(run)
+    assert len(network._setups) == 1
+
+
+def test_permuted_poses_are_those_of_the_training(folder, model, run, tmp_path):
+    text = model.contents.recipe.replace('kind = "toy"', 'kind = "toy"\npermuted = 3')
+    (tmp_path / "p.toml").write_text(text.replace('"set"', json.dumps(str(folder / "set"))), encoding="utf-8")
+    permuted = mph.learning.train(mph.learning.read_recipe(tmp_path / "p.toml"), tmp_path / "p.pt")
+    assert permuted.contents.scanner != model.contents.scanner
+    assert permuted(run).grid == model.contents.grid
+
+
+def test_without_torch_a_model_is_refused_in_a_line_and_core_does_not_need_it():
+    script = """
+import sys
+sys.modules["torch"] = None
+import mphdrr.core as mph
+from mphdrr.core.cli import main
+try:
+    mph.learning.read_model("m.pt")
+except mph.InputError as error:
+    print(error)
+print(main(["learn", "train", "r.toml", "-o", "out/m.pt"]), file=sys.stderr)
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[0] == 'torch is missing: pip install "mphdrr[learning]"'
+
+
+def test_contents_are_all_there_is(model):
+    assert {*Contents.__annotations__} == {
+        "weights", "recipe", "scanner", "shape", "affine", "physics", "fixed", "counts", "trained_on", "curve", "judgement",
+        "versions",
+    }  # fmt: skip
+    assert method_of(str(model.path)).grid == model.contents.grid
+
+
+JUDGE = """
+version = 1
+[grid]
+voxels = 8
+spacing = 12.0
+[validation]
+events = "set"
+split = "test"
+[baselines]
+subsets = 2
+stops = [1, 3]
+fwhm = [0, 10]
+families = ["osem"]
+[models]
+net = "net.pt"
+[[tests]]
+name = "others"
+events = "others"
+levels = [1.0, 0.5]
+"""
+
+
+def test_a_model_is_judged_by_the_command_beside_baselines_and_may_keep_its_rows(folder, model, tmp_path, capsys):
+    (tmp_path / "net.pt").write_bytes((folder / "model.pt").read_bytes())
+    (tmp_path / "set").symlink_to(folder / "set")
+    mph.events.make(small_recipe(tmp_path / "recipe", TEXT.replace("seed = 5", "seed = 6")), tmp_path / "others", 3)
+    (tmp_path / "judge.toml").write_text(JUDGE, encoding="utf-8")
+    command = ["learn", "judge", str(tmp_path / "judge.toml"), "-o", str(tmp_path / "judgement"), "--into-models"]
+    assert main(command) == 0
+    assert " in judgement.md, .json and .png" in capsys.readouterr().out
+    rows = json.loads((tmp_path / "judgement" / "judgement.json").read_text(encoding="utf-8"))["rows"]
+    own = [row for row in rows if row["method"] == "net"]
+    assert [row["level"] for row in own] == [1.0, 0.5] and all(0 < row["nrmse"] < 1 for row in own)
+    assert mph.learning.read_model(tmp_path / "net.pt").contents.judgement["rows"] == own
+    (tmp_path / "judge.toml").write_text(JUDGE.replace('"others"\nlevels', '"set"\nlevels'), encoding="utf-8")
+    assert main(command) == 1
+    assert "net: it was trained on events of the test others" in capsys.readouterr().err

@@ -1,0 +1,308 @@
+"""Trainings: what they learn from, that they go on as if they had not stopped, and that processes share them."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip(
+    "lightning", reason="networks are trained with the extra learning, for which there is no torch here"
+)
+import torch
+
+import mphdrr
+import mphdrr.core as mph
+from mphdrr.core.cli import main
+from mphdrr.core.learning import data
+from mphdrr.core.learning.data import Source, prepared
+from mphdrr.core.learning.networks import NETWORKS
+from mphdrr.core.learning.recipe import parsed, template_text
+from mphdrr.core.learning.training import loss_of, nrmse
+
+from .small_learning import RECIPE, TOY, small_training
+
+
+@pytest.fixture
+def recipe(monkeypatch, tmp_path):
+    monkeypatch.setitem(NETWORKS, "toy", TOY)
+    return small_training(tmp_path)
+
+
+def changed(recipe, before: str, after: str):
+    assert before in recipe.text
+    return parsed(recipe.text.replace(before, after), "training.toml", recipe.folder)
+
+
+def refused(capsys, *arguments: object) -> str:
+    assert main(["learn", *map(str, arguments)]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    return line.removeprefix("mphdrr: ")
+
+
+def same(one: mph.learning.TrainedNetwork, other: mph.learning.TrainedNetwork) -> bool:
+    a, b = one.contents.weights, other.contents.weights
+    return a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "words"),
+    [
+        ("steps = 6", "steps = 0", "training.steps: expected a whole number of 1 or more, got 0"),
+        ("steps = 6", "steps = 6\nseconds = 3", "training.steps does not go with training.seconds"),
+        ("steps = 6", "", "training.steps: missing; give a number of steps, or training.seconds"),
+        ("steps = 6", "seconds = 6\ndevices = 2", "training.seconds: only one process measures its steps; of several"),
+        ("batch = 2", "batch = 3\ndevices = 2", "training.batch: expected a multiple of the 2 processes, got 3"),
+        ("batch = 2", "batches = 2", "training.batches: no such setting; expected steps, seconds, batch, rate"),
+        ('kind = "toy"', 'kind = "toys"', "network.kind 'toys': expected one of after-osem, "),
+        ('kind = "toy"', 'kind = "toy"\ndepth = 3', "network.depth: no such setting; expected kind, permuted, weights_from"),
+        ('kind = "toy"', 'kind = "toy"\nchannels = 2.5', "network.channels: expected a whole number, got 2.5"),
+        ("spacing = 12.0", "", "grid.spacing: missing; give the voxel size in mm"),
+        ("after = [1, 2]", "after = [2, 1]", "osem.after: expected rising numbers, got [2, 1]"),
+        ("version = 1", "version = 2", "version: expected version = 1; a newer mphDRR may read others"),
+        ("[training]", "[trainings]", "trainings: expected TABLE.NAME with a table of data, grid, osem, network, training"),
+    ],
+)  # fmt: skip
+def test_a_recipe_that_cannot_be_used_is_refused_in_a_line(recipe, before, after, words):
+    with pytest.raises(mph.InputError) as refusal:
+        changed(recipe, before, after)
+    assert str(refusal.value).startswith(f"training.toml: {words}")
+
+
+def test_a_network_takes_the_settings_that_its_class_has(recipe):
+    given = changed(recipe, 'kind = "toy"', 'kind = "toy"\nchannels = 3\nkernels = [5, 3]\nleaky = false')
+    assert given.network == {"channels": 3, "kernels": (5, 3), "leaky": False}
+    assert recipe.network == {}
+    assert given.fingerprint != recipe.fingerprint == changed(recipe, "threads = 1", "threads = 2").fingerprint
+
+
+def test_the_recipe_to_begin_with_is_one_for_each_network(tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(NETWORKS, "toy", TOY)
+    assert parsed(template_text("toy"))["network.kind"] == "toy"
+    assert main(["learn", "new", "--like", "unrolled", "-o", str(tmp_path / "new.toml")]) == 0
+    assert 'kind = "unrolled"' in (tmp_path / "new.toml").read_text(encoding="utf-8")
+    capsys.readouterr()
+    assert refused(capsys, "new", "-o", tmp_path / "new.toml").endswith(
+        "it exists; choose another name, or remove it first"
+    )
+
+
+def test_samples_are_counts_osem_and_the_truth_at_their_level(recipe, tmp_path):
+    source = Source(recipe)
+    (samples,) = prepared(source, tmp_path, ["train"])
+    numbers = source.events.split("train").numbers
+    assert samples.draws == [(number, draw) for number in numbers for draw in (0, 1)]
+    levels = []
+    for (number, draw), sample in zip(samples.draws, (samples[i] for i in range(len(samples))), strict=True):
+        event, level = source._by_number[number], (1.0, 0.5)[(number + draw) % 2]
+        means = level * event.images("emission")
+        assert abs(float(sample.counts.sum()) - means.sum()) < 6 * np.sqrt(means.sum())
+        np.testing.assert_allclose(sample.background, 0.25 * level)  # counts that the recipe has in each pixel
+        truth = mph.resample(event.truth, recipe.grid, "mean").array
+        np.testing.assert_allclose(sample.truth * sample.scale, level * truth, rtol=1e-5, atol=1e-4)
+        assert sample.osem.shape == (2, 8, 8, 8)
+        assert float(sample.osem[1].square().mean()) == pytest.approx(1, rel=1e-5)
+        levels.append(level)
+    assert {*levels} == {0.5, 1.0}
+    own = samples.draws.index((numbers[0], 0))
+    event, level = source._by_number[numbers[0]], levels[own]
+    np.testing.assert_array_equal(samples[own].counts, event.images("emission", event.noise_seed, level))
+    assert not torch.equal(samples[own].counts, samples[own + 1].counts)
+
+
+def test_samples_are_made_once_and_go_on_where_they_were_stopped(recipe, tmp_path, monkeypatch):
+    made = []
+
+    def watched(self, draw):
+        made.append(draw)
+        return sample(self, draw)
+
+    sample = Source.sample
+    monkeypatch.setattr(Source, "sample", watched)
+
+    def stop(done: int, total: int) -> None:
+        if done == 3:
+            raise mph.Cancelled
+
+    with pytest.raises(mph.Cancelled):
+        prepared(Source(recipe), tmp_path, ["train"], progress=stop)
+    first = len(made)
+    (samples,) = prepared(Source(recipe), tmp_path, ["train"])
+    assert first < len(samples) and sorted(made) == samples.draws
+    (again,) = prepared(Source(recipe), tmp_path, ["train"])
+    (other,) = prepared(Source(changed(recipe, "after = [1, 2]", "after = [1, 3]")), tmp_path, ["train"])
+    assert again.folder == samples.folder != other.folder
+    assert len(made) == 2 * len(samples)
+    assert not list(samples.folder.glob(".*"))
+
+
+def test_samples_that_do_not_fit_onto_the_disk_are_refused_before_any_is_made(recipe, tmp_path, monkeypatch):
+    usage = data.shutil.disk_usage(tmp_path)
+    monkeypatch.setattr(data.shutil, "disk_usage", lambda _: usage._replace(free=10_000))
+    with pytest.raises(mph.InputError, match=r"the samples take .* KiB, 10 KiB are free"):
+        prepared(Source(recipe), tmp_path, ["train"])
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "words"),
+    [
+        ('events = "set"', 'events = "sets"', "sets"),
+        ('train = "train"', 'train = "training"', "split 'training': there are "),
+        ('events = "set"', 'events = "set"\nmodel = "lines"', "data.model: expected one of the set's models of counts"),
+    ],
+)  # fmt: skip
+def test_events_that_cannot_be_learned_from_are_refused(recipe, tmp_path, before, after, words):
+    with pytest.raises(mph.InputError, match=words):
+        mph.learning.train(changed(recipe, before, after), tmp_path / "m.pt")
+
+
+def test_truth_from_coarse_voxels_is_doubted(monkeypatch, tmp_path):
+    monkeypatch.setitem(NETWORKS, "toy", TOY)
+    recipe = small_training(tmp_path, RECIPE.replace("spacing = 12.0", "spacing = 8.0"))
+    with pytest.warns(mph.InputWarning, match="flatter"):
+        prepared(Source(recipe), tmp_path, ["test"])
+
+
+def test_the_loss_is_the_nrmse_and_a_share_of_those_on_the_way():
+    truth = torch.tensor([[[[1.0, 2.0]]], [[[0.0, 1.0]]]])
+    assert float(nrmse(truth, truth)) < 1e-5
+    assert float(nrmse(torch.zeros_like(truth), truth)) == pytest.approx(1)
+    zero, double = torch.zeros(2, 1, 1, 1, 2), 2 * truth[:, None]
+    assert float(loss_of([zero, double, truth[:, None]], truth)) == pytest.approx(0.6, abs=1e-5)
+    estimate = truth[:, None].clone().requires_grad_()
+    loss_of([estimate], truth).backward()
+    assert torch.isfinite(estimate.grad).all()
+
+
+def test_a_stopped_and_resumed_training_gives_the_same_weights_bit_for_bit(recipe, tmp_path):
+    recipe, told = changed(recipe, "steps = 6", "steps = 60"), []  # three steps a round, a mean of more than one
+    whole = mph.learning.train(
+        recipe, tmp_path / "whole.pt", stages=lambda words: lambda *done: told.append((words, done))
+    )
+    assert told[-1] == ("training", (60, 60))
+
+    def stop_at(step: int):
+        def progress(done: int, total: int) -> None:
+            if done == step:
+                raise mph.Cancelled
+
+        return lambda words: progress if words == "training" else None
+
+    path = tmp_path / "parts.pt"
+    for step in (4, 31):
+        with pytest.raises(mph.Cancelled):
+            mph.learning.train(recipe, path, stages=stop_at(step))
+        assert not path.exists()
+    parts = mph.learning.train(recipe, path)
+    assert same(whole, parts)
+    assert same(whole, mph.learning.train(recipe, path))  # there is nothing left to do
+    no_time = [{**row, "seconds": 0} for row in whole.contents.curve]
+    assert no_time == [{**row, "seconds": 0} for row in parts.contents.curve]
+    assert [row["step"] for row in no_time] == list(range(3, 61, 3))
+    assert [row["events"] for row in no_time] == list(range(6, 121, 6))
+    assert json.loads((tmp_path / "parts-training" / "curve.json").read_text(encoding="utf-8")) == parts.contents.curve
+    assert no_time[-1]["train"] < no_time[0]["train"]
+    assert not same(
+        whole, mph.learning.train(changed(recipe, "batch = 2", "batch = 2\nseed = 1"), tmp_path / "seed.pt")
+    )
+
+
+def test_a_folder_of_another_training_is_not_gone_on_with(recipe, tmp_path):
+    mph.learning.train(recipe, tmp_path / "m.pt")
+    other = changed(recipe, "batch = 2", "batch = 1")
+    with pytest.raises(mph.InputError, match=r"plan\.json: of a training by another recipe: remove its folder"):
+        mph.learning.train(other, tmp_path / "m.pt")
+    (tmp_path / "m-training" / "last.ckpt").write_bytes(b"half a chec")
+    with pytest.raises(mph.InputError, match=r"last\.ckpt: .*remove it to begin anew"):
+        mph.learning.train(recipe, tmp_path / "m.pt")
+
+
+def test_a_training_of_some_seconds_has_the_steps_that_fit_and_keeps_their_number(recipe, tmp_path):
+    timed = changed(recipe, "steps = 6", "seconds = 4.0")
+    begun = time.monotonic()
+    model = mph.learning.train(timed, tmp_path / "m.pt")
+    spent = time.monotonic() - begun
+    plan = json.loads((tmp_path / "m-training" / "plan.json").read_text(encoding="utf-8"))
+    assert plan["steps"] == model.contents.curve[-1]["step"] > 10
+    assert spent < 30  # that of a busy machine
+
+
+def test_a_warm_start_takes_the_weights_of_equal_names_and_shapes(recipe, tmp_path):
+    first = mph.learning.train(recipe, tmp_path / "first.pt")
+    slow = 'kind = "toy"\nweights_from = "first.pt"'
+    recipe = changed(changed(recipe, 'kind = "toy"', slow), "batch = 2", "batch = 2\nrate = 1e-9")
+    begun = mph.learning.train(recipe, tmp_path / "begun.pt")
+    for name, values in first.contents.weights.items():
+        torch.testing.assert_close(begun.contents.weights[name], values, rtol=0, atol=1e-6)
+    wider = changed(recipe, 'weights_from = "first.pt"', 'weights_from = "first.pt"\nchannels = 5')
+    begun = mph.learning.train(wider, tmp_path / "wider.pt")  # the last bias alone is of the same shape
+    torch.testing.assert_close(
+        begun.contents.weights["last.bias"], first.contents.weights["last.bias"], rtol=0, atol=1e-6
+    )
+
+
+SCRIPT = """
+import sys
+from mphdrr.tests.core.small_learning import add_toy
+
+if __name__ == "__main__":
+    add_toy()
+    from mphdrr.core.cli import main
+    raise SystemExit(main(sys.argv[1:]))
+"""
+
+
+def script(folder: Path) -> list[str]:
+    """The command line with the toy, as a program that Lightning can start once more."""
+    (folder / "command.py").write_text(textwrap.dedent(SCRIPT), encoding="utf-8")
+    return [sys.executable, str(folder / "command.py"), "learn", "train"]
+
+
+def environment() -> dict[str, str]:
+    return {**os.environ, "PYTHONPATH": str(Path(mphdrr.__path__[0]).parent)}
+
+
+def test_two_processes_have_the_loss_of_one_with_the_same_batch(recipe, tmp_path):
+    one = mph.learning.train(recipe, tmp_path / "one.pt")
+    both = 'batch = 2\ndevices = 2\nstrategy = "ddp"'
+    (tmp_path / "two.toml").write_text(RECIPE.replace("batch = 2", both), encoding="utf-8")
+    done = subprocess.run(
+        [*script(tmp_path), str(tmp_path / "two.toml"), "-o", str(tmp_path / "two.pt")],
+        cwd=tmp_path, env=environment(), capture_output=True, text=True, timeout=300,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    two = mph.learning.read_model(tmp_path / "two.pt")
+    for ours, theirs in zip(one.contents.curve, two.contents.curve, strict=True):
+        assert ours["train"] == pytest.approx(theirs["train"], abs=1e-4)
+        assert ours["validation"] == pytest.approx(theirs["validation"], abs=1e-4)
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no SIGINT for one process")
+def test_ctrl_c_keeps_a_checkpoint_and_the_same_command_goes_on(recipe, tmp_path):
+    (tmp_path / "long.toml").write_text(RECIPE.replace("steps = 6", "steps = 4000"), encoding="utf-8")
+    command = [*script(tmp_path), str(tmp_path / "long.toml"), "-o", str(tmp_path / "m.pt")]
+    last, before = tmp_path / "m-training" / "last.ckpt", 0
+    for _ in range(2):
+        running = subprocess.Popen(command, cwd=tmp_path, env=environment(), stderr=subprocess.PIPE, text=True)
+        for _ in range(1200):
+            if (last.exists() and last.stat().st_mtime_ns > before) or running.poll() is not None:
+                break
+            time.sleep(0.1)
+        running.send_signal(signal.SIGINT)
+        said = running.communicate(timeout=60)[1].splitlines()
+        assert running.returncode == 130
+        lines = [f"{tmp_path / 'm.pt'}: samples and the last checkpoint are kept; the same command goes on",
+                 "cancelled; no file is left half-written"]  # fmt: skip
+        assert said == [f"mphdrr: {line}" for line in lines]
+        before = last.stat().st_mtime_ns
+    assert not (tmp_path / "m.pt").exists()
+    steps = [row["step"] for row in json.loads((last.parent / "curve.json").read_text(encoding="utf-8"))]
+    assert len(steps) > 1 and steps == list(range(200, 200 * len(steps) + 1, 200))

@@ -71,6 +71,11 @@ class Case:
             found["ssim"] = ssim(volume, self.truth)
         return found | SCORINGS[scoring](volume, self)
 
+    def contrasts(self, volume: Volume, phantom: DerenzoPhantom, rods: Any) -> Any:
+        """`rod_contrasts` of the event's phantom, which it may have mirrored, enlarged and made hotter."""
+        found = rod_contrasts(volume, phantom, self.event.placement, rods)
+        return found / self.event.planned.activity_factor
+
 
 def told(run: ProjectionRun, system: Scanner | None, file: str) -> ProjectionRun:
     """A run whose images are said to be another scanner's, whose workbook is `file`; as it is for None."""
@@ -112,7 +117,7 @@ def measured() -> Iterator[Scores]:
 def _rods(volume: Volume, case: Case) -> Scores:
     """Contrast recovery of all rods, and how many of them are seen."""
     phantom = _phantom(case, DerenzoPhantom)
-    contrasts = rod_contrasts(volume, phantom, case.event.pose, phantom.rods())
+    contrasts = case.contrasts(volume, phantom, phantom.rods())
     known = contrasts[~np.isnan(contrasts)]
     return {"contrast": float(known.mean()), "rods": len(known), "rods_seen": int((known > PRESENT).sum())}
 
@@ -123,7 +128,7 @@ def _pair(volume: Volume, case: Case) -> Scores:
     site = phantom.altered_site()
     if site is None:
         return {}
-    (contrast,) = rod_contrasts(volume, phantom, case.event.pose, [site])
+    (contrast,) = case.contrasts(volume, phantom, [site])
     return {"site": float(contrast), "site_has_rod": phantom.altered < 0}
 
 
@@ -147,7 +152,7 @@ def _missing(phantom: CardiacTorso, case: Case, turn: float) -> Any:
     whole = dataclasses.replace(phantom, defect_severity=0.0)
     angle = case.defect["defect_angle_degrees"] + turn
     lacking = dataclasses.replace(phantom, **{**case.defect, "defect_angle_degrees": (angle + 180) % 360 - 180})
-    arrays = (each.voxelize(case.grid, case.event.pose).array for each in (whole, lacking))
+    arrays = (each.voxelize(case.grid, case.event.placement).array for each in (whole, lacking))
     return np.subtract(*arrays, dtype=np.float64).clip(0)
 
 

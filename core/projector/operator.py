@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import functools
 import math
 from abc import ABC, abstractmethod
@@ -19,6 +20,7 @@ from ..geometry.views import Views
 from ..memory import require
 from ..progress import Progress, part_of, tell
 from ..recording import recorded_warnings
+from ..validation import freeze
 from ..volumes.images import Images
 from ..volumes.volume import Volume
 from . import backends
@@ -176,6 +178,11 @@ class Projector(LinearOperator):
         not depend on it; the adjoint does by float32 rounding, and is the same every time for a given number.
         The adjoint takes a volume per thread, so it uses at most 8, and fewer when memory is short.
 
+    Attributes
+    ----------
+    which : array of int (M,), read-only
+        Of one of `subsets`: its views, as indices of the whole's; else all.
+
     Raises
     ------
     InputError
@@ -225,6 +232,7 @@ class Projector(LinearOperator):
         for doubt in doubts(grid, views, model):
             warn(doubt, 2)
         self.threads = thread_count(threads)
+        self.which = freeze(np.arange(len(views)))
         self._bundles = Bundles(len(views), self._bundle)
         self._depths = model.by_depth(views, grid)
 
@@ -307,13 +315,19 @@ class Projector(LinearOperator):
     def subsets(self, n: int) -> list[Projector]:
         """`n` projectors of parts of the views, balanced over rings and angles, their sizes differing by one at most.
 
-        `balanced_subsets` says which views each has. Raises InputError where `n` is not from 1 to the number of views.
+        Each one's `which` says which of this projector's views it has. Raises InputError where `n` is not from 1 to the
+        number of views.
         """
+        return [self._of_views(which) for which in balanced_subsets(self.views, n)]
+
+    def _of_views(self, which: NDArray[np.int64]) -> Projector:
+        """The projector of some views (indices, in order) alone; of all of them, with the rays that this one has."""
         with recorded_warnings():  # this projector has given them
-            return [
-                Projector(self.grid, self.views[which], self.model.of_views(which), self._asked, self.threads)
-                for which in balanced_subsets(self.views, n)
-            ]
+            part = copy.copy(self)
+            if len(which) < len(self.views):
+                part = Projector(self.grid, self.views[which], self.model.of_views(which), self._asked, self.threads)
+        part.which = freeze(which)
+        return part
 
     def __repr__(self) -> str:
         n_v, n_u = self.views.shape

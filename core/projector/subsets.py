@@ -1,5 +1,7 @@
 """Subsets of views that each look at the object from all sides, for algorithms that use one subset at a time."""
 
+from typing import TypeVar
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -7,6 +9,8 @@ from ..errors import InputError
 from ..geometry.scanner import rings_along_z
 from ..geometry.views import Views
 from ..validation import whole_number
+
+_Subset = TypeVar("_Subset")
 
 _RING_GAP = 0.02  # of the sources' mean distance from the origin: those that differ less in z form a ring
 
@@ -41,7 +45,6 @@ def access_order(n: int) -> list[int]:
     return [k * step % n for k in range(n)]
 
 
-def ordered_subsets(views: Views, n: int) -> list[tuple[int, NDArray[np.int64]]]:
-    """The subsets of `balanced_subsets` with their indices there, in the order in which they are used."""
-    subsets = balanced_subsets(views, n)
-    return [(s, subsets[s]) for s in access_order(len(subsets))]
+def in_access_order(subsets: list[_Subset]) -> list[_Subset]:
+    """What belongs to each subset, in the order in which they are used."""
+    return [subsets[s] for s in access_order(len(subsets))]

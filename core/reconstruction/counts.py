@@ -14,7 +14,6 @@ from ..geometry.system import PinholeSystem
 from ..memory import require
 from ..progress import Progress
 from ..projector import Emission, Projector
-from ..projector.subsets import balanced_subsets
 from ..validation import instance, real_array, shape_text
 from .loop import Loop, plain
 from .priors import Prior, penalty_of
@@ -97,8 +96,6 @@ class CountLoop(Loop):
     Attributes
     ----------
     data : CountData
-    views : list of arrays (n,)
-        The views of each subset.
     parts : list of tuples
         Each subset's projector and counts.
     seen : list of arrays (n_x, n_y, n_z)
@@ -122,11 +119,9 @@ class CountLoop(Loop):
     ) -> None:
         super().__init__(method, A, iterations, *options, **named)
         self.data = CountData.of(method, A, counts, background)
-        self.views = balanced_subsets(A.views, max(1, len(A.views) // 5) if subsets is None else subsets)
-        n, self.parts = len(self.views), [(A, self.data)]
-        if n > 1:
-            self.parts = [(part, self.data[own]) for part, own in zip(A.subsets(n), self.views, strict=True)]
-        require(4 * A.grid.n_voxels * n, f"the sensitivities of {n} subsets")
+        parts = A.subsets(max(1, len(A.views) // 5) if subsets is None else subsets)
+        self.parts = [(part, self.data[part.which]) for part in parts]
+        require(4 * A.grid.n_voxels * len(parts), f"the sensitivities of {len(parts)} subsets")
         ones = ((part, np.ones(part.shape_out, np.float32)) for part, _ in self.parts)
         self.seen = [np.asarray(part.T(one, self.preparing()), np.float32) for part, one in ones]
         self.total: Array = sum(self.seen[1:], self.seen[0])
@@ -137,9 +132,10 @@ class CountLoop(Loop):
 
     def images(self, s: int, values: Array, progress: Progress | None) -> Array:
         """The images of a volume in subset `s`: known where it is what the last step gave."""
+        part, _ = self.parts[s]
         if values is self.values and self._images is not None:
-            return self._images[self.views[s]]
-        return np.asarray(self.parts[s][0](values, progress))
+            return self._images[part.which]
+        return np.asarray(part(values, progress))
 
     def objective(self, values: Array, progress: Progress | None) -> float:
         """The log-likelihood of a volume, less the prior's penalty."""

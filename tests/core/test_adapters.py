@@ -173,10 +173,9 @@ def test_scipy_solves_with_it(problem, rng):
 def test_parallelprojs_loop_of_subsets_is_our_osem(problem):
     """Its example's EM update: ``x * A^H(y / (A x + s)) / A^H 1``, over a sequence of operators."""
     A = problem.A
-    from mphdrr.core.projector.subsets import ordered_subsets
+    from mphdrr.core.projector.subsets import in_access_order
 
-    parts = A.subsets(6)
-    operators = [(mph.parallelproj_operator(parts[s]), which) for s, which in ordered_subsets(A.views, 6)]
+    operators = [(mph.parallelproj_operator(part), part.which) for part in in_access_order(A.subsets(6))]
     ones = [op.adjoint(np.ones(op.out_shape, np.float32)) for op, _ in operators]
     x = np.ones(operators[0][0].in_shape, np.float32)
     for _ in range(2):

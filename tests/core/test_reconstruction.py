@@ -46,6 +46,20 @@ def test_one_subset_is_mlem_and_a_break_changes_nothing(problem):
     assert faster.objective[-1] > whole.objective[1]
 
 
+def test_subsets_say_which_views_they_hold(problem):
+    A, truth = problem
+    images = A(truth)
+    for n in (1, 3):
+        parts = A.subsets(n)
+        assert sorted(np.concatenate([part.which for part in parts])) == A.which.tolist() == list(range(len(A.views)))
+        for part in parts:
+            np.testing.assert_allclose(part(truth), images[part.which], rtol=1e-6)
+            with pytest.raises(ValueError, match="read-only"):
+                part.which[0] = 0
+    half = A.subsets(2)[1]  # a part's own parts say which of its views they hold
+    np.testing.assert_array_equal([half.which[part.which] for part in half.subsets(1)], [half.which])
+
+
 @pytest.mark.parametrize("n", [1, 3, 7, 16, 20, 80])
 def test_subsets_are_balanced(scanner, n):
     views = scanner.views((2, 2))

@@ -8,7 +8,7 @@ from deepinv.utils import TensorList
 from torch import Tensor
 
 from ...projector import Projector
-from ...projector.subsets import ordered_subsets
+from ...projector.subsets import balanced_subsets, in_access_order
 
 
 class ProjectorPhysics(LinearPhysics):
@@ -37,10 +37,9 @@ class ProjectorPhysics(LinearPhysics):
 
     def split_physics(self, n: int) -> StackedLinearPhysics:
         """The physics of `n` balanced subsets of the views."""
-        parts = self.projector.subsets(n)
-        order = [s for s, _ in ordered_subsets(self.projector.views, n)]
-        return StackedLinearPhysics([ProjectorPhysics(parts[s], noise_model=self.noise_model) for s in order])
+        parts = in_access_order(self.projector.subsets(n))
+        return StackedLinearPhysics([ProjectorPhysics(part, noise_model=self.noise_model) for part in parts])
 
     def split_measurements(self, y: Tensor, n: int) -> TensorList:
         """Their measurements, of those of all views (B, C, M, n_v, n_u)."""
-        return TensorList([y[:, :, which] for _, which in ordered_subsets(self.projector.views, n)])
+        return TensorList([y[:, :, which] for which in in_access_order(balanced_subsets(self.projector.views, n))])

@@ -8,7 +8,7 @@ from pytomography.projectors import SystemMatrix
 from torch import Tensor
 
 from ...projector import Projector
-from ...projector.subsets import ordered_subsets
+from ...projector.subsets import in_access_order
 
 _MM_PER_CM = 10.0
 
@@ -29,10 +29,8 @@ class ProjectorMatrix(SystemMatrix):
         """Divide the views into balanced subsets; PyTomography's algorithms call it, each time that they run."""
         if n_subsets == len(self._parts):
             return
-        ordered = ordered_subsets(self.projector.views, n_subsets)
-        parts = self.projector.subsets(n_subsets)
-        self._parts = [parts[s] for s, _ in ordered]
-        self.subset_indices_array = [torch.tensor(which) for _, which in ordered]
+        self._parts = in_access_order(self.projector.subsets(n_subsets))
+        self.subset_indices_array = [torch.tensor(part.which) for part in self._parts]
 
     def forward(self, object: Tensor, subset_idx: int | None = None) -> Tensor:
         """The projections of an object, or those of a subset."""

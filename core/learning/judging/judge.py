@@ -61,8 +61,8 @@ def judge(
     Raises
     ------
     InputError
-        A set cannot be read, a method was trained, or baselines would be tuned, on events of a test, a method gave another grid than the recipe's, or two methods
-        have one name; or another process judges in this folder.
+        A set cannot be read; a method was trained, or baselines would be tuned, on events of a test; a method gives
+        another grid than the recipe's; two methods have one name; or another process judges in this folder.
     """
     folder = ensure_folder(folder)
     names = [method.name for method in methods]

@@ -10,6 +10,7 @@ import pytest
 import mphdrr.core as mph
 from mphdrr.core.learning.judging.judge import judge, judge_recipe
 from mphdrr.core.learning.judging.methods import Family, JudgedMethod, smoothed
+from mphdrr.core.learning.judging.scoring import Case
 from mphdrr.core.learning.judging.sets import SETS, events_by_recipe, set_fingerprint, set_text
 
 from .conftest import WORKBOOK
@@ -85,6 +86,58 @@ def test_the_truth_has_no_error_and_half_of_it_half(folder, tmp_path):
     assert (tmp_path / "judgement.png").stat().st_size > 10_000
 
 
+def test_contrast_is_of_the_event_as_it_was_changed(tmp_path):
+    contrasts = []
+    for name, changes in (("as-it-is", ""), ("changed", "[augmentation]\nactivity = 2.5\nmirror = 1\nsize = 1.02\n")):
+        recipe = small_recipe(tmp_path / f"{name}-recipe", RODS + changes)
+        mph.events.make(recipe, tmp_path / name, 1)
+        (event,) = mph.events.EventSet(tmp_path / name)
+        case = Case(event, event.run("emission"), event.truth.grid)
+        contrasts.append(case.score(case.truth, "rods")["contrast"])
+    assert contrasts[0] > 0.2 and contrasts[1] == pytest.approx(contrasts[0], abs=0.15)
+
+
+HEARTS = (
+    TEXT[: TEXT.index("[[phantoms]]")].replace("voxels = 16\nspacing = 6.0", "voxels = 24\nspacing = 8.0")
+    + """
+[[phantoms]]
+kind = "torso"
+liver = { from = 20, to = 60 }
+[[phantoms]]
+kind = "torso"
+name = "defect"
+defect_severity = 0.8
+defect_width_degrees = 90
+defect_angle_degrees = 90
+liver = { from = 20, to = 60 }
+[phantoms.pose]
+position = [{ from = -5, to = 5 }, 0, 0]
+"""
+    + TEXT[TEXT.index("[models.emission]") : TEXT.index("[radon]")]
+)
+
+
+def test_the_observer_finds_the_defect_in_the_truth_and_not_in_an_even_volume(tmp_path):
+    mph.events.make(small_recipe(tmp_path / "recipe", HEARTS), tmp_path / "hearts", 16)
+    text = JUDGE[: JUDGE.index("[[tests]]")].replace("voxels = 12", "voxels = 24")
+    mph.events.make(
+        small_recipe(tmp_path / "others", HEARTS.replace("seed = 5", "seed = 6")), tmp_path / "validation", 1
+    )
+    (tmp_path / "judge.toml").write_text(text + '[[tests]]\nname = "hearts"\nevents = "hearts"\nscoring = "defect"\n')
+
+    def true(run):
+        return run.volume
+
+    def even(run):
+        noise = np.random.default_rng(run.seed).normal(1, 0.1, run.volume.array.shape)
+        return mph.Volume(noise.astype(np.float32), run.volume.grid, "activity")
+
+    methods = [JudgedMethod("true", true, "true-1"), JudgedMethod("even", even, "even-1")]
+    *_, best, worst = judge(judge_recipe(tmp_path / "judge.toml"), tmp_path / "out", methods).rows
+    assert best["auc"].value == 1 and best["contrast"] == pytest.approx(1)
+    assert worst["auc"].low < 0.5 < worst["auc"].high and abs(worst["contrast"]) < 0.2
+
+
 def test_interrupted_work_goes_on_where_it_stopped(folder, tmp_path):
     asked, recipe = [], judge_recipe(folder / "judge.toml")
 
@@ -117,6 +170,9 @@ def test_a_method_that_was_trained_on_the_test_is_refused(folder, tmp_path):
     with pytest.raises(mph.InputError, match="net: it was trained on events of the test rods: 1"):
         judge(judge_recipe(folder / "judge.toml"), tmp_path, [trained])
     assert set_fingerprint(events) != set_fingerprint(events[:2])
+    (folder / "tuned.toml").write_text(JUDGE.replace('"validation"', '"rods"'))
+    with pytest.raises(mph.InputError, match="baselines: it was trained on events of the test rods: 0, 1, 2"):
+        judge(judge_recipe(folder / "tuned.toml"), tmp_path, [])
     other = JudgedMethod("net", halved, "net-1", events_by_recipe(mph.events.EventSet(folder / "validation")))
     assert judge(judge_recipe(folder / "judge.toml"), tmp_path, [other]).rows
 

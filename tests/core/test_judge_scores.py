@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,6 +11,8 @@ import pytest
 import mphdrr.core as mph
 from mphdrr.core.learning.judging.consistency import expected_deviance, relative_deviance
 from mphdrr.core.learning.judging.rods import rod_contrasts
+from mphdrr.core.learning.judging.scoring import SCORINGS, Case
+from mphdrr.core.learning.judging.summary import compared, means_of, told_of
 
 
 @pytest.mark.parametrize("mean", [0.003, 0.1, 1.0, 7.0, 49.0, 51.0, 400.0])
@@ -58,3 +61,35 @@ def test_mixtures_follow_from_their_seed_and_stay_in_their_ball(look):
     assert not np.array_equal(one, other)
     distance = np.linalg.norm(np.moveaxis(np.indices(grid.shape), 0, -1) * 5.0 + grid.affine[:3, 3], axis=-1)
     assert one.any() and not one[distance > 40 + 5].any()
+
+
+class Altered(mph.DerenzoPhantom):
+    """A phantom whose rod `altered` - 1 is said to be left out, or to be added where this is negative."""
+
+    altered = 0
+
+    def altered_site(self):
+        return self.rods()[abs(self.altered) - 1] if self.altered else None
+
+
+def scores_of_pairs(altered, factor):
+    """The scores of volumes that show a share `factor` of every rod, though one is left out."""
+    phantom = Altered(36.0, (11.0, 10.0, 9.0, 8.0, 7.0, 6.0), 30.0, activity=80.0)
+    phantom.__dict__["altered"] = altered
+    planned = SimpleNamespace(phantom=phantom, activity_factor=1.0)
+    event = SimpleNamespace(planned=planned, placement=np.eye(4), number=0, name="derenzo")
+    volume = phantom.voxelize(mph.Grid.centered((60,) * 3, 1.6))
+    shown = mph.Volume(factor * volume.array, volume.grid, "activity")
+    return SCORINGS["pairs"](shown, Case(event, None, volume.grid)) | {"nrmse": 1 - factor, "megabytes": 1.0}
+
+
+def test_false_rods_are_counted_where_a_rod_is_missing():
+    rows = [scores_of_pairs(altered, 0.9) for altered in (1, 2, 3, -4)]
+    blind = [scores_of_pairs(altered, 0.2) for altered in (1, 2, 3, -4)]
+    found = means_of(rows)
+    assert found["false_rods"].value == 1 and found["sites"] == 3 and found["sensitivity"].value == 1
+    assert means_of(blind)["false_rods"].value == 0 and means_of(blind)["sensitivity"].value == 0
+    beside = compared(rows, blind, 0)
+    assert beside["false_rods_more"] == (1, 1, 1) and beside["ratio"].value == pytest.approx(0.1 / 0.8)
+    assert "3 sites without their rod, fewer than 200" in told_of(found)
+    assert scores_of_pairs(0, 1.0).keys() == {"nrmse", "megabytes"}

@@ -43,7 +43,7 @@ _ROWS = by_key((
     like("grid.voxels", "phantom.voxels"),
     like("grid.spacing", "phantom.spacing"),
     like("grid.center", "phantom.position", text="Middle of the volumes, x y z"),
-    Setting("baselines.subsets", int, 5, "Of OSEM and BSREM", least=1),
+    Setting("baselines.subsets", int, 10, "Of OSEM and BSREM", least=1),
     Setting("baselines.stops", int, (2, 4, 8, 12, 16, 24), "Iterations of OSEM to choose from", least=1, sizes=()),
     Setting("baselines.fwhm", float, (0.0, 2.4, 3.6, 4.8, 6.5, 8.0, 10.0), "Widths of the filter after it to choose from",
             unit="mm", least=0, sizes=()),

@@ -12,9 +12,11 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ...errors import InputError
 from ...events.event_set import Event
+from ...geometry.frames import moved
 from ...geometry.grid import Grid
 from ...geometry.scanner import Scanner
 from ...phantoms.derenzo import DerenzoPhantom
@@ -30,6 +32,7 @@ from .consistency import relative_deviance
 from .observer import channel_outputs
 from .rods import PRESENT, rod_contrasts
 
+Floats = NDArray[np.float64]
 Scores = dict[str, Any]
 _EVERY = 0.005  # s, between looks at the memory
 
@@ -53,6 +56,12 @@ class Case:
         return resample(self.event.truth, self.grid, "mean")
 
     @cached_property
+    def points(self) -> Floats:
+        """The middles of the judge's voxels, (n, 3) mm."""
+        index = np.indices(self.grid.shape).reshape(3, -1).T
+        return moved(self.grid.affine, index)
+
+    @cached_property
     def projector(self) -> Projector:
         """From the judge's grid to the run's images, with the model that made them."""
         return projector_of_run(self.run, self.grid, recipe=model_of(self.run, self.run.recipe))
@@ -70,6 +79,11 @@ class Case:
         if min(self.grid.shape) >= 11:  # the window's side
             found["ssim"] = ssim(volume, self.truth)
         return found | SCORINGS[scoring](volume, self)
+
+    def contrasts(self, volume: Volume, phantom: DerenzoPhantom, rods: Any) -> Any:
+        """`rod_contrasts` of the event's phantom, which it may have mirrored, enlarged and made hotter."""
+        found = rod_contrasts(volume, phantom, self.event.placement, rods)
+        return found / self.event.planned.activity_factor
 
 
 def told(run: ProjectionRun, system: Scanner | None, file: str) -> ProjectionRun:
@@ -112,7 +126,7 @@ def measured() -> Iterator[Scores]:
 def _rods(volume: Volume, case: Case) -> Scores:
     """Contrast recovery of all rods, and how many of them are seen."""
     phantom = _phantom(case, DerenzoPhantom)
-    contrasts = rod_contrasts(volume, phantom, case.event.pose, phantom.rods())
+    contrasts = case.contrasts(volume, phantom, phantom.rods())
     known = contrasts[~np.isnan(contrasts)]
     return {"contrast": float(known.mean()), "rods": len(known), "rods_seen": int((known > PRESENT).sum())}
 
@@ -123,7 +137,7 @@ def _pair(volume: Volume, case: Case) -> Scores:
     site = phantom.altered_site()
     if site is None:
         return {}
-    (contrast,) = rod_contrasts(volume, phantom, case.event.pose, [site])
+    (contrast,) = case.contrasts(volume, phantom, [site])
     return {"site": float(contrast), "site_has_rod": phantom.altered < 0}
 
 
@@ -131,10 +145,9 @@ def _defect(volume: Volume, case: Case) -> Scores:
     """What the observer's channels see at the defect's place, and its contrast: 1 - its mean by that of the other side."""
     phantom = _phantom(case, CardiacTorso)
     own, other = (_missing(phantom, case, turn) for turn in (0.0, 180.0))
-    index = np.indices(case.grid.shape).reshape(3, -1) @ own.ravel() / own.sum()
-    place = case.grid.affine[:3, :3] @ index + case.grid.affine[:3, 3]
+    place = own @ case.points / own.sum()
     shown, true = (
-        1 - np.mean(v.array[own > 0.5 * own.max()]) / np.mean(v.array[other > 0.5 * other.max()])
+        1 - np.mean(v.array.ravel()[own > own.max() / 2]) / np.mean(v.array.ravel()[other > other.max() / 2])
         for v in (volume, case.truth)
     )
     outputs = channel_outputs(volume, place, case.width).tolist()
@@ -143,12 +156,12 @@ def _defect(volume: Volume, case: Case) -> Scores:
 
 
 def _missing(phantom: CardiacTorso, case: Case, turn: float) -> Any:
-    """The activity (n_x, n_y, n_z) that the test's defect takes from a heart, where it is, or turned by so many degrees."""
+    """The activity (n,) in the voxels' middles that the test's defect takes from a heart; `turn` it by so many degrees."""
     whole = dataclasses.replace(phantom, defect_severity=0.0)
     angle = case.defect["defect_angle_degrees"] + turn
     lacking = dataclasses.replace(phantom, **{**case.defect, "defect_angle_degrees": (angle + 180) % 360 - 180})
-    arrays = (each.voxelize(case.grid, case.event.pose).array for each in (whole, lacking))
-    return np.subtract(*arrays, dtype=np.float64).clip(0)
+    values = (each.values(case.points, case.event.placement) for each in (whole, lacking))
+    return np.subtract(*values).clip(0)
 
 
 def defect_of(events: Any) -> dict[str, Any]:

@@ -30,7 +30,9 @@ class WithKernels(build_py):
 
     def find_package_modules(self, package, package_dir):
         """Leave out this file, which lies beside the package's own."""
-        return [found for found in super().find_package_modules(package, package_dir) if found[1] != "setup"]
+        return [
+            found for found in super().find_package_modules(package, package_dir) if found[:2] != ("mphdrr", "setup")
+        ]
 
     def run(self):
         """Do so, or say that there is none for this machine."""

@@ -68,23 +68,6 @@ class Contents:
     judgement: Mapping[str, Any] | None = None
     versions: Mapping[str, str] = field(default_factory=versions)
 
-    @classmethod
-    def of(
-        cls,
-        weights: Mapping[str, torch.Tensor],
-        recipe: TrainingRecipe,
-        setup: Setup,
-        counts: Sequence[float],
-        trained_on: Mapping[str, Any],
-        curve: Sequence[Mapping[str, float]],
-    ) -> "Contents":
-        """Those of a network that was trained with a setup."""
-        grid = setup.A.grid
-        network: Any = NETWORKS[recipe["network.kind"]].load()
-        fixed = network.fixed(setup)
-        return cls(weights, recipe.text, setup.scanner, grid.shape, grid.affine.tolist(), setup.physics, fixed, counts,
-                   trained_on, curve)  # fmt: skip
-
     @cached_property
     def grid(self) -> Grid:
         """The voxels of its volumes."""

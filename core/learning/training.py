@@ -356,15 +356,24 @@ def _contents(recipe: TrainingRecipe, source: Source, samples: Samples, last: Pa
     """What the model file holds: the mean weights of the last checkpoint, and what it was trained for and on."""
     kept, prefix = torch.load(last, map_location="cpu", weights_only=True), "network."
     weights = {name.removeprefix(prefix): values for name, values in kept["state_dict"].items()}
-    counts = counts_of(samples)
+    counts, setup, grid = counts_of(samples), source.setup, recipe.grid
     seen = source.events.split(recipe["data.train"]) + source.events.split(recipe["data.validation"])
-    trained_on = {
-        "events": events_by_recipe(seen), "set": set_fingerprint(seen), "samples": source.fingerprint,
-        "model": source.model, "levels": list(source.levels), "count": len(samples),
-    }  # fmt: skip
-    return Contents.of(
-        weights, recipe, source.setup, (float(counts.min()), float(counts.max())), trained_on, kept["curve"]
-    )
+    network: Any = NETWORKS[recipe["network.kind"]].load()
+    return Contents(
+        weights,
+        recipe=recipe.text,
+        scanner=setup.scanner,
+        shape=grid.shape,
+        affine=grid.affine.tolist(),
+        physics=setup.physics,
+        fixed=network.fixed(setup),
+        counts=(float(counts.min()), float(counts.max())),
+        trained_on={
+            "events": events_by_recipe(seen), "set": set_fingerprint(seen), "samples": source.fingerprint,
+            "model": source.model, "levels": list(source.levels), "count": len(samples),
+        },
+        curve=kept["curve"],
+    )  # fmt: skip
 
 
 @contextmanager

@@ -120,7 +120,9 @@ position = [{ from = -5, to = 5 }, 0, 0]
 def test_the_observer_finds_the_defect_in_the_truth_and_not_in_an_even_volume(tmp_path):
     mph.events.make(small_recipe(tmp_path / "recipe", HEARTS), tmp_path / "hearts", 16)
     text = JUDGE[: JUDGE.index("[[tests]]")].replace("voxels = 12", "voxels = 24")
-    text = text.replace('events = "validation"', 'events = "hearts"')
+    mph.events.make(
+        small_recipe(tmp_path / "others", HEARTS.replace("seed = 5", "seed = 6")), tmp_path / "validation", 1
+    )
     (tmp_path / "judge.toml").write_text(text + '[[tests]]\nname = "hearts"\nevents = "hearts"\nscoring = "defect"\n')
 
     def true(run):
@@ -168,6 +170,9 @@ def test_a_method_that_was_trained_on_the_test_is_refused(folder, tmp_path):
     with pytest.raises(mph.InputError, match="net: it was trained on events of the test rods: 1"):
         judge(judge_recipe(folder / "judge.toml"), tmp_path, [trained])
     assert set_fingerprint(events) != set_fingerprint(events[:2])
+    (folder / "tuned.toml").write_text(JUDGE.replace('"validation"', '"rods"'))
+    with pytest.raises(mph.InputError, match="baselines: it was trained on events of the test rods: 0, 1, 2"):
+        judge(judge_recipe(folder / "tuned.toml"), tmp_path, [])
     other = JudgedMethod("net", halved, "net-1", events_by_recipe(mph.events.EventSet(folder / "validation")))
     assert judge(judge_recipe(folder / "judge.toml"), tmp_path, [other]).rows
 

@@ -314,6 +314,8 @@ def test_a_model_is_judged_by_the_command_beside_baselines_and_may_keep_its_rows
     own = [row for row in rows if row["method"] == "net"]
     assert [row["level"] for row in own] == [1.0, 0.5] and all(0 < row["nrmse"] < 1 for row in own)
     assert mph.learning.read_model(tmp_path / "net.pt").contents.judgement["rows"] == own
-    (tmp_path / "judge.toml").write_text(JUDGE.replace('"others"\nlevels', '"set"\nlevels'), encoding="utf-8")
+    (tmp_path / "judge.toml").write_text(
+        JUDGE.replace('"others"\nlevels', '"set"\nsplit = "train"\nlevels'), encoding="utf-8"
+    )
     assert main(command) == 1
     assert "net: it was trained on events of the test others" in capsys.readouterr().err

@@ -24,7 +24,7 @@ from .recipe import read_judge_recipe as judge_recipe
 from .records import Key, Records, read_json, write_json
 from .report import write_report
 from .scoring import Case, Scores, defect_of, measured, told
-from .sets import refuse_trained_on, set_fingerprint, short_hash
+from .sets import events_by_recipe, refuse_trained_on, set_fingerprint, short_hash
 from .summary import compared, means_of, told_of
 
 __all__ = ["JudgeRecipe", "JudgedMethod", "Judgement", "judge", "judge_recipe"]
@@ -61,8 +61,8 @@ def judge(
     Raises
     ------
     InputError
-        A set cannot be read, a method was trained on events of a test, gave another grid than the recipe's, or two methods
-        have one name; or another process judges in this folder.
+        A set cannot be read; a method was trained, or baselines would be tuned, on events of a test; a method gives
+        another grid than the recipe's; two methods have one name; or another process judges in this folder.
     """
     folder = ensure_folder(folder)
     names = [method.name for method in methods]
@@ -83,6 +83,9 @@ class _Judging:
     ) -> None:
         self.recipe, self.folder, self.methods, self.progress = recipe, folder, methods, progress
         self.validation, *self.tests = (_Tested(recipe, test) for test in (recipe.validation, *recipe.tests))
+        tuned_on = events_by_recipe(self.validation.events)
+        for tested in self.tests:
+            refuse_trained_on("baselines", tuned_on, tested.events, tested.name)
         for tested, method in product(self.tests, methods):
             refuse_trained_on(method.name, method.trained_on, tested.events, tested.name)
         self.done, self.total = 0, sum(map(self._volumes, self.tests))

@@ -50,6 +50,8 @@ class Setup:
     A : Projector
     sensitivity : tensor (n_x, n_y, n_z)
         Counts that one unit of activity in each voxel gives.
+    uniform : tensor (M, n_v, n_u)
+        Counts of one unit of activity in all voxels.
     """
 
     def __init__(self, A: Projector, subsets: int, after: Sequence[int] = (2, 8, 16), permuted: int | None = None):
@@ -62,7 +64,13 @@ class Setup:
 
     @cached_property
     def sensitivity(self) -> torch.Tensor:
+        """See the class."""
         return self.A.T(torch.ones(self.A.shape_out))
+
+    @cached_property
+    def uniform(self) -> torch.Tensor:
+        """See the class."""
+        return self.A(torch.ones(self.A.shape_in))
 
     @cached_property
     def maps(self) -> PerspectiveMaps:

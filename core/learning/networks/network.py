@@ -1,4 +1,4 @@
-"""What all networks share: the interface, the U-Net, and how values stay at least 0."""
+"""What all networks share: the interface, the U-Net, what counts say of a volume, and how values stay at least 0."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -6,8 +6,12 @@ from collections.abc import Sequence
 import torch
 from monai.networks.nets import DynUNet
 from torch import Tensor, nn
+from torch.nn import functional
 
 from ..setup import Sample, Setup
+
+LEAKY = ("leakyrelu", {"negative_slope": 0.1, "inplace": True})
+"""The rectifier of all networks, as MONAI names it."""
 
 
 class Network(nn.Module, ABC):
@@ -19,32 +23,66 @@ class Network(nn.Module, ABC):
 
     @abstractmethod
     def forward(self, setup: Setup, sample: Sample) -> list[Tensor]:
-        """Volumes (B, 1, n_x, n_y, n_z) in units of the samples' scale: estimates on the way, all trained; the last is the result."""
+        """Volumes (B, 1, n_x, n_y, n_z) in units of the samples' scale: estimates on the way, and last the result."""
 
 
-def unet(inputs: int, outputs: int, channels: Sequence[int]) -> nn.Module:
-    """MONAI's U-Net in 3-D without normalisation, which would lose the activity; each side a multiple of 2 ** levels.
+class UNet(nn.Module):
+    """MONAI's U-Net in 3-D or 2-D, for any size, without normalisation, which would lose the activity.
 
     Its last layer begins with 0: a network that corrects a volume begins with that volume.
     """
-    strides, activation = (1, *[2] * (len(channels) - 1)), ("leakyrelu", {"negative_slope": 0.1, "inplace": True})
-    net = DynUNet(
-        3,
-        inputs,
-        outputs,
-        [3] * len(channels),
-        strides,
-        strides[1:],
-        filters=list(channels),
-        norm_name="",
-        act_name=activation,
-    )
-    last = net.output_block.conv.conv
-    nn.init.zeros_(last.weight)
-    nn.init.zeros_(last.bias)
-    return net
+
+    def __init__(self, inputs: int, outputs: int, channels: Sequence[int], dimensions: int = 3):
+        super().__init__()
+        strides = (1, *[2] * (len(channels) - 1))
+        self.divisor = 2 ** (len(channels) - 1)
+        self.net = DynUNet(
+            dimensions,
+            inputs,
+            outputs,
+            [3] * len(channels),
+            strides,
+            strides[1:],
+            filters=list(channels),
+            norm_name="",
+            act_name=LEAKY,
+        )
+        last = self.net.output_block.conv.conv
+        nn.init.zeros_(last.weight)
+        nn.init.zeros_(last.bias)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(B, inputs, …) to (B, outputs, …), of the same type also where it computes with another."""
+        sides = x.shape[2:]
+        missing = [-n % self.divisor for n in sides]
+        padded = functional.pad(x, [each for n in reversed(missing) for each in (0, n)])
+        layout = torch.channels_last_3d if len(sides) == 3 else torch.channels_last
+        y: Tensor = self.net(padded.contiguous(memory_format=layout)).to(x.dtype)
+        return y[(..., *(slice(n) for n in sides))]
+
+
+def middle(sample: Sample) -> Tensor:
+    """The volume by OSEM (B, 1, n_x, n_y, n_z) that networks begin with, of which `Sample.scale` is told."""
+    m = sample.osem.shape[1] // 2
+    return sample.osem[:, m : m + 1]
+
+
+def surplus(setup: Setup, sample: Sample, x: Tensor) -> Tensor:
+    """By how much the counts exceed those that volumes x (B, 1, …) let expect, as a share: (B, M, n_v, n_u)."""
+    activity = functional.relu(x[:, 0]) * sample.scale.view(-1, 1, 1, 1)  # leaky in training: counts cannot be negative
+    expected = setup.A(activity) + sample.background
+    return (sample.counts + 0.5) / (expected + 0.5) - 1
+
+
+def spread(setup: Setup, shares: Tensor) -> Tensor:
+    """The mean (B, 1, n_x, n_y, n_z) of the shares (B, M, n_v, n_u) of the pixels that see a voxel, as they see it.
+
+    Of `surplus` it is the EM algorithm's relative change of the volume.
+    """
+    sensitivity = setup.sensitivity.to(shares)
+    return (setup.A.T(shares) / sensitivity.clamp(min=1e-3 * float(sensitivity.max())))[:, None]
 
 
 def positive(x: Tensor) -> Tensor:
     """At least 0 when it is used; leaky in training, where a ReLU at the end can die for good."""
-    return nn.functional.leaky_relu(x, 0.1) if torch.is_grad_enabled() else nn.functional.relu(x)
+    return functional.leaky_relu(x, 0.1) if torch.is_grad_enabled() else functional.relu(x)

@@ -64,10 +64,12 @@ class Setup:
 
     @cached_property
     def sensitivity(self) -> torch.Tensor:
+        """See the class."""
         return self.A.T(torch.ones(self.A.shape_out))
 
     @cached_property
     def uniform(self) -> torch.Tensor:
+        """See the class."""
         return self.A(torch.ones(self.A.shape_in))
 
     @cached_property

@@ -1,4 +1,4 @@
-"""A U-Net that corrects volumes by OSEM: all that it knows of the geometry, it has from them."""
+"""A U-Net that corrects volumes by OSEM."""
 
 from collections.abc import Sequence
 
@@ -9,7 +9,7 @@ from .network import Network, UNet, middle, positive
 
 
 class Model(Network):
-    """A U-Net with the volumes by OSEM as channels, whose result is added to the middle one.
+    """Adds to the middle one of the volumes by OSEM what a U-Net makes of all of them.
 
     Parameters
     ----------
@@ -19,7 +19,7 @@ class Model(Network):
         By OSEM.
     """
 
-    def __init__(self, channels: Sequence[int] = (16, 32, 48), *, volumes: int = 3):
+    def __init__(self, channels: Sequence[int] = (16, 32, 48), volumes: int = 3):
         super().__init__()
         self.net = UNet(volumes, 1, channels)
 

@@ -38,7 +38,6 @@ class Model(Network):
         camera_channels: Sequence[int] = (16, 32, 32),
         channels: Sequence[int] = (16, 32, 48),
         features: int = 3,
-        *,
         volumes: int = 3,
     ):
         super().__init__()
@@ -81,7 +80,7 @@ class Model(Network):
         return (sample.counts - sample.background) / (uniform + 0.05 * uniform.max()) / scale
 
     def _opinions(self, setup: Setup, images: Tensor, volumes: Tensor, some: Tensor) -> tuple[Tensor, Tensor]:
-        """What some cameras make of their images (B, V, 2, n_v, n_u), in the world: (B, V, outputs, …), (1, V, 1, …) inside."""
+        """What V cameras make of their images (B, V, 2, n_v, n_u), in the world (B, V, outputs, …); inside (1, V, 1, …)."""
         seen = setup.maps.to_views(volumes, some)  # (B, V, volumes, n_u, n_v, n_k)
         n_k = seen.shape[-1]
         spread = images.transpose(-1, -2)[..., None].expand(*seen.shape[:2], 2, *seen.shape[3:])

@@ -30,7 +30,7 @@ class Network(nn.Module, ABC):
 
     @abstractmethod
     def forward(self, setup: Setup, sample: Sample) -> list[Tensor]:
-        """Volumes (B, 1, n_x, n_y, n_z) in units of the samples' scale: estimates on the way, all trained; the last is the result."""
+        """Volumes (B, 1, n_x, n_y, n_z) in units of the samples' scale: estimates on the way, and last the result."""
 
 
 class UNet(nn.Module):
@@ -62,9 +62,9 @@ class UNet(nn.Module):
         """(B, inputs, …) to (B, outputs, …), of the same type also where it computes with another."""
         sides = x.shape[2:]
         missing = [-n % self.divisor for n in sides]
-        x_padded = functional.pad(x, [each for n in reversed(missing) for each in (0, n)])
+        padded = functional.pad(x, [each for n in reversed(missing) for each in (0, n)])
         layout = torch.channels_last_3d if len(sides) == 3 else torch.channels_last
-        y: Tensor = self.net(x_padded.contiguous(memory_format=layout)).to(x.dtype)
+        y: Tensor = self.net(padded.contiguous(memory_format=layout)).to(x.dtype)
         return y[(..., *(slice(n) for n in sides))]
 
 
@@ -77,7 +77,7 @@ def middle(sample: Sample) -> Tensor:
 def surplus(setup: Setup, sample: Sample, x: Tensor) -> Tensor:
     """By how much the counts exceed those that volumes x (B, 1, …) let expect, as a share: (B, M, n_v, n_u)."""
     activity = functional.relu(x[:, 0]) * sample.scale.view(-1, 1, 1, 1)  # leaky in training: counts cannot be negative
-    expected = setup.A(activity.to(sample.counts)) + sample.background
+    expected = setup.A(activity) + sample.background
     return (sample.counts + 0.5) / (expected + 0.5) - 1
 
 

@@ -33,9 +33,7 @@ class Model(Network):
         By OSEM.
     """
 
-    def __init__(
-        self, angles: int = 96, neighbours: int = 1, channels: Sequence[int] = (16, 32, 48), *, volumes: int = 3
-    ):
+    def __init__(self, angles: int = 96, neighbours: int = 1, channels: Sequence[int] = (16, 32, 48), volumes: int = 3):
         super().__init__()
         self.angles, self.neighbours = angles, neighbours
         self.net = UNet((volumes + 1) * (2 * neighbours + 1), 1, channels, dimensions=2)
@@ -44,13 +42,14 @@ class Model(Network):
         """See `Network`."""
         beam, x = parallel_beam(setup.A.grid, self.angles), middle(sample)
         update = x * spread(setup, surplus(setup, sample, x))
-        # (B, volumes + 1, angles, n_v, n_u)
-        images = beam.project(torch.cat([sample.osem, 5 * update], 1)) / beam.length
+        images = (
+            beam.project(torch.cat([sample.osem, 5 * update], 1)) / beam.length
+        )  # (B, volumes + 1, angles, n_v, n_u)
         correction = self.net(self._stacks(images).flatten(0, 1)).view(len(x), self.angles, *images.shape[-2:])
         return [positive(beam.fbp(images[:, sample.osem.shape[1] // 2] + correction)[:, None] * beam.length)]
 
     def _stacks(self, images: Tensor) -> Tensor:
-        """Every projection with its neighbours as channels (B, angles, channels, n_v, n_u); half a circle on, u is mirrored."""
+        """Projections and their neighbours as channels (B, angles, channels, n_v, n_u); half a circle on u is mirrored."""
         n = self.neighbours
         around = torch.cat([images[:, :, -n:].flip(-1), images, images[:, :, :n].flip(-1)], 2) if n else images
         return around.unfold(2, 2 * n + 1, 1).permute(0, 2, 1, 5, 3, 4).flatten(2, 3)
@@ -76,7 +75,8 @@ class ParallelBeam:
         shape = int(np.ceil(height / voxel - 1e-6)), int(np.ceil(2 * width / voxel))
         views = parallel_views(np.arange(angles) * np.pi / angles, shape, self.pitch, center=center)
         self.project, self.length = Projector(grid, views), float(width)
-        weight = np.pi / angles / self.pitch[0] * self.pitch[0] * self.pitch[1] / grid.voxel_volume
+        # A voxel gets its volume by the pixel's area from each view; FBP takes 1 by the pitch of u, and the angle of a view.
+        weight = np.pi / angles / self.pitch[0] * np.prod(self.pitch) / grid.voxel_volume
         self._filter = torch.as_tensor(ramp_matrix(shape[1], "ramp") * weight)
 
     def fbp(self, images: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""Steps through the exact operators, each of which a small U-Net corrects."""
+"""Steps of the EM algorithm through the exact operators, each with a small U-Net."""
 
 from collections.abc import Sequence
 
@@ -11,42 +11,63 @@ from .network import Network, UNet, middle, positive, spread, surplus
 
 
 class Model(Network):
-    """In each step a U-Net gets the volume, those by OSEM, and the EM algorithm's change of it: the likelihood's gradient
-    by the sensitivity. What it gives is added.
+    """Begins with the middle one of the volumes by OSEM; each step adds a part of an EM update and its own U-Net's change.
 
-    In training a step's inner values are made again when its gradient is asked for: memory is that of one step, and a
-    volume of each.
+    The update is the gradient of the log-likelihood by the exact operators, divided by the sensitivity. A U-Net gets it,
+    the volume, and those by OSEM.
 
     Parameters
     ----------
     steps : int
     channels : sequence of int
-        Of each level of a step's U-Net.
+        Of each level of the U-Nets.
+    learn_step : bool
+        Each step also adds a learned multiple of the EM update, at first 0.
     through : bool
-        Whether gradients pass the operators, too, which costs a projection and an adjoint more; else the change is taken
-        as it is.
+        Gradients in training flow through the operators; if not, each step takes its expected counts as given.
+    dual : bool
+        Before they are spread over the volume, the counts' surpluses are corrected by a small network on the images, which
+        gets those of the step before, too, as in learned primal-dual reconstruction.
+    save_memory : bool
+        U-Nets are computed twice in training and keep nothing meanwhile.
     volumes : int
         By OSEM.
+
+    References
+    ----------
+    J. Adler, O. Öktem, "Learned primal-dual reconstruction", IEEE Transactions on Medical Imaging 37 (2018) 1322-1332.
     """
 
     def __init__(
-        self, steps: int = 3, channels: Sequence[int] = (16, 32, 48), through: bool = True, *, volumes: int = 3
+        self,
+        steps: int = 3,
+        channels: Sequence[int] = (16, 32, 48),
+        learn_step: bool = True,
+        through: bool = False,
+        dual: bool = False,
+        save_memory: bool = True,
+        volumes: int = 3,
     ):
         super().__init__()
-        self.nets, self.through = nn.ModuleList(UNet(volumes + 3, 1, channels) for _ in range(steps)), through
+        self.through, self.save_memory = through, save_memory
+        self.nets = nn.ModuleList(UNet(volumes + 3, 1, channels) for _ in range(steps))
+        self.step = nn.Parameter(torch.zeros(steps), requires_grad=learn_step)
+        self.duals = nn.ModuleList(UNet(2, 1, (8, 16, 16), dimensions=2) for _ in range(steps if dual else 0))
 
     def forward(self, setup: Setup, sample: Sample) -> list[Tensor]:
         """See `Network`."""
-        x, estimates = middle(sample), []
-        for net in self.nets:
-            if self.training and torch.is_grad_enabled():
-                x = checkpoint(self._step, net, x, setup, sample, use_reentrant=False)
-            else:
-                x = self._step(net, x, setup, sample)
+        x, shares, estimates = middle(sample), torch.zeros_like(sample.counts), []
+        for k, net in enumerate(self.nets):
+            found = surplus(setup, sample, x if self.through else x.detach())
+            shares = found + self._correction(k, found, shares) if self.duals else found
+            change = spread(setup, shares)
+            features = torch.cat([x, 5 * change, 5 * change * x, sample.osem], 1)  # changes are some 20 % of the volume
+            correction = checkpoint(net, features, use_reentrant=False) if self.save_memory else net(features)
+            x = positive(x + self.step[k] * change * x + correction)
             estimates.append(x)
         return estimates
 
-    def _step(self, net: nn.Module, x: Tensor, setup: Setup, sample: Sample) -> Tensor:
-        with torch.set_grad_enabled(self.through and torch.is_grad_enabled()):
-            change = spread(setup, surplus(setup, sample, x))
-        return positive(x + net(torch.cat([x, sample.osem, 5 * change, 5 * change * x], 1)))
+    def _correction(self, k: int, found: Tensor, before: Tensor) -> Tensor:
+        """What step k adds to the surpluses (B, M, n_v, n_u), view by view."""
+        images = torch.stack([found, before], 2).flatten(0, 1)
+        return self.duals[k](images).view(found.shape)  # type: ignore[no-any-return]

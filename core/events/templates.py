@@ -29,7 +29,7 @@ def template_text(name: str, workbook: AnyPath = EXAMPLE) -> str:
     return with_workbook((_FOLDER / f"{name}.toml").read_text(encoding="utf-8"), workbook)
 
 
-def with_workbook(text: str, workbook: str | os.PathLike[str]) -> str:
+def with_workbook(text: str, workbook: AnyPath) -> str:
     """A recipe's text with a workbook's path in place of the example's."""
     path = str(workbook) if isinstance(workbook, str) else Path(workbook).as_posix()
     return text.replace(toml_value(EXAMPLE.name), toml_value(path), 1)

@@ -37,7 +37,7 @@ class PerspectiveMaps:
         self.n_k = n_k or max(8, round(0.6 * max(grid.shape)))
         self.grids = [PerspectiveGrid(views, m, self.n_k, near[m], far[m]) for m in range(len(views))]
         numbers = 3.0 * len(views) * (grid.n_voxels + np.prod(self.grids[0].shape))
-        require(4 * numbers, f"maps of {len(views)} views")
+        require(float(4 * numbers), f"maps of {len(views)} views")
         axes = np.meshgrid(*map(np.arange, grid.shape), indexing="ij")
         world = np.stack([*axes, np.ones(grid.shape)], -1) @ grid.affine.T
         ones = np.ones((*self.grids[0].shape, 1))
@@ -56,8 +56,8 @@ class PerspectiveMaps:
         return _sampled(x[:, None].expand(-1, len(which), *x.shape[1:]), self._cells[which])
 
     def to_volume(self, y: Tensor, which: Tensor) -> tuple[Tensor, Tensor]:
-        """Values of views (B, V, C, n_u, n_v, n_k) at the voxels, (B, V, C, n_x, n_y, n_z), and where they see: (V, 1, …)."""
-        return _sampled(y, self._voxels[which]), self._inside[which].to(y)
+        """Values of views (B, V, C, n_u, n_v, n_k) at the voxels (B, V, C, …), and 1 for those they see (1, V, 1, …)."""
+        return _sampled(y, self._voxels[which]), self._inside[which][None].to(y)
 
 
 def _sampled(values: Tensor, places: Tensor) -> Tensor:

@@ -17,12 +17,12 @@ from numpy.typing import NDArray
 from ...errors import InputError
 from ...events.event_set import Event
 from ...geometry.frames import moved
-from ...geometry.grid import Grid
+from ...geometry.grid import Grid, same_grid
 from ...geometry.scanner import Scanner
 from ...phantoms.derenzo import DerenzoPhantom
 from ...phantoms.torso import CardiacTorso
 from ...projector import Projector
-from ...reconstruction.scores.images import nrmse, same_grid, ssim
+from ...reconstruction.scores.images import nrmse, ssim
 from ...runs.reconstructing import model_of
 from ...runs.run import ProjectionRun
 from ...runs.run_recipe import projector_of_run, recipe_views

@@ -19,7 +19,7 @@ class Model(Network):
         By OSEM.
     """
 
-    def __init__(self, channels: Sequence[int] = (16, 32, 48), volumes: int = 3):
+    def __init__(self, channels: Sequence[int] = (16, 32, 48), *, volumes: int = 3):
         super().__init__()
         self.net = UNet(volumes, 1, channels)
 

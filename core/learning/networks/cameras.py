@@ -38,6 +38,7 @@ class Model(Network):
         camera_channels: Sequence[int] = (16, 32, 32),
         channels: Sequence[int] = (16, 32, 48),
         features: int = 3,
+        *,
         volumes: int = 3,
     ):
         super().__init__()

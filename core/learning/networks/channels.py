@@ -1,6 +1,7 @@
 """Views as channels into a decoder of volumes, which is told no geometry: what the others are compared with."""
 
 from collections.abc import Sequence
+from typing import Any
 
 from monai.networks.nets import Generator, Regressor
 from torch import Tensor
@@ -27,6 +28,7 @@ class Model(Network):
         self,
         channels: Sequence[int] = (64, 64, 32),
         latent: int = 256,
+        *,
         views: int = 20,
         pixels: Sequence[int] = (32, 32),
         voxels: Sequence[int] = (40, 40, 40),
@@ -38,6 +40,12 @@ class Model(Network):
         like = {"num_res_units": 1, "act": LEAKY, "norm": None}
         self.encoder = Regressor((views, *pixels), (latent,), channels, strides, **like)
         self.decoder = Generator((latent,), (channels[-1], *start), (*channels[-2::-1], 1), strides, **like)
+
+    @classmethod
+    def fixed(cls, setup: Setup) -> dict[str, Any]:
+        """See `Network`."""
+        M, *pixels = setup.A.shape_out
+        return {"views": M, "pixels": pixels, "voxels": setup.A.shape_in}
 
     def forward(self, setup: Setup, sample: Sample) -> list[Tensor]:
         """See `Network`; raises `InputError` for another number of views, pixels or voxels."""

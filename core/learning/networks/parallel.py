@@ -33,7 +33,9 @@ class Model(Network):
         By OSEM.
     """
 
-    def __init__(self, angles: int = 96, neighbours: int = 1, channels: Sequence[int] = (16, 32, 48), volumes: int = 3):
+    def __init__(
+        self, angles: int = 96, neighbours: int = 1, channels: Sequence[int] = (16, 32, 48), *, volumes: int = 3
+    ):
         super().__init__()
         self.angles, self.neighbours = angles, neighbours
         self.net = UNet((volumes + 1) * (2 * neighbours + 1), 1, channels, dimensions=2)

@@ -46,6 +46,7 @@ class Model(Network):
         through: bool = False,
         dual: bool = False,
         save_memory: bool = True,
+        *,
         volumes: int = 3,
     ):
         super().__init__()

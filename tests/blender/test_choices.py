@@ -68,6 +68,7 @@ FROZEN = {
     "NemaBodyProperties": {"quantity": HELD},
     "JaszczakPhantomProperties": {"quantity": HELD},
     "DefrisePhantomProperties": {"quantity": HELD},
+    "MixturePhantomProperties": {"quantity": HELD},
     "SheppLoganProperties": {"quantity": HELD, **PHANTOMS["shepp_logan"]},
     "PointGridProperties": {"quantity": HELD},
     "CardiacTorsoProperties": {"quantity": HELD},
@@ -100,7 +101,7 @@ DEFAULTS = {
     "detector": "VIRTUAL", "backend": "AUTO", "rows": "BY_NUMBER", "unit": "NONE",
     "colors": "INFERNO", "scale": "LINEAR", "planes": "ALL", "look": "DENSITY", "figure": "SCANNER",
     "method": "OSEM", "prior": "NONE", "hole": "AUTO",
-    "how": "SUM", "uniform": "K",
+    "how": "SUM", "uniform": "K", "MixturePhantomProperties.look": "solids",
 }  # fmt: skip
 """What files mean that do not hold a choice, because nobody has made it."""
 

@@ -37,7 +37,7 @@ PROJECTIONS = {
     "backend": {"AUTO": 0, "CPU": 1, "TORCH": 2, "NUMPY": 3, "CUDA": 4},
 }  # fmt: skip
 PHANTOMS = {
-    "derenzo": {}, "nema": {}, "jaszczak": {}, "defrise": {}, "points": {}, "torso": {},
+    "derenzo": {}, "nema": {}, "jaszczak": {}, "defrise": {}, "points": {}, "torso": {}, "mixture": {},
     "shepp_logan": {"contrast": {"modified": 0, "original": 1}},
 }  # fmt: skip
 READ_AS = {

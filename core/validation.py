@@ -12,6 +12,8 @@ from .memory import require
 
 # Copies of fewer numbers always fit into memory.
 _MANY = 2**20
+_FEW = 2**12
+"""Up to so many, a mask of which numbers are finite is faster than what does without."""
 
 
 def real_array(
@@ -83,7 +85,7 @@ def batch_shape(shape: tuple[Any, ...], given: tuple[int, ...]) -> tuple[Any, ..
 
 def require_finite(array: NDArray[Any], name: str, given: NDArray[Any] | None = None) -> None:
     """Raise `InputError` naming the first index at which `array` is not finite; it was made of the numbers `given`."""
-    if array.size > _MANY:
+    if array.size > _FEW:
         # A finite sum proves that all numbers are, in one pass without a mask. The sum of finite numbers may still
         # overflow.
         with np.errstate(over="ignore", invalid="ignore"):

@@ -8,7 +8,6 @@ import hashlib
 import io
 import json
 import os
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -19,7 +18,7 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike
 
-from ..errors import InputError, InputWarning, naming, reading, warn
+from ..errors import InputError, naming, reading, warn
 from ..files import read_bytes, require_ending, write_bytes
 from ..geometry.grid import Grid
 from ..progress import Progress, tell
@@ -27,6 +26,7 @@ from ..projector import Projector
 from ..reconstruction.counts import CountData
 from ..reconstruction.methods import Method
 from ..reconstruction.result import Reconstruction
+from ..recording import recorded_warnings
 from ..runs.reconstructing import reconstruct_run
 from ..runs.run import ProjectionRun, versions
 from ..validation import one_of
@@ -192,8 +192,7 @@ class TrainedNetwork:
         """It under a name in the judge's table; scanners and physics that it was not trained for are judged, too."""
 
         def volume(run: ProjectionRun) -> Volume:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore", InputWarning)
+            with recorded_warnings():  # the judge knows what differs
                 return self(run, ("scanner", "physics"))
 
         return JudgedMethod(name, volume, self.fingerprint, self.contents.trained_on["events"])

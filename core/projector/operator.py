@@ -20,7 +20,7 @@ from ..geometry.views import Views
 from ..memory import require
 from ..progress import Progress, part_of, tell
 from ..recording import recorded_warnings
-from ..validation import freeze
+from ..validation import freeze, shape_text
 from ..volumes.images import Images
 from ..volumes.volume import Volume
 from . import backends
@@ -101,7 +101,9 @@ class LinearOperator(ABC):
         if not batch:
             return self._run_one(x, progress, mu)
         n = math.prod(batch)
-        require(x.itemsize * n * math.prod(self.shape_out), f"a batch of {n} times {_times(self.shape_out)} numbers")
+        require(
+            x.itemsize * n * math.prod(self.shape_out), f"a batch of {n} times {shape_text(self.shape_out)} numbers"
+        )
         results = zeros((*batch, *self.shape_out), x)
         for done, index in enumerate(np.ndindex(batch)):
             results[index] = self._run_one(x[index], part_of(progress, done, n), mu)
@@ -177,11 +179,6 @@ class Projector(LinearOperator):
         Threads of cpu and numpy, by default one per core (torch has a setting of its own, cuda needs none). The images do
         not depend on it; the adjoint does by float32 rounding, and is the same every time for a given number.
         The adjoint takes a volume per thread, so it uses at most 8, and fewer when memory is short.
-
-    Attributes
-    ----------
-    which : array of int (M,), read-only
-        Of one of `subsets`: its views, as indices of the whole's; else all.
 
     Raises
     ------
@@ -315,23 +312,21 @@ class Projector(LinearOperator):
     def subsets(self, n: int) -> list[Projector]:
         """`n` projectors of parts of the views, balanced over rings and angles, their sizes differing by one at most.
 
-        Each one's `which` says which of this projector's views it has. Raises InputError where `n` is not from 1 to the
-        number of views.
+        Each one's `which` says which views it has. Raises InputError where `n` is not from 1 to their number.
         """
-        return [self._of_views(which) for which in balanced_subsets(self.views, n)]
-
-    def _of_views(self, which: NDArray[np.int64]) -> Projector:
-        """The projector of some views (indices, in order) alone; of all of them, with the rays that this one has."""
+        parts: list[Projector] = []
         with recorded_warnings():  # this projector has given them
-            part = copy.copy(self)
-            if len(which) < len(self.views):
-                part = Projector(self.grid, self.views[which], self.model.of_views(which), self._asked, self.threads)
-        part.which = freeze(which)
-        return part
+            for which in balanced_subsets(self.views, n):
+                own = self.grid, self.views[which], self.model.of_views(which), self._asked, self.threads
+                parts.append(copy.copy(self) if n == 1 else Projector(*own))
+                parts[-1].which = freeze(which)
+        return parts
 
     def __repr__(self) -> str:
         n_v, n_u = self.views.shape
-        return f"Projector({_times(self.grid.shape)} voxels, {len(self.views)} views of {n_v} x {n_u}, {self.backend})"
+        return (
+            f"Projector({shape_text(self.grid.shape)} voxels, {len(self.views)} views of {n_v} x {n_u}, {self.backend})"
+        )
 
     def _check(self, x: Volume | ArrayOrTensor, batch: bool = True) -> ArrayOrTensor:
         if isinstance(x, Volume):
@@ -348,7 +343,7 @@ class Projector(LinearOperator):
     ) -> ArrayOrTensor:
         n_views, n_v, n_u = self.shape_out
         itemsize = 8 if self._float64 or is_double(x) else 4
-        what = f"projecting {_times(self.shape_in)} voxels into {n_views} images of {n_v} x {n_u} pixels"
+        what = f"projecting {shape_text(self.shape_in)} voxels into {n_views} images of {n_v} x {n_u} pixels"
         require(itemsize * (n_views * n_v * n_u + self.grid.n_voxels) + self._extra_bytes(itemsize), what)
         images = None
         tell(progress, 0, n_views)
@@ -366,7 +361,7 @@ class Projector(LinearOperator):
         execution = self._execution(y)
         given = images = execution.to_backend(y)
         needed = images.itemsize * self.grid.n_voxels + self._extra_bytes(images.itemsize)
-        require(needed, f"the adjoint into {_times(self.grid.shape)} voxels")
+        require(needed, f"the adjoint into {shape_text(self.grid.shape)} voxels")
         self._require_rays()
         n = len(self.views)
         tell(progress, 0, n)
@@ -502,8 +497,4 @@ class Projector(LinearOperator):
 
 
 def _describe(grid: Grid) -> str:
-    return f"{_times(grid.shape)} voxels of {_times(tuple(f'{s:.6g}' for s in grid.spacing))} mm"
-
-
-def _times(numbers: tuple[Any, ...]) -> str:
-    return " x ".join(map(str, numbers))
+    return f"{shape_text(grid.shape)} voxels of {' x '.join(f'{s:.6g}' for s in grid.spacing)} mm"

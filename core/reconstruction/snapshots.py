@@ -14,6 +14,8 @@ from .counts import LEAST, CountData
 class Snapshots:
     """OSEM whose subsets and sensitivities are made once: the numbers of `osem`, without its objective and options.
 
+    It begins with the even volume that gives as many counts, so that twice the counts and background give twice the volume.
+
     Parameters
     ----------
     A : Projector
@@ -25,7 +27,8 @@ class Snapshots:
     def __init__(self, A: Projector, subsets: int) -> None:
         self._parts = in_access_order(A.subsets(subsets))
         self._seen = [np.asarray(part.T(np.ones(part.shape_out, np.float32))) for part in self._parts]
-        self._start = (sum(self._seen) > LEAST).astype(np.float32)
+        total = np.sum(self._seen, axis=0)
+        self._even = (total > LEAST) / total.sum(dtype=float)  # of one count
 
     def __call__(
         self, counts: Array, after: Sequence[int], background: Array | float = 0.0, progress: Progress | None = None
@@ -36,7 +39,7 @@ class Snapshots:
         """
         data = CountData(counts, np.broadcast_to(np.float32(background), counts.shape))
         own = [data[part.which] for part in self._parts]
-        x, found = self._start, []
+        x, found = (counts.sum(dtype=float) * self._even).astype(np.float32), []
         for number in range(1, max(after) + 1):
             for part, measured, seen in zip(self._parts, own, self._seen, strict=True):
                 factor = part.T(measured.ratio(np.asarray(part(x))))

@@ -8,6 +8,7 @@ import io
 import json
 import shutil
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 
@@ -75,7 +76,9 @@ class Source:
         """The first event's, which says what scanner and physics are."""
         run = self.events[0].run(self.model)
         model = self.events.recipe.models[self.model]
-        return run if "recipe" in run.settings else _with_recipe(run, model.tables())
+        if "recipe" not in run.settings:  # none of projections describes its volume
+            run = replace(run, settings={**run.settings, "recipe": model.tables()})
+        return run
 
     @cached_property
     def setup(self) -> Setup:
@@ -160,8 +163,13 @@ class Samples(Dataset[Sample]):
     def __len__(self) -> int:
         return len(self.draws)
 
+    def record(self, index: int) -> NDArray[np.void]:
+        """A sample's arrays by name, on the disk."""
+        found: NDArray[np.void] = np.load(_path(self.folder, self.draws[index]), mmap_mode="r")
+        return found
+
     def __getitem__(self, index: int) -> Sample:
-        record = np.load(_path(self.folder, self.draws[index]), mmap_mode="r")
+        record = self.record(index)
         return Sample(*(torch.from_numpy(np.array(record[name])) for name in Sample._fields))
 
     def __getitems__(self, indices: Sequence[int]) -> list[Sample]:
@@ -225,13 +233,6 @@ def _path(folder: Path, draw: Draw) -> Path:
     return folder / f"{draw[0]:06d}-{draw[1]}.npy"
 
 
-def _with_recipe(run: ProjectionRun, tables: dict[str, dict[str, object]]) -> ProjectionRun:
-    """A run that says what made its images, though no recipe of projections describes its volume."""
-    settings = {**run.settings, "recipe": tables}
-    return ProjectionRun(run.projections, run.system, run.views, run.volume, run.unit, settings, run.seed,
-                         background=run.background)  # fmt: skip
-
-
 def counts_of(samples: Samples) -> NDArray[np.float64]:
-    """The total counts of each sample."""
-    return np.array([float(sample.counts.sum()) for sample in (samples[i] for i in range(len(samples)))])
+    """The total counts of each sample; nothing else of it is read."""
+    return np.array([samples.record(i)["counts"].sum(dtype=float) for i in range(len(samples))])

@@ -216,5 +216,5 @@ class _Tested:
         """Bias and standard deviation over draws of noise: their root mean squares by that of the truth."""
         cases = [self.case(event, level, draw) for draw in range(self.test["draws"])]
         found = bias_and_deviation((method.function(case.run) for case in cases), cases[0].truth)
-        return {name: nrmse(volume.array + truth, truth) for truth in [cases[0].truth.array]
-                for name, volume in found._asdict().items()}  # fmt: skip
+        truth = cases[0].truth.array
+        return {name: nrmse(volume.array + truth, truth) for name, volume in found._asdict().items()}

@@ -45,7 +45,8 @@ ALLOWED = ("scanner", "grid", "physics")
 _NO_PHYSICS = ("time", "background")
 """Entries of a model's record that may differ: a network is given counts and background of each scan."""
 _KEPT = 4
-"""Setups that a network keeps."""
+_SETUPS: dict[Any, Setup] = {}
+"""Setups that all networks share, the last used last, and how many are kept."""
 _FAR = 2.0  # times fewer or more counts than any that it was trained on
 
 
@@ -195,22 +196,22 @@ class TrainedNetwork:
             with recorded_warnings():  # the judge knows what differs
                 return self(run, ("scanner", "physics"))
 
-        return JudgedMethod(name, volume, self.fingerprint, self.contents.trained_on["events"])
+        def saved() -> float:
+            return next(reversed(_SETUPS.values())).saved if _SETUPS else 0.0
+
+        return JudgedMethod(name, volume, self.fingerprint, self.contents.trained_on["events"], saved)
 
     def setup(self, A: Projector) -> Setup:
-        """What it is told of a scanner, kept for the next scans by it."""
-        recipe = self.recipe
-        made = Setup(A, recipe["osem.subsets"], recipe["osem.after"], recipe["network.permuted"])
+        """What it is told of a scanner, kept for the next scans by it, and for other networks."""
+        own = tuple(self.recipe[key] for key in ("osem.subsets", "osem.after", "network.permuted"))
+        made = Setup(A, *own)
         if getattr(A.model, "mu", None) is not None:  # of which the record has the grid alone
             return made
-        key = made.scanner, made.physics, A.grid.shape, A.grid.affine.tobytes()
-        if key not in self._setups and len(self._setups) >= _KEPT:
-            self._setups.clear()
-        return self._setups.setdefault(key, made)
-
-    @cached_property
-    def _setups(self) -> dict[Any, Setup]:
-        return {}
+        key = made.scanner, made.physics, A.grid.shape, A.grid.affine.tobytes(), own
+        _SETUPS[key] = _SETUPS.pop(key, made)
+        if len(_SETUPS) > _KEPT:
+            del _SETUPS[next(iter(_SETUPS))]
+        return _SETUPS[key]
 
     def reconstruct(
         self,

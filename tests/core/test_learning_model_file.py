@@ -25,6 +25,7 @@ import torch
 import mphdrr.core as mph
 from mphdrr.core.cli import main
 from mphdrr.core.events import EventSet
+from mphdrr.core.learning import model_file
 from mphdrr.core.learning.judging.sets import events_by_recipe
 from mphdrr.core.learning.model_file import Contents, read_model, sealed, write_model
 from mphdrr.core.learning.networks import NETWORKS
@@ -240,12 +241,13 @@ def test_a_model_is_judged_under_a_name_without_warnings(model, run):
     assert found.grid == model.contents.grid
 
 
-def test_operators_are_kept_for_the_next_scan_by_the_same_scanner(folder, model):
+def test_operators_are_kept_for_the_next_scan_by_the_same_scanner(folder, model, monkeypatch):
+    monkeypatch.setattr(model_file, "_SETUPS", {})
     runs = [event.run("emission", noise_seed=1) for event in EventSet(folder / "set")[:3]]
     network = mph.learning.read_model(folder / "model.pt")
     for run in runs:
         network(run)
-    assert len(network._setups) == 1
+    assert len(model_file._SETUPS) == 1
 
 
 def test_permuted_poses_are_those_of_the_training(folder, model, run, tmp_path):

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
-from functools import cached_property
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import cache, cached_property
 from itertools import product
 from pathlib import Path
 from typing import Any
 
 from ...errors import InputError, naming
-from ...events.event_set import Event
+from ...events.event_set import Event, EventSet
 from ...files import ensure_folder, locked, remove_leftovers
 from ...geometry.system import chosen_modules
 from ...progress import Progress, tell
@@ -131,7 +132,9 @@ class _Judging:
     def _rows(self, tested: _Tested, level: float) -> list[Row]:
         """A row for each method, beside the best baseline and the best of those tuned on the set itself."""
         found, scores = list[Row](), []
-        for kind, method in self._methods(tested, level):
+        methods = self._methods(tested, level)
+        self._work(tested, level, [method for _, method in methods])
+        for kind, method in methods:
             scores.append(self._scores(tested, level, method))
             row = {"test": tested.name, "level": level, "method": method.name, "kind": kind}
             found.append({**row, "fingerprint": method.fingerprint, **means_of(*scores[-1])})
@@ -144,20 +147,28 @@ class _Judging:
                     row[name] = {"method": found[best]["method"], **beside}
         return [{**row, "notes": told_of(row)} for row in found]
 
+    def _work(self, tested: _Tested, level: float, methods: Sequence[JudgedMethod]) -> None:
+        """Score all methods, event by event, so that they share what each is read and made for."""
+        records = [self._records(tested, method) for method in methods]
+        for events, draw, score in ((tested.events, 0, tested.scores), (tested.drawn, _SEVERAL, tested.draws)):
+            for event in events:
+                cases, key = tested.cases(event, level), tested.key(event, level, draw)
+                for method, kept in zip(methods, records, strict=True):
+                    if key not in kept:
+                        with naming(f"{tested.name}: event {event.number}: {method.name}"):
+                            kept.add(key, score(cases, method))
+                    self._tell(draw != _SEVERAL)
+
     def _scores(self, tested: _Tested, level: float, method: JudgedMethod) -> tuple[list[Row], list[Row]]:
         """A method's scores of all events, and those over draws of noise of some."""
-        records = Records(self.folder / "scores" / f"{tested.fingerprint}-{method.fingerprint[:16]}.jsonl")
-        drawn = tested.events[: tested.test["drawn_events"] if tested.test["draws"] > 1 else 0]
-        for events, draw, score in ((tested.events, 0, tested.scores), (drawn, _SEVERAL, tested.draws)):
-            for event in events:
-                if (key := tested.key(event, level, draw)) not in records:
-                    with naming(f"{tested.name}: event {event.number}: {method.name}"):
-                        records.add(key, score(event, level, method))
-                self._tell(draw != _SEVERAL)
+        records = self._records(tested, method)
         return tuple(  # type: ignore[return-value]
             [records[tested.key(event, level, draw)] for event in events]
-            for events, draw in ((tested.events, 0), (drawn, _SEVERAL))
+            for events, draw in ((tested.events, 0), (tested.drawn, _SEVERAL))
         )
+
+    def _records(self, tested: _Tested, method: JudgedMethod) -> Records:
+        return Records(self.folder / "scores" / f"{tested.fingerprint}-{method.fingerprint[:16]}.jsonl")
 
     def _picture(self, tested: _Tested) -> list[tuple[str, Volume]]:
         """The first event of a test: the truth, the first baseline's volume and those of all methods."""
@@ -187,34 +198,47 @@ class _Tested:
     def fingerprint(self) -> str:
         """What scores depend on besides event, level, draw and method."""
         source = None if self.system is None or self.system.source is None else self.system.source.sha256
-        own = [self.test[name] for name in ("scoring", "model", "draws", "channel_width")]
+        own = [self.test[name] for name in ("scoring", "model", "believed_model", "draws", "channel_width")]
         return short_hash([*own, self.grid.shape, self.grid.affine.tolist(), source, self.defect])
 
     @property
     def record(self) -> dict[str, Any]:
         """What the judgement says of the test."""
-        own = {name: self.test[name] for name in ("scoring", "levels", "believed")}
+        own = {name: self.test[name] for name in ("scoring", "levels", "believed", "believed_model")}
         return {"set": set_fingerprint(self.events), "events": len(self.events), "fingerprint": self.fingerprint, **own}
 
     def key(self, event: Event, level: float, draw: int) -> Key:
         """What the scores of an event are kept by."""
         return event.recipe.fingerprint, event.number, level, draw
 
+    @property
+    def drawn(self) -> EventSet:
+        """The events of which bias and deviation over draws of noise are taken."""
+        return self.events[: self.test["drawn_events"] if self.test["draws"] > 1 else 0]
+
+    def cases(self, event: Event, level: float) -> Callable[[int], Case]:
+        """An event as methods are asked for it, by the draw of noise; each is made once."""
+        return cache(lambda draw: self.case(event, level, draw))
+
     def case(self, event: Event, level: float, draw: int = 0) -> Case:
         """An event as methods are asked for it."""
-        run = event.run(self.test["model"], (event.noise_seed + draw) % 2**64, level)
+        seed = (event.noise_seed + draw) % 2**64
+        run = event.run(self.test["model"], seed, level)
+        if self.test["believed_model"] is not None:
+            run = replace(event.run(self.test["believed_model"], seed, level), projections=run.projections)
         return Case(event, told(run, self.system, self.file), self.grid, self.test["channel_width"], self.defect)
 
-    def scores(self, event: Event, level: float, method: JudgedMethod) -> Scores:
+    def scores(self, cases: Callable[[int], Case], method: JudgedMethod) -> Scores:
         """The scores of a method's volume."""
-        case = self.case(event, level)
+        case = cases(0)
         with measured() as found:
             volume = method.function(case.run)
+        found["seconds"] += method.saved()
         return {**case.score(volume, self.test["scoring"]), **found}
 
-    def draws(self, event: Event, level: float, method: JudgedMethod) -> Scores:
+    def draws(self, of_draw: Callable[[int], Case], method: JudgedMethod) -> Scores:
         """Bias and standard deviation over draws of noise: their root mean squares by that of the truth."""
-        cases = [self.case(event, level, draw) for draw in range(self.test["draws"])]
+        cases = [of_draw(draw) for draw in range(self.test["draws"])]
         found = bias_and_deviation((method.function(case.run) for case in cases), cases[0].truth)
         truth = cases[0].truth.array
         return {name: nrmse(volume.array + truth, truth) for name, volume in found._asdict().items()}

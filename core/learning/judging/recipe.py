@@ -34,6 +34,7 @@ _TEST = by_key((
     Setting("levels", float, (1.0,), "Shares of the acquisition time", above=0, sizes=()),
     Setting("believed", str, None, "Workbook of the geometry that methods are told", "that which made the images",
             is_path=True),
+    Setting("believed_model", str, None, "Model of the set whose physics methods are told", "that of the images"),
     Setting("tuned_on_itself", bool, False, "Also judge baselines that are tuned on the test's own events"),
     Setting("draws", int, 0, "Draws of noise of which bias and standard deviation are taken; 0: neither", least=0),
     Setting("drawn_events", int, 3, "Events, the first ones, that bias and deviation are of", least=1),

@@ -12,7 +12,7 @@ from .network import Network, UNet, middle, positive, surplus
 class Model(Network):
     """One U-Net for all cameras, in (u, v, k), then another in the world.
 
-    The first gets a camera's image and by how much its counts exceed those expected, spread along its rays, and the volumes
+    It begins as `after_osem`, whose weights it can take. The first gets a camera's image and by how much its counts exceed those expected, spread along its rays, and the volumes
     so far in its perspective: what the others hold. It gives a change of the volume, how sure it is of it, and features. The
     second gets the volumes by OSEM and of all cameras the mean, the mean weighed by confidence, and the variance between
     them: it weighs the cameras voxel by voxel.
@@ -43,12 +43,14 @@ class Model(Network):
     ):
         super().__init__()
         self.cameras, self.rounds = cameras, rounds
+        self.net = UNet(volumes, 1, channels)
         self.camera = UNet(volumes + 4, 2 + features, camera_channels)
         self.fuse = UNet(volumes + 4 + features, 1, channels)
 
     def forward(self, setup: Setup, sample: Sample) -> list[Tensor]:
         """See `Network`."""
-        x, estimates = middle(sample), []
+        x = positive(middle(sample) + self.net(sample.osem))
+        estimates = [x]
         for _ in range(self.rounds):
             mean, variance, weighed = self._exchange(setup, sample, x)
             estimates.append(positive(x + weighed[:, :1]))

@@ -11,7 +11,7 @@ from .network import Network, UNet, middle, positive, spread, surplus
 
 
 class Model(Network):
-    """Begins with the middle one of the volumes by OSEM; each step adds a part of an EM update and its own U-Net's change.
+    """Begins as `after_osem`, whose weights it can take; each step adds a part of an EM update and its own U-Net's change.
 
     The update is the gradient of the log-likelihood by the exact operators, divided by the sensitivity. A U-Net gets it,
     the volume, and those by OSEM.
@@ -40,7 +40,7 @@ class Model(Network):
 
     def __init__(
         self,
-        steps: int = 3,
+        steps: int = 2,
         channels: Sequence[int] = (16, 32, 48),
         learn_step: bool = True,
         through: bool = False,
@@ -51,22 +51,27 @@ class Model(Network):
     ):
         super().__init__()
         self.through, self.save_memory = through, save_memory
+        self.net = UNet(volumes, 1, channels)
         self.nets = nn.ModuleList(UNet(volumes + 3, 1, channels) for _ in range(steps))
         self.step = nn.Parameter(torch.zeros(steps), requires_grad=learn_step)
         self.duals = nn.ModuleList(UNet(2, 1, (8, 16, 16), dimensions=2) for _ in range(steps if dual else 0))
 
     def forward(self, setup: Setup, sample: Sample) -> list[Tensor]:
         """See `Network`."""
-        x, shares, estimates = middle(sample), torch.zeros_like(sample.counts), []
+        x, shares = positive(middle(sample) + self._of(self.net, sample.osem)), torch.zeros_like(sample.counts)
+        estimates = [x]
         for k, net in enumerate(self.nets):
             found = surplus(setup, sample, x if self.through else x.detach())
             shares = found + self._correction(k, found, shares) if self.duals else found
             change = spread(setup, shares)
             features = torch.cat([x, 5 * change, 5 * change * x, sample.osem], 1)  # changes are some 20 % of the volume
-            correction = checkpoint(net, features, use_reentrant=False) if self.save_memory else net(features)
-            x = positive(x + self.step[k] * change * x + correction)
+            x = positive(x + self.step[k] * change * x + self._of(net, features))
             estimates.append(x)
         return estimates
+
+    def _of(self, net: nn.Module, features: Tensor) -> Tensor:
+        found: Tensor = checkpoint(net, features, use_reentrant=False) if self.save_memory else net(features)
+        return found
 
     def _correction(self, k: int, found: Tensor, before: Tensor) -> Tensor:
         """What step k adds to the surpluses (B, M, n_v, n_u), view by view."""

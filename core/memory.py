@@ -11,6 +11,9 @@ from .errors import InputError
 # The rest is left to other programs.
 _USABLE_SHARE = 0.9
 
+# Bytes that are not worth asking the system again, which takes as long as a small projection.
+_LITTLE = 2**20
+
 _PROCESS = Path("/proc/self")
 # Of Linux's control groups: the file with a limit in bytes, and that with how many are used, page cache included.
 _LIMITS = {"memory.max": "memory.current", "memory.limit_in_bytes": "memory.usage_in_bytes"}
@@ -80,6 +83,19 @@ def require(n_bytes: float, what: str) -> None:
             f"{what} needs {readable_size(n_bytes)} of memory, but {readable_size(usable)} can be used: "
             "choose fewer voxels or pixels, or free some memory"
         )
+
+
+class Requirements:
+    """`require` for work that is done again and again: what is little, and has fitted once, is not asked for again."""
+
+    def __init__(self) -> None:
+        self._fitted: set[str] = set()
+
+    def __call__(self, n_bytes: float, what: str) -> None:
+        """See `require`."""
+        if n_bytes > _LITTLE or what not in self._fitted:
+            require(n_bytes, what)
+            self._fitted.add(what)
 
 
 def readable_size(n_bytes: float) -> str:

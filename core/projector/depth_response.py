@@ -5,11 +5,13 @@ What the numbers of a view are comes from `hole_response`; the work is done by f
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..arrays import Array
 
@@ -42,8 +44,8 @@ class DepthResponse:
     """Planes in 1 / mm of 1 / h."""
     before: Array
     """(rows, columns): what a part counts at a cell of the fine image in all, times h^2, and without `after`."""
-    kernel: Array
-    """(planes, taps, taps): what a pixel counts of the cells from its first on."""
+    padded: Array
+    """The kernel between rows of zeros, as many as a pixel's rows of cells: the backend cpu reads on into them."""
     steps: tuple[int, int]
     """Rows and columns of cells from a pixel to the next."""
     after: Array
@@ -52,7 +54,18 @@ class DepthResponse:
     @property
     def shape(self) -> tuple[int, int, int]:
         """Planes of depth, and rows and columns of cells in each."""
-        return len(self.kernel), *self.before.shape  # type: ignore[return-value]
+        return len(self.padded), *self.before.shape  # type: ignore[return-value]
+
+    @property
+    def kernel(self) -> Array:
+        """(planes, taps, taps): what a pixel counts of the cells from its first on."""
+        return self.padded[:, self.steps[0] : -self.steps[0]]
+
+    @functools.cached_property
+    def bounds(self) -> NDArray[np.int64]:
+        """(planes, padded rows, 2): where in each row of the kernel taps begin that are not 0, and where they end."""
+        has = self.padded != 0
+        return np.stack([has.argmax(-1), has.shape[2] - has[..., ::-1].argmax(-1)], -1) * has.any(-1, keepdims=True)
 
     def of_part(self, origin: Index, shape: Index) -> tuple[DepthResponse, tuple[slice, slice]]:
         """The response to a part of the volume alone, and the rows and columns of pixels that may see it."""
@@ -72,7 +85,7 @@ class DepthResponse:
             pixels.append(slice(start, stop))
             cells.append(slice(step * start, step * stop + size - step * n))
         planes = (1 / depth - self.first_plane) * self.planes_per_inverse
-        nearer = min(max(math.ceil(planes.max()), 1), len(self.kernel) - 1)
+        nearer = min(max(math.ceil(planes.max()), 1), len(self.padded) - 1)
         farther = min(max(math.floor(planes.min()), 0), nearer - 1)
         matrix[0] -= cells[1].start * matrix[2]
         matrix[1] -= cells[0].start * matrix[2]
@@ -81,6 +94,6 @@ class DepthResponse:
             matrix=matrix,
             first_plane=self.first_plane + farther / self.planes_per_inverse,
             before=self.before[tuple(cells)],
-            kernel=self.kernel[farther : nearer + 1],
+            padded=self.padded[farther : nearer + 1],
             after=self.after[tuple(pixels)],
         ), (pixels[0], pixels[1])

@@ -268,7 +268,7 @@ class Emission(Model):
                 f"emission: {len(self.system)} modules but {len(views)} views; give the system whose views they are"
             )
         views.require_pinholes("emission")
-        u, v, k = self.system.frames().transpose(1, 0, 2)
+        u, v, k = self._frames.transpose(1, 0, 2)
         moved = np.linalg.norm(views.sources - self.system.centers, axis=1) > _SAME_PLACE
         turned = np.zeros(len(views), dtype=bool)
         for steps, axis in ((views.u_steps, u), (views.v_steps, v)):
@@ -289,6 +289,10 @@ class Emission(Model):
         """What the model says of hole, edge, walls, cone, crystal and photons, for `sensitivity`, maps and cameras."""
         return Optics(**{f.name: getattr(self, f.name) for f in fields(Optics)})
 
+    @functools.cached_property
+    def _frames(self) -> Floats:
+        return self.system.frames()
+
     @property
     def effective_diameter(self) -> Floats:
         """d_e (M,), mm: the opaque hole that lets as many photons pass along the axis."""
@@ -296,7 +300,7 @@ class Emission(Model):
 
     def beams(self, views: Views, m: int, grid: Grid) -> Iterator[Beam]:
         """Rays from the pinhole through the grid, weighted with counts per (decay / (s mm^3) mm)."""
-        u, v, k = self.system.frames()[m]
+        u, v, k = self._frames[m]
         l = self.system.collimator_length[m]
         pinhole, rays, scale = views.sources[m], view_rays(views, m), self._crystal_scale(views, m)
         # The pixels' places on the crystal, mm along u and v from its centre, point-inverted.
@@ -438,7 +442,7 @@ class Emission(Model):
 
     def _crystal_scale(self, views: Views, m: int) -> float:
         """A length on the crystal, per length on view m's plane."""
-        distance = (views.detector_centers[m] - views.sources[m]) @ self.system.frames()[m, 2]
+        distance = (views.detector_centers[m] - views.sources[m]) @ self._frames[m, 2]
         return float(self.system.collimator_length[m] / distance)
 
     def _crystal_pitch(self, views: Views, m: int) -> tuple[float, float]:

@@ -41,6 +41,7 @@ from .transmittance import mean_transmittance
 
 VoxelBox = tuple[tuple[slice, ...], NDArray[np.bool_]]
 """A box of a grid, and which of its voxels."""
+Part = tuple[DepthResponse, tuple[slice, slice]]
 Weigh = Callable[[int, Array, Array], Array]
 
 # In units of the geometric mean of the two largest of the widths of pixel, voxel and the hole's shadow on the crystal:
@@ -54,8 +55,10 @@ _LARGE_VOXELS = 0.6
 _PAIR_SMEAR = 0.366 * math.sqrt(12)
 # Larger voxels, mm, are cut into parts of this size at most: kernels as wide as their shadows would take longer.
 _LARGEST = 6.0
-# Layers of voxels that a thread adds to before it takes others, and bytes of the views' cells that are in memory.
-_SLAB, _CELLS_AT_ONCE = 4, 2**28
+# Voxels that a thread adds to, in whole layers, before it takes others, and bytes of the views' cells that are in memory.
+_SLAB, _CELLS_AT_ONCE = 2**14, 2**28
+# Parts of the volume, on average, whose responses a view keeps: the whole, and what a volume fills. They share its numbers.
+_PARTS_OF_VIEW = 2
 # Bytes of transmittances that are kept from call to call.
 _KEPT = 2**30
 # Largest ratio of the largest and the smallest shadow of the hole in a grid, and about so much in a zone.
@@ -98,6 +101,7 @@ class WholeHoles:
         self.n, self.pixels, self.grid, self.mu = len(views), views.shape, grid, mu
         self._made: dict[tuple[int, float], DepthResponse] = {}
         self._zones: dict[int, list[tuple[float, float]]] = {}
+        self._parts: dict[tuple[int, Index, Index], list[Part]] = {}
         self._passing: dict[int, tuple[Index, Array]] = {}
         self._room = _KEPT
         self._views, self._system, self._diameters, self._frames = views, system, diameters, system.frames()
@@ -133,7 +137,8 @@ class WholeHoles:
     ) -> Array:
         """The adjoint. Each thread has a slab of the volume, so the result does not depend on their number."""
         volume = np.zeros(self.grid.shape, images.dtype)
-        slabs = [slice(x, x + _SLAB) for x in range(0, len(volume), _SLAB)]
+        layers = max(1, _SLAB // math.prod(volume.shape[1:]))
+        slabs = [slice(x, x + layers) for x in range(0, len(volume), layers)]
         whole = (0, 0, 0), self.grid.shape
 
         def give(m: int) -> tuple[Array | None, list[tuple[DepthResponse, Array]]]:
@@ -156,8 +161,17 @@ class WholeHoles:
             report(first)
         return volume
 
-    def _of_part(self, m: int, origin: Index, shape: Index) -> list[tuple[DepthResponse, tuple[slice, slice]]]:
+    def _of_part(self, m: int, origin: Index, shape: Index) -> list[Part]:
         """View m's responses to a part of the volume, of the zones that it reaches into, and the pixels that may see it."""
+        found = self._parts.get((m, origin, shape))
+        if found is None:
+            found = self._make_part(m, origin, shape)
+            if len(self._parts) >= _PARTS_OF_VIEW * self.n:
+                self._parts.clear()
+            self._parts[m, origin, shape] = found
+        return found
+
+    def _make_part(self, m: int, origin: Index, shape: Index) -> list[Part]:
         row = self.depths(m)
         depths = [row @ (*np.add(origin, corner), 1) for corner in itertools.product(*((0, n - 1) for n in shape))]
         if m not in self._zones:
@@ -305,7 +319,7 @@ class WholeHoles:
         of_pixel *= np.outer(*(share_inside(pixels[i], abs(pitches[i]), self._sides[m]) for i in range(2)))
         secant = 1 + (places[0][:, None] ** 2 + places[1] ** 2) / l**2
         before = grid.voxel_volume / len(pieces) * l**2 * of_direction * (1 + second.mean() / secant**2)
-        before, kernel = before.astype(np.float32), kernel.astype(np.float32)
+        before, kernel = before.astype(np.float32), np.pad(kernel.astype(np.float32), ((0, 0), (steps[0],) * 2, (0, 0)))
         zone = near, far, farthest, (n_planes - 1) / (nearest - farthest)
         return DepthResponse(matrix, pieces, along, *limits, *zone, before, kernel, steps, of_pixel)
 

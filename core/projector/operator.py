@@ -17,7 +17,7 @@ from ..arrays import Array, ArrayOrTensor, cast_like, checked, is_double, is_ten
 from ..errors import InputError, warn
 from ..geometry.grid import Grid
 from ..geometry.views import Views
-from ..memory import require
+from ..memory import Requirements, require
 from ..progress import Progress, part_of, tell
 from ..recording import recorded_warnings
 from ..validation import freeze, shape_text
@@ -217,8 +217,8 @@ class Projector(LinearOperator):
         ):
             if not isinstance(value, kind):
                 raise InputError(f"projector: expected {what}, got {type(value).__name__}")
-        self.grid = grid
-        self.views = views
+        self.grid, self.views = grid, views
+        self._require = Requirements()
         self._asked, self._auto = backend, backend == "auto"
         self._backend = backends.choose(backend)
         self._float64 = self._backend.always_float64 and not self._auto
@@ -344,7 +344,7 @@ class Projector(LinearOperator):
         n_views, n_v, n_u = self.shape_out
         itemsize = 8 if self._float64 or is_double(x) else 4
         what = f"projecting {shape_text(self.shape_in)} voxels into {n_views} images of {n_v} x {n_u} pixels"
-        require(itemsize * (n_views * n_v * n_u + self.grid.n_voxels) + self._extra_bytes(itemsize), what)
+        self._require(itemsize * (n_views * n_v * n_u + self.grid.n_voxels) + self._extra_bytes(itemsize), what)
         images = None
         tell(progress, 0, n_views)
         for m, image in enumerate(self._images(x, mu)):
@@ -361,7 +361,7 @@ class Projector(LinearOperator):
         execution = self._execution(y)
         given = images = execution.to_backend(y)
         needed = images.itemsize * self.grid.n_voxels + self._extra_bytes(images.itemsize)
-        require(needed, f"the adjoint into {shape_text(self.grid.shape)} voxels")
+        self._require(needed, f"the adjoint into {shape_text(self.grid.shape)} voxels")
         self._require_rays()
         n = len(self.views)
         tell(progress, 0, n)
@@ -487,7 +487,7 @@ class Projector(LinearOperator):
     def _require_rays(self) -> None:
         n_v, n_u = self.views.shape
         # An image of float32, and some arrays of float64 from which the weights of its rays are made.
-        require(110 * n_v * n_u, f"an image of {n_v} x {n_u} pixels, with its rays,")
+        self._require(110 * n_v * n_u, f"an image of {n_v} x {n_u} pixels, with its rays,")
 
     def _finished(self, result: ArrayOrTensor, x: ArrayOrTensor) -> ArrayOrTensor:
         """`result` as float32, unless it is to be float64 (where "auto" falls back to numpy it is not)."""

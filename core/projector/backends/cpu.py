@@ -294,7 +294,7 @@ def cells_to_pixels(cells: Array, of: DepthResponse) -> Array:
     """The image (n_v, n_u) of a view's cells."""
     image = np.zeros(of.after.shape, cells.dtype)
     sorted_cells = _sorted_cells(of, cells.dtype)
-    np.multiply(_by_place(cells, of), _by_place(of.before, of), out=sorted_cells, casting="same_kind")
+    sorted_cells[...] = _by_place(cells * of.before, of)  # faster than products of what is apart
     _run_pixels(_library.cells_to_pixels, of, sorted_cells, image)
     image *= of.after
     return image
@@ -346,13 +346,11 @@ def _run_voxels(
 
 def _run_pixels(kernel: Any, of: DepthResponse, sorted_cells: Array, image: Array) -> None:
     """Run a kernel between the sorted cells and the pixels of one view."""
-    taps = np.pad(of.kernel, ((0, 0), (of.steps[0],) * 2, (0, 0))).astype(image.dtype, copy=False)
-    has = taps != 0
-    bounds = np.stack([has.argmax(-1), taps.shape[2] - has[..., ::-1].argmax(-1)], -1) * has.any(-1, keepdims=True)
+    taps = of.padded.astype(image.dtype, copy=False)
     job = _DepthJob(
         is_double=image.dtype == np.float64,
         cells=sorted_cells.ctypes.data, planes=of.shape[0], rows=of.shape[1], columns=of.shape[2],
-        kernel=taps.ctypes.data, bounds=bounds.ctypes.data, taps=of.kernel.shape[1:], step=of.steps,
+        kernel=taps.ctypes.data, bounds=of.bounds.ctypes.data, taps=of.kernel.shape[1:], step=of.steps,
         image=image.ctypes.data, row=image.strides[0] // image.itemsize, pixels=of.after.shape,
     )  # fmt: skip
     kernel(level, job)

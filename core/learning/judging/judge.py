@@ -6,7 +6,6 @@ import os
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cache, cached_property
-from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +15,7 @@ from ...files import ensure_folder, locked, remove_leftovers
 from ...geometry.system import chosen_modules
 from ...progress import Progress, tell
 from ...reconstruction.scores.images import bias_and_deviation, nrmse
+from ...validation import one_of
 from ...volumes.volume import Volume
 from ...workbook import read_scanner
 from .judgement import BASELINE, METHOD, ORACLE, Judgement
@@ -82,13 +82,15 @@ class _Judging:
     def __init__(
         self, recipe: JudgeRecipe, folder: Path, methods: Sequence[JudgedMethod], progress: Progress | None
     ) -> None:
-        self.recipe, self.folder, self.methods, self.progress = recipe, folder, methods, progress
+        self.recipe, self.folder, self.progress = recipe, folder, progress
         self.validation, *self.tests = (_Tested(recipe, test) for test in (recipe.validation, *recipe.tests))
         tuned_on = events_by_recipe(self.validation.events)
         for tested in self.tests:
             refuse_trained_on("baselines", tuned_on, tested.events, tested.name)
-        for tested, method in product(self.tests, methods):
-            refuse_trained_on(method.name, method.trained_on, tested.events, tested.name)
+        self.chosen = {tested.name: _chosen(tested, methods) for tested in self.tests}
+        for tested in self.tests:
+            for method in self.chosen[tested.name]:
+                refuse_trained_on(method.name, method.trained_on, tested.events, tested.name)
         self.done, self.total = 0, sum(map(self._volumes, self.tests))
         self.tuning = read_json(folder / "tuning.json")
 
@@ -105,7 +107,8 @@ class _Judging:
 
     def _volumes(self, tested: _Tested) -> int:
         """How many volumes a test asks for."""
-        methods = len(self.recipe.families) * (1 + tested.test["tuned_on_itself"]) + len(self.methods)
+        methods = len(self.recipe.families) * (1 + tested.test["tuned_on_itself"])
+        methods += len(self.chosen[tested.name])
         return methods * len(tested.events) * len(tested.test["levels"])
 
     def _tell(self, more: int) -> None:
@@ -127,7 +130,7 @@ class _Judging:
         found = [(BASELINE, self._tuned(family, self.validation, level)) for family in self.recipe.families]
         if tested.test["tuned_on_itself"]:
             found += [(ORACLE, self._tuned(family, tested, level)) for family in self.recipe.families]
-        return found + [(METHOD, method) for method in self.methods]
+        return found + [(METHOD, method) for method in self.chosen[tested.name]]
 
     def _rows(self, tested: _Tested, level: float) -> list[Row]:
         """A row for each method, beside the best baseline and the best of those tuned on the set itself."""
@@ -175,8 +178,17 @@ class _Judging:
         level = tested.test["levels"][0]
         case = tested.case(tested.events[0], level)
         first = [method for _, method in self._methods(tested, level)][:1]
-        shown = {method.name: method for method in (*first, *self.methods)}
+        shown = {method.name: method for method in (*first, *self.chosen[tested.name])}
         return [("truth", case.truth), *((name, method.function(case.run)) for name, method in shown.items())]
+
+
+def _chosen(tested: _Tested, methods: Sequence[JudgedMethod]) -> list[JudgedMethod]:
+    """The methods that a test names, of those that there are; without names all."""
+    known = {method.name: method for method in methods}
+    names = tested.test["models"] or tuple(known)
+    for name in names:
+        one_of(name, known, f"{tested.name}: models")
+    return [known[name] for name in names]
 
 
 class _Tested:

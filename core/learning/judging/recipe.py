@@ -29,6 +29,7 @@ _TEST = by_key((
     Setting("model", str, "emission", "Which of its images"),
     Setting("count", int, None, "How many events, the first ones", "all", least=1),
     Setting("name", str, None, "What the table calls it"),
+    Setting("models", str, None, "Names of the models that are judged on it", "all", sizes=()),
     Setting("scoring", str, "volumes", "What is scored besides the voxels",
             words=named(("volumes", "rods", "pairs", "defect"))),
     Setting("levels", float, (1.0,), "Shares of the acquisition time", above=0, sizes=()),

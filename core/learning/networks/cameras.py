@@ -14,7 +14,7 @@ class Model(Network):
 
     It begins as `after_osem`, whose weights it can take. The first U-Net gets a camera's image and by how much its counts
     exceed those expected, spread along its rays, and the volumes so far in its perspective: what the others hold. It gives a
-    change of the volume, how sure it is of it, and features. The second gets the volumes by OSEM and of all cameras the mean,
+    change of the volume, how sure it is of it, and features. The second gets the volumes by OSEM and over cameras the mean,
     the mean weighed by confidence, and the variance between them: it weighs the cameras voxel by voxel.
 
     Parameters

@@ -12,36 +12,9 @@ from mphdrr.core.learning.networks import NETWORKS, Kind
 from mphdrr.core.learning.recipe import TrainingRecipe, read_recipe
 
 from .small_events import TEXT, small_recipe
+from .small_recipes import TRAINING
 
 EVENTS = 8
-RECIPE = """
-version = 1
-
-[data]
-events = "set"
-levels = [1.0, 0.5]
-draws = 2
-train = "train"
-validation = "test"
-
-[grid]
-voxels = 8
-spacing = 12.0
-
-[osem]
-subsets = 2
-after = [1, 2]
-
-[network]
-kind = "toy"
-
-[training]
-steps = 6
-batch = 2
-precision = "32"
-threads = 1
-accelerator = "cpu"
-"""
 
 
 class Toy(nn.Module):
@@ -81,7 +54,7 @@ def add_toy() -> None:
     NETWORKS["toy"] = TOY  # type: ignore[index]
 
 
-def small_training(folder: Path, text: str = RECIPE, events: str = TEXT) -> TrainingRecipe:
+def small_training(folder: Path, text: str = TRAINING, events: str = TEXT) -> TrainingRecipe:
     """The recipe of a training in a folder, with its set of events."""
     if not (folder / "set").exists():
         make(small_recipe(folder, events), folder / "set", EVENTS)

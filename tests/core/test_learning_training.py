@@ -28,7 +28,8 @@ from mphdrr.core.learning.networks import NETWORKS
 from mphdrr.core.learning.recipe import parsed, template_text
 from mphdrr.core.learning.training import loss_of, nrmse
 
-from .small_learning import RECIPE, TOY, small_training
+from .small_learning import TOY, small_training
+from .small_recipes import TRAINING
 
 
 @pytest.fixture
@@ -166,7 +167,7 @@ def test_events_that_cannot_be_learned_from_are_refused(recipe, tmp_path, before
 
 def test_truth_from_coarse_voxels_is_doubted(monkeypatch, tmp_path):
     monkeypatch.setitem(NETWORKS, "toy", TOY)
-    recipe = small_training(tmp_path, RECIPE.replace("spacing = 12.0", "spacing = 8.0"))
+    recipe = small_training(tmp_path, TRAINING.replace("spacing = 12.0", "spacing = 8.0"))
     with pytest.warns(mph.InputWarning, match="flatter"):
         prepared(Source(recipe), tmp_path, ["test"])
 
@@ -273,7 +274,7 @@ def environment() -> dict[str, str]:
 def test_two_processes_have_the_loss_of_one_with_the_same_batch(recipe, tmp_path):
     one = mph.learning.train(recipe, tmp_path / "one.pt")
     both = 'batch = 2\ndevices = 2\nstrategy = "ddp"'
-    (tmp_path / "two.toml").write_text(RECIPE.replace("batch = 2", both), encoding="utf-8")
+    (tmp_path / "two.toml").write_text(TRAINING.replace("batch = 2", both), encoding="utf-8")
     done = subprocess.run(
         [*script(tmp_path), str(tmp_path / "two.toml"), "-o", str(tmp_path / "two.pt")],
         cwd=tmp_path, env=environment(), capture_output=True, text=True, timeout=300,
@@ -287,7 +288,7 @@ def test_two_processes_have_the_loss_of_one_with_the_same_batch(recipe, tmp_path
 
 @pytest.mark.skipif(os.name == "nt", reason="Windows has no SIGINT for one process")
 def test_ctrl_c_keeps_a_checkpoint_and_the_same_command_goes_on(recipe, tmp_path):
-    (tmp_path / "long.toml").write_text(RECIPE.replace("steps = 6", "steps = 4000"), encoding="utf-8")
+    (tmp_path / "long.toml").write_text(TRAINING.replace("steps = 6", "steps = 4000"), encoding="utf-8")
     command = [*script(tmp_path), str(tmp_path / "long.toml"), "-o", str(tmp_path / "m.pt")]
     last, before = tmp_path / "m-training" / "last.ckpt", 0
     for _ in range(2):

@@ -36,12 +36,12 @@ from .small_recipes import JUDGE
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory) -> Path:
+def folder(tmp_path_factory, small_set) -> Path:
     """A trained model and the events it was trained on."""
     folder = tmp_path_factory.mktemp("learned")
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(NETWORKS, "toy", TOY)
-        mph.learning.train(small_training(folder), folder / "model.pt")
+        mph.learning.train(small_training(folder, small_set), folder / "model.pt")
     return folder
 
 

@@ -33,9 +33,9 @@ from .small_recipes import TRAINING
 
 
 @pytest.fixture
-def recipe(monkeypatch, tmp_path):
+def recipe(monkeypatch, tmp_path, small_set):
     monkeypatch.setitem(NETWORKS, "toy", TOY)
-    return small_training(tmp_path)
+    return small_training(tmp_path, small_set)
 
 
 def changed(recipe, before: str, after: str):
@@ -165,9 +165,8 @@ def test_events_that_cannot_be_learned_from_are_refused(recipe, tmp_path, before
         mph.learning.train(changed(recipe, before, after), tmp_path / "m.pt")
 
 
-def test_truth_from_coarse_voxels_is_doubted(monkeypatch, tmp_path):
-    monkeypatch.setitem(NETWORKS, "toy", TOY)
-    recipe = small_training(tmp_path, TRAINING.replace("spacing = 12.0", "spacing = 8.0"))
+def test_truth_from_coarse_voxels_is_doubted(recipe, tmp_path):
+    recipe = changed(recipe, "spacing = 12.0", "spacing = 8.0")
     with pytest.warns(mph.InputWarning, match="flatter"):
         prepared(Source(recipe), tmp_path, ["test"])
 
@@ -227,7 +226,7 @@ def test_a_folder_of_another_training_is_not_gone_on_with(recipe, tmp_path):
 
 
 def test_a_training_of_some_seconds_has_the_steps_that_fit_and_keeps_their_number(recipe, tmp_path):
-    timed = changed(recipe, "steps = 6", "seconds = 4.0")
+    timed = changed(recipe, "steps = 6", "seconds = 1.0")
     begun = time.monotonic()
     model = mph.learning.train(timed, tmp_path / "m.pt")
     spent = time.monotonic() - begun
@@ -271,6 +270,7 @@ def environment() -> dict[str, str]:
     return {**os.environ, "PYTHONPATH": str(Path(mphdrr.__path__[0]).parent)}
 
 
+@pytest.mark.long  # each process imports torch
 def test_two_processes_have_the_loss_of_one_with_the_same_batch(recipe, tmp_path):
     one = mph.learning.train(recipe, tmp_path / "one.pt")
     both = 'batch = 2\ndevices = 2\nstrategy = "ddp"'
@@ -286,6 +286,7 @@ def test_two_processes_have_the_loss_of_one_with_the_same_batch(recipe, tmp_path
         assert ours["validation"] == pytest.approx(theirs["validation"], abs=1e-4)
 
 
+@pytest.mark.long  # each process imports torch
 @pytest.mark.skipif(os.name == "nt", reason="Windows has no SIGINT for one process")
 def test_ctrl_c_keeps_a_checkpoint_and_the_same_command_goes_on(recipe, tmp_path):
     (tmp_path / "long.toml").write_text(TRAINING.replace("steps = 6", "steps = 4000"), encoding="utf-8")

@@ -201,7 +201,7 @@ def test_phantom_outside_the_grid_leaves_it_empty():
         ({"rod_diameters": (1, 2, 3)}, "Derenzo rod diameters: expected one for each of 6 sectors .0: empty., got 3"),
         ({"rod_diameters": (1, 2, 3, 4, 5, -6)}, "expected 0 or more"),
         ({"rod_diameters": (50,) * 6}, "no rod"),
-        ({"altered": 1000}, "Derenzo altered: there is no rod 1000 to leave out of 1.. rods"),
+        ({"altered": 1000}, "Derenzo altered: there is no rod 1000 to leave out of 73"),
         ({"altered": 1, "rod_diameters": (13, 0, 0, 0, 0, 0)}, "there is no rod 1 to leave out of 1"),
         ({"altered": -7}, "Derenzo altered: expected a sector with rods to add one to, got sector 7 of 6"),
         (

@@ -240,3 +240,17 @@ def test_every_set_reads_plans_and_stays_in_its_volume(name, tmp_path):
 
 def test_no_set_has_the_seed_of_another():
     assert len({mph.events.EventRecipe(set_text(name)).seed for name in SETS}) == len(SETS)
+
+
+def test_every_event_of_the_pairs_has_one_altered_rod_and_one_left_out_had_neighbours():
+    recipe = mph.events.EventRecipe(set_text("pairs"))
+    drawn = set()
+    for number in range(400):
+        phantom = mph.events.plan(recipe, number).phantom
+        site = phantom.altered_site()
+        rods = phantom.rods()
+        mine = rods[rods[:, 0] == site[0]]
+        apart = np.hypot(mine[:, 1] - site[1], mine[:, 2] - site[2]) / site[3]
+        assert (np.abs(apart - 2) < 1e-9).sum() == 2 if phantom.altered > 0 else apart.min() == 0
+        drawn.add(phantom.altered)
+    assert drawn == {*range(-6, 0), *range(1, 7)}

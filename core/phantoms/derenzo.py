@@ -35,8 +35,8 @@ class DerenzoRods(Shape):
 
     `radius` is R, `rod_diameters` is w of each sector (0 leaves it empty), `height` the length of the rods, centred on
     z = 0, all mm; `sectors` is S, 2 or more. One rod may be `altered`: n leaves out rod n, counted from 1 in the order of
-    `rods`; -n adds a rod to sector n (from 1, along -y), in a row 0 before its rows: on its middle line, sqrt(3) w before
-    its first rod.
+    `rods`; -n adds a rod to sector n (from 1, along -y), as the only one of a row 0: on its middle line, sqrt(3) w before
+    row 1.
     """
 
     radius: float
@@ -150,7 +150,7 @@ class DerenzoRods(Shape):
         """Exact for points whose nearest rod lies in their own sector.
 
         Rods stay 0.36 w or more away from their sector's borders: the sign is always right, and a point near a border gets
-        its bound from the border. Beside a rod that is left out, the next ones are 2 w from it or more.
+        its bound from the border. From a rod that is left out, the next ones are sqrt(3) w or more.
         """
         kind = points.dtype.type
         x, y, z = points
@@ -172,7 +172,7 @@ class DerenzoRods(Shape):
             to_rod = np.hypot(t - along, s - across)
             if self.altered > 0:
                 gone = (sector == self.altered_site[0]) & self._is_altered_site(along, across)
-                to_rod = np.where(gone, np.maximum(to_rod, 2 * safe - to_rod), to_rod)
+                to_rod = np.where(gone, np.maximum(to_rod, step - to_rod), to_rod)
             np.minimum(nearest, np.where(many > 0, to_rod, np.inf), out=nearest)
         distance = np.where(rows[sector] > 0, nearest - w / 2, np.inf).astype(kind)
         # A rod of the neighbouring sector is at least this far: outside, the smaller of both bounds holds.

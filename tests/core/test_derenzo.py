@@ -129,7 +129,7 @@ ALTERED = [
 ] + [
     (34.0, (11.5, 7.5, 6.5, 5.5, 9.5, 10.5), altered) for altered in (1, 2, 5, -1, -2, -3, -4, -6)
 ] + [
-    (40.0, (5.0, 4.5, 4.0, 3.5, 3.0, 0.0, 2.5, 2.0), altered) for altered in (1, 9, 60, -1, -7, -8)
+    (40.0, (5.0, 4.5, 4.0, 3.5, 3.0, 0.0, 2.5, 2.0), altered) for altered in (1, 8, 40, -1, -7, -8)
 ]  # fmt: skip
 
 
@@ -146,7 +146,9 @@ def test_one_altered_rod_is_so_in_all_that_the_phantom_gives(radius, diameters, 
         np.testing.assert_array_equal(site, before[altered - 1])
     else:
         first = before[before[:, 0] == sector][0]
-        assert sector == -altered - 1 and np.hypot(*(first[1:3] - site[1:3])) == pytest.approx(np.sqrt(3) * w)
+        rows = 2 if len(diameters) > 6 else 1  # row 1 of narrow sectors has no room for a rod
+        assert sector == -altered - 1
+        assert first[1:3] - site[1:3] == pytest.approx(first[1:3] / np.hypot(*first[1:3]) * np.sqrt(3) * w * rows)
         apart = np.hypot(before[:, 1] - x, before[:, 2] - y) - (before[:, 3] + w) / 2
         assert apart.min() > 0
     area = np.pi / 4 * w**2 * (1 if altered < 0 else -1)

@@ -13,6 +13,9 @@ ROOT = Path(__file__).resolve().parent
 sys.path.insert(0, str(ROOT / "tools"))
 import build_kernels  # noqa: E402
 
+# Their imports are what others find there.
+PUBLIC = ("core", "core/events", "core/projector", "core/workbook")
+
 
 def stub_of(source):
     """Give what says the names of a package's public interface to type checkers: imports count if they name them twice."""
@@ -38,8 +41,9 @@ class WithKernels(build_py):
         """Do so, or say that there is none for this machine."""
         super().run()
         if not self.editable_mode:
-            stub = Path(self.build_lib, "mphdrr", "core", "__init__.pyi")
-            stub.write_text(stub_of((ROOT / "core" / "__init__.py").read_text(encoding="utf-8")), encoding="utf-8")
+            for package in PUBLIC:
+                source = (ROOT / package / "__init__.py").read_text(encoding="utf-8")
+                Path(self.build_lib, "mphdrr", package, "__init__.pyi").write_text(stub_of(source), encoding="utf-8")
         if name := self.get_finalized_command("bdist_wheel").kernels:
             folder = build_kernels.KERNELS.relative_to(ROOT)
             build_kernels.build(name, ROOT / folder if self.editable_mode else Path(self.build_lib, "mphdrr", folder))

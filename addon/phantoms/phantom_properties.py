@@ -200,7 +200,7 @@ def _property(field: Any, kind: Kind, update: Any) -> Any:
         return EnumProperty(**options, items=choices.items(choices.PHANTOM_WORDS, words))
     many = {"size": len(default)} if isinstance(default, tuple) else {}
     if not unit:
-        return (IntVectorProperty if many else IntProperty)(**options, **many, min=1)
+        return (IntVectorProperty if many else IntProperty)(**options, **many, min=known["least"])
     if unit.startswith("of "):
         options |= {"description": f"Share {unit}, {known['text']}"}
     elif unit == "DEG":

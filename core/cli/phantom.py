@@ -90,13 +90,15 @@ def _add_derenzo(parser: argparse.ArgumentParser) -> None:
     water = "a cylinder of water around the rods, mm; without it, none"
     add("--water", type=float, nargs=2, default=[0, 0], metavar=("RADIUS", "HEIGHT"), help=water)
     add("--background", type=float, default=0.0, metavar="kBq/mL", help="concentration in the water")
+    altered = "N leaves rod N out, -N adds one to sector N, before its rows"
+    add("--altered", type=int, default=0, metavar="N", help=altered)
 
 
 def _derenzo(arguments: argparse.Namespace) -> mph.Phantom:
     radius, height = arguments.water
     return mph.DerenzoPhantom(
         arguments.radius, tuple(arguments.rods), arguments.height, arguments.activity, arguments.sectors,
-        cylinder_radius=radius, cylinder_height=height, background=arguments.background,
+        cylinder_radius=radius, cylinder_height=height, background=arguments.background, altered=arguments.altered,
     )  # fmt: skip
 
 

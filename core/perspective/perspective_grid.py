@@ -125,6 +125,21 @@ class PerspectiveGrid:
         """The coordinates (column, row, k) (…, 3) of world points (…, 3), mm; of a parallel view, (column, row, depth)."""
         return transform_points(self.matrix, points)
 
+    def index_from_world(self, points: ArrayLike) -> Floats:
+        """Where world points (…, 3), mm, lie in arrays: their three indices (…, 3), fractions between the cells' places.
+
+        Infinite, or not a number, of points at the source's depth; those behind it have no cell, though they have indices.
+        """
+        points = real_array(points, "points", (3,), batch=True)
+        p = points @ self.index_matrix[:, :3].T + self.index_matrix[:, 3]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.asarray(p[..., :3] / p[..., [3, 3, 4]])
+
+    def world_from_index(self, index: ArrayLike) -> Floats:
+        """World points (…, 3), mm, of an array's indices (…, 3), also between cells: the inverse of `index_from_world`."""
+        index = real_array(index, "index", (3,), batch=True)
+        return self.to_world(np.concatenate([index[..., :2], self.planes_at(index[..., 2:])], axis=-1))
+
     def centers(self) -> Floats:
         """World points (n_u, n_v, n_k, 3), mm, of the cells' places."""
         columns, rows = (np.arange(n, dtype=np.float64) for n in self.shape[:2])

@@ -6,6 +6,7 @@ from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from ..arrays import Floats
+from ..geometry.frames import moved
 from ..geometry.grid import Grid
 from ..geometry.views import Views
 from ..memory import require
@@ -38,15 +39,11 @@ class PerspectiveMaps:
         self.grids = [PerspectiveGrid(views, m, self.n_k, near[m], far[m]) for m in range(len(views))]
         numbers = 3.0 * len(views) * (grid.n_voxels + np.prod(self.grids[0].shape))
         require(float(4 * numbers), f"maps of {len(views)} views")
-        axes = np.meshgrid(*map(np.arange, grid.shape), indexing="ij")
-        world = np.stack([*axes, np.ones(grid.shape)], -1) @ grid.affine.T
-        ones = np.ones((*self.grids[0].shape, 1))
+        world = moved(grid.affine, np.moveaxis(np.indices(grid.shape), 0, -1))
         cells, voxels = [], []
         for g in self.grids:
-            index = np.concatenate([g.centers(), ones], -1) @ grid.index_from_world.T
-            cells.append(_normalized(index[..., :3], grid.shape))
-            p = world @ g.index_matrix.T
-            voxels.append(_normalized(p[..., :3] / p[..., [3, 3, 4]], g.shape))
+            cells.append(_normalized(moved(grid.index_from_world, g.centers()), grid.shape))
+            voxels.append(_normalized(g.index_from_world(world), g.shape))
         self._cells, self._voxels = torch.stack(cells), torch.stack(voxels)
         edges = 1 + 1 / torch.tensor([n - 1 for n in self.grids[0].shape[::-1]])
         self._inside = (self._voxels.abs() <= edges).all(-1)[:, None]

@@ -14,7 +14,7 @@ from ..physics.materials import WATER_MU
 from ..validation import at_least_0, freeze, positive, real_array
 from .intervals import Interval, Points, Real
 from .phantom import Phantom
-from .settings import setting
+from .settings import count, setting
 from .shapes import Cylinder, Shape, Vector
 from .surfaces import Surface, lathe
 
@@ -34,13 +34,16 @@ class DerenzoRods(Shape):
     counter-clockwise as seen from +z. With more than 6 sectors, a row holds as many rods as its sector has room for.
 
     `radius` is R, `rod_diameters` is w of each sector (0 leaves it empty), `height` the length of the rods, centred on
-    z = 0, all mm; `sectors` is S, 2 or more.
+    z = 0, all mm; `sectors` is S, 2 or more. One rod may be `altered`: n leaves out rod n, counted from 1 in the order of
+    `rods`; -n adds a rod to sector n (from 1, along -y), as the only one of a row 0: on its middle line, sqrt(3) w before
+    row 1.
     """
 
     radius: float
     rod_diameters: Vector
     height: float
     sectors: int = SECTORS
+    altered: int = 0
 
     KIND = "derenzo_rods"
 
@@ -62,21 +65,52 @@ class DerenzoRods(Shape):
             raise InputError(f"Derenzo phantom: {many}; choose thicker ones, or 0 for an empty sector")
         if not any(rows):
             raise InputError(f"Derenzo phantom: no rod of {self.rod_diameters} mm fits into {within}")
+        self._check_altered()
         ends = np.linalg.norm(self.rods[:, 1:3], axis=1) + self.rods[:, 3] / 2
         outermost, half = float(ends.max()), self.height / 2
         volume = float(np.sum(np.pi / 4 * self.rods[:, 3] ** 2) * self.height)
         self._set_size((outermost, outermost, half), math.hypot(outermost, half), volume)
 
+    def _check_altered(self) -> None:
+        if isinstance(self.altered, bool) or not isinstance(self.altered, int | np.integer):
+            raise InputError(f"Derenzo altered: expected a whole number, got {self.altered!r}")
+        self._set("altered", int(self.altered))
+        if self.altered > 0 and (self.altered > len(self._pattern) or len(self._pattern) == 1):
+            raise InputError(f"Derenzo altered: there is no rod {self.altered} to leave out of {len(self._pattern)}")
+        if self.altered < 0:
+            sector = f"sector {-self.altered} of {self.sectors}"
+            if -self.altered - 1 not in self._pattern[:, 0]:
+                raise InputError(f"Derenzo altered: expected a sector with rods to add one to, got {sector}")
+            _, x, y, w = self.altered_site
+            apart = np.hypot(self._pattern[:, 1] - x, self._pattern[:, 2] - y) - (self._pattern[:, 3] + w) / 2
+            if apart.min() <= 0:
+                raise InputError(f"Derenzo altered: there is no room for one more rod of {w:g} mm in {sector}")
+
     @cached_property
     def rods(self) -> Floats:
-        """Every rod as (sector, x, y, diameter), array (n_rods, 4), mm."""
+        """Every rod as (sector, x, y, diameter), array (n_rods, 4), mm; one that is added is the last."""
+        if self.altered > 0:
+            return freeze(np.delete(self._pattern, self.altered - 1, axis=0))
+        return freeze(np.vstack([self._pattern, self.altered_site])) if self.altered else self._pattern
+
+    @cached_property
+    def altered_site(self) -> Floats:
+        """The rod that is left out or added, as a row (4,) of `rods`; only where one is."""
+        if self.altered > 0:
+            return freeze(self._pattern[self.altered - 1])
+        sector = -self.altered - 1
+        return freeze(np.array([sector, *self._rows[sector][0] * self._axes[sector, 0], self.rod_diameters[sector]]))
+
+    @cached_property
+    def _pattern(self) -> Floats:
+        """The rods before one is altered."""
         table = []
         for sector, (w, (margin, rows)) in enumerate(zip(self.rod_diameters, self._rows, strict=True)):
             along, across = self._axes[sector]
             for n in range(1, rows + 1):
-                count = int(self._rods_in_row(np.array(float(n))))
-                for j in range(count):
-                    x, y = (margin + _ROW_STEP * w * n) * along + (2 * j - (count - 1)) * w * across
+                many = int(self._rods_in_row(np.array(float(n))))
+                for j in range(many):
+                    x, y = (margin + _ROW_STEP * w * n) * along + (2 * j - (many - 1)) * w * across
                     table.append((sector, x, y, w))
         return freeze(np.array(table))
 
@@ -116,7 +150,7 @@ class DerenzoRods(Shape):
         """Exact for points whose nearest rod lies in their own sector.
 
         Rods stay 0.36 w or more away from their sector's borders: the sign is always right, and a point near a border gets
-        its bound from the border.
+        its bound from the border. From a rod that is left out, the next ones are sqrt(3) w or more.
         """
         kind = points.dtype.type
         x, y, z = points
@@ -132,16 +166,29 @@ class DerenzoRods(Shape):
         lower = np.clip(np.floor((t - margin) / step), 1, last)
         nearest = np.full(x.shape, np.inf, kind)
         for n in (lower, np.minimum(lower + 1, last)):
-            count = self._rods_in_row(n).astype(kind)
-            j = np.clip(np.rint((s / safe + count - 1) / 2), 0, np.maximum(count - 1, 0))
-            to_rod = np.hypot(t - margin - step * n, s - (2 * j - count + 1) * safe)
-            np.minimum(nearest, np.where(count > 0, to_rod, np.inf), out=nearest)
+            many = self._rods_in_row(n).astype(kind)
+            j = np.clip(np.rint((s / safe + many - 1) / 2), 0, np.maximum(many - 1, 0))
+            along, across = margin + step * n, (2 * j - many + 1) * safe
+            to_rod = np.hypot(t - along, s - across)
+            if self.altered > 0:
+                gone = (sector == self.altered_site[0]) & self._is_altered_site(along, across)
+                to_rod = np.where(gone, np.maximum(to_rod, step - to_rod), to_rod)
+            np.minimum(nearest, np.where(many > 0, to_rod, np.inf), out=nearest)
         distance = np.where(rows[sector] > 0, nearest - w / 2, np.inf).astype(kind)
         # A rod of the neighbouring sector is at least this far: outside, the smaller of both bounds holds.
         half = np.pi / self.sectors
         border = t * kind(np.sin(half)) - np.abs(s) * kind(np.cos(half)) + kind(0.36 * self.rods[:, 3].min())
         distance = np.where(distance > 0, np.minimum(distance, border), distance)
+        if self.altered < 0:
+            _, site_x, site_y, site_w = self.altered_site.astype(kind)
+            distance = np.minimum(distance, np.hypot(x - site_x, y - site_y) - site_w / 2)
         return np.maximum(distance, np.abs(z) - kind(self.height / 2))
+
+    def _is_altered_site(self, along: Real, across: Real) -> Real:
+        """Whether rods, at places along and across their sector, are the one that is left out."""
+        sector, x, y, w = self.altered_site
+        t, s = self._axes[int(sector)] @ (x, y)
+        return np.maximum(abs(along - t), abs(across - s)) < w / 2
 
     def _intervals(self, starts: Points, directions: Points) -> Interval:
         parts = [
@@ -173,6 +220,7 @@ class DerenzoPhantom(Phantom):
     cylinder_height: float = setting(0.0, "mm", "of the water; 0 for the rods' own", 0.0)
     background: float = setting(0.0, "kBq/mL", "in the water", 0.0)
     mu: float = setting(WATER_MU, "1/mm", "of the rods and of the water", 0.0)
+    altered: int = count(0, "n: rod n is left out; -n: sector n has one more, before its rows", -SECTORS)
 
     title = "Derenzo phantom"
 
@@ -180,7 +228,7 @@ class DerenzoPhantom(Phantom):
         for name in ("activity", "cylinder_radius", "cylinder_height", "background", "mu"):
             title = f"Derenzo {name.replace('_', ' ')}"
             object.__setattr__(self, name, at_least_0(getattr(self, name), title))
-        for name in ("radius", "rod_diameters", "height"):  # the rods check them
+        for name in ("radius", "rod_diameters", "height", "altered"):  # the rods check them
             object.__setattr__(self, name, getattr(self._rods, name))
         if self.activity == 0 and not (self.background and self.cylinder_radius):
             expected = "more than 0 kBq/mL, or 0 in a cylinder with a background"
@@ -217,11 +265,15 @@ class DerenzoPhantom(Phantom):
         """Every rod as (sector, x, y, diameter), array (n_rods, 4), mm."""
         return self._rods.rods
 
+    def altered_site(self) -> Floats | None:
+        """Where a rod is left out or added, as a row (4,) of `rods`: sector, x, y, diameter; None where none is."""
+        return self._rods.altered_site if self.altered else None
+
     @cached_property
     def _rods(self) -> DerenzoRods:
         return DerenzoRods(
             radius=self.radius, rod_diameters=self.rod_diameters, height=self.height, sectors=self.sectors,
-            activity=self.activity, mu=self.mu, name="rods",
+            altered=self.altered, activity=self.activity, mu=self.mu, name="rods",
         )  # fmt: skip
 
     @property

@@ -169,8 +169,9 @@ def paint_voxels(
     """
     require(5.0 * grid.n_voxels, "a volume of {} x {} x {} voxels".format(*grid.shape))
     image = np.zeros(grid.shape, np.float32)
+    limits = _limits(layers)
     painted = zip(layers, _seen_beneath(layers), changes, strict=True)
-    strokes = [stroke for each in painted if (stroke := _Stroke(grid, *each)).blocks]
+    strokes = [stroke for each in painted if (stroke := _Stroke(grid, *each, limits)).blocks]
     total, done = sum(len(stroke.blocks) for stroke in strokes), 0
     with ThreadPoolExecutor(cores()) as pool:
         for stroke in strokes:
@@ -178,19 +179,24 @@ def paint_voxels(
             for _ in (stroke.paint_points if stroke.is_small else stroke.paint_cells)(box, pool):
                 done += 1
                 tell(progress, done, total)
-    # Where layers were sampled at different points, one may replace a little more than there was.
-    values = [layer.value for layer in layers]
-    if min(values, default=0.0) >= 0:
-        highest = None if any(layer.adds for layer in layers) else max(values, default=0.0)
-        np.clip(image, 0.0, highest, out=image)
-    return image
+    return np.clip(image, *limits, out=image)
+
+
+def _limits(layers: Sequence[Layer]) -> tuple[float, float]:
+    """The smallest and the largest value that painting these layers can leave."""
+    values = [0.0, *(layer.value for layer in layers)]
+    if min(values) < 0:
+        return -np.inf, np.inf
+    return 0.0, np.inf if any(layer.adds for layer in layers) else max(values)
 
 
 class _Stroke:
     """Painting one layer over those beneath it."""
 
-    def __init__(self, grid: Grid, layer: Layer, beneath: Sequence[Layer], mean_change: float) -> None:
-        self.grid, self.layer, self.beneath, self.mean_change = grid, layer, beneath, mean_change
+    def __init__(
+        self, grid: Grid, layer: Layer, beneath: Sequence[Layer], mean_change: float, limits: tuple[float, float]
+    ) -> None:
+        self.grid, self.layer, self.beneath, self.mean_change, self.limits = grid, layer, beneath, mean_change, limits
         shape, shape_from_index = layer.shape, layer.from_world @ grid.affine
         # Bounds of the indices of the shape's points: the tighter of its box and its ball.
         index_from_shape = np.linalg.inv(shape_from_index)
@@ -236,22 +242,31 @@ class _Stroke:
         self.n_samples = int(min(samples, _MAX_SAMPLES))
 
     def paint_points(self, box: Floats32, pool: ThreadPoolExecutor) -> Iterator[None]:
-        """Points of the shape, each with an equal share of its volume, are added to the voxels that they fall into."""
-        total, hits = np.zeros(box.shape), 0
+        """Points of the shape, each with an equal share of its volume, are added to the voxels that they fall into.
+
+        What they replace is scaled so that the shape's total change is the known one.
+        """
+        inside, replaced = np.zeros((2, *box.shape))
+        hits, replaced_in_all = 0, 0.0
         index_from_shape = np.linalg.inv(self.grid.affine) @ self.layer.pose
 
         def sample(first: int) -> tuple[Indices, Points]:
             points = _shape_points(self.layer.shape, first)
-            change = self.layer.value - values_at(self.beneath, _moved(self.layer.pose, points))
-            return np.rint(_moved(index_from_shape, points)).astype(np.int64), change
+            beneath = values_at(self.beneath, _moved(self.layer.pose, points))
+            return np.rint(_moved(index_from_shape, points)).astype(np.int64), beneath
 
-        for index, change in pool.map(sample, self.blocks):
-            hits += len(change)
+        for index, beneath in pool.map(sample, self.blocks):
+            hits += len(beneath)
+            replaced_in_all += float(beneath.sum())
             index -= self.start[:, None]
-            held = np.all((index >= 0) & (index < np.array(total.shape)[:, None]), axis=0)
-            np.add.at(total, tuple(index[:, held]), change[held])
+            held = np.all((index >= 0) & (index < np.array(box.shape)[:, None]), axis=0)
+            place = tuple(index[:, held])
+            np.add.at(inside, place, 1)
+            np.add.at(replaced, place, beneath[held])
             yield
-        box += total * (self.in_voxels / max(hits, 1))
+        known = (self.layer.value - self.mean_change) * hits
+        scale = known / replaced_in_all if replaced_in_all else 1.0
+        box += (self.layer.value * inside - scale * replaced) * (self.in_voxels / max(hits, 1))
 
     def paint_cells(self, box: Floats32, pool: ThreadPoolExecutor) -> Iterator[None]:
         """Voxels inside the shape are filled; those that its surface cuts are sampled."""
@@ -275,12 +290,17 @@ class _Stroke:
             cuts.append(of_block)
             yield
         cut, (change, uncertain) = (np.concatenate(parts, axis=-1) for parts in zip(*cuts, strict=True))
+        place = np.unravel_index(cut, box.shape)
+        # Layers sampled at different points may replace a little more than there was: what is left is then certain.
+        left = box[place] + change
+        change = np.clip(left, *self.limits) - box[place]
+        uncertain[(left < self.limits[0]) | (left > self.limits[1])] = 0
         if self.in_grid:
             # What is missing goes to where the shares c are uncertain, as c (1 - c): so they stay between 0 and 1.
             missing -= float(box.sum(dtype=np.float64) + change.sum(dtype=np.float64))
             spread = max(float(uncertain.sum(dtype=np.float64)), 1e-300)
             change += np.float32(np.clip(missing / spread, -1, 1)) * uncertain
-        box[np.unravel_index(cut, box.shape)] += change
+        box[place] += change
 
 
 class _Sampled:

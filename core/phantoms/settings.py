@@ -24,9 +24,12 @@ def setting(
     return dataclasses.field(default=default, metadata={"unit": unit, "text": text, "least": least, "option": option})
 
 
-def count(default: int | tuple[int, ...], text: str) -> Any:
-    """A field of a phantom's dataclass: a whole number of at least 1, or several."""
-    return dataclasses.field(default=default, metadata={"text": text})
+def count(default: int | tuple[int, ...], text: str, least: int = 1) -> Any:
+    """A field of a phantom's dataclass: a whole number of at least 1, or several.
+
+    A class that allows other ones checks them itself; `least` is then the smallest that panels offer.
+    """
+    return dataclasses.field(default=default, metadata={"text": text, "least": least})
 
 
 def choice(default: str, choices: tuple[str, ...], text: str) -> Any:

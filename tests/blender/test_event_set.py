@@ -37,6 +37,7 @@ spacing = 6.0
 kind = "derenzo"
 radius = {{ from = 30, to = 36 }}
 rod_diameters = [10, {{ from = 8, to = 9 }}, 0, 0, 0, 0]
+altered = -2
 activity = {{ from = 50, to = 100 }}
 [phantoms.pose]
 position = [{{ from = -8, to = 8 }}, 0, 5]
@@ -96,6 +97,7 @@ def test_the_phantom_in_the_scene_becomes_that_of_the_event(recipe, scene, mirro
     assert bpy.ops.mphdrr.try_event(number=planned.number) == {"FINISHED"}
     item = only_phantom()
     made = phantoms.recipe_of(phantoms.settings_of(item)).phantom
+    assert made.altered == planned.phantom.altered == -2
     assert made.radius == pytest.approx(planned.phantom.radius, rel=1e-6)
     np.testing.assert_allclose(made.rod_diameters, planned.phantom.rod_diameters, rtol=1e-6)
     assert made.activity == pytest.approx(planned.activity_factor * planned.phantom.activity, rel=1e-6)

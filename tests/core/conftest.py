@@ -160,6 +160,14 @@ def event_set(tmp_path_factory: pytest.TempPathFactory) -> events.EventSet:
     return events.make(small_recipe(folder, EVENT_RECIPE), folder / "set", 5)
 
 
+@pytest.fixture(scope="session")
+def small_set(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of eight small events, to copy."""
+    folder = tmp_path_factory.mktemp("small-events")
+    events.make(small_recipe(folder), folder / "set", 8)
+    return folder / "set"
+
+
 def distance_to_line(points: np.ndarray, line: np.ndarray) -> np.ndarray:
     """Distances (…) of points (…, 3) to a line, a Plücker matrix (4, 4), that is not at infinity."""
     direction = line[:3, 3]

@@ -2,46 +2,16 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import torch
 from torch import nn
 
-from mphdrr.core.events import make
 from mphdrr.core.learning.networks import NETWORKS, Kind
 from mphdrr.core.learning.recipe import TrainingRecipe, read_recipe
 
-from .small_events import TEXT, small_recipe
-
-EVENTS = 8
-RECIPE = """
-version = 1
-
-[data]
-events = "set"
-levels = [1.0, 0.5]
-draws = 2
-train = "train"
-validation = "test"
-
-[grid]
-voxels = 8
-spacing = 12.0
-
-[osem]
-subsets = 2
-after = [1, 2]
-
-[network]
-kind = "toy"
-
-[training]
-steps = 6
-batch = 2
-precision = "32"
-threads = 1
-accelerator = "cpu"
-"""
+from .small_recipes import TRAINING
 
 
 class Toy(nn.Module):
@@ -81,9 +51,8 @@ def add_toy() -> None:
     NETWORKS["toy"] = TOY  # type: ignore[index]
 
 
-def small_training(folder: Path, text: str = RECIPE, events: str = TEXT) -> TrainingRecipe:
-    """The recipe of a training in a folder, with its set of events."""
-    if not (folder / "set").exists():
-        make(small_recipe(folder, events), folder / "set", EVENTS)
+def small_training(folder: Path, events: Path, text: str = TRAINING) -> TrainingRecipe:
+    """The recipe of a training in a folder, with a copy of its set of events."""
+    shutil.copytree(events, folder / "set")
     (folder / "training.toml").write_text(text, encoding="utf-8")
     return read_recipe(folder / "training.toml")

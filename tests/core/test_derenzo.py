@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from functools import partial
 
 import numpy as np
 import pytest
@@ -123,6 +124,60 @@ def test_voxels_hold_the_share_of_their_rods(rng):
     assert abs(difference.mean()) < 2e-3
 
 
+ALTERED = [
+    (40.0, RODS, altered) for altered in (1, 2, 3, 8, 30, -1, -2, -6)
+] + [
+    (34.0, (11.5, 7.5, 6.5, 5.5, 9.5, 10.5), altered) for altered in (1, 2, 5, -1, -2, -3, -4, -6)
+] + [
+    (40.0, (5.0, 4.5, 4.0, 3.5, 3.0, 0.0, 2.5, 2.0), altered) for altered in (1, 8, 40, -1, -7, -8)
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("radius", "diameters", "altered"), ALTERED)
+def test_one_altered_rod_is_so_in_all_that_the_phantom_gives(radius, diameters, altered, rng):
+    make = partial(mph.DerenzoPhantom, radius, diameters, 20.0, activity=3.0, sectors=len(diameters))
+    usual, phantom = make(), make(altered=altered)
+    rods, site = phantom.rods(), phantom.altered_site()
+    sector, x, y, w = site
+    before = usual.rods()
+    more, fewer = (rods, before) if altered < 0 else (before, rods)
+    assert sorted(map(tuple, more)) == sorted([*map(tuple, fewer), tuple(site)])
+    if altered > 0:
+        np.testing.assert_array_equal(site, before[altered - 1])
+    else:
+        first = before[before[:, 0] == sector][0]
+        rows = 2 if len(diameters) > 6 else 1  # row 1 of narrow sectors has no room for a rod
+        assert sector == -altered - 1
+        assert first[1:3] - site[1:3] == pytest.approx(first[1:3] / np.hypot(*first[1:3]) * np.sqrt(3) * w * rows)
+        apart = np.hypot(before[:, 1] - x, before[:, 2] - y) - (before[:, 3] + w) / 2
+        assert apart.min() > 0
+    area = np.pi / 4 * w**2 * (1 if altered < 0 else -1)
+    assert phantom.total_activity == pytest.approx(usual.total_activity + 3e-3 * area * 20, rel=1e-9)
+    assert total(phantom.voxelize(mph.Grid.centered(45, 2.0))) == pytest.approx(phantom.total_activity, rel=1e-3)
+    places = np.array([x, y, 0]) + rng.uniform(-3, 3, (20_000, 3)) * w
+    to_rods = np.hypot(places[:, None, 0] - rods[:, 1], places[:, None, 1] - rods[:, 2]) - rods[:, 3] / 2
+    inside = (to_rods.min(axis=1) < 0) & (np.abs(places[:, 2]) < 10)
+    np.testing.assert_array_equal(phantom.values(places), 3.0 * inside)
+    ends = np.array([x, y, 0]) + np.array([[0.1, 0.2, -40.0], [0.1, 0.2, 40.0]])
+    assert phantom.line_integrals(*ends) == pytest.approx(60.0 if altered < 0 else 0.0)
+    (mesh,) = phantom.meshes()
+    assert len(mesh.vertices) * len(before) == len(usual.meshes()[0].vertices) * len(rods)
+    shape = phantom.shapes[0]
+    true = np.maximum(to_rods.min(axis=1), np.abs(places[:, 2]) - 10)
+    found = shape.distance(places.T)
+    assert np.array_equal(found < 0, true < 0) and (np.abs(found) <= np.abs(true) + 1e-9)[true > 0].all()
+
+
+def test_no_rod_is_altered_by_default_and_files_keep_one_that_is(tmp_path):
+    assert mph.DerenzoPhantom().altered_site() is None
+    for altered in (0, 4, -3):
+        phantom = mph.DerenzoPhantom(altered=altered)
+        mph.write_phantom(phantom, tmp_path / "rods.toml")
+        assert ("altered" in (tmp_path / "rods.toml").read_text(encoding="utf-8")) == (altered != 0)
+        (shape,) = mph.read_phantom(tmp_path / "rods.toml").shapes
+        np.testing.assert_array_equal(shape.rods, phantom.rods())
+
+
 def test_euler_angles_turn_psi_then_theta_then_phi():
     tilt = mph.euler_pose(theta=np.pi / 2)
     assert np.allclose(tilt @ [0, 0, 1, 1], [1, 0, 0, 1])  # the axis tilts towards +x
@@ -148,6 +203,18 @@ def test_phantom_outside_the_grid_leaves_it_empty():
         ({"rod_diameters": (1, 2, 3)}, "Derenzo rod diameters: expected one for each of 6 sectors .0: empty., got 3"),
         ({"rod_diameters": (1, 2, 3, 4, 5, -6)}, "expected 0 or more"),
         ({"rod_diameters": (50,) * 6}, "no rod"),
+        ({"altered": 1000}, "Derenzo altered: there is no rod 1000 to leave out of 73"),
+        ({"altered": 1, "rod_diameters": (13, 0, 0, 0, 0, 0)}, "there is no rod 1 to leave out of 1"),
+        ({"altered": -7}, "Derenzo altered: expected a sector with rods to add one to, got sector 7 of 6"),
+        (
+            {"altered": -6, "rod_diameters": (8, 6, 5, 4, 3, 0)},
+            "expected a sector with rods to add one to, got sector 6",
+        ),
+        (
+            {"altered": -1, "rod_diameters": (12, 1, 1, 1, 1, 1)},
+            "there is no room for one more rod of 12 mm in sector 1",
+        ),
+        ({"altered": 1.5}, "Derenzo altered: expected a whole number, got 1.5"),
         ({"rod_diameters": (8, 6, 5, 4, 3, 1e-9)}, "more than 100000 rods"),
         ({"height": -1}, "Derenzo height"),
         ({"activity": "hot"}, "Derenzo activity"),

@@ -22,6 +22,7 @@ from .conftest import WORKBOOK
 from .dicom_files import write_series
 from .small_events import TEXT
 from .small_events import WORKBOOK as SMALL_WORKBOOK
+from .small_recipes import JUDGE, TRAINING
 
 THORAX = WORKBOOK.parent / "phantoms" / "thorax.toml"
 
@@ -74,6 +75,10 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "derenzo.toml").write_text(
         text.replace('modules = "1-4,21-24"', "").replace("[6, 8]", "[96]\nrows = 14\ncolumns = 16")
     )
+    training = TRAINING.replace('"set"\n', '"set"\nmodel = "counts"\n').replace("steps = 6", "steps = 2")
+    (folder / "training.toml").write_text(training.replace('"toy"', '"after-osem"\nchannels = [4, 4, 4]'))
+    test = '[[tests]]\nname = "rods"\nevents = "set"\nsplit = "train"\ncount = 1\n'
+    (folder / "judge.toml").write_text(JUDGE.replace('"validation"', '"set"\nsplit = "test"') + test)
     run(folder, "mphdrr phantom derenzo --voxels 24 --spacing 4 -o heart.nii.gz")
     heart = "mphdrr project scanner.xlsx --volume heart.nii.gz --emission --time 600 --set model.intrinsic_fwhm=2"
     run(folder, f"{heart} --size 24 24 --write-recipe heart.toml")
@@ -89,12 +94,17 @@ def test_every_example_runs(example, inputs, tmp_path):
     here = tmp_path / "here"
     shutil.copytree(inputs, here)
     words = example.split()
+    if "model.pt" in words:
+        pytest.importorskip("lightning", reason="networks need torch and Lightning, which are not installed here")
     # A few events of many (the fiftieth part of 150 has three), and small pictures, runs and volumes.
     example = example.replace("-n 100000 ", "-n 150 ").replace("-n 1000", "-n 6").replace("1600x900", "320x240")
     if words[1:3] == ["figure", "scanner"]:
         example += " --size 320x240"
     elif words[1:3] == ["project", "scanner.xlsx"] and "--counts" not in words:
         example += " --size 16 16"
+    elif "--method model.pt" in example:  # of a scan by the scanner of its training
+        run(here, "mphdrr learn train training.toml -o model.pt")
+        mph.write_run(mph.events.EventSet(here / "set")[0].run("counts", noise_seed=1), here / "run.h5")
     elif words[1] == "reconstruct":
         example = example.replace("--iterations 20", "--iterations 2") + " --voxels 16 --spacing 6"
     if words[1:3] == ["events", "make"] and "--recipe" in words:

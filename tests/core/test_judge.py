@@ -15,20 +15,10 @@ from mphdrr.core.learning.judging.sets import SETS, events_by_recipe, set_finger
 
 from .conftest import WORKBOOK
 from .small_events import TEXT, small_recipe
+from .small_recipes import JUDGE
 
 RODS = TEXT[: TEXT.index('[[phantoms]]\nkind = "points"')] + TEXT[TEXT.index("[models.lines]") :]
-JUDGE = """
-version = 1
-[grid]
-voxels = 12
-spacing = 8.0
-[validation]
-events = "validation"
-[baselines]
-subsets = 2
-stops = [1, 3]
-fwhm = [0, 10]
-families = ["osem"]
+RODS_TEST = """
 [[tests]]
 name = "rods"
 events = "rods"
@@ -47,7 +37,7 @@ def folder(tmp_path_factory):
     for name, seed in (("rods", 5), ("validation", 6)):
         recipe = small_recipe(path / "recipes" / name, RODS.replace("seed = 5", f"seed = {seed}"))
         mph.events.make(recipe, path / name, 3)
-    (path / "judge.toml").write_text(JUDGE)
+    (path / "judge.toml").write_text(JUDGE + RODS_TEST)
     return path
 
 
@@ -119,7 +109,7 @@ position = [{ from = -5, to = 5 }, 0, 0]
 
 def test_the_observer_finds_the_defect_in_the_truth_and_not_in_an_even_volume(tmp_path):
     mph.events.make(small_recipe(tmp_path / "recipe", HEARTS), tmp_path / "hearts", 16)
-    text = JUDGE[: JUDGE.index("[[tests]]")].replace("voxels = 12", "voxels = 24")
+    text = JUDGE.replace("voxels = 12", "voxels = 24")
     mph.events.make(
         small_recipe(tmp_path / "others", HEARTS.replace("seed = 5", "seed = 6")), tmp_path / "validation", 1
     )
@@ -170,7 +160,7 @@ def test_a_method_that_was_trained_on_the_test_is_refused(folder, tmp_path):
     with pytest.raises(mph.InputError, match="net: it was trained on events of the test rods: 1"):
         judge(judge_recipe(folder / "judge.toml"), tmp_path, [trained])
     assert set_fingerprint(events) != set_fingerprint(events[:2])
-    (folder / "tuned.toml").write_text(JUDGE.replace('"validation"', '"rods"'))
+    (folder / "tuned.toml").write_text((JUDGE + RODS_TEST).replace('"validation"', '"rods"'))
     with pytest.raises(mph.InputError, match="baselines: it was trained on events of the test rods: 0, 1, 2"):
         judge(judge_recipe(folder / "tuned.toml"), tmp_path, [])
     other = JudgedMethod("net", halved, "net-1", events_by_recipe(mph.events.EventSet(folder / "validation")))
@@ -220,7 +210,7 @@ def test_one_reconstruction_gives_all_stops_and_filters(folder):
     ('families = ["osem"]', 'families = ["fbp"]', "families: expected one of osem, bsrem"),
 ])  # fmt: skip
 def test_entries_that_cannot_be_understood_are_named(folder, old, new, message):
-    (folder / "wrong.toml").write_text(JUDGE.replace(old, new))
+    (folder / "wrong.toml").write_text((JUDGE + RODS_TEST).replace(old, new))
     with pytest.raises(mph.InputError, match=message) as refused:
         judge_recipe(folder / "wrong.toml")
     assert "\n" not in str(refused.value)
@@ -240,3 +230,17 @@ def test_every_set_reads_plans_and_stays_in_its_volume(name, tmp_path):
 
 def test_no_set_has_the_seed_of_another():
     assert len({mph.events.EventRecipe(set_text(name)).seed for name in SETS}) == len(SETS)
+
+
+def test_every_event_of_the_pairs_has_one_altered_rod_and_one_left_out_had_neighbours():
+    recipe = mph.events.EventRecipe(set_text("pairs"))
+    drawn = set()
+    for number in range(400):
+        phantom = mph.events.plan(recipe, number).phantom
+        site = phantom.altered_site()
+        rods = phantom.rods()
+        mine = rods[rods[:, 0] == site[0]]
+        apart = np.hypot(mine[:, 1] - site[1], mine[:, 2] - site[2]) / site[3]
+        assert (np.abs(apart - 2) < 1e-9).sum() == 2 if phantom.altered > 0 else apart.min() == 0
+        drawn.add(phantom.altered)
+    assert drawn == {*range(-6, 0), *range(1, 7)}

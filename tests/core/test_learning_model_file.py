@@ -33,15 +33,16 @@ from mphdrr.core.reconstruction.methods import method_of
 
 from .small_events import TEXT, small_recipe
 from .small_learning import TOY, small_training
+from .small_recipes import JUDGE
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory) -> Path:
+def folder(tmp_path_factory, small_set) -> Path:
     """A trained model and the events it was trained on."""
     folder = tmp_path_factory.mktemp("learned")
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(NETWORKS, "toy", TOY)
-        mph.learning.train(small_training(folder), folder / "model.pt")
+        mph.learning.train(small_training(folder, small_set), folder / "model.pt")
     return folder
 
 
@@ -282,19 +283,10 @@ def test_contents_are_all_there_is(model):
     assert method_of(str(model.path)).grid == model.contents.grid
 
 
-JUDGE = """
-version = 1
-[grid]
-voxels = 8
-spacing = 12.0
-[validation]
-events = "set"
-split = "test"
-[baselines]
-subsets = 2
-stops = [1, 3]
-fwhm = [0, 10]
-families = ["osem"]
+OWN_JUDGE = JUDGE.replace("voxels = 12\nspacing = 8.0", "voxels = 8\nspacing = 12.0")
+OWN_JUDGE = (
+    OWN_JUDGE.replace('"validation"', '"set"\nsplit = "test"')
+    + """
 [models]
 net = "net.pt"
 [[tests]]
@@ -302,13 +294,14 @@ name = "others"
 events = "others"
 levels = [1.0, 0.5]
 """
+)
 
 
 def test_a_model_is_judged_by_the_command_beside_baselines_and_may_keep_its_rows(folder, model, tmp_path, capsys):
     (tmp_path / "net.pt").write_bytes((folder / "model.pt").read_bytes())
     (tmp_path / "set").symlink_to(folder / "set")
     mph.events.make(small_recipe(tmp_path / "recipe", TEXT.replace("seed = 5", "seed = 6")), tmp_path / "others", 3)
-    (tmp_path / "judge.toml").write_text(JUDGE, encoding="utf-8")
+    (tmp_path / "judge.toml").write_text(OWN_JUDGE, encoding="utf-8")
     command = ["learn", "judge", str(tmp_path / "judge.toml"), "-o", str(tmp_path / "judgement"), "--into-models"]
     assert main(command) == 0
     assert " in judgement.md, .json and .png" in capsys.readouterr().out
@@ -317,7 +310,7 @@ def test_a_model_is_judged_by_the_command_beside_baselines_and_may_keep_its_rows
     assert [row["level"] for row in own] == [1.0, 0.5] and all(0 < row["nrmse"] < 1 for row in own)
     assert mph.learning.read_model(tmp_path / "net.pt").contents.judgement["rows"] == own
     (tmp_path / "judge.toml").write_text(
-        JUDGE.replace('"others"\nlevels', '"set"\nsplit = "train"\nlevels'), encoding="utf-8"
+        OWN_JUDGE.replace('"others"\nlevels', '"set"\nsplit = "train"\nlevels'), encoding="utf-8"
     )
     assert main(command) == 1
     assert "net: it was trained on events of the test others" in capsys.readouterr().err

@@ -28,13 +28,14 @@ from mphdrr.core.learning.networks import NETWORKS
 from mphdrr.core.learning.recipe import parsed, template_text
 from mphdrr.core.learning.training import loss_of, nrmse
 
-from .small_learning import RECIPE, TOY, small_training
+from .small_learning import TOY, small_training
+from .small_recipes import TRAINING
 
 
 @pytest.fixture
-def recipe(monkeypatch, tmp_path):
+def recipe(monkeypatch, tmp_path, small_set):
     monkeypatch.setitem(NETWORKS, "toy", TOY)
-    return small_training(tmp_path)
+    return small_training(tmp_path, small_set)
 
 
 def changed(recipe, before: str, after: str):
@@ -164,9 +165,8 @@ def test_events_that_cannot_be_learned_from_are_refused(recipe, tmp_path, before
         mph.learning.train(changed(recipe, before, after), tmp_path / "m.pt")
 
 
-def test_truth_from_coarse_voxels_is_doubted(monkeypatch, tmp_path):
-    monkeypatch.setitem(NETWORKS, "toy", TOY)
-    recipe = small_training(tmp_path, RECIPE.replace("spacing = 12.0", "spacing = 8.0"))
+def test_truth_from_coarse_voxels_is_doubted(recipe, tmp_path):
+    recipe = changed(recipe, "spacing = 12.0", "spacing = 8.0")
     with pytest.warns(mph.InputWarning, match="flatter"):
         prepared(Source(recipe), tmp_path, ["test"])
 
@@ -226,7 +226,7 @@ def test_a_folder_of_another_training_is_not_gone_on_with(recipe, tmp_path):
 
 
 def test_a_training_of_some_seconds_has_the_steps_that_fit_and_keeps_their_number(recipe, tmp_path):
-    timed = changed(recipe, "steps = 6", "seconds = 4.0")
+    timed = changed(recipe, "steps = 6", "seconds = 1.0")
     begun = time.monotonic()
     model = mph.learning.train(timed, tmp_path / "m.pt")
     spent = time.monotonic() - begun
@@ -270,10 +270,11 @@ def environment() -> dict[str, str]:
     return {**os.environ, "PYTHONPATH": str(Path(mphdrr.__path__[0]).parent)}
 
 
+@pytest.mark.long  # each process imports torch
 def test_two_processes_have_the_loss_of_one_with_the_same_batch(recipe, tmp_path):
     one = mph.learning.train(recipe, tmp_path / "one.pt")
     both = 'batch = 2\ndevices = 2\nstrategy = "ddp"'
-    (tmp_path / "two.toml").write_text(RECIPE.replace("batch = 2", both), encoding="utf-8")
+    (tmp_path / "two.toml").write_text(TRAINING.replace("batch = 2", both), encoding="utf-8")
     done = subprocess.run(
         [*script(tmp_path), str(tmp_path / "two.toml"), "-o", str(tmp_path / "two.pt")],
         cwd=tmp_path, env=environment(), capture_output=True, text=True, timeout=300,
@@ -285,9 +286,10 @@ def test_two_processes_have_the_loss_of_one_with_the_same_batch(recipe, tmp_path
         assert ours["validation"] == pytest.approx(theirs["validation"], abs=1e-4)
 
 
+@pytest.mark.long  # each process imports torch
 @pytest.mark.skipif(os.name == "nt", reason="Windows has no SIGINT for one process")
 def test_ctrl_c_keeps_a_checkpoint_and_the_same_command_goes_on(recipe, tmp_path):
-    (tmp_path / "long.toml").write_text(RECIPE.replace("steps = 6", "steps = 4000"), encoding="utf-8")
+    (tmp_path / "long.toml").write_text(TRAINING.replace("steps = 6", "steps = 4000"), encoding="utf-8")
     command = [*script(tmp_path), str(tmp_path / "long.toml"), "-o", str(tmp_path / "m.pt")]
     last, before = tmp_path / "m-training" / "last.ckpt", 0
     for _ in range(2):

@@ -31,12 +31,12 @@ GRID = mph.Grid.centered((8, 8, 8), 12.0)
 
 
 @cache
-def setup_of(every: int = 16, permuted: int | None = None, backend: str = "auto") -> Setup:
-    """Of every n-th module."""
+def setup_of(every: int = 16, permuted: int | None = None, backend: str = "auto", **model: Any) -> Setup:
+    """Of every n-th module; `model` are settings of its `Emission`."""
     system = mph.read_system(WORKBOOK)[::every]
     views = system.views(shape=(8, 8), detector="real")
     return Setup(
-        mph.Projector(GRID, views, mph.Emission(system, time=60.0), backend, threads=1), 2, (1, 2, 3), permuted
+        mph.Projector(GRID, views, mph.Emission(system, time=60.0, **model), backend, threads=1), 2, (1, 2, 3), permuted
     )
 
 
@@ -86,7 +86,9 @@ def test_gradients_are_those_of_finite_differences(kind):
     options = (
         {"save_memory": False} if kind == "unrolled" else {}
     )  # computed again, U-Nets would have their own weights
-    setup, model = setup_of(backend="numpy"), network(kind, **options).double().eval()  # float64 throughout
+    # In float64 throughout, and of one ray for each pixel: any projector's gradient is its adjoint.
+    setup = setup_of(backend="numpy", hole="point", pixel_points=1, tolerance=1e9)
+    model = network(kind, **options).double().eval()
     sample = Sample(*(each.double() for each in scan(setup)))
     parameters = dict(model.named_parameters())
     sizes = [p.numel() for p in parameters.values()]

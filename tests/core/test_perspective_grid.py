@@ -110,14 +110,13 @@ def test_planes_are_evenly_spaced_in_what_they_say(parallel, uniform):
 
 
 @CASES
-def test_index_matrices_number_the_centers(parallel, uniform):
+def test_indices_number_the_centers(parallel, uniform):
     for grid in grids(parallel, uniform):
         index = np.moveaxis(np.indices(grid.shape), 0, -1)
-        centers = np.concatenate([grid.centers(), np.ones((*grid.shape, 1))], axis=-1)
-        p = centers @ grid.index_matrix.T
+        p = np.concatenate([grid.centers(), np.ones((*grid.shape, 1))], axis=-1) @ grid.index_matrix.T
         assert (p[..., 3:] > 0).all()
-        found = np.stack([p[..., 0] / p[..., 3], p[..., 1] / p[..., 3], p[..., 2] / p[..., 4]], axis=-1)
-        np.testing.assert_allclose(found, index, atol=1e-10)
+        np.testing.assert_allclose(grid.index_from_world(grid.centers()), index, atol=1e-10)
+        np.testing.assert_allclose(grid.world_from_index(index), grid.centers(), atol=1e-10)
         np.testing.assert_allclose(grid.from_world(grid.centers())[..., :2], index[..., :2], atol=1e-10)
         depth = mph.view_frames(grid.views)[grid.m, 2] @ (grid.centers() - grid.views.sources[grid.m])[..., None]
         np.testing.assert_allclose(depth[..., 0], np.broadcast_to(grid.depths, grid.shape), rtol=1e-12)
@@ -159,6 +158,43 @@ def test_cell_volumes_are_integrals_of_the_jacobian(parallel, uniform):
         np.testing.assert_allclose(whole, area * (330**3 - 120**3) / (3 * distances**2), rtol=1e-10)
     else:
         np.testing.assert_allclose(whole, area * 210, rtol=1e-12)
+
+
+@CASES
+def test_indices_lead_to_the_world_and_back(parallel, uniform, rng):
+    points = rng.uniform(-60, 60, (4, 50, 3))
+    for grid in grids(parallel, uniform):
+        index = grid.index_from_world(points)
+        assert index.shape == points.shape
+        np.testing.assert_allclose(index[..., :2], grid.from_world(points)[..., :2], atol=1e-9)
+        assert np.abs(grid.world_from_index(index) - points).max() < 1e-9
+        between = rng.uniform(-0.5, np.array(grid.shape) - 0.5, (200, 3))
+        assert np.abs(grid.index_from_world(grid.world_from_index(between)) - between).max() < 1e-9
+        np.testing.assert_allclose(grid.index_from_world(points[0, 0]), index[0, 0], atol=1e-9)
+    refused(lambda: grid.index_from_world([1, 2]), "points", "3")
+    refused(lambda: grid.world_from_index([1, 2, np.nan]), "index")
+
+
+@CASES
+def test_indices_are_those_of_what_is_resampled(parallel, uniform):
+    """Tiny voxels get what is linear in a view's indices there; its cells the values of a volume where they lie."""
+    tiny = mph.Grid.centered((4, 3, 2), 1e-3, (5, -4, 3))
+    volume_grid = mph.Grid.centered((60, 60, 60), 1.0)
+    places, slope = volume_grid.affine, np.array([0.3, -0.5, 0.7])
+    world = np.moveaxis(np.indices(volume_grid.shape), 0, -1) @ places[:3, :3].T + places[:3, 3]
+    volume = mph.Volume((world @ slope).astype(np.float32), volume_grid, "activity")
+    for grid in grids(parallel, uniform, n_k=40)[:3]:
+        values = np.indices(grid.shape).astype(np.float64)
+        middles = np.moveaxis(np.indices(tiny.shape), 0, -1) @ tiny.affine[:3, :3].T + tiny.affine[:3, 3]
+        index = grid.index_from_world(middles)
+        for axis in range(3):
+            found = mph.from_perspective(values[axis], grid, tiny)
+            np.testing.assert_allclose(found, index[..., axis], atol=1e-4)
+        cells = np.moveaxis(values, 0, -1)
+        points = grid.world_from_index(cells)
+        inside = (np.abs(points) < 20).all(axis=-1)
+        seen = mph.to_perspective(volume, grid)
+        assert inside.any() and np.abs(seen - points @ slope)[inside].max() < 0.75  # 1 voxel along the slope
 
 
 @CASES

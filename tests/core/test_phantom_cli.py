@@ -46,6 +46,7 @@ NUMPY = ["--size", "9", "9", "--backend", "numpy"]
             "derenzo --rods 8 5 4 --sectors 3 --water 45 50 --background 3",
             mph.DerenzoPhantom(40, (8, 5, 4), 40, 100, 3, 45, 50, 3),
         ),
+        ("derenzo --altered -3", mph.DerenzoPhantom(activity=100, altered=-3)),
         ("cylinder --radius 30 20 --height 9", one(mph.Cylinder(radius=(30, 20), height=9, activity=100, mu=0))),
         ("sphere --radius 3", one(mph.Sphere(radius=3, activity=100, mu=0))),
         ("ellipsoid --radii 3 4 5", one(mph.Ellipsoid(radii=(3, 4, 5), activity=100, mu=0))),

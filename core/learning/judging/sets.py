@@ -22,6 +22,7 @@ SETS: Mapping[str, str] = MappingProxyType({
     "train": "to train and to tune with: Derenzo rods, mixtures of ellipsoids, cylinders and boxes",
     "derenzo": "a test: Derenzo rods of other sizes, in other poses",
     "unseen": "a test: textures, cold rods, spheres, a head, blobs",
+    "pairs": "a test: Derenzo rods, one left out or added",
     "cardiac": "a test: a torso with and without a perfusion defect; 64³ voxels, all modules",
 })  # fmt: skip
 """What each recipe is for, by name."""

@@ -36,7 +36,8 @@ def means_of(rows: Rows, drawn: Rows = ()) -> dict[str, Any]:
         found["sensitivity"] = wilson(sum(row["site"] > PRESENT for row in with_rod), len(with_rod))
     if without:
         found["false_rods"] = wilson(sum(row["site"] > PRESENT for row in without), len(without))
-        found["sites"] = len(without)
+    if with_rod or without:
+        found["sites"] = len(with_rod) + len(without)
     absent, present = ([row["channels"] for row in rows if row.get("defect") is has] for has in (False, True))
     if absent and present:
         try:
@@ -67,5 +68,5 @@ def told_of(row: Mapping[str, Any]) -> list[str]:
     if row["events"] < ENOUGH_EVENTS:
         notes.append(f"{row['events']} events, fewer than {ENOUGH_EVENTS}")
     if row.get("sites", ENOUGH_SITES) < ENOUGH_SITES:
-        notes.append(f"{row['sites']} sites without their rod, fewer than {ENOUGH_SITES}")
+        notes.append(f"{row['sites']} altered sites, fewer than {ENOUGH_SITES}")
     return notes

@@ -1,0 +1,183 @@
+"""Tables and picture of docs/learning-study.md, from the judgements in a folder: python figures.py FOLDER."""
+
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import mphdrr.core as mph
+from mphdrr.core.events import EventSet
+from mphdrr.core.figures.page import Page
+from mphdrr.core.figures.parts import FAINT, INK, Axes, heading, ticks
+from mphdrr.core.learning.judging.records import Records
+from mphdrr.core.learning.judging.statistics import ratio_of_means
+from mphdrr.core.runs.display import Display
+
+JUDGES = ("judge-known", "judge-scanners", "judge-pairs")
+NAMES = {
+    "after-osem": "1 U-Net after OSEM", "after-osem-short": "1, as many steps as 2 and 4",
+    "cameras-begun": "2 camera nets, begun with 1", "cameras": "2 camera nets, from scratch",
+    "parallel": "3 parallel projections, FBP",
+    "unrolled-begun": "4 unrolled, begun with 1", "unrolled": "4 unrolled, from scratch (true poses)",
+    "unrolled-permuted": "4, permuted poses", "channels": "views as channels, no geometry",
+}  # fmt: skip
+COLORS = {"after-osem": "#b8433a", "cameras-begun": "#2b6ca3", "unrolled-begun": "#2f8a4b", "unrolled": "#8a6d2f",
+          "unrolled-permuted": "#8a5aa0", "channels": "#777777"}  # fmt: skip
+SIZE, TOP = 190, 90
+
+Row = dict[str, Any]
+
+
+class Findings:
+    """The rows of all judgements, by test, level, training and seed."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.rows, self.baselines = folder, dict[tuple[str, float, str, int], Row](), list[Row]()
+        for judge in JUDGES:
+            if not (folder / judge / "judgement.json").exists():
+                continue
+            found = json.loads((folder / judge / "judgement.json").read_text())
+            for row in found["rows"]:
+                row["file"] = folder / judge / "scores" / (
+                    f"{found['tests'][row['test']]['fingerprint']}-{row['fingerprint'][:16]}.jsonl"
+                )
+                if row["kind"] == "method":
+                    kind, _, seed = row["method"].rpartition("-")
+                    self.rows[row["test"], row["level"], kind, int(seed)] = row
+                else:
+                    self.baselines.append(row)
+
+    def of(self, test: str, kind: str, level: float = 1.0) -> list[Row]:
+        """The rows of all seeds."""
+        return [row for (*key, _), row in sorted(self.rows.items()) if key == [test, level, kind]]
+
+    def errors(self, row: Row) -> Any:
+        """NRMSE of each event of a row."""
+        events = EventSet(self.folder / "sets" / self.sets[row["test"]])
+        kept = Records(row["file"])
+        return np.array([kept[e.recipe.fingerprint, e.number, row["level"], 0]["nrmse"] for e in events][: row["events"]])
+
+    sets = {
+        "derenzo": "derenzo", "unseen": "unseen", "pairs": "pairs", "sixteen modules": "sixteen",
+        "moved by 10 mm": "moved", "wider holes": "holes", "misaligned by 1 mm and 0.5 degrees": "misaligned",
+        "penetration by rays": "physics", "scatter": "physics", "fewer counts": "derenzo",
+    }  # fmt: skip
+
+
+def interval(values: Sequence[float]) -> str:
+    """A value with its interval."""
+    return "{:.3f} [{:.3f}, {:.3f}]".format(*values)
+
+
+def over_seeds(rows: list[Row], name: str = "best_baseline") -> str:
+    """Mean and SD over training seeds of the ratio of NRMSE; of one seed its interval."""
+    values = [row[name]["ratio"][0] for row in rows if name in row]
+    if len(values) < 2:
+        return interval(rows[0][name]["ratio"]) if values else ""
+    return f"{np.mean(values):.3f} ± {np.std(values, ddof=1):.3f}, first {interval(rows[0][name]['ratio'])}"
+
+
+def table(heads: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
+    """In Markdown."""
+    return "\n".join(f"| {' | '.join(line)} |" for line in (heads, ["---"] * len(heads), *lines)) + "\n"
+
+
+def known(found: Findings) -> str:
+    """The table of the scanner that was trained with."""
+    lines = []
+    for row in found.baselines:
+        if row["test"] == "derenzo":
+            lines.append([row["method"], "", f"{row['nrmse']:.3f}", interval(row["best_baseline"]["ratio"]), "", "",
+                          f"{row['deviance']:.2f}", f"{row['sensitivity'][0]:.2f}", f"{row['seconds']:.1f}"])  # fmt: skip
+    for kind, name in NAMES.items():
+        rows, unseen = found.of("derenzo", kind), found.of("unseen", kind)
+        if rows:
+            curve = json.loads((found.folder / f"{rows[0]['method']}-training" / "curve.json").read_text())[-1]
+            lines.append([
+                name, f"{curve['step']}", f"{np.mean([row['nrmse'] for row in rows]):.3f}", over_seeds(rows),
+                over_seeds(unseen), over_seeds(unseen, "best_on_itself"), f"{rows[0]['deviance']:.2f}",
+                f"{rows[0]['sensitivity'][0]:.2f}", f"{rows[0]['seconds']:.1f}",
+            ])  # fmt: skip
+    heads = ("method", "steps", "NRMSE, rods", "by the best baseline", "unseen kinds", "by one tuned on them", "deviance",
+             "rods seen", "s")  # fmt: skip
+    return table(heads, lines)
+
+
+def unknown(found: Findings) -> str:
+    """The table of other scanners, physics and counts: by the best baseline, and by method 1 of the same seed."""
+    lines = []
+    for test, level in dict.fromkeys((test, level) for test, level, *_ in found.rows):
+        if test in ("derenzo", "unseen", "draws", "pairs"):
+            continue
+        for kind in ("after-osem", "cameras-begun", "unrolled-begun"):
+            rows, beside = found.of(test, kind, level), found.of(test, "after-osem", level)
+            ratios = [
+                ratio_of_means(found.errors(row), found.errors(other), 0)
+                for row, other in zip(rows, beside, strict=True)
+                if kind != "after-osem"
+            ]
+            lines.append([test, f"{level:g}", NAMES[kind], over_seeds(rows), "; ".join(map(interval, ratios))])
+    return table(("test", "counts", "method", "by the best baseline", "by method 1, each seed"), lines)
+
+
+def pairs(found: Findings) -> str:
+    """The table of rods left out or added."""
+    rows = [row for row in found.baselines if row["test"] == "pairs"]
+    rows += [row for (test, *_), row in found.rows.items() if test == "pairs"]
+    lines = [[row["method"], interval(row["sensitivity"]), interval(row["false_rods"])] for row in rows]
+    return table(("method", "added rods seen", "false rods"), lines)
+
+
+def picture(found: Findings) -> Page:
+    """Middle slices of two events, and the learning curves by time and by events."""
+    methods = ("after-osem", "cameras-begun", "unrolled-begun", "unrolled", "unrolled-permuted", "channels")
+    page = Page(1660, 1130)
+    top = heading(page, "Do networks need to know where the cameras are?", [
+        "Middle slices of one event each; below, the NRMSE of validation events while they are trained, three seeds"])  # fmt: skip
+    for test in ("derenzo", "unseen"):
+        event = EventSet(found.folder / "sets" / test)[2]
+        run = event.run("emission", event.noise_seed)
+        grid = mph.learning.read_model(found.folder / "after-osem-0.pt").contents.grid
+        shown = [("truth", mph.resample(event.truth, grid, "mean"))]
+        shown += [(NAMES[kind], mph.learning.read_model(found.folder / f"{kind}-0.pt").judged(kind).function(run))
+                  for kind in methods]  # fmt: skip
+        display = Display("inferno")
+        window = display.window(shown[0][1].array)
+        for column, (name, volume) in enumerate(shown):
+            left = 60 + column * (SIZE + 35)
+            page.text(name, left, top + 20, 0.62 * page.em, INK)
+            values = volume.array[:, :, volume.array.shape[2] // 2]
+            page.image(display.colored(values.T[::-1], window), left, top + 30, SIZE, SIZE)
+        top += SIZE + 60
+    for column, (name, text) in enumerate({"seconds": "seconds of training", "events": "events seen"}.items()):
+        curves(found, page, (110 + column * 800, top + 40, 660, 330), name, text, methods)
+    return page
+
+
+def curves(found: Findings, page: Page, frame: Any, name: str, text: str, methods: Sequence[str]) -> None:
+    """Learning curves of all seeds."""
+    read = {(kind, seed): json.loads(path.read_text()) for kind in methods for seed in range(3)
+            if (path := found.folder / f"{kind}-{seed}-training" / "curve.json").exists()}  # fmt: skip
+    most = max(row[name] for rows in read.values() for row in rows)
+    axes = Axes(page, frame, (0, most), (0.25, 0.9), page.em)
+    axes.draw(ticks(0, most, 6), ticks(0.25, 0.9, 6), "", text)
+    for (kind, _), rows in read.items():
+        axes.curve([r[name] for r in rows], [min(r["validation"], 0.9) for r in rows], COLORS[kind], 0.1)
+    for place, kind in enumerate(methods):
+        x, y = frame[0] + frame[2] - 300, frame[1] + 40 + 24 * place
+        page.line([(x, y - 5), (x + 30, y - 5)], COLORS[kind], 3)
+        page.text(NAMES[kind], x + 40, y, 0.7 * page.em, FAINT)
+
+
+def main(folder: Path) -> None:
+    """Write study.md and study.png."""
+    found = Findings(folder)
+    (folder / "study.md").write_text("\n".join([known(found), unknown(found), pairs(found)]), encoding="utf-8")
+    picture(found).write(folder / "study.png")
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))

@@ -1,4 +1,4 @@
-"""Tables and picture of docs/learning-study.md, from the judgements in a folder: python figures.py FOLDER."""
+"""Tables and picture of docs/learning-study.md, from the judgements in a folder: python study_figures.py FOLDER."""
 
 import json
 import sys
@@ -16,7 +16,6 @@ from mphdrr.core.learning.judging.records import Records
 from mphdrr.core.learning.judging.statistics import ratio_of_means
 from mphdrr.core.runs.display import Display
 
-JUDGES = ("judge-known", "judge-scanners", "judge-pairs")
 NAMES = {
     "after-osem": "1 U-Net after OSEM", "after-osem-short": "1, as many steps as 2 and 4",
     "cameras-begun": "2 camera nets, begun with 1", "cameras": "2 camera nets, from scratch",
@@ -36,13 +35,11 @@ class Findings:
 
     def __init__(self, folder: Path) -> None:
         self.folder, self.rows, self.baselines = folder, dict[tuple[str, float, str, int], Row](), list[Row]()
-        for judge in JUDGES:
-            if not (folder / judge / "judgement.json").exists():
-                continue
-            found = json.loads((folder / judge / "judgement.json").read_text())
+        for judge in sorted(path.parent for path in folder.glob("judge-*/judgement.json")):
+            found = json.loads((judge / "judgement.json").read_text())
             for row in found["rows"]:
-                row["file"] = folder / judge / "scores" / (
-                    f"{found['tests'][row['test']]['fingerprint']}-{row['fingerprint'][:16]}.jsonl"
+                row["file"] = (
+                    judge / "scores" / (f"{found['tests'][row['test']]['fingerprint']}-{row['fingerprint'][:16]}.jsonl")
                 )
                 if row["kind"] == "method":
                     kind, _, seed = row["method"].rpartition("-")
@@ -58,7 +55,9 @@ class Findings:
         """NRMSE of each event of a row."""
         events = EventSet(self.folder / "sets" / self.sets[row["test"]])
         kept = Records(row["file"])
-        return np.array([kept[e.recipe.fingerprint, e.number, row["level"], 0]["nrmse"] for e in events][: row["events"]])
+        return np.array(
+            [kept[e.recipe.fingerprint, e.number, row["level"], 0]["nrmse"] for e in events][: row["events"]]
+        )
 
     sets = {
         "derenzo": "derenzo", "unseen": "unseen", "pairs": "pairs", "sixteen modules": "sixteen",
@@ -135,8 +134,8 @@ def picture(found: Findings) -> Page:
     """Middle slices of two events, and the learning curves by time and by events."""
     methods = ("after-osem", "cameras-begun", "unrolled-begun", "unrolled", "unrolled-permuted", "channels")
     page = Page(1660, 1130)
-    top = heading(page, "Do networks need to know where the cameras are?", [
-        "Middle slices of one event each; below, the NRMSE of validation events while they are trained, three seeds"])  # fmt: skip
+    text = "Middle slices of one event each; below, the NRMSE of validation events while they are trained, three seeds"
+    top = heading(page, "Do networks need to know where the cameras are?", [text])
     for test in ("derenzo", "unseen"):
         event = EventSet(found.folder / "sets" / test)[2]
         run = event.run("emission", event.noise_seed)

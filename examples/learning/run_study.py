@@ -1,4 +1,4 @@
-"""All figures of docs/learning-study.md: python study.py FOLDER [JOBS].
+"""All figures of docs/learning-study.md: python run_study.py FOLDER [JOBS].
 
 Event sets, trainings and judgements are made by `mphdrr` from the recipes beside this file, which are copied into FOLDER, by
 JOBS processes at once (2). What was interrupted goes on at the next call, and what is there is not made again.
@@ -7,11 +7,12 @@ JOBS processes at once (2). What was interrupted goes on at the next call, and w
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
+import study_figures
 
 import mphdrr.core as mph
 from mphdrr.core.example import EXAMPLE
@@ -30,11 +31,14 @@ FIRST = ("after-osem", "after-osem-half", "after-osem-short", "cameras", "unroll
 """Trainings of each seed."""
 BEGUN = ("cameras-begun", "unrolled-begun")
 """Those of each seed that begin with the weights of after-osem-half."""
-ONCE = ("parallel-0", "hour-0")
+ONCE = ("parallel-0",)
+JUDGES = ("judge-known", "judge-scanners", "judge-pairs")
 
 
 def scanners(folder: Path) -> None:
     """Workbooks of scanners that no training has seen: modules moved by 10 mm, wider holes, small misalignments."""
+    if (folder / "misaligned.xlsx").exists():  # the last one
+        return
     shutil.copy(EXAMPLE, folder / "scanner.xlsx")
     system = mph.read_system(folder / "scanner.xlsx")
     places, axes = np.random.default_rng(1).normal(size=(2, len(system), 3))
@@ -106,13 +110,13 @@ class Study:
         self.train("first-0")  # makes the samples that the others share
         self.at_once(self.train, [f"{kind}-{seed}" for seed in SEEDS for kind in FIRST])
         self.at_once(self.train, [*(f"{kind}-{seed}" for seed in SEEDS for kind in BEGUN), *ONCE])
-        self.at_once(self.judge, ("judge-known", "judge-other"))
+        self.at_once(self.judge, JUDGES)
+        study_figures.main(self.folder)
 
-    def at_once(self, work, names: Iterable[str]) -> None:
+    def at_once(self, work: Callable[[str], None], names: Iterable[str]) -> None:
         """Several works, `jobs` at a time; the first fault ends all."""
         with ThreadPoolExecutor(self.jobs) as pool:
-            for done in [pool.submit(work, name) for name in names]:
-                done.result()
+            list(pool.map(work, names))
 
 
 if __name__ == "__main__":

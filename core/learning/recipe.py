@@ -44,9 +44,7 @@ _ROWS = by_key((
             "worth", least=0),
     Setting("network.weights_from", str, None, "Model file (.pt) whose weights of equal name and shape it begins with",
             "random weights", is_path=True),
-    Setting("training.steps", int, None, "How many steps", least=1, needs=("no training.seconds",)),
-    Setting("training.seconds", float, None, "As many steps as fit into this time, which is measured once", unit="s",
-            above=0, needs=("no training.steps",)),
+    Setting("training.steps", int, 3000, "How many steps", least=1),
     Setting("training.batch", int, 1, "Scans in each step, of all devices together", least=1),
     Setting("training.rate", float, 1.5e-3, "Learning rate, at its largest", above=0),
     Setting("training.seed", int, 0, "Seed of weights, order and noise", least=0, most=2**31 - 1),
@@ -94,12 +92,8 @@ class TrainingRecipe(Values):
         super().__post_init__()
         required(self["data.events"], "data.events", "name the folder of an event set")
         required(self["grid.spacing"], "grid.spacing", "give the voxel size in mm")
-        if self["training.steps"] is None:
-            required(self["training.seconds"], "training.steps", "give a number of steps, or training.seconds")
         if list(self["osem.after"]) != sorted(set(self["osem.after"])):
             raise InputError(f"osem.after: expected rising numbers, got {list(self['osem.after'])}")
-        if self.processes > 1 and self["training.steps"] is None:
-            raise InputError("training.seconds: only one process measures its steps; of several give training.steps")
         if self["training.batch"] % self.processes:
             batch = self["training.batch"]
             raise InputError(f"training.batch: expected a multiple of the {self.processes} processes, got {batch}")

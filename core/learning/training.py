@@ -14,7 +14,6 @@ import time
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +24,7 @@ from lightning.pytorch.callbacks import Callback, EMAWeightAveraging, ModelCheck
 from lightning.pytorch.loggers import TensorBoardLogger
 from numpy.typing import NDArray
 from torch import Tensor
-from torch.utils.data import DataLoader, default_collate
+from torch.utils.data import DataLoader
 
 from ..errors import InputError, reading
 from ..files import ensure_folder, read_text, write_bytes
@@ -40,8 +39,6 @@ from .setup import Sample, Setup
 _ON_THE_WAY = 0.3  # weight of estimates before the last
 _ROUNDS, _LONGEST = 20, 200  # rounds of a training, if they are not longer than so many steps
 _VALIDATED = 32  # samples at the end of each round
-_MEASURED = 0.05  # share of the time in which steps are measured
-_LEAST_MEASURED = 8  # steps
 
 
 def nrmse(estimate: Tensor, truth: Tensor) -> Tensor:
@@ -59,11 +56,11 @@ def loss_of(estimates: list[Tensor], truth: Tensor) -> Tensor:
 class Trained(pl.LightningModule):
     """A network in training: loss, steps, rate, and the learning curve, which checkpoints keep."""
 
-    def __init__(self, network: torch.nn.Module, setup: Callable[[], Setup], recipe: TrainingRecipe, steps: int):
+    def __init__(self, network: torch.nn.Module, setup: Callable[[], Setup], recipe: TrainingRecipe):
         super().__init__()
         self.network = network
         self.told = setup  # a function, which the average of the weights does not copy with the module
-        self.recipe, self.steps = recipe, steps
+        self.recipe, self.steps = recipe, recipe["training.steps"]
         self.curve: list[dict[str, float]] = []
         self._losses: list[Tensor] = []  # of the steps of this round
         self.spent, self._begun = 0.0, time.monotonic()
@@ -117,15 +114,15 @@ class Trained(pl.LightningModule):
 class _Rounds(pl.LightningDataModule):
     """Batches of each round, in an order that seed and round decide; each process takes its part of a batch."""
 
-    def __init__(self, train: Samples, validation: Samples, recipe: TrainingRecipe, steps: int, length: int) -> None:
+    def __init__(self, train: Samples, validation: Samples, recipe: TrainingRecipe, length: int) -> None:
         super().__init__()
-        self.train, self.validation, self.recipe, self.steps, self.length = train, validation, recipe, steps, length
+        self.train, self.validation, self.recipe, self.length = train, validation, recipe, length
 
     def train_dataloader(self) -> DataLoader[Sample]:
         """The batches of the round that begins; the last may be shorter."""
         batch, done = self.recipe["training.batch"], self._trainer.current_epoch
         random = np.random.default_rng((self.recipe["training.seed"], done))
-        count = min(self.length, self.steps - done * self.length) * batch
+        count = min(self.length, self.recipe["training.steps"] - done * self.length) * batch
         passes = math.ceil(count / len(self.train))
         order = np.concatenate([random.permutation(len(self.train)) for _ in range(passes)])[:count]
         return DataLoader(self.train, batch_sampler=self._own(order.reshape(-1, batch).T).T.tolist())
@@ -204,12 +201,11 @@ def train(
     splits = recipe["data.train"], recipe["data.validation"]
     samples, validation = prepared(source, folder.parent, splits, workers, stages("preparing"))
     with _quiet():
-        network, batch = _begun(recipe, source), _first_batch(recipe, samples)
-        plan = _plan(recipe, source, folder, lambda: _fitting(recipe, network, source.setup, batch, len(validation)))
-        module = Trained(network, lambda: source.setup, recipe, plan["steps"])
-        length = min(_LONGEST, math.ceil(plan["steps"] / _ROUNDS))
-        trainer, last = _trainer(recipe, folder, plan, length, stages("training")), folder / "last.ckpt"
-        _fit(trainer, module, _Rounds(samples, validation, recipe, plan["steps"], length), last)
+        precision = _kept_precision(recipe, source, folder)
+        module = Trained(_begun(recipe, source), lambda: source.setup, recipe)
+        length = min(_LONGEST, math.ceil(recipe["training.steps"] / _ROUNDS))
+        trainer, last = _trainer(recipe, folder, precision, length, stages("training")), folder / "last.ckpt"
+        _fit(trainer, module, _Rounds(samples, validation, recipe, length), last)
     if trainer.is_global_zero:
         write_model(_contents(recipe, source, samples, last), path)
     trainer.strategy.barrier()
@@ -230,18 +226,16 @@ def _begun(recipe: TrainingRecipe, source: Source) -> torch.nn.Module:
     return network
 
 
-def _plan(recipe: TrainingRecipe, source: Source, folder: Path, fitting: Callable[[], int]) -> dict[str, Any]:
-    """Number of steps and precision, decided once and kept in the folder; `InputError` where another recipe's is there."""
+def _kept_precision(recipe: TrainingRecipe, source: Source, folder: Path) -> str:
+    """The numbers that a training computes in, kept in its folder; `InputError` where that is of another recipe."""
     path, known = folder / "plan.json", f"{recipe.fingerprint} {source.fingerprint}"
-    if path.exists():
-        with reading(path, "the plan of a training"):
-            plan: dict[str, Any] = json.loads(read_text(path))
-            if plan["recipe"] != known:
-                raise InputError("of a training by another recipe: remove its folder, or choose another -o")
-            return plan
-    plan = {"recipe": known, "steps": recipe["training.steps"] or fitting(), "precision": _precision(recipe)}
-    write_bytes(path, json.dumps(plan).encode())
-    return plan
+    if not path.exists():
+        write_bytes(path, json.dumps({"recipe": known, "precision": _precision(recipe)}).encode())
+    with reading(path, "the plan of a training"):
+        plan = json.loads(read_text(path))
+        if plan["recipe"] != known:
+            raise InputError("of a training by another recipe: remove its folder, or choose another -o")
+        return str(plan["precision"])
 
 
 def _device(recipe: TrainingRecipe) -> torch.device:
@@ -261,62 +255,18 @@ def _precision(recipe: TrainingRecipe) -> str:
     return "bf16-mixed" if is_fast else "32"
 
 
-def _first_batch(recipe: TrainingRecipe, samples: Samples) -> Sample:
-    """The first samples, as many as a process takes in a step."""
-    own = recipe["training.batch"] // recipe.processes
-    batch: Sample = default_collate([samples[i % len(samples)] for i in range(own)])
-    return batch
-
-
-def _fitting(recipe: TrainingRecipe, network: torch.nn.Module, setup: Setup, batch: Sample, validated: int) -> int:
-    """How many steps fit into the recipe's time: some are done with a copy of the network, and measured."""
-    begun, device, precision = time.monotonic(), _device(recipe), _precision(recipe)
-    copy = deepcopy(network).to(device)
-    batch = Sample(*(values.to(device) for values in batch))
-    optimizer = torch.optim.AdamW(copy.parameters(), lr=1e-6)
-    kind = {"bf16-mixed": torch.bfloat16, "16-mixed": torch.float16}.get(precision)
-
-    def forward() -> list[Tensor]:
-        with torch.autocast(device.type, dtype=kind, enabled=kind is not None):
-            found: list[Tensor] = copy(setup, batch)
-            return found
-
-    def step() -> None:
-        optimizer.zero_grad()
-        loss_of(forward(), batch.truth).backward()
-        optimizer.step()
-
-    def seconds_of(work: Callable[[], object]) -> float:
-        started = time.monotonic()
-        work()
-        if device.type == "cuda":
-            torch.cuda.synchronize()
-        return time.monotonic() - started
-
-    times: list[float] = []
-    while len(times) < _LEAST_MEASURED or time.monotonic() - begun < _MEASURED * recipe["training.seconds"]:
-        times.append(seconds_of(step))
-    each = float(np.median(times[len(times) // 2 :]))  # the first ones make what the others have
-    with torch.no_grad():
-        forward()
-        validation = seconds_of(forward) * min(validated, _VALIDATED) / len(batch.truth)
-    left = recipe["training.seconds"] - (time.monotonic() - begun)
-    steps = (left - _ROUNDS * validation) / each
-    return max(1, int(min(steps, left / (each + validation / _LONGEST)) if steps > _ROUNDS * _LONGEST else steps))
-
-
 def _trainer(
-    recipe: TrainingRecipe, folder: Path, plan: dict[str, Any], length: int, progress: Progress | None
+    recipe: TrainingRecipe, folder: Path, precision: Any, length: int, progress: Progress | None
 ) -> pl.Trainer:
-    """Lightning's trainer of a plan, whose rounds have so many steps."""
-    steps = plan["steps"]
+    """Lightning's trainer of a recipe, whose rounds have so many steps."""
+    steps = recipe["training.steps"]
     decay = 1 - 1 / min(max(steps / 50, 1), 1000)  # the mean is over the last steps, at a small rate
     return pl.Trainer(
         accelerator={"cuda": "gpu"}.get(_device(recipe).type, "cpu"),
         devices=recipe["training.devices"],
         num_nodes=recipe["training.nodes"],
         strategy=recipe["training.strategy"],
-        precision=plan["precision"],
+        precision=precision,
         max_epochs=math.ceil(steps / length),
         gradient_clip_val=1.0,
         num_sanity_val_steps=0,

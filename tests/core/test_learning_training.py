@@ -58,11 +58,8 @@ def same(one: mph.learning.TrainedNetwork, other: mph.learning.TrainedNetwork) -
     ("before", "after", "words"),
     [
         ("steps = 6", "steps = 0", "training.steps: expected a whole number of 1 or more, got 0"),
-        ("steps = 6", "steps = 6\nseconds = 3", "training.steps does not go with training.seconds"),
-        ("steps = 6", "", "training.steps: missing; give a number of steps, or training.seconds"),
-        ("steps = 6", "seconds = 6\ndevices = 2", "training.seconds: only one process measures its steps; of several"),
         ("batch = 2", "batch = 3\ndevices = 2", "training.batch: expected a multiple of the 2 processes, got 3"),
-        ("batch = 2", "batches = 2", "training.batches: no such setting; expected steps, seconds, batch, rate"),
+        ("batch = 2", "batches = 2", "training.batches: no such setting; expected steps, batch, rate"),
         ('kind = "toy"', 'kind = "toys"', "network.kind 'toys': expected one of after-osem, "),
         ('kind = "toy"', 'kind = "toy"\ndepth = 3', "network.depth: no such setting; expected kind, permuted, weights_from"),
         ('kind = "toy"', 'kind = "toy"\nchannels = 2.5', "network.channels: expected a whole number, got 2.5"),
@@ -223,16 +220,6 @@ def test_a_folder_of_another_training_is_not_gone_on_with(recipe, tmp_path):
     (tmp_path / "m-training" / "last.ckpt").write_bytes(b"half a chec")
     with pytest.raises(mph.InputError, match=r"last\.ckpt: .*remove it to begin anew"):
         mph.learning.train(recipe, tmp_path / "m.pt")
-
-
-def test_a_training_of_some_seconds_has_the_steps_that_fit_and_keeps_their_number(recipe, tmp_path):
-    timed = changed(recipe, "steps = 6", "seconds = 1.0")
-    begun = time.monotonic()
-    model = mph.learning.train(timed, tmp_path / "m.pt")
-    spent = time.monotonic() - begun
-    plan = json.loads((tmp_path / "m-training" / "plan.json").read_text(encoding="utf-8"))
-    assert plan["steps"] == model.contents.curve[-1]["step"] > 10
-    assert spent < 30  # that of a busy machine
 
 
 def test_a_warm_start_takes_the_weights_of_equal_names_and_shapes(recipe, tmp_path):

@@ -120,6 +120,16 @@ def test_a_library_of_another_version_is_not_used(monkeypatch):
 
 
 @pytest.mark.parametrize("kind", TOLERANCE)
+def test_denormal_numbers_are_0_in_kernels_and_nowhere_else(level, kind):
+    """They are slow there, and what else runs in the thread may need them."""
+    volume = np.full((8, 8, 8), np.finfo(kind).tiny / 8, kind)
+    mapped = Lattices(Grid.centered(volume.shape, 1.0)).between(Ends(np.full((1, 3), -9.0), np.full((1, 3), 9.0)))
+    assert not cpu.forward(volume, *mapped).any()
+    assert cpu.forward(2**20 * volume, *mapped).all()
+    assert (volume * kind(0.5)).all()
+
+
+@pytest.mark.parametrize("kind", TOLERANCE)
 def test_the_last_voxel_of_a_long_way_counts_whole(level, kind):
     grid = Grid.centered((8, 8, 512), 1.0)
     volume = np.zeros(grid.shape, kind)

@@ -163,9 +163,9 @@ class Scanner(ABC):
     def attributes_at(self, poses: Floats) -> Mapping[str, Array]:
         """The attributes that its modules have when they are moved and turned as rigid bodies to these poses (M, 4, 4)."""
 
-    def at_poses(self, poses: Floats) -> Self:
-        """The scanner with its modules moved and turned as rigid bodies to these poses (M, 4, 4)."""
-        return self.replace(**self.attributes_at(poses))
+    def at_poses(self, poses: Floats, **changes: Any) -> Self:
+        """The scanner with its modules moved and turned as rigid bodies to these poses (M, 4, 4), and other `changes`."""
+        return self.replace(**self.attributes_at(poses), **changes)
 
     @classmethod
     def aimed(cls, places: Floats) -> Floats | None:

@@ -5,7 +5,7 @@ valid as long as the visible one is its rounding. A number that the user has typ
 """
 
 import json
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from functools import lru_cache
 from types import SimpleNamespace
@@ -196,17 +196,17 @@ def _carry(
     kind: Kind, rows: _Rows, known: Sequence[dict[str, Any]], poses: NDArray[np.float64], which: list[int]
 ) -> None:
     """Write the attributes into `rows` that modules have at their poses; one by one where they cannot be together."""
-    names, own = kind.columns.fields, ("numbers", *kind.columns.scalars)
+    names = kind.columns.fields
 
-    def carried(which: list[int]) -> Scanner:
+    def carried(which: list[int]) -> Mapping[str, NDArray[Any]]:
         imported = kind.of({name: np.array([known[m].get(name, rows[name][m]) for m in which]) for name in names})
-        return imported.at_poses(poses[which], **{name: np.array([rows[name][m] for m in which]) for name in own})
+        return imported.attributes_at(poses[which])
 
     for some, there in together(which, carried):
         if isinstance(there, InputError):
             raise there
-        for name in names.keys() - set(own):
-            for m, value in zip(some, getattr(there, name).tolist(), strict=True):
+        for name, values in there.items():
+            for m, value in zip(some, values.tolist(), strict=True):
                 rows[name][m] = value
 
 

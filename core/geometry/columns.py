@@ -7,6 +7,7 @@ units, limits and help from here.
 import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 
 from ..arrays import Array, Floats
 from ..errors import InputError
-from ..validation import one_for_all, radians, real_array
+from ..validation import one_for_all, radians, real_array, real_numbers
 
 MAP_UNITS = {"dm": 100.0, "ft": 304.8, "mil": 0.0254, "0.1 mm": 0.1}
 """Unit -> mm, of units that only a column map may name."""
@@ -98,7 +99,7 @@ class Column:
             return text
         return next((word for word in self.choices if word.casefold() == text.casefold()), None)
 
-    @property
+    @cached_property
     def units(self) -> dict[str, float]:
         """Unit -> mm or rad; the first is that of a heading without one. "" is that of a plain number."""
         known = {"length": LENGTH_UNITS, "angle": ANGLE_UNITS}.get(self.kind, {"": 1.0})
@@ -167,7 +168,7 @@ class Column:
         Those of a coordinate are all three: (M, 3), or one triple for all.
         """
         if self.axis is not None:
-            vectors = real_array(values, self.field, None)
+            vectors = real_numbers(values, self.field)
             if n is not None and vectors.shape in ((), (3,)):
                 vectors = np.broadcast_to(vectors, (n, 3))
             return real_array(vectors, self.field, (n, 3))

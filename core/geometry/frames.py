@@ -32,14 +32,15 @@ def module_frames(centers: ArrayLike) -> Floats:
     k = principal_rays(centers)
     u = _cross(np.array([0.0, 0.0, 1.0]), k)
     parallel = np.linalg.norm(u, axis=1) < _PARALLEL
-    u[parallel] = np.cross([1.0, 0.0, 0.0], k[parallel])
+    if parallel.any():
+        u[parallel] = _cross(np.array([1.0, 0.0, 0.0]), k[parallel])
     u /= np.linalg.norm(u, axis=1)[:, None]
     return np.stack([u, _cross(k, u), k], axis=1)
 
 
 def _cross(a: Floats, b: Floats) -> Floats:
-    """numpy.cross of (..., 3) to the same digits; of a few vectors, four times as fast."""
-    (ax, ay, az), (bx, by, bz) = np.moveaxis(a, -1, 0), np.moveaxis(b, -1, 0)
+    """numpy.cross of (3,) or (M, 3) to the same digits; of a few vectors, many times as fast."""
+    (ax, ay, az), (bx, by, bz) = a.T, b.T
     return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=-1)
 
 

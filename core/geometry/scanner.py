@@ -60,15 +60,15 @@ class Scanner(ABC):
             SCANNERS[cls.kind] = cls
 
     def __post_init__(self) -> None:
-        own, more = {f.name for f in fields(self)}, dict[str, Any]()  # type: ignore[arg-type]
-        given = own | self.more.keys()
+        own, more = vars(self), dict[str, Any]()
+        given = own.keys() | self.more.keys()
         n: int | None = None
         if unknown := self.more.keys() - self.columns.fields.keys():
             raise InputError(f"{sorted(unknown)[0]}: is no column of a {self.kind} scanner")
         for name, columns in self.columns.fields.items():
             of = columns[0]
             values = getattr(self, name) if name in given else of.default(self.columns.needed_values(self))
-            held = vars(self) if name in own else more
+            held = own if name in own else more
             held[name] = freeze(of.checked(values, n))
             n = len(held[name])
             if n == 0:
@@ -77,7 +77,7 @@ class Scanner(ABC):
         numbers = freeze(real_array(wanted, "numbers", (n,), np.int64))
         if not np.array_equal(numbers, wanted):
             raise InputError("numbers: expected whole numbers")
-        vars(self).update(more=more, numbers=numbers)
+        own.update(more=more, numbers=numbers)
         for name, column in self.columns.scalars.items():
             if column.plausible[0] > 0:
                 unit = next(iter(column.units))
@@ -160,8 +160,12 @@ class Scanner(ABC):
         return self.poses()[:, :3, :3].transpose(0, 2, 1)
 
     @abstractmethod
+    def attributes_at(self, poses: Floats) -> Mapping[str, Array]:
+        """The attributes that its modules have when they are moved and turned as rigid bodies to these poses (M, 4, 4)."""
+
     def at_poses(self, poses: Floats, **changes: Any) -> Self:
         """The scanner with its modules moved and turned as rigid bodies to these poses (M, 4, 4), and other `changes`."""
+        return self.replace(**self.attributes_at(poses), **changes)
 
     @classmethod
     def aimed(cls, places: Floats) -> Floats | None:

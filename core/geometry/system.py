@@ -2,12 +2,12 @@
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Self, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..arrays import Floats
+from ..arrays import Array, Floats
 from ..errors import InputError, naming, warn
 from ..system_source import SystemSource
 from ..validation import lengths, positive, real_array, whole_shape
@@ -125,11 +125,10 @@ class PinholeSystem(Scanner):
         """World-from-module poses (M, 4, 4): columns u, v, k and the pinhole centre, mm."""
         return affine_matrix(self.frames().transpose(0, 2, 1), self.centers)
 
-    def at_poses(self, poses: Floats, **changes: Any) -> Self:
-        """The system with its pinholes, and their modules turned with them, at these poses (M, 4, 4)."""
+    def attributes_at(self, poses: Floats) -> dict[str, Array]:
+        """The pinholes' places and the tilts with which the modules are turned with them."""
         centers = poses[:, :3, 3]
-        tilt = tilts(module_frames(centers), poses[:, :3, :3].transpose(0, 2, 1))
-        return self.replace(centers=centers, tilt=tilt, **changes)
+        return {"centers": centers, "tilt": tilts(module_frames(centers), poses[:, :3, :3].transpose(0, 2, 1))}
 
     @classmethod
     def aimed(cls, places: Floats) -> Floats:

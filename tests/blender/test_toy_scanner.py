@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 
 import bpy
 import numpy as np
@@ -91,13 +91,13 @@ def xray():
             axes = np.stack([self.panel_u, self.panel_v, np.cross(self.panel_u, self.panel_v)], axis=2)
             return affine_matrix(axes, self.sources)
 
-        def at_poses(self, poses: Any, **changes: Any) -> Self:
+        def attributes_at(self, poses: Any) -> dict[str, Any]:
             motion = poses @ np.linalg.inv(self.poses())
             turned = {
                 name: (motion[:, :3, :3] @ getattr(self, name)[..., None])[..., 0] for name in ("panel_u", "panel_v")
             }
             middle = (motion[:, :3, :3] @ self.panel_centers[..., None])[..., 0] + motion[:, :3, 3]
-            return self.replace(sources=poses[:, :3, 3], panel_centers=middle, **turned, **changes)
+            return {"sources": poses[:, :3, 3], "panel_centers": middle, **turned}
 
         def views(self, shape=(256, 256), detector="virtual", magnification=10.0, pitch=None, offset=(0, 0)) -> Views:
             n_v, n_u = shape

@@ -191,9 +191,9 @@ class Tubes(Scanner):
         columns = np.stack([u, np.cross(k, u), k, self.spots], axis=2)
         return np.concatenate([columns, np.broadcast_to([[[0.0, 0.0, 0.0, 1.0]]], (len(self), 1, 4))], axis=1)
 
-    def at_poses(self, poses):
+    def attributes_at(self, poses):
         distance = np.linalg.norm(self.panels - self.spots, axis=1, keepdims=True)
-        return self.replace(spots=poses[:, :3, 3], panels=poses[:, :3, 3] + distance * poses[:, :3, 2])
+        return {"spots": poses[:, :3, 3], "panels": poses[:, :3, 3] + distance * poses[:, :3, 2]}
 
     def views(self, shape=(8, 8), detector="virtual", magnification=10.0, pitch=None, offset=(0.0, 0.0)):
         u, v, _ = self.frames().transpose(1, 0, 2)

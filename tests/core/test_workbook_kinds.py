@@ -65,8 +65,8 @@ def xray():
             poses[:, :3, 3] = self.sources
             return poses
 
-        def at_poses(self, poses: NDArray[np.float64]) -> XRay:
-            return self.replace(sources=poses[:, :3, 3])
+        def attributes_at(self, poses: NDArray[np.float64]) -> dict[str, Any]:
+            return {"sources": poses[:, :3, 3]}
 
         def views(self, shape: tuple[int, int]) -> mph.Views:
             raise NotImplementedError

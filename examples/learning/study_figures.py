@@ -60,9 +60,9 @@ class Findings:
         )
 
     sets = {
-        "derenzo": "derenzo", "unseen": "unseen", "pairs": "pairs", "sixteen modules": "sixteen",
-        "moved by 10 mm": "moved", "wider holes": "holes", "misaligned by 1 mm and 0.5 degrees": "misaligned",
-        "penetration by rays": "physics", "scatter": "physics", "fewer counts": "derenzo",
+        "derenzo": "derenzo", "unseen": "unseen", "pairs": "pairs", "sixteen-modules": "sixteen",
+        "moved-10-mm": "moved", "wider-holes": "holes", "misaligned": "misaligned",
+        "penetration": "physics", "scatter": "physics", "fewer-counts": "derenzo",
     }  # fmt: skip
 
 

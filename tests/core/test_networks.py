@@ -30,6 +30,15 @@ TOLD = ["after-osem", "cameras", "parallel", "unrolled"]
 GRID = mph.Grid.centered((8, 8, 8), 12.0)
 
 
+@pytest.fixture(autouse=True, scope="module")
+def one_thread():
+    """At toy sizes several threads wait for each other longer than they work."""
+    usual = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(usual)
+
+
 @cache
 def setup_of(every: int = 16, permuted: int | None = None, backend: str = "auto", **model: Any) -> Setup:
     """Of every n-th module; `model` are settings of its `Emission`."""

@@ -238,7 +238,7 @@ def test_a_u_net_of_fewer_than_three_levels_or_without_channels_is_refused_in_a_
 
 @pytest.mark.parametrize("channels", [(), (4, 0)])
 def test_views_as_channels_without_channels_are_refused_in_a_line(channels):
-    with pytest.raises(mph.InputError, match="^network.channels: expected one level or more, each of 1 or more, got"):
+    with pytest.raises(mph.InputError, match=r"^network\.channels: expected one level or more, each of 1 or more, got"):
         network("channels", channels=channels)
 
 

@@ -72,7 +72,9 @@ def network_settings(kind: str) -> Mapping[str, Setting]:
         several = isinstance(argument.default, tuple)
         one = argument.default[0] if several else argument.default
         sizes = () if several else None
-        row = Setting(f"network.{name}", type(one), argument.default, f"Of {NETWORKS[kind].label}", sizes=sizes)
+        least = int(several) if type(one) is int else None  # several are channels of levels, and the like
+        key, text = f"network.{name}", f"Of {NETWORKS[kind].label}"
+        row = Setting(key, type(one), argument.default, text, least=least, sizes=sizes)
         found[row.key] = row
     return found
 

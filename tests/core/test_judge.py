@@ -12,12 +12,23 @@ from mphdrr.core.learning.judging.judge import judge, judge_recipe
 from mphdrr.core.learning.judging.methods import Family, JudgedMethod, smoothed
 from mphdrr.core.learning.judging.scoring import Case
 from mphdrr.core.learning.judging.sets import SETS, events_by_recipe, set_fingerprint, set_text
+from mphdrr.core.phantoms import painting
 
 from .conftest import WORKBOOK
 from .small_events import TEXT, small_recipe
 from .small_recipes import JUDGE
 
 RODS = TEXT[: TEXT.index('[[phantoms]]\nkind = "points"')] + TEXT[TEXT.index("[models.lines]") :]
+BELIEVED = """
+[models.believed]
+kind = "emission"
+time = 50
+hole = "point"
+pixel_points = 1
+tolerance = 1e6
+background = 0.5
+
+[radon]"""
 RODS_TEST = """
 [[tests]]
 name = "rods"
@@ -28,6 +39,12 @@ draws = 3
 drawn_events = 1
 tuned_on_itself = true
 """
+SHORT_TEST = """
+[[tests]]
+name = "rods"
+events = "rods"
+count = 1
+"""
 
 
 @pytest.fixture(scope="module")
@@ -35,10 +52,17 @@ def folder(tmp_path_factory):
     """A folder with a judge's recipe and its sets."""
     path = tmp_path_factory.mktemp("judge")
     for name, seed in (("rods", 5), ("validation", 6)):
-        recipe = small_recipe(path / "recipes" / name, RODS.replace("seed = 5", f"seed = {seed}"))
+        text = RODS.replace("seed = 5", f"seed = {seed}").replace("[radon]", BELIEVED.lstrip())
+        recipe = small_recipe(path / "recipes" / name, text)
         mph.events.make(recipe, path / name, 3)
     (path / "judge.toml").write_text(JUDGE + RODS_TEST)
     return path
+
+
+def short_recipe(folder, text=SHORT_TEST):
+    """The judge's recipe with other tests."""
+    (folder / "short.toml").write_text(JUDGE + text)
+    return judge_recipe(folder / "short.toml")
 
 
 def truth(run):
@@ -88,7 +112,7 @@ def test_contrast_is_of_the_event_as_it_was_changed(tmp_path):
 
 
 HEARTS = (
-    TEXT[: TEXT.index("[[phantoms]]")].replace("voxels = 16\nspacing = 6.0", "voxels = 24\nspacing = 8.0")
+    TEXT[: TEXT.index("[[phantoms]]")].replace("voxels = 16\nspacing = 6.0", "voxels = 16\nspacing = 8.0")
     + """
 [[phantoms]]
 kind = "torso"
@@ -107,9 +131,10 @@ position = [{ from = -5, to = 5 }, 0, 0]
 )
 
 
-def test_the_observer_finds_the_defect_in_the_truth_and_not_in_an_even_volume(tmp_path):
-    mph.events.make(small_recipe(tmp_path / "recipe", HEARTS), tmp_path / "hearts", 16)
-    text = JUDGE.replace("voxels = 12", "voxels = 24")
+def test_the_observer_finds_the_defect_in_the_truth_and_not_in_an_even_volume(tmp_path, monkeypatch):
+    monkeypatch.setattr(painting, "_SAMPLES_OF_OVERLAP", 1 << 13)  # totals to some percent are enough
+    mph.events.make(small_recipe(tmp_path / "recipe", HEARTS), tmp_path / "hearts", 12)
+    text = JUDGE.replace("voxels = 12", "voxels = 16")
     mph.events.make(
         small_recipe(tmp_path / "others", HEARTS.replace("seed = 5", "seed = 6")), tmp_path / "validation", 1
     )
@@ -164,7 +189,38 @@ def test_a_method_that_was_trained_on_the_test_is_refused(folder, tmp_path):
     with pytest.raises(mph.InputError, match="baselines: it was trained on events of the test rods: 0, 1, 2"):
         judge(judge_recipe(folder / "tuned.toml"), tmp_path, [])
     other = JudgedMethod("net", halved, "net-1", events_by_recipe(mph.events.EventSet(folder / "validation")))
-    assert judge(judge_recipe(folder / "judge.toml"), tmp_path, [other]).rows
+    assert judge(short_recipe(folder), tmp_path, [other]).rows
+
+
+def test_a_test_that_names_models_judges_those_only(folder, tmp_path):
+    text = SHORT_TEST + 'models = ["half"]\n' + SHORT_TEST.replace('name = "rods"', 'name = "all"')
+    rows = judge(short_recipe(folder, text), tmp_path, METHODS).rows
+    judged = {name: [row["method"] for row in rows if row["test"] == name][1:] for name in ("rods", "all")}
+    assert judged == {"rods": ["half"], "all": ["truth", "half"]}
+    with pytest.raises(mph.InputError, match="rods: models 'third': expected one of truth, half") as refused:
+        judge(short_recipe(folder, SHORT_TEST + 'models = ["half", "third"]\n'), tmp_path, METHODS)
+    assert "\n" not in str(refused.value)
+
+
+def test_methods_are_told_the_physics_that_is_believed_and_scores_by_another_are_not_reused(folder, tmp_path):
+    (event, *_) = mph.events.EventSet(folder / "rods")
+    true, believed = (event.run(name, event.noise_seed) for name in ("emission", "believed"))
+    told = []
+
+    def method(run):
+        told.append(run)
+        return halved(run)
+
+    methods, rows = [JudgedMethod("told", method, "told-1")], []
+    for text in ("", 'believed_model = "believed"\n', 'believed_model = "believed"\n'):
+        rows.append(judge(short_recipe(folder, SHORT_TEST + text), tmp_path, methods).rows[1])
+    assert len(told) == 2 + 2 + 1  # an event and its picture; the third time the picture alone
+    for run, belief in zip(told, (true, true, believed, believed, believed), strict=True):
+        np.testing.assert_array_equal(run.projections, true.projections)
+        np.testing.assert_array_equal(run.background, belief.background)
+        assert run.recipe.tables() == belief.recipe.tables()
+    assert true.recipe.tables() != believed.recipe.tables()
+    assert rows[0]["deviance"] != rows[1]["deviance"] and rows[1] == rows[2]
 
 
 def test_methods_are_told_the_geometry_that_is_believed(folder, tmp_path):

@@ -8,6 +8,7 @@ import os
 import pickle
 import subprocess
 import sys
+import time
 import warnings
 import zipfile
 from dataclasses import replace
@@ -30,6 +31,7 @@ from mphdrr.core.learning.judging.sets import events_by_recipe
 from mphdrr.core.learning.model_file import Contents, read_model, sealed, write_model
 from mphdrr.core.learning.networks import NETWORKS
 from mphdrr.core.reconstruction.methods import method_of
+from mphdrr.core.reconstruction.snapshots import Snapshots
 
 from .small_events import TEXT, small_recipe
 from .small_learning import TOY, small_training
@@ -157,6 +159,31 @@ def test_a_judgement_is_kept_without_a_change_of_what_the_network_does(folder, m
     assert judged.contents.judgement == {"rows": [{"nrmse": 0.5}]} and model.contents.judgement is None
     assert judged.sha256 != model.sha256 and judged.fingerprint == model.fingerprint
     assert mph.learning.read_model(tmp_path / "m.pt").contents.judgement == judged.contents.judgement
+
+
+def test_networks_of_one_setup_share_osems_volumes_and_say_the_seconds_that_it_saved(model, run, tmp_path, monkeypatch):
+    monkeypatch.setattr(model_file, "_SETUPS", {})
+    weights = {name: 2 * values for name, values in model.contents.weights.items()}
+    write_model(replace(model.contents, weights=weights), tmp_path / "double.pt")
+    double, asked, whole = read_model(tmp_path / "double.pt"), [], Snapshots.__call__
+
+    def counted(snapshots, counts, after, background):
+        asked.append(snapshots)
+        return whole(snapshots, counts, after, background)
+
+    monkeypatch.setattr(Snapshots, "__call__", counted)
+    first, second = model.judged("first"), double.judged("second")
+    begun = time.perf_counter()
+    one = first.function(run)
+    spent = time.perf_counter() - begun
+    assert first.saved() == 0
+    other = second.function(run)
+    assert len(asked) == 1 and 0 < second.saved() < spent
+    second.function(replace(run, projections=2 * run.projections))
+    assert len(asked) == 2 and second.saved() == 0
+    model_file._SETUPS.clear()  # nothing is shared
+    np.testing.assert_array_equal(second.function(run).array, other.array)
+    assert len(asked) == 3 and second.saved() == 0 and not np.array_equal(one.array, other.array)
 
 
 def test_the_network_is_what_was_trained(folder, model, run):

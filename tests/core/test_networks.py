@@ -30,6 +30,15 @@ TOLD = ["after-osem", "cameras", "parallel", "unrolled"]
 GRID = mph.Grid.centered((8, 8, 8), 12.0)
 
 
+@pytest.fixture(autouse=True, scope="module")
+def one_thread():
+    """At toy sizes several threads wait for each other longer than they work."""
+    usual = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(usual)
+
+
 @cache
 def setup_of(every: int = 16, permuted: int | None = None, backend: str = "auto", **model: Any) -> Setup:
     """Of every n-th module; `model` are settings of its `Emission`."""
@@ -216,6 +225,21 @@ def test_parallel_projections_give_the_volume_of_fbp():
 @pytest.mark.parametrize("shape", [(9, 10, 11), (12, 8, 5)])
 def test_the_u_net_takes_any_size(shape):
     assert UNet(2, 3, (4, 4, 4))(torch.ones(1, 2, *shape)).shape == (1, 3, *shape)
+
+
+@pytest.mark.parametrize("channels", [(), (4,), (4, 4), (4, 0, 4), (4, 4, -4)])
+@pytest.mark.parametrize("name", ["channels", "camera_channels"])
+def test_a_u_net_of_fewer_than_three_levels_or_without_channels_is_refused_in_a_line(name, channels):
+    with pytest.raises(mph.InputError) as refusal:
+        network("cameras", **{name: channels})
+    words = f"network.{name}: expected three levels or more, each of 1 or more, got {list(channels)}"
+    assert str(refusal.value) == words
+
+
+@pytest.mark.parametrize("channels", [(), (4, 0)])
+def test_views_as_channels_without_channels_are_refused_in_a_line(channels):
+    with pytest.raises(mph.InputError, match=r"^network\.channels: expected one level or more, each of 1 or more, got"):
+        network("channels", channels=channels)
 
 
 def test_saving_memory_changes_no_gradient():

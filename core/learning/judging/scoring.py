@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from ...errors import InputError
 from ...events.event_set import Event
+from ...events.planning import PlannedEvent
 from ...geometry.frames import moved
 from ...geometry.grid import Grid, same_grid
 from ...geometry.scanner import Scanner
@@ -51,6 +52,11 @@ class Case:
     """Settings of the defect that some events of the test have."""
 
     @cached_property
+    def planned(self) -> PlannedEvent:
+        """What the event was made of."""
+        return self.event.planned
+
+    @cached_property
     def truth(self) -> Volume:
         """The event's truth on the judge's grid, as means over its voxels."""
         return resample(self.event.truth, self.grid, "mean")
@@ -60,6 +66,15 @@ class Case:
         """The middles of the judge's voxels, (n, 3) mm."""
         index = np.indices(self.grid.shape).reshape(3, -1).T
         return moved(self.grid.affine, index)
+
+    @cached_property
+    def missing(self) -> list[Floats]:
+        """The activity (n,) in `points` that the test's defect takes from the event's heart, and on its other side."""
+        whole = dataclasses.replace(_phantom(self, CardiacTorso), defect_severity=0.0)
+        angle, values = self.defect["defect_angle_degrees"], whole.values(self.points, self.event.placement)
+        turned = ({**self.defect, "defect_angle_degrees": each} for each in (angle, angle % 360 - 180))
+        lacking = (dataclasses.replace(whole, **settings) for settings in turned)
+        return [(values - each.values(self.points, self.event.placement)).clip(0) for each in lacking]
 
     @cached_property
     def projector(self) -> Projector:
@@ -83,7 +98,7 @@ class Case:
     def contrasts(self, volume: Volume, phantom: DerenzoPhantom, rods: Any) -> Any:
         """`rod_contrasts` of the event's phantom, which it may have mirrored, enlarged and made hotter."""
         found = rod_contrasts(volume, phantom, self.event.placement, rods)
-        return found / self.event.planned.activity_factor
+        return found / self.planned.activity_factor
 
 
 def told(run: ProjectionRun, system: Scanner | None, file: str) -> ProjectionRun:
@@ -143,25 +158,15 @@ def _pair(volume: Volume, case: Case) -> Scores:
 
 def _defect(volume: Volume, case: Case) -> Scores:
     """What the observer's channels see at the defect's place, and its contrast: 1 - its mean by that of the other side."""
-    phantom = _phantom(case, CardiacTorso)
-    own, other = (_missing(phantom, case, turn) for turn in (0.0, 180.0))
+    own, other = case.missing
     place = own @ case.points / own.sum()
     shown, true = (
         1 - np.mean(v.array.ravel()[own > own.max() / 2]) / np.mean(v.array.ravel()[other > other.max() / 2])
         for v in (volume, case.truth)
     )
     outputs = channel_outputs(volume, place, case.width).tolist()
-    has_defect = phantom.defect_severity > 0
+    has_defect = _phantom(case, CardiacTorso).defect_severity > 0
     return {"channels": outputs, "defect": has_defect} | ({"contrast": float(shown / true)} if has_defect else {})
-
-
-def _missing(phantom: CardiacTorso, case: Case, turn: float) -> Any:
-    """The activity (n,) in the voxels' middles that the test's defect takes from a heart; `turn` it by so many degrees."""
-    whole = dataclasses.replace(phantom, defect_severity=0.0)
-    angle = case.defect["defect_angle_degrees"] + turn
-    lacking = dataclasses.replace(phantom, **{**case.defect, "defect_angle_degrees": (angle + 180) % 360 - 180})
-    values = (each.values(case.points, case.event.placement) for each in (whole, lacking))
-    return np.subtract(*values).clip(0)
 
 
 def defect_of(events: Any) -> dict[str, Any]:
@@ -175,7 +180,7 @@ def defect_of(events: Any) -> dict[str, Any]:
 
 
 def _phantom(case: Case, kind: type[Any]) -> Any:
-    phantom = case.event.planned.phantom
+    phantom = case.planned.phantom
     if not isinstance(phantom, kind):
         raise InputError(f"event {case.event.number}: this scoring is of a {kind.title}, not of {case.event.name}")
     return phantom

@@ -44,7 +44,7 @@ class Model(Network):
         super().__init__()
         self.cameras, self.rounds = cameras, rounds
         self.net = UNet(volumes, 1, channels)
-        self.camera = UNet(volumes + 4, 2 + features, camera_channels)
+        self.camera = UNet(volumes + 4, 2 + features, camera_channels, name="camera_channels")
         self.fuse = UNet(volumes + 4 + features, 1, channels)
 
     def forward(self, setup: Setup, sample: Sample) -> list[Tensor]:

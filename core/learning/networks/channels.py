@@ -34,6 +34,8 @@ class Model(Network):
         voxels: Sequence[int] = (40, 40, 40),
     ):
         super().__init__()
+        if not channels or min(channels) < 1:
+            raise InputError(f"network.channels: expected one level or more, each of 1 or more, got {list(channels)}")
         self.sizes = views, tuple(pixels), tuple(voxels)
         strides = [2] * len(channels)
         start = [-(-n // 2 ** len(channels)) for n in voxels]  # rounded up: what is too much is cut off

@@ -9,10 +9,12 @@ from monai.networks.nets import DynUNet
 from torch import Tensor, nn
 from torch.nn import functional
 
+from ...errors import InputError
 from ..setup import Sample, Setup
 
 LEAKY = ("leakyrelu", {"negative_slope": 0.1, "inplace": True})
 """The rectifier of all networks, as MONAI names it."""
+_LEVELS = 3  # fewer are no U-Net for MONAI
 
 
 class Network(nn.Module, ABC):
@@ -36,11 +38,14 @@ class Network(nn.Module, ABC):
 class UNet(nn.Module):
     """MONAI's U-Net in 3-D or 2-D, for any size, without normalisation, which would lose the activity.
 
-    Its last layer begins with 0: a network that corrects a volume begins with that volume.
+    Its last layer begins with 0: a network that corrects a volume begins with that volume. `InputError` for fewer than
+    three levels of `channels`, which it calls `name`, or a level without a channel.
     """
 
-    def __init__(self, inputs: int, outputs: int, channels: Sequence[int], dimensions: int = 3):
+    def __init__(self, inputs: int, outputs: int, channels: Sequence[int], dimensions: int = 3, name: str = "channels"):
         super().__init__()
+        if len(channels) < _LEVELS or min(channels) < 1:
+            raise InputError(f"network.{name}: expected three levels or more, each of 1 or more, got {list(channels)}")
         strides = (1, *[2] * (len(channels) - 1))
         self.divisor = 2 ** (len(channels) - 1)
         self.net = DynUNet(

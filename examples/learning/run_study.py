@@ -31,7 +31,7 @@ FIRST = ("after-osem", "after-osem-half", "after-osem-short", "cameras", "unroll
 """Trainings of each seed."""
 BEGUN = ("cameras-begun", "unrolled-begun")
 """Those of each seed that begin with the weights of after-osem-half."""
-ONCE = ("parallel-0", "unrolled-through-0", "cameras-rounds-0")
+ONCE = ("hour-0", "unrolled-through-0")
 JUDGES = ("judge-known", "judge-scanners", "judge-pairs")
 
 

@@ -111,12 +111,12 @@ class Setup:
 
     @cached_property
     def scanner(self) -> str:
-        """SHA-256 of the views, to 1e-6 mm: what a model was trained for, and what it is told now."""
-        views = self.A.views
-        numbers = np.concatenate(
-            [np.ravel(a) for a in (views.sources, views.detector_centers, views.u_steps, views.v_steps)]
-        )
-        return hashlib.sha256(np.round(numbers, 6).tobytes() + repr(views.shape).encode()).hexdigest()
+        """SHA-256 of views and modules, numbers to 1e-6 mm or rad: what a model was trained for, and what it is told now."""
+        views, modules = self.A.views, self.A.model.system.values().values()
+        numbers = (views.sources, views.detector_centers, views.u_steps, views.v_steps)
+        told = [np.round(a, 6) + 0.0 for a in (*numbers, *(a for a in modules if a.dtype.kind == "f"))]
+        texts = [a.tolist() for a in modules if a.dtype.kind != "f"]
+        return hashlib.sha256(b"".join(a.tobytes() for a in told) + repr((views.shape, texts)).encode()).hexdigest()
 
     @cached_property
     def physics(self) -> str:

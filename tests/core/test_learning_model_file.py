@@ -269,6 +269,19 @@ def test_a_model_is_judged_under_a_name_without_warnings(model, run):
     assert found.grid == model.contents.grid
 
 
+def test_other_holes_are_another_scanner(folder, model, run, monkeypatch):
+    """They change no view, and no setting of the physics."""
+    monkeypatch.setattr(model_file, "_SETUPS", {})
+    wider = replace(run, system=run.system.replace(pinhole_diameter=1.5 * run.system.pinhole_diameter))
+    with pytest.raises(mph.InputError, match="trained for another scanner; --allow scanner takes it anyway"):
+        model(wider)
+    with pytest.warns(mph.InputWarning, match="trained for another scanner"):
+        _, after = (model(each, allow=("scanner",)) for each in (run, wider))
+        model_file._SETUPS.clear()
+        alone = model(wider, allow=("scanner",))
+    np.testing.assert_array_equal(after.array, alone.array)
+
+
 def test_operators_are_kept_for_the_next_scan_by_the_same_scanner(folder, model, monkeypatch):
     monkeypatch.setattr(model_file, "_SETUPS", {})
     runs = [event.run("emission", noise_seed=1) for event in EventSet(folder / "set")[:3]]

@@ -25,7 +25,12 @@ NAMES = {
 }  # fmt: skip
 COLORS = {"after-osem": "#b8433a", "cameras-begun": "#2b6ca3", "unrolled-begun": "#2f8a4b", "unrolled": "#8a6d2f",
           "unrolled-permuted": "#8a5aa0", "channels": "#777777"}  # fmt: skip
-SIZE, TOP = 190, 90
+STEP = {"after-osem": 0.058, "cameras-begun": 0.33, "unrolled-begun": 0.29, "unrolled": 0.29, "unrolled-permuted": 0.29,
+        "channels": 0.037}  # fmt: skip
+"""Seconds of one thread for a step, measured by itself: two trainings at once wait for each other."""
+BEFORE = 1500
+"""Steps of the U-Net that others begin with."""
+SIZE = 190
 
 Row = dict[str, Any]
 
@@ -158,17 +163,24 @@ def picture(found: Findings) -> Page:
 
 def curves(found: Findings, page: Page, frame: Any, name: str, text: str, methods: Sequence[str]) -> None:
     """Learning curves of all seeds."""
-    read = {(kind, seed): json.loads(path.read_text()) for kind in methods for seed in range(3)
-            if (path := found.folder / f"{kind}-{seed}-training" / "curve.json").exists()}  # fmt: skip
-    most = max(row[name] for rows in read.values() for row in rows)
+    read = {(kind, path.parent.name): curve(path, kind, name) for kind in methods
+            for path in sorted(found.folder.glob(f"{kind}-?-training/curve.json"))}  # fmt: skip
+    most = max(x for xs, _ in read.values() for x in xs)
     axes = Axes(page, frame, (0, most), (0.25, 0.9), page.em)
     axes.draw(ticks(0, most, 6), ticks(0.25, 0.9, 6), "", text)
-    for (kind, _), rows in read.items():
-        axes.curve([r[name] for r in rows], [min(r["validation"], 0.9) for r in rows], COLORS[kind], 0.1)
+    for (kind, _), (xs, ys) in read.items():
+        axes.curve(xs, ys, COLORS[kind], 0.1)
     for place, kind in enumerate(methods):
         x, y = frame[0] + frame[2] - 300, frame[1] + 40 + 24 * place
         page.line([(x, y - 5), (x + 30, y - 5)], COLORS[kind], 3)
         page.text(NAMES[kind], x + 40, y, 0.7 * page.em, FAINT)
+
+
+def curve(path: Path, kind: str, name: str) -> tuple[list[float], list[float]]:
+    """Seconds or events, and the NRMSE of validation events."""
+    rows, before = json.loads(path.read_text()), kind.endswith("-begun")
+    own, first = (STEP[kind], BEFORE * STEP["after-osem"]) if name == "seconds" else (1.0, BEFORE)
+    return [first * before + own * row["step"] for row in rows], [min(row["validation"], 0.9) for row in rows]
 
 
 def main(folder: Path) -> None:

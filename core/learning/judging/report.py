@@ -105,7 +105,7 @@ def _slices(page: Page, title: str, volumes: list[tuple[str, Volume]], top: int)
     page.text(title, 40, top + side / 2 + 30, page.em, INK, "middle", upward=True)
     for column, (name, volume) in enumerate(volumes):
         left = 70 + column * (side + 20)
-        page.text(name, left, top + 20, 0.7 * page.em, INK)
+        page.text(name, left, top + 20, min(0.7 * page.em, 1.6 * side / len(name)), INK)
         values = volume.array[:, :, volume.array.shape[2] // 2]
         page.image(display.colored(values.T[::-1], window), left, top + 30, side, side)
 

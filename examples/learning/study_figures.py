@@ -118,6 +118,8 @@ def unknown(found: Findings) -> str:
             continue
         for kind in ("after-osem", "cameras-begun", "unrolled-begun"):
             rows, beside = found.of(test, kind, level), found.of(test, "after-osem", level)
+            if not rows:
+                continue
             ratios = [
                 ratio_of_means(found.errors(row), found.errors(other), 0)
                 for row, other in zip(rows, beside, strict=True)

@@ -20,7 +20,7 @@ NAMES = {
     "after-osem": "1 U-Net after OSEM", "after-osem-short": "1, as many steps as 2 and 4",
     "cameras-begun": "2 camera nets, begun with 1", "cameras": "2 camera nets, from scratch",
     "parallel": "3 parallel projections, FBP",
-    "unrolled-begun": "4 unrolled, begun with 1", "unrolled": "4 unrolled, from scratch (true poses)",
+    "unrolled-begun": "4 unrolled, begun with 1", "unrolled": "4 unrolled, from scratch",
     "unrolled-permuted": "4, permuted poses", "channels": "views as channels, no geometry",
 }  # fmt: skip
 COLORS = {"after-osem": "#b8433a", "cameras-begun": "#2b6ca3", "unrolled-begun": "#2f8a4b", "unrolled": "#8a6d2f",
@@ -173,7 +173,7 @@ def curves(found: Findings, page: Page, frame: Any, name: str, text: str, method
     for (kind, _), (xs, ys) in read.items():
         axes.curve(xs, ys, COLORS[kind], 0.1)
     for place, kind in enumerate(methods):
-        x, y = frame[0] + frame[2] - 300, frame[1] + 40 + 24 * place
+        x, y = frame[0] + frame[2] - 300, frame[1] + 130 + 24 * place
         page.line([(x, y - 5), (x + 30, y - 5)], COLORS[kind], 3)
         page.text(NAMES[kind], x + 40, y, 0.7 * page.em, FAINT)
 

@@ -196,10 +196,9 @@ class TrainedNetwork:
             with recorded_warnings():  # the judge knows what differs
                 return self(run, ("scanner", "physics"))
 
-        def saved() -> float:
-            return next(reversed(_SETUPS.values())).saved if _SETUPS else 0.0
-
-        return JudgedMethod(name, volume, self.fingerprint, self.contents.trained_on["events"], saved)
+        return JudgedMethod(
+            name, volume, self.fingerprint, self.contents.trained_on["events"], lambda: self._used[-1].saved
+        )
 
     def setup(self, A: Projector) -> Setup:
         """What it is told of a scanner, kept for the next scans by it, and for other networks."""
@@ -212,6 +211,11 @@ class TrainedNetwork:
         if len(_SETUPS) > _KEPT:
             del _SETUPS[next(iter(_SETUPS))]
         return _SETUPS[key]
+
+    @cached_property
+    def _used(self) -> list[Setup]:
+        """The setup of the last scan, in a list of one."""
+        return []
 
     def reconstruct(
         self,
@@ -237,6 +241,7 @@ class TrainedNetwork:
             Called before and after.
         """
         data, setup = CountData.of(self.label, A, images, background), self.setup(A)
+        self._used[:] = [setup]
         doubts = [*self._allowed(setup, allow), *self._far(float(data.counts.sum()))]
         for text in doubts:
             warn(text, 2)

@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..perspective.perspective_maps import PerspectiveMaps
-from ..projector import Projector
+from ..projector import Emission, Projector
 from ..reconstruction.snapshots import Snapshots
 
-_KEPT_SCANS = 8
-"""Scans whose volumes by OSEM are kept."""
+_KEPT = 2**24
+"""Bytes of the last scans' volumes by OSEM that are kept, besides those of one scan."""
 
 
 class Sample(NamedTuple):
@@ -61,12 +61,14 @@ class Setup:
     """
 
     def __init__(self, A: Projector, subsets: int, after: Sequence[int] = (2, 8, 16), permuted: int | None = None):
-        if A.model.takes != ("activity",):
-            raise InputError(f"learned reconstruction: expected a projector of emission, got one of {A.model.name}")
+        model = A.model
+        if not isinstance(model, Emission):
+            raise InputError(f"learned reconstruction: expected a projector of emission, got one of {model.name}")
         if permuted is not None:
             order = np.random.default_rng(permuted).permutation(len(A.views))
-            A = Projector(A.grid, A.views[order], A.model.of_views(order), A.backend, A.threads)
-        self.A, self.subsets, self.after = A, subsets, tuple(after)
+            model = model.of_views(order)
+            A = Projector(A.grid, A.views[order], model, A.backend, A.threads)
+        self.A, self.subsets, self.after, self._modules = A, subsets, tuple(after), model.system
         self.saved = 0.0
         self._scans: dict[bytes, tuple[NDArray[np.float32], float]] = {}
 
@@ -105,14 +107,15 @@ class Setup:
         if key not in self._scans:
             volumes = self._snapshots(counts, self.after, background)
             self._scans[key] = volumes, time.perf_counter() - begun
-        if len(self._scans) > _KEPT_SCANS:
+        found = self._scans[key][0]
+        while len(self._scans) > max(1, _KEPT // found.nbytes):
             del self._scans[next(iter(self._scans))]
-        return self._scans[key][0]
+        return found
 
     @cached_property
     def scanner(self) -> str:
         """SHA-256 of views and modules, numbers to 1e-6 mm or rad: what a model was trained for, and what it is told now."""
-        views, modules = self.A.views, self.A.model.system.values().values()
+        views, modules = self.A.views, self._modules.values().values()
         numbers = (views.sources, views.detector_centers, views.u_steps, views.v_steps)
         told = [np.round(a, 6) + 0.0 for a in (*numbers, *(a for a in modules if a.dtype.kind == "f"))]
         texts = [a.tolist() for a in modules if a.dtype.kind != "f"]

@@ -134,13 +134,13 @@ class _Judging:
 
     def _rows(self, tested: _Tested, level: float) -> list[Row]:
         """A row for each method, beside the best baseline and the best of those tuned on the set itself."""
-        found, scores = list[Row](), []
         methods = self._methods(tested, level)
-        self._work(tested, level, [method for _, method in methods])
-        for kind, method in methods:
-            scores.append(self._scores(tested, level, method))
-            row = {"test": tested.name, "level": level, "method": method.name, "kind": kind}
-            found.append({**row, "fingerprint": method.fingerprint, **means_of(*scores[-1])})
+        scores = self._scores(tested, level, [method for _, method in methods])
+        found: list[Row] = [
+            {"test": tested.name, "level": level, "method": method.name, "kind": kind, "fingerprint": method.fingerprint,
+             **means_of(*own)}
+            for (kind, method), own in zip(methods, scores, strict=True)
+        ]  # fmt: skip
         for kind, name in ((BASELINE, "best_baseline"), (ORACLE, "best_on_itself")):
             known = [i for i, row in enumerate(found) if row["kind"] == kind]
             if known:
@@ -150,28 +150,28 @@ class _Judging:
                     row[name] = {"method": found[best]["method"], **beside}
         return [{**row, "notes": told_of(row)} for row in found]
 
-    def _work(self, tested: _Tested, level: float, methods: Sequence[JudgedMethod]) -> None:
-        """Score all methods, event by event, so that they share what each is read and made for."""
-        records = [self._records(tested, method) for method in methods]
-        for events, draw, score in ((tested.events, 0, tested.scores), (tested.drawn, _SEVERAL, tested.draws)):
+    def _scores(
+        self, tested: _Tested, level: float, methods: Sequence[JudgedMethod]
+    ) -> list[tuple[list[Row], list[Row]]]:
+        """Each method's scores of all events, and those over draws of noise of some.
+
+        All methods are asked for an event before the next, so that they share what it is read and made for.
+        """
+        names = (f"{tested.fingerprint}-{method.fingerprint[:16]}.jsonl" for method in methods)
+        records = [Records(self.folder / "scores" / name) for name in names]
+        found: list[tuple[list[Row], list[Row]]] = [([], []) for _ in methods]
+        for part, (events, draw, score) in enumerate(
+            ((tested.events, 0, tested.scores), (tested.drawn, _SEVERAL, tested.draws))
+        ):
             for event in events:
                 cases, key = tested.cases(event, level), tested.key(event, level, draw)
-                for method, kept in zip(methods, records, strict=True):
+                for method, kept, rows in zip(methods, records, found, strict=True):
                     if key not in kept:
                         with naming(f"{tested.name}: event {event.number}: {method.name}"):
                             kept.add(key, score(cases, method))
+                    rows[part].append(kept[key])
                     self._tell(draw != _SEVERAL)
-
-    def _scores(self, tested: _Tested, level: float, method: JudgedMethod) -> tuple[list[Row], list[Row]]:
-        """A method's scores of all events, and those over draws of noise of some."""
-        records = self._records(tested, method)
-        return tuple(  # type: ignore[return-value]
-            [records[tested.key(event, level, draw)] for event in events]
-            for events, draw in ((tested.events, 0), (tested.drawn, _SEVERAL))
-        )
-
-    def _records(self, tested: _Tested, method: JudgedMethod) -> Records:
-        return Records(self.folder / "scores" / f"{tested.fingerprint}-{method.fingerprint[:16]}.jsonl")
+        return found
 
     def _picture(self, tested: _Tested) -> list[tuple[str, Volume]]:
         """The first event of a test: the truth, the first baseline's volume and those of all methods."""

@@ -20,6 +20,7 @@ from mphdrr.core.learning.judging.sets import set_text
 
 HERE = Path(__file__).parent
 SEEDS = (0, 1, 2)
+BEGUN = 'weights_from = "after-osem-half-0.pt"'
 EVENTS = {
     "train": 990, "derenzo": 50, "unseen": 50, "pairs": 220,
     "sixteen": 50, "moved": 50, "holes": 50, "misaligned": 50, "physics": 50,
@@ -27,11 +28,22 @@ EVENTS = {
 """How many of each set."""
 SIXTEEN = "1,5,9,13,21,25,29,33,41,45,49,53,61,65,69,73"
 """Every fifth of the 20 modules is left out."""
-FIRST = ("after-osem", "after-osem-half", "after-osem-short", "cameras", "unrolled", "unrolled-permuted", "channels")
-"""Trainings of each seed."""
-BEGUN = ("cameras-begun", "unrolled-begun")
-"""Those of each seed that begin with the weights of after-osem-half."""
-ONCE = ("hour-0", "unrolled-through-0")
+TRAININGS = {
+    "after-osem": ("after-osem", 3000, ""),
+    "after-osem-half": ("after-osem", 1500, ""),  # others begin with it
+    "after-osem-short": ("after-osem", 570, ""),  # about as many steps as the others have
+    "unrolled": ("unrolled", 600, "save_memory = false"),
+    "unrolled-permuted": ("unrolled", 600, "save_memory = false\npermuted = 1"),  # each module is told another's pose
+    "channels": ("channels", 4800, ""),
+    "cameras-begun": ("cameras", 270, f"{BEGUN}"),
+    "unrolled-begun": ("unrolled", 300, f"save_memory = false\n{BEGUN}"),
+    "unrolled-through": ("unrolled", 300, f"save_memory = false\nthrough = true\n{BEGUN}"),
+    "hour": ("after-osem", 7000, ""),
+    "first": ("after-osem", 1, ""),  # makes the samples that the others share
+}
+"""Network, steps and settings of each: 180 s of one thread, but for the short one and the last two."""
+ONCE = ("hour", "unrolled-through")
+"""Those of one seed."""
 JUDGES = ("judge-known", "judge-scanners", "judge-pairs")
 
 
@@ -63,9 +75,23 @@ def set_recipe(name: str) -> str:
 
 def training_recipe(name: str) -> str:
     """The recipe of a training and a seed, such as cameras-1."""
-    kind, _, seed = name.rpartition("-")
-    text = (HERE / f"{kind}.toml").read_text(encoding="utf-8")
+    training, _, seed = name.rpartition("-")
+    kind, steps, settings = TRAININGS[training]
+    text = (HERE / "training.toml").read_text(encoding="utf-8")
+    text = text.replace('kind = "after-osem"', f'kind = "{kind}"\n{settings}').replace(
+        "steps = 3000", f"steps = {steps}"
+    )
     return text.replace("seed = 0", f"seed = {seed}").replace("-half-0.pt", f"-half-{seed}.pt")
+
+
+def trainings(have_begun: bool) -> list[str]:
+    """Those with seeds, that begin with the weights of another or do not."""
+    return [
+        f"{name}-{seed}"
+        for seed in SEEDS
+        for name, (*_, settings) in TRAININGS.items()
+        if name != "first" and (BEGUN in settings) == have_begun and (seed == 0 or name not in ONCE)
+    ]
 
 
 class Study:
@@ -108,8 +134,8 @@ class Study:
         scanners(self.folder)
         self.at_once(self.events, EVENTS)
         self.train("first-0")  # makes the samples that the others share
-        self.at_once(self.train, [f"{kind}-{seed}" for seed in SEEDS for kind in FIRST])
-        self.at_once(self.train, [*(f"{kind}-{seed}" for seed in SEEDS for kind in BEGUN), *ONCE])
+        for have_begun in (False, True):
+            self.at_once(self.train, trainings(have_begun))
         self.at_once(self.judge, JUDGES)
         study_figures.main(self.folder)
 

@@ -17,12 +17,16 @@ from mphdrr.core.learning.judging.statistics import ratio_of_means
 from mphdrr.core.runs.display import Display
 
 NAMES = {
-    "after-osem": "1 U-Net after OSEM", "after-osem-short": "1, as many steps as 2 and 4",
-    "cameras-begun": "2 camera nets, begun with 1", "cameras": "2 camera nets, from scratch",
-    "parallel": "3 parallel projections, FBP",
-    "unrolled-begun": "4 unrolled, begun with 1", "unrolled": "4 unrolled, from scratch",
-    "unrolled-permuted": "4, permuted poses", "channels": "views as channels, no geometry",
-}  # fmt: skip
+    "after-osem": "1 U-Net after OSEM",
+    "after-osem-short": "1, as many steps as 2 and 4",
+    "hour": "1, for seven minutes",
+    "cameras-begun": "2 camera nets, begun with 1",
+    "unrolled-begun": "4 unrolled, begun with 1",
+    "unrolled-through": "4, begun with 1, gradients through the operators",
+    "unrolled": "4 unrolled, from scratch",
+    "unrolled-permuted": "4, permuted poses",
+    "channels": "views as channels, no geometry",
+}
 COLORS = {"after-osem": "#b8433a", "cameras-begun": "#2b6ca3", "unrolled-begun": "#2f8a4b", "unrolled": "#8a6d2f",
           "unrolled-permuted": "#8a5aa0", "channels": "#777777"}  # fmt: skip
 STEP = {"after-osem": 0.058, "cameras-begun": 0.33, "unrolled-begun": 0.29, "unrolled": 0.29, "unrolled-permuted": 0.29,

@@ -19,7 +19,7 @@ FOLDER = Path(__file__).parents[2] / "examples" / "learning"
 sys.path.insert(0, str(FOLDER))
 import run_study as study  # noqa: E402
 
-TRAININGS = [f"{kind}-{seed}" for seed in study.SEEDS for kind in (*study.FIRST, *study.BEGUN)]
+TRAININGS = study.trainings(False) + study.trainings(True)
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +36,7 @@ def test_the_recipe_of_each_set_is_understood(folder, name):
     assert recipe.models["emission"]["model.kind"] == "emission"
 
 
-@pytest.mark.parametrize("name", [*TRAININGS, *study.ONCE, "first-0"])
+@pytest.mark.parametrize("name", [*TRAININGS, "first-0"])
 def test_the_recipe_of_each_training_is_understood_and_has_its_seed(folder, name):
     (folder / f"{name}.toml").write_text(study.training_recipe(name), encoding="utf-8")
     recipe = mph.learning.read_recipe(folder / f"{name}.toml")
@@ -48,7 +48,7 @@ def test_the_recipe_of_each_training_is_understood_and_has_its_seed(folder, name
 @pytest.mark.parametrize("name", study.JUDGES)
 def test_what_is_judged_is_trained_on_sets_that_are_made(name):
     recipe = read_judge_recipe(FOLDER / f"{name}.toml")
-    assert {*recipe.models} <= {*TRAININGS, *study.ONCE}
+    assert {*recipe.models} <= {*TRAININGS}
     for test in recipe.tests:
         assert test["events"].removeprefix("sets/") in study.EVENTS and {*(test["models"] or ())} <= {*recipe.models}
 

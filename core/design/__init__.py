@@ -1,0 +1,1 @@
+"""Geometries that are calibrated by measurements and improved by gradients."""

@@ -1,0 +1,14 @@
+"""SciPy's solvers, imported when they are asked for: an extra, which no other file needs."""
+
+from importlib import import_module
+from typing import Any
+
+from ..errors import InputError
+
+
+def scipy_module(name: str) -> Any:
+    """``scipy.<name>``, such as "optimize". Raises InputError where SciPy is missing."""
+    try:
+        return import_module(f"scipy.{name}")
+    except ModuleNotFoundError:
+        raise InputError('scipy is missing: pip install "mphdrr[design]"') from None

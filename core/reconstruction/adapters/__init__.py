@@ -10,7 +10,7 @@ from typing import Any
 
 from ...errors import InputError
 from ...projector import Projector
-from ...projector.operator import LinearOperator
+from ...projector.linear_operator import LinearOperator
 from ...validation import instance
 from .parallelproj_operator import ParallelprojOperator
 

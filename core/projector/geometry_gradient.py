@@ -1,9 +1,7 @@
 """How images move with the geometry: derivatives by the modules' places, frames, collimators, holes and pixels."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -11,11 +9,9 @@ from ..arrays import Array, Floats, Floats32, checked
 from ..errors import InputError
 from ..geometry.frames import module_frames, tilted
 from ..geometry.system import PinholeSystem
+from ..volumes.volume import Volume
 from .emission import Emission
-
-if TYPE_CHECKING:
-    from ..volumes.volume import Volume
-    from .operator import Projector
+from .operator import Projector
 
 # Steps of central differences of what is smooth and quickly made: relative, or rad.
 _STEP = 1e-5
@@ -38,7 +34,7 @@ class GeometryGradient(NamedTuple):
     """(M, 2): by the image's middle along u and v on the crystal, 1/mm; that of a virtual detector is point-inverted."""
 
     def by_columns(self, system: PinholeSystem) -> tuple[Floats, Floats]:
-        """Derivatives by ``system.centers``, with which the frames turn, and by ``system.tilt``: (M, 3) each, 1/mm, 1/rad."""
+        """Derivatives by ``system.centers``, with which frames turn, and by ``system.tilt``: (M, 3), 1/mm and 1/rad."""
         by_centers, by_tilt = self.centers.copy(), np.empty_like(self.centers)
         for axis, step in enumerate(_STEP * np.eye(3)):
             far = step * system.pinhole_distance[:, None]
@@ -54,8 +50,9 @@ class GeometryGradient(NamedTuple):
 def geometry_gradient(A: Projector, volume: Volume | Floats | Floats32, images: Floats | Floats32) -> GeometryGradient:
     """Of the sum of `images` times ``A(volume)``, the derivatives by the geometry.
 
-    They are exact derivatives of what `A` computes, but for the few places where the number of a voxel's parts, of cells or of
-    planes changes: computed in float64 where volume or images are, else in float32 as the images themselves.
+    They are exact derivatives of what `A` computes, but for the few places where the number of a voxel's parts, of cells or
+    of planes changes. Attenuated, there are more such places: at each, rays pass from voxel to voxel. With float64 they hold
+    to 1e-8 (``Projector(..., double=True)``), else as far as float32 does.
 
     Parameters
     ----------
@@ -72,7 +69,7 @@ def geometry_gradient(A: Projector, volume: Volume | Floats | Floats32, images: 
     holes, model = A._depths, A.model
     if holes is None or not isinstance(model, Emission):
         raise InputError(
-            "geometry gradient: expected a projector of Emission by hole 'depth'; `emission_images` has the derivatives by rays"
+            "geometry gradient: expected a projector of Emission by hole 'depth'; those by rays are in `emission_images`"
         )
     if A._close_parts:
         raise InputError(
@@ -99,24 +96,28 @@ def geometry_gradient(A: Projector, volume: Volume | Floats | Floats32, images: 
     )
 
 
-def _effective_rise(model: Emission) -> Array:
+def _effective_rise(model: Emission) -> Floats:
     """The derivative of the effective diameter by the diameter (M,)."""
     d = model.system.pinhole_diameter
     more, less = (model.optics.effective_diameter(d * scale) for scale in (1 + _STEP, 1 - _STEP))
-    rise: Array = (more - less) / (2 * _STEP * d)
+    rise: Floats = (more - less) / (2 * _STEP * d)
     return rise
 
 
 def _by_blur(A: Projector, volume: Array, images: Array) -> Array:
     """Derivatives through the detector's blur by the pixels' sizes along u and v, (M, 2)."""
-    by, holes = np.zeros((len(images), 2)), A._depths
-    if holes is None or A.model.response(A.views, 0) is None:
+    by, holes, views, model = np.zeros((len(images), 2)), A._depths, A.views, A.model
+    if holes is None or not isinstance(model, Emission) or model.response(views, 0) is None:
         return by
-    views = A.views
-    wide, narrow = (replace(views, u_steps=a * views.u_steps, v_steps=a * views.v_steps) for a in (1 + _STEP, 1 - _STEP))
+    wide, narrow = (
+        replace(views, u_steps=a * views.u_steps, v_steps=a * views.v_steps) for a in (1 + _STEP, 1 - _STEP)
+    )
     for m, image in enumerate(holes.images(volume, *A._depth_arguments(volume)[1:])):
-        (v, u), more, less = (A.model.response(each, m) for each in (views, wide, narrow))  # type: ignore[misc]
+        (v, u), more, less = (model.response(each, m) for each in (views, wide, narrow))  # type: ignore[misc]
         rise_v, rise_u = ((a - b) / (2 * _STEP) for a, b in zip(more, less, strict=True))  # type: ignore[arg-type]
-        pitch = A.model._crystal_pitch(views, m)
-        by[m] = (images[m] * (v @ image @ rise_u.T)).sum() / pitch[0], (images[m] * (rise_v @ image @ u.T)).sum() / pitch[1]
+        pitch = model.crystal_pitch(views, m)
+        by[m] = (
+            (images[m] * (v @ image @ rise_u.T)).sum() / pitch[0],
+            (images[m] * (rise_v @ image @ u.T)).sum() / pitch[1],
+        )
     return by

@@ -13,7 +13,7 @@ _LEAST = 2e-4
 
 
 class KernelNumbers(NamedTuple):
-    """What the kernels of a zone depend on; lengths are in cells, along v and u. Derivatives by them have the same fields."""
+    """What the kernels of a zone depend on; lengths in cells, along v and u. Derivatives by them have the same fields."""
 
     hole: Array
     """(2,): the hole's diameter."""

@@ -29,7 +29,6 @@ from ..arrays import Array, cropped
 from ..errors import InputError
 from ..geometry.frames import moved
 from ..geometry.grid import Grid
-from ..geometry.system import PinholeSystem
 from ..geometry.views import Views
 from ..volumes.volume import Volume
 from .depth_response import DepthResponse, Index
@@ -37,7 +36,7 @@ from .hole_zone import Sums, ViewNumbers, Zone
 from .lattices import rounded_up
 from .parallel import in_order, run_all
 from .rays import view_rays
-from .transmittance import VoxelRays
+from .transmittance import Field, VoxelRays
 
 VoxelBox = tuple[tuple[slice, ...], NDArray[np.bool_]]
 """A box of a grid, and which of its voxels."""
@@ -72,10 +71,12 @@ class WholeHoles:
 
     Parameters
     ----------
-    views, grid, system
-        The views, the volume's grid and the modules.
-    diameters
-        The holes', (M,), mm.
+    views, grid
+        The views, and the volume's grid.
+    frames
+        The modules' u, v and k, (M, 3, 3).
+    lengths, diameters
+        The collimators' and the holes', (M,), mm.
     sides
         Sides of the square on each crystal in which pixels count, (M,), mm.
     weigh
@@ -91,11 +92,12 @@ class WholeHoles:
         self,
         views: Views,
         grid: Grid,
-        system: PinholeSystem,
+        frames: Array,
+        lengths: Array,
         diameters: Array,
         sides: Array,
         weigh: Weigh,
-        mu: Volume | None,
+        mu: Volume | Field | None,
         is_strict: bool,
     ) -> None:
         self.n, self.pixels, self.grid, self.mu = len(views), views.shape, grid, mu
@@ -104,15 +106,15 @@ class WholeHoles:
         self._parts: dict[tuple[int, Index, Index, type], list[Part]] = {}
         self._passing: dict[int, tuple[Index, Array]] = {}
         self._room = _KEPT
-        self._views, self._system, self._diameters, self._frames = views, system, diameters, system.frames()
+        self._views, self._frames, self._lengths, self._diameters = views, frames, lengths, diameters
         self._sides, self._weigh, self._is_strict = sides, weigh, is_strict
 
     def _module(self, m: int) -> tuple[Array, Array, float, float]:
         """Module m's pinhole, mm, its frame u, v, k, the collimator's length and the hole's diameter, mm."""
-        l, d = float(self._system.collimator_length[m]), float(self._diameters[m])
+        l, d = float(self._lengths[m]), float(self._diameters[m])
         return self._views.sources[m], self._frames[m], l, d
 
-    def images(self, volume: Array, functions: ModuleType, workers: int, mu: Volume | None = None) -> Iterator[Array]:
+    def images(self, volume: Array, functions: ModuleType, workers: int, mu: Field | None = None) -> Iterator[Array]:
         """The images of `volume` one by one; `mu` may attenuate in place of the usual."""
         (filled,), origin = cropped(volume)
         filled, kind = np.ascontiguousarray(filled), volume.dtype.type
@@ -133,7 +135,7 @@ class WholeHoles:
         functions: ModuleType,
         workers: int,
         report: Callable[[int], None],
-        mu: Volume | None = None,
+        mu: Field | None = None,
     ) -> Array:
         """The adjoint. Each thread has a slab of the volume, so the result does not depend on their number."""
         volume = np.zeros(self.grid.shape, images.dtype)
@@ -174,6 +176,7 @@ class WholeHoles:
         def of_view(m: int) -> tuple[Array, Array, ViewNumbers]:
             pinhole, frame, *_ = self._module(m)
             numbers, by_passing = ViewNumbers.zero(), np.zeros_like(filled)
+            center: Array
             parts = self._of_part(m, origin, filled.shape, kind)
             passes = self._passes(m, origin, filled, None) if parts else None
             for (of, pixels), zone in zip(parts, self._reached(m, origin, filled.shape), strict=True):
@@ -196,7 +199,7 @@ class WholeHoles:
 
         return in_order(of_view, range(self.n), workers)
 
-    def mu_gradient(self, volume: Array, images: Array, functions: ModuleType, workers: int, mu: Volume) -> Array:
+    def mu_gradient(self, volume: Array, images: Array, functions: ModuleType, workers: int, mu: Field) -> Array:
         """Of the sum of `images` times those of `volume`, the derivatives by `mu`, on its grid."""
         (filled,), origin = cropped(volume)
         filled = np.ascontiguousarray(filled)
@@ -240,7 +243,7 @@ class WholeHoles:
             self._made[m, far, kind] = self.make(m, far, near).response(kind)
         return self._made[m, far, kind]
 
-    def _passes(self, m: int, origin: Index, part: Array, mu: Volume | None) -> Array | None:
+    def _passes(self, m: int, origin: Index, part: Array, mu: Field | None) -> Array | None:
         """What attenuation leaves of the photons from each voxel of a part of the volume."""
         if mu is None and self.mu is None:
             return None
@@ -258,7 +261,7 @@ class WholeHoles:
         inside = tuple(slice(a, a + n) for a, n in zip(first.tolist(), part.shape, strict=True))
         return np.ascontiguousarray(kept[inside])  # type: ignore[index]
 
-    def _rays(self, m: int, mu: Volume, origin: Index, part: Array) -> VoxelRays:
+    def _rays(self, m: int, mu: Volume | Field, origin: Index, part: Array) -> VoxelRays:
         """Rays from view m's pinhole through a part of the volume."""
         _, frame, l, d = self._module(m)
         margin = d / 2 * (1 / l + 1 / self._limits(m)[1])
@@ -278,7 +281,8 @@ class WholeHoles:
         depths = (self.grid.corners() - pinhole) @ k
         far = rounded_up(max(1.001 * float(depths.max()), l / 10))
         near = rounded_up(l / (_MOST_RATIO * (1 + l / far) - 1))
-        nearest = 1 / rounded_up(1.001 / depths.min()) if depths.min() > 0 else float(depths.min())
+        first = float(depths.min())
+        nearest = 1 / rounded_up(1.001 / first) if first > 0 else first
         if nearest < near and self._is_strict:
             raise InputError(
                 "emission: hole 'depth' is for volumes at some distance from the pinholes, but the grid's depths before one "
@@ -329,7 +333,7 @@ class WholeHoles:
         steps = _cells_of_pixel(abs(pitch[0]), *widths), _cells_of_pixel(abs(pitch[1]), *widths)
         _, middle, largest = sorted((*widths, np.abs(pitch).min()))
         sharpness = math.sqrt(middle * largest)
-        half = np.linalg.norm(grid.spacing) / 2
+        half = float(np.linalg.norm(grid.spacing)) / 2
         farthest, nearest = 1 / (far + half), 1 / max(near - half, near / 2)  # of whole voxels, 1 / mm
         n_planes = 2 + int((nearest - farthest) * l * (d + min(across[0], _LARGEST)) / (_PLANE_APART * sharpness))
         # A voxel's places of one depth lie around a line: a box along it, and beside it what remains of the edges. Where
@@ -338,7 +342,7 @@ class WholeHoles:
         slope = ends.max() / l + d / 2 / near
         skew = _SKEW * sharpness * near / l / max(slope, np.linalg.norm(_line(to_camera[:, :3])[:2]))
         largest_piece = min(max(skew, (skew / 2 * (d * (near / l + 1)) ** 2) ** (1 / 3)), _LARGEST)
-        cell = np.abs(pitch / steps).max() / sharpness
+        cell = float(np.abs(pitch / steps).max()) / sharpness
         cell /= 1 if widths[0] == largest else _LARGE_VOXELS
 
         def weigh(v: Array, u: Array) -> Array:

@@ -1,7 +1,7 @@
 """A view's response to voxels in a zone of depth, and its derivatives by the view's numbers.
 
-What is counted in whole numbers (planes, cells, parts of a voxel) and where the planes lie is the zone's lattice, which small
-changes of the view leave as it is: the response is a smooth function of the numbers.
+What is counted in whole numbers (planes, cells, parts of a voxel) and where the planes lie is the zone's lattice, which
+small changes of the view leave as it is: the response is a smooth function of the numbers.
 """
 
 import functools
@@ -42,7 +42,7 @@ class ViewNumbers(NamedTuple):
 
     def plus(self, other: Self) -> Self:
         """The sums, number by number."""
-        return type(self)(*(a + b for a, b in zip(self, other, strict=True)))
+        return type(self)(*(a + b for a, b in zip(self, other, strict=True)))  # type: ignore[operator]
 
 
 class Sums(NamedTuple):
@@ -67,8 +67,8 @@ class Zone:
     numbers: ViewNumbers
     pixels: tuple[int, int]
     weigh: Callable[[Array, Array], Array]
-    """What a mm^2 of the crystal counts, times l^2, along lines to these places (v, u) on the crystal, mm. It goes with the square
-    of the hole's diameter, with 1 / l^2, and else depends on the lines' slopes alone."""
+    """What a mm^2 of the crystal counts, times l^2, along lines to these places (v, u) on the crystal, mm. It goes with the
+    square of the hole's diameter, with 1 / l^2, and else depends on the lines' slopes alone."""
     side: float
     """That of the square on the crystal in which pixels count, mm."""
     volume: float
@@ -84,8 +84,8 @@ class Zone:
     limits: tuple[float, float, float]
     """Those of `DepthResponse`: of_point, of_pair, parts_per_cell."""
     share: float
-    """A photon's direction, on which its counts depend, lies between that of the voxel and that of the pixel as seen from the hole's
-    middle, so much of the way: the factors of either are powers that are 1 together."""
+    """A photon's direction, on which its counts depend, lies between that of the voxel and that of the pixel as seen from the
+    hole's middle, so much of the way: the factors of either are powers that are 1 together."""
 
     @property
     def _sizes(self) -> Array:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import functools
 from collections.abc import Iterator
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -25,12 +24,12 @@ from . import backends
 from .bundles import Bundle, Bundles
 from .doubts import doubts
 from .execution import Execution
-from .geometry_gradient import GeometryGradient, geometry_gradient
 from .lattices import require_no_negative, same_lattice
 from .linear_operator import LinearOperator
 from .models import Model, Transmission
 from .parallel import thread_count
 from .subsets import balanced_subsets
+from .transmittance import Field
 
 
 class Projector(LinearOperator):
@@ -64,7 +63,8 @@ class Projector(LinearOperator):
     Notes
     -----
     The integral along a ray is exact for the piecewise constant volume (Siddon 1985), from source to target.
-    The results are float32; float64 with `double` or ``backend="numpy"``, and for tensors of float64 with all backends but cuda.
+    The results are float32; float64 with `double` or ``backend="numpy"``, and for tensors of float64 with all backends but
+    cuda.
     On a GPU the adjoint of the torch and cuda backends adds in no fixed order: it differs by float32 rounding from
     call to call. Up to 128 MiB of rays and their weights are kept from call to call.
 
@@ -107,7 +107,9 @@ class Projector(LinearOperator):
         self._settings: dict[str, Any] = {"backend": backend, "threads": threads, "double": double}
         if self._backend.name == "cuda":
             if double:
-                raise InputError("projector: backend cuda computes in float32 alone: leave double out, or take another backend")
+                raise InputError(
+                    "projector: backend cuda computes in float32 alone: leave double out, or take another backend"
+                )
             model = model.by_rays()
         self.model = model
         model.check(views)
@@ -162,10 +164,6 @@ class Projector(LinearOperator):
             return self._run(x.detach(), progress, mu.detach()), gradients
 
         return autograd.step(run, x, mu)
-
-    def geometry_gradient(self, volume: Volume | ArrayOrTensor, images: ArrayOrTensor) -> GeometryGradient:
-        """Of the sum of `images` times those of `volume`, the derivatives by the geometry: `geometry_gradient`."""
-        return geometry_gradient(self, volume, images)
 
     @property
     def backend(self) -> str:
@@ -254,7 +252,7 @@ class Projector(LinearOperator):
         tell(progress, 0, n)
         images = self._responded(images)
         if self._depths is not None:
-            arguments = *self._depth_arguments(images), lambda done: tell(progress, done, n), self._mu_volume(mu)
+            arguments = *self._depth_arguments(images), lambda done: tell(progress, done, n), self._mu_field(mu)
             volume = self._depths.backproject(*arguments)
             for m, box, close, of_part in self._close_parts:
                 volume[box] += np.where(close, of_part.T._run(to_numpy(given[m : m + 1], None), mu=mu), 0)
@@ -285,7 +283,7 @@ class Projector(LinearOperator):
     def _projected(self, execution: Execution, x: ArrayOrTensor, mu: ArrayOrTensor) -> Iterator[ArrayOrTensor]:
         """The images before the detector's response."""
         if self._depths is not None:
-            yield from self._depths.images(*self._depth_arguments(x), self._mu_volume(mu))
+            yield from self._depths.images(*self._depth_arguments(x), self._mu_field(mu))
             return
         if not self.model.weights_voxels:
             yield from execution.images(x, self._bundles, self._mu(mu))
@@ -328,7 +326,9 @@ class Projector(LinearOperator):
         on_gpu = self._auto and is_tensor(x) and x.device.type != "cpu"
         backend = backends.for_tensor(x) if on_gpu else self._backend
         mu_grid = None if self.model.mu is None else self.model.mu.grid
-        return Execution(backend, self.grid, mu_grid, self._float64 or backend.always_float64 or is_double(x), self.threads)
+        return Execution(
+            backend, self.grid, mu_grid, self._float64 or backend.always_float64 or is_double(x), self.threads
+        )
 
     def _depth_arguments(self, x: ArrayOrTensor) -> tuple[ArrayOrTensor, Any, int]:
         """What `WholeHoles` takes: the array, the functions and the threads."""
@@ -339,8 +339,9 @@ class Projector(LinearOperator):
 
     def _depth_mu_gradient(self, images: ArrayOrTensor, x: ArrayOrTensor, mu: ArrayOrTensor) -> Array:
         """The gradient by mu of the depth-dependent response, and of the voxels that are too close to a pinhole for it."""
-        arguments = to_numpy(images, None), *self._depth_arguments(x)[1:], self._mu_volume(mu)
-        gradient = self._depths.mu_gradient(self._depth_arguments(x)[0], *arguments)  # type: ignore[union-attr]
+        volume, *how = self._depth_arguments(x)
+        arguments = volume, to_numpy(images, None), *how, self._mu_field(mu)
+        gradient: Array = self._depths.mu_gradient(*arguments)  # type: ignore[union-attr]
         for m, box, close, of_part in self._close_parts:
             part = cast_like(np.where(close, to_numpy(x[box], None), 0), images)
             gradient += to_numpy(of_part._mu_gradient(images[m : m + 1], part, mu), None)
@@ -360,9 +361,9 @@ class Projector(LinearOperator):
                     parts.append((m, box, close, Projector(grid, self.views[which], model, **self._settings)))
         return parts
 
-    def _mu_volume(self, mu: ArrayOrTensor) -> Volume | None:
+    def _mu_field(self, mu: ArrayOrTensor) -> Field | None:
         """`mu` on the grid of the model's."""
-        return None if mu is None else replace(self.model.mu, array=to_numpy(mu, np.float32))  # type: ignore[type-var]
+        return None if mu is None else Field(to_numpy(mu, None), self.model.mu.grid)  # type: ignore[union-attr]
 
     def _mu(self, mu: ArrayOrTensor) -> ArrayOrTensor:
         return self.model.mu.array if mu is None and self.model.mu is not None else mu

@@ -3,6 +3,7 @@
 import functools
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -26,6 +27,13 @@ _TURNED = 0.015
 _SLOPE = (math.sqrt(5) - 1) / 2
 
 
+class Field(NamedTuple):
+    """Numbers on a grid, of any type; a `Volume` has the same fields, and float32."""
+
+    array: Array
+    grid: Grid
+
+
 @dataclass(frozen=True, eq=False)
 class VoxelRays:
     """Rays from view m's pinhole through all voxels of a part of a grid.
@@ -44,7 +52,7 @@ class VoxelRays:
         The numbers' type, numpy's float32 or float64.
     """
 
-    mu: Volume
+    mu: Volume | Field
     grid: Grid
     part: Grid
     views: Views
@@ -82,6 +90,11 @@ class VoxelRays:
         execution = Execution(backends.choose("auto"), self.part, self.mu.grid, self.kind is np.float64)
         return np.ones((1, rows, columns), self.kind), Bundles(1, lambda _: bundle), execution
 
+    @property
+    def _mu_array(self) -> Array:
+        array: Array = self.mu.array.astype(self.kind, copy=False)
+        return array
+
     @functools.cached_property
     def _chords(self) -> Array:
         """The sums of the rays' chords through each voxel, mm."""
@@ -96,7 +109,7 @@ class VoxelRays:
         meet it, weighted by their chords, up to 16 where it is farthest. Voxels that no ray meets get 0.
         """
         ones, bundles, execution = self._rays
-        passing = np.asarray(execution.backproject(ones, bundles, self.mu.array.astype(self.kind, copy=False)))
+        passing = np.asarray(execution.backproject(ones, bundles, self._mu_array))
         return self._by_chords(passing)
 
     def _by_chords(self, values: Array) -> Array:
@@ -106,13 +119,11 @@ class VoxelRays:
     def gradient(self, by_passing: Array) -> Floats:
         """Derivatives by the pinhole's place (3,), with which the rays go, from those by `passing`."""
         _, bundles, execution = self._rays
-        mu = self.mu.array.astype(self.kind, copy=False)
-        whole = gradient_by_fans(execution, bundles, self._by_chords(by_passing), mu)
+        whole = gradient_by_fans(execution, bundles, self._by_chords(by_passing), self._mu_array)
         whole -= gradient_by_fans(execution, bundles, self._by_chords(by_passing * self.passing), None)
         return whole[0] + whole[1]
 
     def mu_gradient(self, by_passing: Array) -> Array:
         """Derivatives by mu, on its whole grid, from those by `passing`."""
         ones, bundles, execution = self._rays
-        mu = self.mu.array.astype(self.kind, copy=False)
-        return np.asarray(execution.mu_gradient(ones, bundles, self._by_chords(by_passing), mu))
+        return np.asarray(execution.mu_gradient(ones, bundles, self._by_chords(by_passing), self._mu_array))

@@ -320,7 +320,7 @@ def pixels_to_cells(image: Array, of: DepthResponse) -> Array:
 def differentiate_places(
     volume: Array, cells: Array, of: DepthResponse, passes: Array | None = None
 ) -> tuple[Floats, Floats]:
-    """Of the sum of `volume` times what the adjoint of `voxels_to_cells` gives: by `of.matrix` (3, 4), and by its line (3,)."""
+    """Of the sum of `volume` times what `voxels_to_cells`' adjoint gives: by `of.matrix` (3, 4), and by its line (3,)."""
     gradient = np.zeros(3 + 12 * len(of.pieces))
     _run_voxels(_library.differentiate_places, of, cells, volume, passes, gradient=gradient)
     by_shifts = gradient[3:].reshape(-1, 4, 3)  # and times the voxels' indices

@@ -84,8 +84,8 @@ class Zone:
     limits: tuple[float, float, float]
     """Those of `DepthResponse`: of_point, of_pair, parts_per_cell."""
     share: float
-    """A photon's direction, on which its counts depend, lies between that of the voxel and that of the pixel as seen from the
-    hole's middle, so much of the way: the factors of either are powers that are 1 together."""
+    """A photon's direction, on which its counts depend, lies between that of the voxel and that of the pixel as seen from
+    the hole's middle, so much of the way: the factors of either are powers that are 1 together."""
 
     @property
     def _sizes(self) -> Array:

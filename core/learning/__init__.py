@@ -8,7 +8,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from ..errors import InputError
+from ..errors import needing
 from ..reconstruction.methods import METHOD_FILES, Method
 
 _PUBLIC = {
@@ -25,10 +25,8 @@ _PUBLIC = {
 def __getattr__(name: str) -> Any:
     if name not in _PUBLIC:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    try:
+    with needing("mphdrr[learning]"):
         return getattr(import_module(f".{_PUBLIC[name]}", __name__), name)
-    except ModuleNotFoundError as error:
-        raise InputError(f'{error.name} is missing: pip install "mphdrr[learning]"') from None
 
 
 def __dir__() -> list[str]:

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import import_module
 
-from ...errors import InputError
+from ...errors import needing
 
 
 @dataclass(frozen=True)
@@ -17,10 +17,8 @@ class Kind:
 
     def load(self) -> type:
         """Its class; `InputError` where torch or MONAI is missing."""
-        try:
+        with needing("mphdrr[learning]"):
             return import_module(f".{self.file}", __name__).Model  # type: ignore[no-any-return]
-        except ImportError as error:
-            raise InputError(f'{error.name} is missing: pip install "mphdrr[learning]"') from None
 
 
 NETWORKS: Mapping[str, Kind] = {

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputError, naming
+from ..geometry.grid import Grid
 from ..phantoms.kinds import KINDS, Kind
 from ..phantoms.settings import setting_names
 from ..phantoms.torso import CardiacTorso
@@ -66,6 +67,14 @@ def required(value: Any, key: str, what: str) -> Any:
     if value is None:
         raise InputError(f"{key}: missing; {what}")
     return value
+
+
+def grid_of(values: Any, name: str) -> Grid:
+    """The voxels that a table of a recipe says by voxels, spacing and center; `InputError`, which names it, if it cannot."""
+    spacing = required(values[f"{name}.spacing"], f"{name}.spacing", "give the voxel size in mm")
+    with naming(name):
+        voxels = np.broadcast_to(values[f"{name}.voxels"], 3)
+        return Grid.centered(voxels, np.broadcast_to(spacing, 3), values[f"{name}.center"])
 
 
 def _as_earlier(row: Setting, value: Any) -> Any:

@@ -19,7 +19,7 @@ from ..runs.recipe import Recipe
 from ..runs.settings import Setting, named
 from ..toml import parse_toml, toml_text
 from .draws import Drawn, DrawnValues, check_odds
-from .entries import PhantomEntry, by_key, flat, is_text, like, phantom_entry, plain_name, required, table
+from .entries import PhantomEntry, by_key, flat, grid_of, is_text, like, phantom_entry, plain_name, required, table
 from .inputs import Input, original_input
 
 VERSION = 1
@@ -143,9 +143,7 @@ class EventRecipe:
     @cached_property
     def grid(self) -> Grid:
         """The voxels of the truth."""
-        spacing = required(self["truth.spacing"], "truth.spacing", "give the voxel size in mm")
-        n_x, n_y, n_z = np.broadcast_to(self["truth.voxels"], 3).tolist()
-        return Grid.centered((n_x, n_y, n_z), np.broadcast_to(spacing, 3), self["truth.center"])
+        return grid_of(self, "truth")
 
     @cached_property
     def phantoms(self) -> tuple[PhantomEntry, ...]:

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import import_module
+from typing import Any
 
 from ...errors import needing
 
@@ -15,10 +16,10 @@ class Kind:
     text: str  # one line of help
     file: str  # beside this one
 
-    def load(self) -> type:
+    def load(self) -> Any:
         """Its class; `InputError` where torch or MONAI is missing."""
         with needing("mphdrr[learning]"):
-            return import_module(f".{self.file}", __name__).Model  # type: ignore[no-any-return]
+            return import_module(f".{self.file}", __name__).Model
 
 
 NETWORKS: Mapping[str, Kind] = {

@@ -87,7 +87,7 @@ _MAY_BE_0 = ("network.features", "network.neighbours", "network.permuted", "trai
 def test_nonsense_in_any_setting_of_any_network_is_refused_with_its_table_and_name(recipe, kind):
     given = {**recipe.given, "network.kind": kind}
     rows = dataclasses.replace(recipe, given=given).rows
-    assert len(rows) > 25
+    assert len(rows) > 20
     for key, row in rows.items():
         for wrong in _WRONG[row.kind]:
             if key == "grid.center" or (wrong == 0 and key in _MAY_BE_0):
@@ -120,9 +120,6 @@ def test_what_a_scanner_a_set_or_lightning_does_not_take_is_refused_by_the_comma
     (tmp_path / "wrong.toml").write_text(text, encoding="utf-8")
     said = refused(capsys, "train", tmp_path / "wrong.toml", "-o", tmp_path / "m.pt", "--quiet")
     assert re.search(words, said)
-    assert mph.learning.train(
-        recipe, tmp_path / "m.pt"
-    ).path.exists()  # the folder is that of the recipe once it is mended
 
 
 def test_a_network_takes_the_settings_that_its_class_has(recipe):
@@ -263,7 +260,9 @@ def test_a_stopped_and_resumed_training_gives_the_same_weights_bit_for_bit(recip
 
 
 def test_a_folder_of_another_training_is_not_gone_on_with(recipe, tmp_path):
-    mph.learning.train(recipe, tmp_path / "m.pt")
+    with pytest.raises(mph.InputError, match="Lightning refuses"):
+        mph.learning.train(changed(recipe, "batch = 2", 'batch = 2\nstrategy = "words"'), tmp_path / "m.pt")
+    mph.learning.train(recipe, tmp_path / "m.pt")  # nothing was trained there by the other
     other = changed(recipe, "batch = 2", "batch = 1")
     with pytest.raises(mph.InputError, match=r"plan\.json: of a training by another recipe: remove its folder"):
         mph.learning.train(other, tmp_path / "m.pt")

@@ -4,13 +4,13 @@ import argparse
 
 from .. import learning
 from ..errors import InputError
-from ..files import replacing
+from ..files import write_bytes
 from ..learning.judging.judge import judge
 from ..learning.judging.recipe import read_judge_recipe
 from ..learning.networks import NETWORKS
 from ..learning.recipe import template_text
 from ..progress import Progress
-from .options import add_command, add_run, output_path, progress_bar, say
+from .options import add_command, add_run, new_recipe_path, output_path, progress_bar, say
 
 
 def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
@@ -48,11 +48,8 @@ def _new(arguments: argparse.Namespace) -> None:
     if arguments.output is None:
         print(text, end="")
         return
-    path = output_path(arguments.output, (".toml",))
-    if path.exists():  # recipes are edited by hand
-        raise InputError(f"{path}: it exists; choose another name, or remove it first")
-    with replacing(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+    path = new_recipe_path(arguments.output)
+    write_bytes(path, text.encode())
     print(f"{path}: edit it, then: mphdrr learn train {path} -o model.pt")
 
 

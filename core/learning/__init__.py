@@ -5,11 +5,10 @@ commands and panels can say what is missing. `read_model`, `read_recipe` and `tr
 """
 
 from importlib import import_module
-from pathlib import Path
 from typing import Any
 
 from ..errors import needing
-from ..reconstruction.methods import METHOD_FILES, Method
+from ..reconstruction.methods import METHOD_FILES
 
 _PUBLIC = {
     "read_model": "model_file",
@@ -33,9 +32,4 @@ def __dir__() -> list[str]:
     return sorted(_PUBLIC)
 
 
-def _network(path: Path) -> Method:
-    found: Method = __getattr__("read_model")(path).method
-    return found
-
-
-METHOD_FILES[".pt"] = _network
+METHOD_FILES[".pt"] = lambda path: __getattr__("read_model")(path).method

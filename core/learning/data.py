@@ -176,9 +176,6 @@ class Samples(Dataset[Sample]):
         record = self.record(index)
         return Sample(*(torch.from_numpy(np.array(record[name])) for name in Sample._fields))
 
-    def __getitems__(self, indices: Sequence[int]) -> list[Sample]:
-        return [self[index] for index in indices]
-
 
 def prepared(
     source: Source, beside: Path, splits: Sequence[str], workers: int = 1, progress: Progress | None = None

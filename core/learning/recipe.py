@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import InputError, naming
-from ..events.entries import by_key, flat, grid_of, like, required
+from ..events.entries import by_key, check_entries, flat, grid_of, like, required
+from ..files import AnyPath
 from ..geometry.grid import Grid
 from ..runs.recipe import Values
 from ..runs.settings import Setting, named
@@ -130,12 +131,12 @@ def parsed(text: str, name: str = "recipe", folder: Path | None = None) -> Train
     """The recipe in a text in TOML; messages call it `name`, and its paths are relative to `folder`."""
     with naming(name):
         values = parse_toml(text, name)
-        if values.pop("version", None) != VERSION:
-            raise InputError(f"version: expected version = {VERSION}; a newer mphDRR may read others")
+        check_entries(values, VERSION, ("version", *TABLES))
+        del values["version"]
         return TrainingRecipe(flat(values, _ROWS, *TABLES), text, folder or Path())
 
 
-def read_recipe(path: str | os.PathLike[str]) -> TrainingRecipe:
+def read_recipe(path: AnyPath) -> TrainingRecipe:
     """The recipe of a training in a TOML file; paths in it are relative to its folder. `InputError` names the entry."""
     return parsed(toml_text(path), str(path), Path(path).absolute().parent)
 

@@ -68,8 +68,8 @@ def same(one: mph.learning.TrainedNetwork, other: mph.learning.TrainedNetwork) -
         ('kind = "toy"', 'kind = "toy"\nkernels = [3, 0]', "network.kernels: expected a whole number of 1 or more, got 0"),
         ("spacing = 12.0", "", "grid.spacing: missing; give the voxel size in mm"),
         ("after = [1, 2]", "after = [2, 1]", "osem.after: expected rising numbers, got [2, 1]"),
-        ("version = 1", "version = 2", "version: expected version = 1; a newer mphDRR may read others"),
-        ("[training]", "[trainings]", "trainings: expected TABLE.NAME with a table of data, grid, osem, network, training"),
+        ("version = 1", "version = 2", "version: expected 1, got 2; a newer mphDRR may read it"),
+        ("[training]", "[trainings]", "trainings: no such entry; expected version, data, grid, osem, network, training"),
     ],
 )  # fmt: skip
 def test_a_recipe_that_cannot_be_used_is_refused_in_a_line(recipe, before, after, words):

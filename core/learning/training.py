@@ -165,10 +165,7 @@ class _Watch(Callback):
 
 
 def train(
-    recipe: TrainingRecipe,
-    path: AnyPath,
-    workers: int = 1,
-    stages: Stages = lambda stage: None,
+    recipe: TrainingRecipe, path: AnyPath, workers: int = 1, stages: Stages = lambda stage: None
 ) -> TrainedNetwork:
     """Train a network, and write its model file.
 

@@ -33,10 +33,7 @@ _PICTURES = 3
 
 
 def judge(
-    recipe: JudgeRecipe,
-    folder: AnyPath,
-    methods: Sequence[JudgedMethod] = (),
-    progress: Progress | None = None,
+    recipe: JudgeRecipe, folder: AnyPath, methods: Sequence[JudgedMethod] = (), progress: Progress | None = None
 ) -> Judgement:
     """Judge methods beside baselines, and write ``judgement.md``, ``.json`` and ``.png`` into a folder.
 

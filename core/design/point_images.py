@@ -147,6 +147,7 @@ class Discs(NamedTuple):
         within = quadrants[..., 1:, 1:] - quadrants[..., 1:, :-1] - quadrants[..., :-1, 1:] + quadrants[..., :-1, :-1]
         radius = radii[:, None, None]
         shares = within / (np.pi * radius**2)
+        shares[0] = np.maximum(shares[0], 0)  # rounding
         shares[1:3] *= -self.pitch.T[:, :, None, None]  # a disc moved forward is edges moved back
         shares[3] -= 2 * shares[0] / radius
         shares *= self.weights

@@ -1,4 +1,4 @@
-"""Least squares of modules' poses and of points, from where the modules see the points: SciPy's solver, a sparse Jacobian.
+"""Least squares of modules' places and tilts, and of points, from where the modules see the points.
 
 Reference: B. Triggs, P. McLauchlan, R. Hartley, A. Fitzgibbon, "Bundle adjustment: a modern synthesis", Vision Algorithms:
 Theory and Practice, Lecture Notes in Computer Science 1883 (2000) 298-372; on gauges its section 9.
@@ -6,148 +6,169 @@ Theory and Practice, Lecture Notes in Computer Science 1883 (2000) 298-372; on g
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import Any
+import math
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import Floats
-from ..geometry.frames import cross_matrix, rotations
+from ..geometry.frames import cross_matrix, module_frames, rotations
+from ..geometry.system import PinholeSystem
 from .solvers import scipy_module
 
+LENGTH, OFFSET = "collimator_length", "detector_offset"
 _LOSS = 3.0  # standard deviations above which robust fits count a residual by its size, not its square
+_GAUGE_SD = 1e-3  # mm that the pinholes, as a whole, may be away from the nominal ones
+
+
+class Moved(NamedTuple):
+    """Modules and points somewhere."""
+
+    centers: Floats  # (M, 3), world mm
+    tilt: Floats  # (M, 3), rad
+    aimed: Floats  # (M, 3, 3): the frames without tilt
+    frames: Floats  # (M, 3, 3)
+    length: Floats  # (M,), mm
+    offset: Floats  # (M, 2), mm along u and v: how far pixels lie from where the views have them on the crystal
+    points: Floats  # (K, 3), world mm
+
+    def seen(self) -> Floats:
+        """Where the modules see the points (K, M, 2), mm on the crystals, point-inverted."""
+        local = np.einsum("mij,kmj->kmi", self.frames, self.points[:, None] - self.centers)
+        return self.length[:, None] * local[..., :2] / local[..., 2:] + self.offset
 
 
 @dataclass(frozen=True)
 class Bundle:
-    """M modules that see K points, and what is measured of them."""
+    """M modules that see K points. The numbers x are of each module its shift along its nominal u, v and k, the change of its
+    tilt, of its length and of its offset, where these are fitted, in units of `sd`; then the points' shifts, mm."""
 
-    centers: Floats  # (M, 3), world mm
-    frames: Floats  # (M, 3, 3)
-    length: Floats  # (M,), mm
-    offset: Floats  # (M, 2), mm: how far the pixels lie from where the views have them, on the crystal, point-inverted
-    points: Floats  # (K, 3), world mm
-    sd: Floats  # (P,): the modules' numbers are so far from the nominal ones: places, turns, then length or offset or both
+    system: PinholeSystem  # nominal
+    points: Floats  # (K, 3), world mm: known, or where the fit begins
     fits_points: bool
-    fits_length: bool
+    fit: tuple[str, ...]
+    sd: Floats  # (P,), mm and rad: how far a module's numbers may be from the nominal ones
     places: Floats  # (K, M, 2), mm on the crystals: where the points are seen
     whitening: Floats  # (K, M, 2, 2): makes their errors ones of variance 1
     used: NDArray[np.bool_]  # (K, M)
-    distances: tuple[NDArray[np.intp], Floats, float]  # pairs (D, 2) of points, their distances (D,) and SD, mm
+    pairs: NDArray[np.intp]  # (D, 2): points whose distance is known
+    distances: Floats  # (D,), mm
+    distance_sd: float
 
-    @property
-    def n_modules(self) -> int:
-        """How many numbers of modules are fitted."""
-        return len(self.centers) * len(self.sd)
+    def start(self) -> Floats:
+        """The nominal numbers."""
+        return np.zeros(len(self.sd) * len(self.system) + 3 * len(self.points) * self.fits_points)
 
-    def moved(self, x: Floats) -> Bundle:
-        """The modules and points whose numbers have changed by x: of modules in units of `sd`, of points in mm."""
-        of_modules = self.sd * x[: self.n_modules].reshape(len(self.centers), -1)
-        centers = self.centers + np.einsum("mij,mi->mj", self.frames, of_modules[:, :3])
-        turned = rotations(of_modules[:, 3:6]).swapaxes(1, 2) @ self.frames
-        extra = of_modules[:, 6:]
-        length = self.length + extra[:, 0] if self.fits_length else self.length
-        offset = self.offset + extra[:, -2:] if extra.shape[1] > 1 else self.offset
-        points = self.points + x[self.n_modules :].reshape(-1, 3) if self.fits_points else self.points
-        return replace(self, centers=centers, frames=turned, length=length, offset=offset, points=points)
+    def of_modules(self, x: Floats) -> Floats:
+        """The modules' numbers (M, P) in x."""
+        return x[: len(self.sd) * len(self.system)].reshape(len(self.system), -1)
 
-    def seen(self) -> Floats:
-        """Where the modules see the points (K, M, 2), mm on the crystals."""
-        local = np.einsum("mij,kmj->kmi", self.frames, self.points[:, None] - self.centers)
-        return self.length[:, None] * local[..., :2] / local[..., 2:] + self.offset
+    def moved(self, x: Floats) -> Moved:
+        """Modules and points with the numbers x."""
+        own = self.sd * self.of_modules(x)
+        system = self.system
+        centers = system.centers + np.einsum("mij,mi->mj", system.frames(), own[:, :3])
+        tilt, aimed = system.tilt + own[:, 3:6], module_frames(centers)
+        length = system.collimator_length + (own[:, 6] if LENGTH in self.fit else 0.0)
+        offset = own[:, -2:] if OFFSET in self.fit else np.zeros((len(system), 2))
+        points = self.points + (x[own.size :].reshape(-1, 3) if self.fits_points else 0.0)
+        return Moved(centers, tilt, aimed, rotations(tilt).swapaxes(1, 2) @ aimed, length, offset, points)
+
+    def gauge(self) -> Floats:
+        """Shifts (G, M, 3), mm in the world, of all pinholes together of which images tell nothing: 3 shifts, 3 turns, a scale."""
+        if not self.fits_points:
+            return np.zeros((0, len(self.system), 3))
+        told = self.used.any(axis=0)[:, None]
+        apart = self.system.centers - np.average(self.system.centers, axis=0, weights=told[:, 0])
+        ways = [np.broadcast_to(axis, apart.shape) for axis in np.eye(3)] + [
+            np.cross(axis, apart) for axis in np.eye(3)
+        ]
+        ways = told * np.array(ways if len(self.pairs) else [*ways, apart])
+        return ways / np.sqrt((ways**2).sum((1, 2), keepdims=True))
 
     def residuals(self, x: Floats) -> Floats:
-        """Those of the places, of the distances, and of the numbers that are thought to be about the nominal ones."""
+        """In units of their standard deviations: of places, distances, what is thought of the numbers, and the gauge."""
         now = self.moved(x)
         off = np.einsum("nij,nj->ni", self.whitening[self.used], (now.seen() - self.places)[self.used])
-        pairs, lengths, sd = self.distances
-        apart = np.linalg.norm(now.points[pairs[:, 0]] - now.points[pairs[:, 1]], axis=1)
-        return np.concatenate([off.ravel(), (apart - lengths) / sd, x[: self.n_modules]])
+        apart = np.linalg.norm(now.points[self.pairs[:, 0]] - now.points[self.pairs[:, 1]], axis=1)
+        gauge = (self.gauge() * (now.centers - self.system.centers)).sum((1, 2))
+        of_distances = (apart - self.distances) / self.distance_sd
+        return np.concatenate([off.ravel(), of_distances, self.of_modules(x).ravel(), gauge / _GAUGE_SD])
 
     def jacobian(self, x: Floats) -> Any:
         """The residuals' derivatives by x, a sparse matrix."""
-        sparse = scipy_module("sparse")
-        now = self.moved(x)
-        turns = self.sd[3:6] * x[: self.n_modules].reshape(len(self.centers), -1)[:, 3:6]
-        back = now.frames @ self.frames.swapaxes(1, 2)
+        now, n_m, n_p, n = self.moved(x), len(self.system), len(self.sd), len(x)
         k, m = np.nonzero(self.used)
+        nominal = self.system.frames()
         local = np.einsum("nij,nj->ni", now.frames[m], now.points[k] - now.centers[m])
-        height = local[:, 2]
-        slopes = local[:, :2] / height[:, None]
-        by_local = np.concatenate([np.broadcast_to(np.eye(2), (len(k), 2, 2)), -slopes[:, :, None]], axis=2)
-        by_local *= (now.length[m] / height)[:, None, None]
-        by_turn = cross_matrix(local) @ back[m] @ _left_jacobian(turns)[m]
-        blocks = [-by_local @ back[m], by_local @ by_turn]
-        if self.fits_length:
-            blocks.append(slopes[:, :, None])
-        if len(self.sd) > 7 or (len(self.sd) > 6 and not self.fits_length):
-            blocks.append(np.broadcast_to(np.eye(2), (len(k), 2, 2)))
-        values = self.sd * np.concatenate(blocks, axis=2)
-        columns = m[:, None] * len(self.sd) + np.arange(len(self.sd))
+        slopes = local[:, :2] / local[:, 2:]
+        by_local = np.concatenate([np.broadcast_to(np.eye(2), (len(k), 2, 2)), -slopes[..., None]], axis=2)
+        by_local = (now.length[m] / local[:, 2])[:, None, None] * by_local
+        by_turn = by_local @ cross_matrix(local) @ (now.frames @ now.aimed.swapaxes(1, 2))[m]
+        back = now.frames @ nominal.swapaxes(1, 2)
+        by_shift = by_turn @ (_aiming(now) @ now.aimed @ nominal.swapaxes(1, 2))[m] - by_local @ back[m]
+        parts = [by_shift, by_turn @ _left_jacobian(now.tilt)[m]]
+        parts += [slopes[..., None]] * (LENGTH in self.fit)
+        parts += [np.broadcast_to(np.eye(2), (len(k), 2, 2))] * (OFFSET in self.fit)
+        white = self.whitening[self.used]
+        of_places = _placed(white @ (self.sd * np.concatenate(parts, axis=2)), m * n_p, n)
+        of_gauge = np.zeros((len(self.gauge()), n_m, n_p))
+        of_gauge[..., :3] = self.sd[:3] * np.einsum("mij,gmj->gmi", nominal, self.gauge()) / _GAUGE_SD
+        sparse = scipy_module("sparse")
+        rows = [of_places, sparse.eye(n_m * n_p, n), _placed(of_gauge.reshape(1, -1, n_m * n_p), np.zeros(1, int), n)]
         if self.fits_points:
-            values = np.concatenate([values, by_local @ now.frames[m]], axis=2)
-            columns = np.concatenate([columns, self.n_modules + 3 * k[:, None] + np.arange(3)], axis=1)
-        values = self.whitening[self.used] @ values
-        rows = np.broadcast_to(np.arange(2 * len(k)).reshape(-1, 2, 1), values.shape)
-        columns = np.broadcast_to(columns[:, None], values.shape)
-        size = len(x)
-        of_places = sparse.csr_matrix((values.ravel(), (rows.ravel(), columns.ravel())), (2 * len(k), size))
-        return sparse.vstack([of_places, self._of_distances(now.points, size), sparse.eye(self.n_modules, size)], "csr")
-
-    def _of_distances(self, points: Floats, size: int) -> Any:
-        pairs, _, sd = self.distances
-        between = points[pairs[:, 0]] - points[pairs[:, 1]]
-        slopes = between / np.linalg.norm(between, axis=1, keepdims=True) / sd
-        columns = self.n_modules + 3 * pairs[:, :, None] + np.arange(3)
-        values = np.stack([slopes, -slopes], axis=1)
-        rows = np.broadcast_to(np.arange(len(pairs))[:, None, None], columns.shape)
-        return scipy_module("sparse").csr_matrix((values.ravel(), (rows.ravel(), columns.ravel())), (len(pairs), size))
-
-    def start(self) -> Floats:
-        """All numbers as they are."""
-        return np.zeros(self.n_modules + 3 * len(self.points) * self.fits_points)
+            rows[0] = rows[0] + _placed(white @ by_local @ now.frames[m], n_m * n_p + 3 * k, n)
+            first, second = n_m * n_p + 3 * self.pairs.T
+            between = now.points[self.pairs[:, 0]] - now.points[self.pairs[:, 1]]
+            slopes = (between / np.linalg.norm(between, axis=1, keepdims=True) / self.distance_sd)[:, None]
+            rows.insert(1, _placed(slopes, first, n) - _placed(slopes, second, n))
+        return sparse.vstack(rows, "csr")
 
     def solved(self, x: Floats, robust: bool = False) -> Floats:
         """The numbers with the least sum of squares, or, `robust`, with one that large residuals hardly move."""
+        loss, accuracy = ("soft_l1", 1e-6) if robust else ("linear", 1e-10)
         found = scipy_module("optimize").least_squares(
-            self.residuals, x, self.jacobian, method="trf", tr_solver="lsmr", loss="soft_l1" if robust else "linear",
-            f_scale=_LOSS if robust else 1.0, xtol=1e-10, ftol=1e-10, gtol=1e-10, max_nfev=100,
-            tr_options={"atol": 1e-12, "btol": 1e-12, "maxiter": 5000, "regularize": False},
+            self.residuals, x, self.jacobian, x_scale="jac", loss=loss, f_scale=_LOSS, xtol=accuracy, ftol=accuracy,
+            max_nfev=100, tr_solver="lsmr", tr_options={"atol": 1e-8, "btol": 1e-8, "maxiter": 3000, "regularize": False},
         )  # fmt: skip
         return np.asarray(found.x)
 
+    def off(self, x: Floats) -> Floats:
+        """Distances (K, M) of spots from where x has them, in standard deviations."""
+        return np.linalg.norm(np.einsum("kmij,kmj->kmi", self.whitening, self.moved(x).seen() - self.places), axis=2)
+
     def covariance(self, x: Floats) -> tuple[Floats, Floats]:
-        """That of all numbers at x, in mm and rad of the modules as they are then; and the residuals' leverages (K, M)."""
+        """The modules' numbers' covariances (M, P, P) at x, in the units of x, and the spots' leverages (K, M)."""
         J = self.jacobian(x)
         C = np.linalg.inv((J.T @ J).toarray())
-        n = 2 * int(self.used.sum())
+        n_m, n_p, n = len(self.system), len(self.sd), 2 * int(self.used.sum())
         leverages = np.zeros(self.used.shape)
         leverages[self.used] = np.asarray(J[:n].multiply(J[:n] @ C).sum(axis=1)).reshape(-1, 2).sum(axis=1)
-        # From turns and shifts along the nominal axes to those along the modules' axes now.
-        n_m, n_p = len(self.centers), len(self.sd)
-        turns = self.sd[3:6] * x[: self.n_modules].reshape(n_m, n_p)[:, 3:6]
-        back = rotations(turns).swapaxes(1, 2)
-        T = np.broadcast_to(np.eye(n_p), (n_m, n_p, n_p)).copy()
-        T[:, :3, :3], T[:, 3:6, 3:6] = back, back @ _left_jacobian(turns)
-        return changed(C, T * self.sd), leverages
+        of_modules = C[: n_m * n_p, : n_m * n_p].reshape(n_m, n_p, n_m, n_p)
+        return of_modules[np.arange(n_m), :, np.arange(n_m)], leverages
 
 
-def changed(covariance: Floats, blocks: Floats) -> Floats:
-    """The covariance of all numbers after those of each module are multiplied by its matrix in `blocks` (M, P, P)."""
-    n_m, n_p, _ = blocks.shape
-    size = n_m * n_p
-    rest = len(covariance) - size
-
-    def rows(matrix: Floats) -> Floats:
-        of_modules = blocks @ matrix[:size].reshape(n_m, n_p, -1)
-        return np.concatenate([of_modules.reshape(size, -1), matrix[size:]]) if rest else of_modules.reshape(size, -1)
-
-    return rows(rows(covariance).T)
+def _placed(values: Floats, first: NDArray[np.intp], n: int) -> Any:
+    """A sparse matrix (N R, n) of blocks `values` (N, R, C), one below the other, which begin at columns `first` (N,)."""
+    rows, columns = np.arange(values[..., 0].size), first[:, None, None] + np.arange(values.shape[2])
+    index = np.repeat(rows, values.shape[2]), np.broadcast_to(columns, values.shape).ravel()
+    return scipy_module("sparse").csr_matrix((values.ravel(), index), (len(rows), n))
 
 
 def _left_jacobian(turns: Floats) -> Floats:
-    """Matrices (M, 3, 3) from small changes of rotation vectors (M, 3) to the rotations that come after them, rad."""
+    """Matrices (M, 3, 3) from small changes of rotation vectors (M, 3), rad, to the rotations that come after them."""
     angle, cross = np.linalg.norm(turns, axis=1)[:, None, None], cross_matrix(turns)
-    cubic = np.where(angle > 1e-4, (1 - np.sinc(angle / np.pi)) / np.maximum(angle, 1e-4) ** 2, 1 / 6)
-    return np.eye(3) + 0.5 * np.sinc(angle / (2 * np.pi)) ** 2 * cross + cubic * (cross @ cross)
+    cubic = np.where(angle > 1e-4, (1 - np.sinc(angle / math.pi)) / np.maximum(angle, 1e-4) ** 2, 1 / 6)
+    return np.eye(3) + 0.5 * np.sinc(angle / (2 * math.pi)) ** 2 * cross + cubic * (cross @ cross)
+
+
+def _aiming(now: Moved) -> Floats:
+    """Matrices (M, 3, 3) from shifts of pinholes along u, v and k without tilt, mm, to the turns that keep them aimed, rad."""
+    turns = np.zeros_like(now.aimed)
+    b = np.linalg.norm(now.centers, axis=1)
+    z_v, z_k = now.aimed[:, 1:, 2].T
+    turns[:, 0, 1], turns[:, 1, 0] = 1 / b, -1 / b
+    turns[:, 2, 0] = np.where(np.abs(z_v) > 1e-9, -z_k / (b * np.where(z_v, z_v, 1.0)), 0.0)  # u stays horizontal
+    return turns

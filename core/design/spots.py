@@ -1,8 +1,8 @@
-"""Spots: where on its crystal each module sees a point source, how well the counts tell it, and whether they are a disc's.
+"""Spots: where each module sees a point source, how well its counts tell that, and whether they are those of a disc.
 
 An image depends on the geometry through the middle of the hole's shadow alone, once the shadow's radius, its counts and an
-even background are free in each image. So the counts are used up here: middles and covariances are all that a calibration
-needs, and neither the activity, nor the hole's diameter, nor the crystal's blur decide over a module's place.
+even background are free in each image. So middles and their covariances are all that a calibration needs, and neither the
+activity, nor the hole's diameter, nor the crystal's efficiency decide over a module's place.
 """
 
 from __future__ import annotations
@@ -12,16 +12,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import Floats
+from ..arrays import Array, Floats
 from ..progress import Progress, tell
-from ..projector.emission import Emission
-from .point_images import Discs, Lattice, each_pixel
+from .point_images import Lattice, disc_shares
+from .solvers import scipy_module
 
 _MARGIN = 3  # pixels around the expected shadow
-_FEWEST = 20  # counts of a spot
-_SIGNIFICANT = 6.0  # standard deviations that a spot has more counts than the background
-_STEPS = 25
-_CONVERGED = 0.01  # of a standard deviation
+_FEWEST, _SIGNIFICANT = 20, 6.0  # counts of a spot; standard deviations that they are above the background
+_STEPS, _CONVERGED = 25, 0.01  # of Fisher's scoring; standard deviations that its last step moves
 _FLOOR = 1e-3  # least background of a pixel, as a share of one that the shadow covers: strays are not impossible
 
 
@@ -29,159 +27,121 @@ _FLOOR = 1e-3  # least background of a pixel, as a share of one that the shadow 
 class Spots:
     """The spots of K acquisitions in M modules, by `find_spots`."""
 
-    pixels: Floats  # (K, M, 2): column and row of their middles; NaN where there is none
+    seen: NDArray[np.bool_]  # (K, M): where there is one, whole
+    pixels: Floats  # (K, M, 2): column and row of their middles
     covariance: Floats  # (K, M, 2, 2), px^2
     radii: Floats  # (K, M), of the shadows, mm
     counts: Floats  # (K, M), of the spots
-    windows: Floats  # (K, M, n, n): counts around the spots
-    expected: Floats  # (K, M, n, n), by the discs
-    first: Floats  # (K, M, 2): columns and rows of the windows' first pixels
+    even: Floats  # (K, M): background of a pixel, besides the known one
+    first: Array  # (K, M, 2): column and row of the first pixels of windows around the spots
+    windows: Floats  # (K, M, n_v, n_u): the counts there
+    known: Floats  # (K, M, n_v, n_u): the known background there
 
-    @property
-    def seen(self) -> NDArray[np.bool_]:
-        """(K, M): where there is a spot."""
-        return np.isfinite(self.pixels[..., 0])
+    def expected(self, lattice: Lattice, pixels: Floats) -> Floats:
+        """The windows' expected counts (K, M, n_v, n_u) if the middles were at these columns and rows (K, M, 2)."""
+        shape = self.windows.shape[2:]
+        of_window = np.abs(lattice.step), shape, lattice.blurs(shape)
+        shares = [disc_shares(at, r, *of_window)[0] for at, r in zip(pixels - self.first, self.radii, strict=True)]
+        return self.counts[..., None, None] * shares + self.even[..., None, None] + self.known
 
-    def pearson(self) -> tuple[Floats, Floats]:
-        """Pearson's sum (K, M) of squared differences from `expected` over the expected variance, and its numbers (K, M).
+    def pearson(self, lattice: Lattice) -> tuple[Floats, Floats]:
+        """Pearson's sum of squares (K, M) of the windows, and its degrees of freedom (K, M).
 
-        Of pixels that expect less than a count, the sums are compared.
+        Pixels that expect less than one count are put together.
         """
-        bright = self.expected >= 1
-        each = np.where(bright, (self.windows - self.expected) ** 2 / np.where(bright, self.expected, 1.0), 0.0)
-        dim, dim_expected = ((~bright * counts).sum((2, 3)) for counts in (self.windows, self.expected))
-        rest = (dim - dim_expected) ** 2 / np.maximum(dim_expected, 1e-9)
-        pooled = dim_expected >= 1
-        return each.sum((2, 3)) + pooled * rest, (bright.sum((2, 3)) + pooled).astype(float)
+        expected = self.expected(lattice, self.pixels)
+        bright = expected >= 1
+        each = (bright * (self.windows - expected) ** 2 / np.maximum(expected, 1)).sum((2, 3))
+        dim, of_dim = ((~bright * counts).sum((2, 3)) for counts in (self.windows, expected))
+        together = of_dim >= 1
+        rest = together * (dim - of_dim) ** 2 / np.maximum(of_dim, 1)
+        return each + rest, bright.sum((2, 3)) + together - 4.0  # of middle, radius and counts
 
 
 def find_spots(
-    images: Floats, model: Emission, lattice: Lattice, radii: Floats, pixels: Floats | None = None, progress: Progress | None = None
+    images: Floats, known: Floats, lattice: Lattice, radii: Floats, progress: Progress | None = None
 ) -> Spots:
     """The spots in images (K, M, n_v, n_u) of one point source in each acquisition.
 
-    The window with most counts, its centroid, and from there the largest Poisson likelihood of middle, radius, counts and
-    background, by Fisher's scoring.
+    From the centroid of the brightest window, Fisher's scoring leads to the largest Poisson likelihood of middle, radius,
+    counts and background. Shadows whose edge is sharp, with few counts in a pixel, are known less well than the covariance
+    has it.
 
     Parameters
     ----------
-    images, model, lattice
-        Counts, and the modules' physics and pixels.
+    images, known
+        Counts, and the known background, which broadcasts to one acquisition.
+    lattice
+        The modules' pixels.
     radii
         (M,), mm: about what the shadows have.
-    pixels
-        (K, M, 2): the middles, if they are known; then only the rest is fitted.
     progress
         Counts acquisitions.
     """
     found = []
-    sigma = np.broadcast_to(model.optics.intrinsic_fwhm, len(radii)) / 2.355
-    reach = (radii + 3 * sigma)[:, None] / np.abs(lattice.step)
-    half = int(np.ceil(reach.max())) + _MARGIN
     for k, counts in enumerate(images):
-        found.append(_spots(counts, model, lattice, radii, half, None if pixels is None else pixels[k]))
+        found.append(_spots(counts, np.broadcast_to(known, counts.shape), lattice, radii))
         tell(progress, k + 1, len(images))
     return Spots(*(np.array(each) for each in zip(*found, strict=True)))
 
 
-def _spots(
-    counts: Floats, model: Emission, lattice: Lattice, radii: Floats, half: int, pixels: Floats | None
-) -> tuple[Floats, ...]:
+def _spots(counts: Floats, known: Floats, lattice: Lattice, radii: Floats) -> tuple[Array, ...]:
     """The fields of `Spots` of one acquisition."""
-    n_m, size = len(counts), 2 * half + 1
-    known = np.broadcast_to(each_pixel(model.background), counts.shape)
-    if pixels is None:
-        width = np.maximum(1, np.rint(1.5 * radii[:, None] / np.abs(lattice.step)).astype(int)).max(axis=0)
-        middle = _brightest(counts - known, width)
-    else:
-        middle = np.nan_to_num(pixels)
-    first = np.rint(middle).astype(int) - half
-    windows, background = (_cut(each, first, size) for each in (counts, known))
-    inside = _cut(np.ones_like(counts), first, size)
-    discs = Discs.of(model, lattice, np.arange(n_m), first, (size, size))
-    outside = np.maximum(((counts - known).sum((1, 2)) - (windows - background).sum((1, 2))), 0)
-    even = outside / np.maximum(counts[0].size - inside.sum((1, 2)), 1)
-    totals = (windows - background).sum((1, 2)) - even * inside.sum((1, 2))
-    noise = np.sqrt(windows.sum((1, 2)) + 1)
-    seen = (totals >= _FEWEST) & (totals > _SIGNIFICANT * noise) | (pixels is not None)
-    start = np.stack([*middle.T, radii, np.maximum(totals, 1.0), even])
-    if pixels is None:
-        for _ in range(3):
-            start[:2] = _centroids(windows - background - even[:, None, None] * inside, first, start[:2].T, half).T
-    fitted, covariance, expected = _likeliest(windows, background, discs, start, pixels is None)
-    column, row = fitted[:2]
-    shadow = fitted[2][:, None] / np.abs(lattice.step)
-    edge = np.minimum(fitted[:2].T, np.array(lattice.shape[::-1]) - 1 - fitted[:2].T) + 0.5
-    strayed = np.abs(fitted[:2].T - first - half).max(axis=1) > half
-    seen &= (edge > shadow).all(axis=1) & ~strayed & np.isfinite(covariance).all((1, 2))
-    places = np.where(seen[:, None], np.stack([column, row], axis=1), np.nan)
-    return places, covariance, fitted[2], fitted[3], windows, expected, first
+    pitch, size = np.abs(lattice.step), np.array(lattice.shape[::-1])
+    reach = np.ceil(((radii + 3 * lattice.sigma)[:, None] / pitch).max(axis=0)).astype(int) + _MARGIN
+    n_u, n_v = np.minimum(2 * reach + 1, size)
+    even = np.maximum(np.median(counts - known, axis=(1, 2)), 0)
+    width = np.ceil(1.5 * (radii[:, None] / pitch).max(axis=0)).astype(int)
+    sums = scipy_module("ndimage").uniform_filter(counts - known, (0, width[1], width[0]), mode="constant")
+    row, column = np.unravel_index(sums.reshape(len(counts), -1).argmax(axis=1), lattice.shape)
+    first = np.clip(np.stack([column, row], axis=1) - [n_u // 2, n_v // 2], 0, size - [n_u, n_v])
+    windows, background = (
+        np.lib.stride_tricks.sliding_window_view(each, (n_v, n_u), (1, 2))[
+            np.arange(len(each)), first[:, 1], first[:, 0]
+        ]
+        for each in (counts, known)
+    )
+    excess = windows - background - even[:, None, None]
+    totals = excess.sum((1, 2))
+    seen = (totals >= _FEWEST) & (totals > _SIGNIFICANT * np.sqrt(windows.sum((1, 2))))
+    centroids = [
+        (excess.sum(axis) * np.arange(n)).sum(1) / np.where(seen, totals, np.inf) for axis, n in ((1, n_u), (2, n_v))
+    ]
+    start = np.stack([*centroids, radii, np.maximum(totals, 1.0), even])
+    values, covariance = _likeliest(windows, background, start, pitch, lattice.blurs((n_v, n_u)))
+    pixels = first + values[:2].T
+    inside = np.minimum(pixels, size - 1 - pixels) + 0.5 >= values[2][:, None] / pitch
+    seen &= inside.all(axis=1) & (values[:2].T > 0).all(axis=1) & (values[:2].T < [n_u - 1, n_v - 1]).all(axis=1)
+    return seen, pixels, covariance, *values[2:], first, windows, background
 
 
-def _brightest(images: Floats, width: Floats) -> Floats:
-    """Column and row (M, 2) of the middle of the rectangle of `width` (2,) pixels with most counts in each image."""
-    n_u, n_v = width
-    sums = np.pad(images, ((0, 0), (n_v // 2 + 1, n_v // 2), (n_u // 2 + 1, n_u // 2))).cumsum(axis=1).cumsum(axis=2)
-    boxes = sums[:, n_v:, n_u:] - sums[:, :-n_v, n_u:] - sums[:, n_v:, :-n_u] + sums[:, :-n_v, :-n_u]
-    best = boxes.reshape(len(images), -1).argmax(axis=1)
-    row, column = np.unravel_index(best, boxes.shape[1:])
-    return np.stack([column - (n_u % 2 == 0) * 0.5, row - (n_v % 2 == 0) * 0.5], axis=1)
+def _likeliest(
+    windows: Floats, known: Floats, start: Floats, pitch: Floats, blurs: tuple[Floats, Floats] | None
+) -> tuple[Floats, Floats]:
+    """Column, row, radius, counts and background (5, S) that windows (S, n_v, n_u) most likely have, from `start`.
 
-
-def _cut(images: Floats, first: Floats, size: int) -> Floats:
-    """Windows (M, size, size) of images, 0 beyond their edges."""
-    n_v, n_u = images.shape[1:]
-    column, row = (first[:, axis, None] + np.arange(size) for axis in (0, 1))
-    inside = ((row >= 0) & (row < n_v))[:, :, None] & ((column >= 0) & (column < n_u))[:, None, :]
-    at = np.arange(len(images))[:, None, None], np.clip(row, 0, n_v - 1)[:, :, None], np.clip(column, 0, n_u - 1)[:, None, :]
-    return np.where(inside, images[at], 0.0)
-
-
-def _centroids(windows: Floats, first: Floats, middle: Floats, half: int) -> Floats:
-    """Centroids (M, 2), column and row, of the counts within `half` pixels of where they are thought to be."""
-    index = np.arange(windows.shape[1])
-    column, row = ((index + first[:, axis, None]) for axis in (0, 1))
-    near_u, near_v = (np.abs(x - m[:, None]) <= half for x, m in zip((column, row), middle.T, strict=True))
-    counts = windows * near_v[:, :, None] * near_u[:, None, :]
-    total = np.maximum(counts.sum((1, 2)), 1.0)
-    moved = np.stack([(counts.sum(1) * column).sum(1), (counts.sum(2) * row).sum(1)], axis=1) / total[:, None]
-    return np.clip(moved, first + 1, first + len(index) - 2)
-
-
-def _likeliest(windows: Floats, known: Floats, discs: Discs, start: Floats, is_free: bool) -> tuple[Floats, Floats, Floats]:
-    """Middle, radius, counts and background of the discs that windows (S, n, n) most likely are of, from `start` (5, S).
-
-    Returns these (5, S), the covariance (S, 2, 2) of the middles, and the expected counts (S, n, n). Where the middle is
-    not free it stays.
+    Also the covariance (S, 2, 2) of columns and rows. A background within the floor is returned as 0.
     """
-    values, free = start.copy(), slice(0 if is_free else 2, 5)
-    widest = start[2] * 5
-    area = discs.pitch.prod(axis=1) / np.pi
+    values, shape = start.copy(), windows.shape[1:]
+    of_spot = (-1, 1, 1)
     for _ in range(_STEPS):
-        shares, slopes = discs.shares(values[:2].T, values[2])
-        floor = np.minimum(_FLOOR * values[3] * area / values[2] ** 2, values[3])
+        shares, slopes = disc_shares(values[:2].T, values[2], pitch, shape, blurs)
+        floor = _FLOOR * values[3] * pitch.prod(axis=1) / (np.pi * values[2] ** 2)
         values[4] = np.maximum(values[4], floor)
-        even = discs.weights * 1.0
-        expected = values[3][:, None, None] * shares + values[4][:, None, None] * even + known
-        expected = np.maximum(expected, 1e-12)
-        slopes = np.concatenate([values[3][:, None, None] * slopes, [shares, even]])[free]
-        flat = slopes.reshape(len(slopes), len(windows), -1).swapaxes(0, 1)
-        weighted = flat / expected.reshape(len(windows), 1, -1)
-        information = weighted @ flat.swapaxes(1, 2)
-        score = (weighted @ (windows - expected).reshape(len(windows), -1, 1))[..., 0]
-        information += np.eye(information.shape[1]) * (1e-9 * np.trace(information, axis1=1, axis2=2)[:, None, None] + 1e-30)
+        expected = values[3].reshape(of_spot) * shares + values[4].reshape(of_spot) + known
+        slopes = np.stack([*values[3].reshape(of_spot) * slopes, shares, np.ones_like(shares)], axis=1)
+        slopes = slopes.reshape(*slopes.shape[:2], -1)
+        weighted = slopes / expected.reshape(len(slopes), 1, -1)
+        information = weighted @ slopes.swapaxes(1, 2)
+        information += 1e-9 * np.eye(5) * information.diagonal(axis1=1, axis2=2)[:, None] + 1e-30 * np.eye(5)
         covariance = np.linalg.inv(information)
-        step = np.einsum("sij,sj->is", covariance, score)
-        size = np.abs(step) / np.sqrt(np.diagonal(covariance, axis1=1, axis2=2).T)
-        whole = np.zeros_like(values)
-        whole[free] = step
-        most = 0.5 * values[2] / discs.pitch.T
-        whole[:2] = np.clip(whole[:2], -most, most)
-        values[:2] += whole[:2]
-        values[2] = np.clip(values[2] + whole[2], np.maximum(0.6 * values[2], widest / 100), np.minimum(1.6 * values[2], widest))
-        values[3:] = np.maximum(values[3:] + whole[3:], 0.2 * values[3:])
-        held = values[4] <= floor  # the background, whose steps below are none
-        if (size[:-1].max() < _CONVERGED) and (held | (size[-1] < _CONVERGED)).all():
+        step = (covariance @ (weighted @ (windows - expected).reshape(len(slopes), -1, 1)))[..., 0].T
+        size = np.abs(step) / np.sqrt(covariance.diagonal(axis1=1, axis2=2).T)
+        wide = values[2] / pitch.T
+        most = 0.5 * np.stack([*wide, values[2], values[3]]) / np.maximum(np.abs(step[:4]), 1e-30)
+        values += np.minimum(most.min(axis=0), 1.0) * step
+        size[4] *= values[4] > floor  # it cannot go farther down
+        if size.max() < _CONVERGED:
             break
-    middle = covariance[:, :2, :2] if is_free else np.zeros((len(windows), 2, 2))
-    return values, middle, np.maximum(expected - (held * floor)[:, None, None] * even, 0)
+    values[4] = np.where(values[4] > floor, values[4], 0.0)
+    return values, covariance[:, :2, :2]

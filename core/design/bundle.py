@@ -20,7 +20,7 @@ from .solvers import scipy_module
 
 LENGTH, OFFSET = "collimator_length", "detector_offset"
 _LOSS = 3.0  # standard deviations above which robust fits count a residual by its size, not its square
-_GAUGE_SD = 1e-3  # mm that the pinholes, as a whole, may be away from the nominal ones
+_GAUGE_SD = 5e-3  # mm that the pinholes, as a whole, may be away from the nominal ones
 
 
 class Moved(NamedTuple):

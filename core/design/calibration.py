@@ -27,7 +27,7 @@ _NAMES = ("position u", "position v", "position k", "tilt u", "tilt v", "tilt k"
 _FEWEST = 3  # points: a module has six numbers, and each point tells two
 _OUTLYING = 6.0  # standard deviations from where the geometry has a spot
 _FAR = 5.0  # standard deviations of what was thought of a module's numbers
-_ROUNDS = 6
+_ROUNDS = 20
 _CHANCE = 1e-3  # that any module of a right model is said not to fit
 _TOLD = 0.75  # of a number's variance that images must take away
 
@@ -239,22 +239,25 @@ def _triangulated(system: PinholeSystem, places: Floats, seen: NDArray[np.bool_]
 
 def _without_outliers(bundle: Bundle) -> tuple[Bundle, Floats]:
     """The bundle without the images that do not fit, and its solution."""
-    seen, x = bundle.used, bundle.solved(bundle.start(), robust=True)
-    far = np.zeros(len(bundle.system), bool)
+    x, robust = bundle.start(), True
     for _ in range(_ROUNDS):
-        off = bundle.off(x)
-        usual = max(1.0, float(np.median(off[seen])) / math.sqrt(2 * math.log(2)))  # the median of two normal numbers
-        far |= (np.abs(bundle.of_modules(x)) > _FAR).any(axis=1)
-        if far.sum() > len(far) / 2:
+        x, used = bundle.solved(x, robust), bundle.used
+        off = used * bundle.off(x)
+        usual = max(1.0, float(np.median(off[used])) / math.sqrt(2 * math.log(2)))  # the median of two normal numbers
+        bad = used & (np.abs(bundle.of_modules(x)) > _FAR).any(axis=1)  # would be another module's images, or upside down
+        if not bad.any():  # the worst only: they draw others away
+            bad = off > max(_OUTLYING * usual, float(off.max()) / 2)
+            bad |= used & bad.any(axis=0) & ((used & ~bad).sum(axis=0) <= _FEWEST)  # which anything fits
+        if not bad.any() and not robust:
+            break
+        robust = bool(bad.any())
+        bundle = replace(bundle, used=used & ~bad)
+        if bundle.used.any(axis=0).sum() < len(bundle.system) / 2:
             raise InputError(
                 "calibrate: most modules would be farther than 5 standard deviations from the nominal geometry; expected "
                 "points in the scanner's frame (or their distances instead), or larger position_sd and tilt_sd_degrees"
             )
-        used = seen & (off <= _OUTLYING * usual) & ~far
-        bundle, before = replace(bundle, used=used), bundle.used
-        x = bundle.solved(x)
-        if np.array_equal(used, before):
-            break
+        bundle.of_modules(x)[bad.any(axis=0)] = 0.0
     return bundle, x
 
 

@@ -42,8 +42,11 @@ class Moved(NamedTuple):
 
 @dataclass(frozen=True)
 class Bundle:
-    """M modules that see K points. The numbers x are of each module its shift along its nominal u, v and k, the change of its
-    tilt, of its length and of its offset, where these are fitted, in units of `sd`; then the points' shifts, mm."""
+    """M modules that see K points.
+
+    The numbers x are of each module its shift along its nominal u, v and k, the change of its tilt, and those of its length
+    and its offset where these are fitted, in units of `sd`; then the points' shifts, mm.
+    """
 
     system: PinholeSystem  # nominal
     points: Floats  # (K, 3), world mm: known, or where the fit begins
@@ -77,7 +80,7 @@ class Bundle:
         return Moved(centers, tilt, aimed, rotations(tilt).swapaxes(1, 2) @ aimed, length, offset, points)
 
     def gauge(self) -> Floats:
-        """Shifts (G, M, 3), mm in the world, of all pinholes together of which images tell nothing: 3 shifts, 3 turns, a scale."""
+        """Shifts (G, M, 3), world mm, of all pinholes together that images do not tell: 3 shifts, 3 turns, a scale."""
         if not self.fits_points:
             return np.zeros((0, len(self.system), 3))
         told = self.used.any(axis=0)[:, None]
@@ -165,7 +168,7 @@ def _left_jacobian(turns: Floats) -> Floats:
 
 
 def _aiming(now: Moved) -> Floats:
-    """Matrices (M, 3, 3) from shifts of pinholes along u, v and k without tilt, mm, to the turns that keep them aimed, rad."""
+    """Matrices (M, 3, 3) from shifts of pinholes along aimed u, v and k, mm, to the turns that keep them aimed, rad."""
     turns = np.zeros_like(now.aimed)
     b = np.linalg.norm(now.centers, axis=1)
     z_v, z_k = now.aimed[:, 1:, 2].T

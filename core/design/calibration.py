@@ -64,9 +64,8 @@ class Calibration:
     told : array (M, P)
         Share of each number's variance, as it was thought before, that the images take away: one with 0 has stayed nominal.
     gauge : tuple of str
-        What images cannot tell of the scanner as a whole: "shift", "turn" and, of unknown scale, "scale" (7 numbers, or 6, or
-        with known points none). By these the pinholes are on average where they nominally are, and covariances are of
-        that.
+        What images cannot tell of the scanner as a whole: "shift", "turn" and, of unknown scale, "scale": 7 numbers, or 6,
+        or none with known points. By these the pinholes are on average where they nominally are.
     detector_offset : array (M, 2)
         How far pixels lie from where the given views have them, mm along u and v on the crystal.
     residuals : array (M, n_v, n_u)
@@ -167,7 +166,7 @@ def calibrate(
         one_of(name, FITTED, "calibrate: fit")
     own = {LENGTH: [collimator_length_sd], OFFSET: [detector_offset_sd] * 2}
     fitted = tuple(name for name in FITTED if name in fit)
-    sd = [position_sd] * 3 + [math.radians(tilt_sd_degrees)] * 3 + sum((own[name] for name in fitted), [])
+    sd = [position_sd] * 3 + [math.radians(tilt_sd_degrees)] * 3 + [each for name in fitted for each in own[name]]
     sds = np.array([positive(each, "calibrate: standard deviations") for each in sd])
     pairs, lengths = _known_distances(distances, n_k)
     if points is not None and len(pairs):
@@ -244,7 +243,9 @@ def _without_outliers(bundle: Bundle) -> tuple[Bundle, Floats]:
         x, used = bundle.solved(x, robust), bundle.used
         off = used * bundle.off(x)
         usual = max(1.0, float(np.median(off[used])) / math.sqrt(2 * math.log(2)))  # the median of two normal numbers
-        bad = used & (np.abs(bundle.of_modules(x)) > _FAR).any(axis=1)  # would be another module's images, or upside down
+        bad = used & (np.abs(bundle.of_modules(x)) > _FAR).any(
+            axis=1
+        )  # would be another module's images, or upside down
         if not bad.any():  # the worst only: they draw others away
             bad = off > max(_OUTLYING * usual, float(off.max()) / 2)
             bad |= used & bad.any(axis=0) & ((used & ~bad).sum(axis=0) <= _FEWEST)  # which anything fits
@@ -271,24 +272,21 @@ def _result(views: Views, bundle: Bundle, x: Floats, spots: Spots, lattice: Latt
         now.frames @ nominal.frames().swapaxes(1, 2) * bundle.sd[:3]
     )  # shifts along the module's own axes
     covariance = units @ covariance @ units.swapaxes(1, 2)
-    squares = (seen * bundle.off(x) ** 2).sum(axis=0), (seen * spots.pearson(lattice)[0]).sum(axis=0)
-    of_middles = (2 * used - leverages).sum(axis=0)
-    of_pixels = (seen * (spots.pearson(lattice)[1] + 2) - leverages).sum(axis=0)
-    middles = (used * bundle.off(x) ** 2).sum(axis=0)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        misfit, chi_square = (
-            np.where(used.any(axis=0) & (freedom > 0.5), total / freedom, np.nan)
-            for total, freedom in ((middles, of_middles), (sum(squares), of_pixels))
-        )
+    off, (pearson, freedom) = bundle.off(x) ** 2, spots.pearson(lattice)
+    of_middles, of_pixels = (2 * used - leverages).sum(axis=0), (seen * (freedom + 2) - leverages).sum(axis=0)
+    sums = ((used * off).sum(axis=0), of_middles), ((seen * (pearson + off)).sum(axis=0), of_pixels)
+    told_of = used.any(axis=0) & (of_middles > 0.5)
+    misfit, chi_square = (np.where(told_of, total / np.where(told_of, of, 1.0), np.nan) for total, of in sums)
     odd = (seen & ~used).any(axis=0) | _improbable(misfit, of_middles) | _improbable(chi_square, of_pixels)
     expected = spots.expected(lattice, (now.seen() - lattice.first) / lattice.step)
     over, total = ((seen[..., None, None] * each).sum(axis=0) for each in (spots.windows - expected, expected))
     extras = {LENGTH: ("length",), OFFSET: ("offset u", "offset v")}
+    names = (*_NAMES, *(name for kind in bundle.fit for name in extras[kind]))
     gauge = ("shift", "turn", "scale")[: len(bundle.gauge()) // 3 + len(bundle.gauge()) % 3]
     return Calibration(
         nominal.replace(centers=now.centers, tilt=now.tilt, collimator_length=now.length),
         _moved_views(views, nominal, now), now.points, covariance[:, :6, :6], chi_square, misfit,
-        tuple(nominal.numbers[odd].tolist()), used, _NAMES + sum((extras[name] for name in bundle.fit), ()),
+        tuple(nominal.numbers[odd].tolist()), used, names,
         np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)), told, gauge, now.offset, over / np.sqrt(np.maximum(total, 1)),
     )  # fmt: skip
 

@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..arrays import Floats
-from ..geometry.system import PinholeSystem
 from ..geometry.views import Views
 from ..physics.crystal import gaussian_blur
 from ..physics.performance import sensitivity

@@ -39,9 +39,10 @@ class Spots:
 
     def expected(self, lattice: Lattice, pixels: Floats) -> Floats:
         """The windows' expected counts (K, M, n_v, n_u) if the middles were at these columns and rows (K, M, 2)."""
-        shape = self.windows.shape[2:]
-        of_window = np.abs(lattice.step), shape, lattice.blurs(shape)
-        shares = [disc_shares(at, r, *of_window)[0] for at, r in zip(pixels - self.first, self.radii, strict=True)]
+        n_v, n_u = self.windows.shape[2:]
+        pitch, blurs = np.abs(lattice.step), lattice.blurs((n_v, n_u))
+        at = zip(pixels - self.first, self.radii, strict=True)
+        shares = [disc_shares(middles, radii, pitch, (n_v, n_u), blurs)[0] for middles, radii in at]
         return self.counts[..., None, None] * shares + self.even[..., None, None] + self.known
 
     def pearson(self, lattice: Lattice) -> tuple[Floats, Floats]:
@@ -95,12 +96,7 @@ def _spots(counts: Floats, known: Floats, lattice: Lattice, radii: Floats) -> tu
     sums = scipy_module("ndimage").uniform_filter(counts - known, (0, width[1], width[0]), mode="constant")
     row, column = np.unravel_index(sums.reshape(len(counts), -1).argmax(axis=1), lattice.shape)
     first = np.clip(np.stack([column, row], axis=1) - [n_u // 2, n_v // 2], 0, size - [n_u, n_v])
-    windows, background = (
-        np.lib.stride_tricks.sliding_window_view(each, (n_v, n_u), (1, 2))[
-            np.arange(len(each)), first[:, 1], first[:, 0]
-        ]
-        for each in (counts, known)
-    )
+    windows, background = (_cut(each, first, n_v, n_u) for each in (counts, known))
     excess = windows - background - even[:, None, None]
     totals = excess.sum((1, 2))
     seen = (totals >= _FEWEST) & (totals > _SIGNIFICANT * np.sqrt(windows.sum((1, 2))))
@@ -111,8 +107,14 @@ def _spots(counts: Floats, known: Floats, lattice: Lattice, radii: Floats) -> tu
     values, covariance = _likeliest(windows, background, start, pitch, lattice.blurs((n_v, n_u)))
     pixels = first + values[:2].T
     inside = np.minimum(pixels, size - 1 - pixels) + 0.5 >= values[2][:, None] / pitch
-    seen &= inside.all(axis=1) & (values[:2].T > 0).all(axis=1) & (values[:2].T < [n_u - 1, n_v - 1]).all(axis=1)
+    seen &= (inside & (np.abs(pixels - first - reach) < reach)).all(axis=1)
     return seen, pixels, covariance, *values[2:], first, windows, background
+
+
+def _cut(images: Floats, first: Array, n_v: int, n_u: int) -> Floats:
+    """Windows (M, n_v, n_u) of images, each from its own column and row."""
+    column, row = first[:, 0, None, None] + np.arange(n_u), first[:, 1, None, None] + np.arange(n_v)[:, None]
+    return images[np.arange(len(images))[:, None, None], row, column]
 
 
 def _likeliest(
@@ -122,10 +124,10 @@ def _likeliest(
 
     Also the covariance (S, 2, 2) of columns and rows. A background within the floor is returned as 0.
     """
-    values, shape = start.copy(), windows.shape[1:]
+    values, (n_v, n_u) = start.copy(), windows.shape[1:]
     of_spot = (-1, 1, 1)
     for _ in range(_STEPS):
-        shares, slopes = disc_shares(values[:2].T, values[2], pitch, shape, blurs)
+        shares, slopes = disc_shares(values[:2].T, values[2], pitch, (n_v, n_u), blurs)
         floor = _FLOOR * values[3] * pitch.prod(axis=1) / (np.pi * values[2] ** 2)
         values[4] = np.maximum(values[4], floor)
         expected = values[3].reshape(of_spot) * shares + values[4].reshape(of_spot) + known

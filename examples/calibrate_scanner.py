@@ -2,8 +2,8 @@
 
     python calibrate_scanner.py [scanner.xlsx] [--picture calibration.png] [--modules 80] [--voxels 64]
 
-The true scanner's pinholes are 1 mm off along each axis and its modules tilted by 0.5 degrees (standard deviations). Each of
-eight points makes about 20 000 counts in each module; nobody knows where the points are. Then the true scanner sees rods, and
+The true scanner's pinholes are 1 mm off along each axis and its modules tilted by 0.5 degrees (standard deviations). Eight
+points make about 20 000 counts each in each module; nobody knows where the points are. Then the true scanner sees rods, and
 three reconstructions differ only in the geometry that they are told: nominal, calibrated and true.
 """
 
@@ -52,7 +52,9 @@ def main() -> None:
     found = mph.calibrate(nominal, images, nominal.views(shape), model=mph.Emission(nominal, **PHYSICS))
     print(f"calibrated in {time.perf_counter() - began:.1f} s: chi-square {np.nanmean(found.chi_square):.3f}")
     for name, sd in zip(found.names, np.sqrt((found.spread**2).mean(axis=0)), strict=True):
-        print(f"  {name:10s} known to " + (f"{np.degrees(sd):.3f} degrees" if name.startswith("tilt") else f"{sd:.3f} mm"))
+        print(
+            f"  {name:10s} known to " + (f"{np.degrees(sd):.3f} degrees" if name.startswith("tilt") else f"{sd:.3f} mm")
+        )
 
     # A scan of rods by the true scanner, reconstructed with three geometries.
     phantom = mph.DerenzoPhantom(35, (10, 8, 7, 6, 5, 4), 35, activity=100)

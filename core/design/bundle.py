@@ -19,6 +19,7 @@ from ..geometry.system import PinholeSystem
 from .solvers import scipy_module
 
 LENGTH, OFFSET = "collimator_length", "detector_offset"
+FARTHEST = 6.0  # standard deviations that a module's numbers may be from the nominal ones
 _LOSS = 3.0  # standard deviations above which robust fits count a residual by its size, not its square
 _GAUGE_SD = 5e-3  # mm that the pinholes, as a whole, may be away from the nominal ones
 
@@ -132,9 +133,12 @@ class Bundle:
     def solved(self, x: Floats, robust: bool = False) -> Floats:
         """The numbers with the least sum of squares, or, `robust`, with one that large residuals hardly move."""
         loss, accuracy = ("soft_l1", 1e-6) if robust else ("linear", 1e-10)
+        most = np.full(len(x), np.inf)
+        self.of_modules(most)[:] = FARTHEST
+        lsmr = {"atol": 1e-8, "btol": 1e-8, "maxiter": 3000, "regularize": False}
         found = scipy_module("optimize").least_squares(
-            self.residuals, x, self.jacobian, x_scale="jac", loss=loss, f_scale=_LOSS, xtol=accuracy, ftol=accuracy,
-            max_nfev=100, tr_solver="lsmr", tr_options={"atol": 1e-8, "btol": 1e-8, "maxiter": 3000, "regularize": False},
+            self.residuals, x, self.jacobian, (-most, most), x_scale="jac", loss=loss, f_scale=_LOSS, xtol=accuracy,
+            ftol=accuracy, max_nfev=200, tr_solver="lsmr", tr_options=lsmr,
         )  # fmt: skip
         return np.asarray(found.x)
 

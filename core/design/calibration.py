@@ -25,6 +25,7 @@ FITTED = (LENGTH, OFFSET)
 """What can be fitted besides places and tilts. A detector's roll is the module's tilt about k, as the hole is round."""
 _NAMES = ("position u", "position v", "position k", "tilt u", "tilt v", "tilt k")
 _FEWEST = 3  # points: a module has six numbers, and each point tells two
+_UNLIKE = 5.0  # standard deviations that an image is less like a disc's than by chance
 _OUTLYING = 6.0  # standard deviations from where the geometry has a spot
 _FAR = 5.0  # standard deviations of what was thought of a module's numbers
 _ROUNDS = 20
@@ -177,6 +178,9 @@ def calibrate(
     _require_spots(spots.seen)
     places = lattice.first + lattice.step * spots.pixels
     covariance = spots.covariance * lattice.step[:, :, None] * lattice.step[:, None, :]
+    pearson, freedom = spots.pearson(lattice)
+    unlike = pearson / np.maximum(freedom, 1)  # a disc's image: then the middle is known less well
+    covariance *= np.where(unlike > 1 + _UNLIKE * np.sqrt(2 / np.maximum(freedom, 1)), unlike, 1.0)[..., None, None]
     covariance[~spots.seen], places[~spots.seen] = np.eye(2), 0.0
     whitening = np.linalg.inv(np.linalg.cholesky(covariance))
     start = _triangulated(system, places, spots.seen) if points is None else points

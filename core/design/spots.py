@@ -20,7 +20,7 @@ from .solvers import scipy_module
 _MARGIN = 3  # pixels around the expected shadow
 _FEWEST, _SIGNIFICANT = 20, 6.0  # counts of a spot; standard deviations that they are above the background
 _STEPS, _CONVERGED = 25, 0.01  # of Fisher's scoring; standard deviations that its last step moves
-_FLOOR = 1e-3  # least background of a pixel, as a share of one that the shadow covers: strays are not impossible
+_FLOOR = 1e-5  # least background of a pixel, as a share of one that the shadow covers: strays are not impossible
 
 
 @dataclass(frozen=True)
@@ -142,8 +142,8 @@ def _likeliest(
         wide = values[2] / pitch.T
         most = 0.5 * np.stack([*wide, values[2], values[3]]) / np.maximum(np.abs(step[:4]), 1e-30)
         values += np.minimum(most.min(axis=0), 1.0) * step
-        size[4] *= values[4] > floor  # it cannot go farther down
+        size[4] *= values[4] > 1.01 * floor  # it cannot go farther down
         if size.max() < _CONVERGED:
             break
-    values[4] = np.where(values[4] > floor, values[4], 0.0)
+    values[4] = np.where(values[4] > 1.01 * floor, values[4], 0.0)
     return values, covariance[:, :2, :2]

@@ -20,7 +20,11 @@ from .solvers import scipy_module
 
 LENGTH, OFFSET = "collimator_length", "detector_offset"
 FARTHEST = 6.0  # standard deviations that a module's numbers may be from the nominal ones
-_LOSS = 3.0  # standard deviations above which robust fits count a residual by its size, not its square
+_LOSSES = (
+    300.0,
+    30.0,
+    3.0,
+)  # standard deviations above which robust fits count residuals by their size, one after the other
 _GAUGE_SD = 5e-3  # mm that the pinholes, as a whole, may be away from the nominal ones
 
 
@@ -132,15 +136,17 @@ class Bundle:
 
     def solved(self, x: Floats, robust: bool = False) -> Floats:
         """The numbers with the least sum of squares, or, `robust`, with one that large residuals hardly move."""
-        loss, accuracy = ("soft_l1", 1e-6) if robust else ("linear", 1e-10)
         most = np.full(len(x), np.inf)
         self.of_modules(most)[:] = FARTHEST
         lsmr = {"atol": 1e-8, "btol": 1e-8, "maxiter": 3000, "regularize": False}
-        found = scipy_module("optimize").least_squares(
-            self.residuals, x, self.jacobian, (-most, most), x_scale="jac", loss=loss, f_scale=_LOSS, xtol=accuracy,
-            ftol=accuracy, max_nfev=200, tr_solver="lsmr", tr_options=lsmr,
-        )  # fmt: skip
-        return np.asarray(found.x)
+        for scale in _LOSSES if robust else (1.0,):
+            accuracy = 1e-10 if not robust else 1e-6 if scale == _LOSSES[-1] else 1e-3
+            found = scipy_module("optimize").least_squares(
+                self.residuals, x, self.jacobian, (-most, most), x_scale="jac", loss="soft_l1" if robust else "linear",
+                f_scale=scale, xtol=accuracy, ftol=accuracy, max_nfev=100, tr_solver="lsmr", tr_options=lsmr,
+            )  # fmt: skip
+            x = np.asarray(found.x)
+        return x
 
     def off(self, x: Floats) -> Floats:
         """Distances (K, M) of spots from where x has them, in standard deviations."""

@@ -90,11 +90,10 @@ class Bundle:
             return np.zeros((0, len(self.system), 3))
         told = self.used.any(axis=0)[:, None]
         apart = self.system.centers - np.average(self.system.centers, axis=0, weights=told[:, 0])
-        ways = [np.broadcast_to(axis, apart.shape) for axis in np.eye(3)] + [
-            np.cross(axis, apart) for axis in np.eye(3)
-        ]
-        ways = told * np.array(ways if len(self.pairs) else [*ways, apart])
-        return ways / np.sqrt((ways**2).sum((1, 2), keepdims=True))
+        turns = [np.cross(axis, apart) for axis in np.eye(3)]
+        scale = [] if len(self.pairs) else [apart]
+        ways = told * np.array([*(np.broadcast_to(axis, apart.shape) for axis in np.eye(3)), *turns, *scale])
+        return ways / np.sqrt(np.maximum((ways**2).sum((1, 2), keepdims=True), 1e-12))  # 0 of a turn about two pinholes
 
     def residuals(self, x: Floats) -> Floats:
         """In units of their standard deviations: of places, distances, what is thought of the numbers, and the gauge."""

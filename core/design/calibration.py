@@ -175,7 +175,7 @@ def calibrate(
     lattice = Lattice.of(model, views)
     radii = model.effective_diameter / 2 * (1 + system.collimator_length / system.pinhole_distance)
     spots = find_spots(images, each_pixel(model), lattice, radii, progress)
-    _require_spots(spots.seen)
+    _require_spots(spots.seen, 2 if points is None else 1)
     places = lattice.first + lattice.step * spots.pixels
     covariance = spots.covariance * lattice.step[:, :, None] * lattice.step[:, None, :]
     pearson, freedom = spots.pearson(lattice)
@@ -215,10 +215,10 @@ def _known_distances(distances: ArrayLike | None, n_k: int) -> tuple[NDArray[np.
     return pairs, lengths
 
 
-def _require_spots(seen: NDArray[np.bool_]) -> None:
-    for k in np.flatnonzero(seen.sum(axis=1) < 2)[:1]:
+def _require_spots(seen: NDArray[np.bool_], modules: int) -> None:
+    for k in np.flatnonzero(seen.sum(axis=1) < modules)[:1]:
         found = f"acquisition {k + 1}: {seen[k].sum()} modules see a point source"
-        raise InputError(f"calibrate: images: {found}, expected 2 or more")
+        raise InputError(f"calibrate: images: {found}, expected {modules} or more")
     if seen.sum(axis=0).max() < _FEWEST:
         raise InputError(
             f"calibrate: images: no module sees {_FEWEST} points; expected more of them in its field of view"

@@ -224,6 +224,12 @@ def test_lengths_and_offsets_are_found_too(some):
     assert np.sqrt((seen**2).mean()) < 0.02
 
 
+def test_known_points_calibrate_a_module_alone(some):
+    measured = Measured(some[:1])
+    found = measured.calibrated(points=measured.points)
+    assert found.gauge == () and measured.normalized(found)[0] < 3
+
+
 def test_counts_of_a_background_do_not_move_spots(some):
     measured = Measured(some)
     images = measured.images() + measured.rng.poisson(2.0, (8, len(some), *SHAPE))

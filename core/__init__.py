@@ -12,6 +12,8 @@ Everything imported here is the public interface. Arguments that cannot be used 
 import types
 
 from . import events, learning
+from .design.calibration import Calibration, calibrate
+from .design.point_images import point_images
 from .errors import InputError, InputWarning
 from .exchange import read_geometry, write_geometry
 from .geometry.checks import GeometryReport, check_geometry

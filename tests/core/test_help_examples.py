@@ -84,6 +84,13 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     run(folder, f"{heart} --size 24 24 --write-recipe heart.toml")
     run(folder, "mphdrr project heart.toml -o run.h5")
     run(folder, "mphdrr events make set --recipe derenzo.toml -n 13")
+    system = mph.read_system(WORKBOOK)
+    views, model = system.views((32, 32)), mph.Emission(system, time=60.0)
+    for k, place in enumerate(np.diag([30.0, 30.0, 30.0])):
+        images = np.random.default_rng(k).poisson(mph.point_images(model, views, [place], activity=1e5)[0])
+        counts = mph.counts_run(images[:, ::-1, ::-1], system, "1-80", "back-v", 60.0)
+        mph.write_run(counts, folder / f"point{k}.h5")
+    (folder / "points.toml").write_text('[runs]\nfiles = ["point0.h5", "point1.h5", "point2.h5"]\n')
     return folder
 
 

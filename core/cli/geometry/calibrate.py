@@ -1,0 +1,87 @@
+"""``mphdrr geometry calibrate RECIPE -o FILE``."""
+
+import argparse
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...design.calibration import Calibration
+from ...design.calibration_recipe import run_calibration
+from ...files import write_bytes
+from ...runs.display import DIVERGING, Display
+from ...runs.mosaic import sheet, write_png
+from ...workbook import write_system
+from ..options import add_run, counted, output_path, print_answer, progress_bar
+
+_LISTED = 5
+_MOST = 5.0  # standard deviations at the ends of the picture's colours
+
+
+def add_parser(actions: Any) -> None:
+    """Add the action."""
+    parser = add_run(actions, "calibrate", _run)
+    parser.add_argument("recipe", metavar="RECIPE", help="recipe of the calibration (.toml)")
+    text = "the calibrated workbook (.xlsx, .xlsm); covariances (.json) and residuals (.png) are written beside it"
+    parser.add_argument("-o", "--output", required=True, metavar="FILE", help=text)
+    parser.add_argument("--json", action="store_true", help="print JSON")
+
+
+def _run(arguments: argparse.Namespace) -> None:
+    """Find where the modules are from images of point sources, and write the workbook with their places and tilts.
+
+    mphdrr geometry calibrate points.toml -o calibrated.xlsx
+    """
+    path = output_path(arguments.output, (".xlsx", ".xlsm"))
+    found = run_calibration(arguments.recipe, progress_bar("finding spots"))
+    source = found.system.source
+    write_system(found.system, path, None if source is None else source.path)
+    record = _record(found)
+    write_bytes(path.with_suffix(".json"), json.dumps(record, indent=1).encode())
+    display = Display(colors=DIVERGING, low=-_MOST, high=_MOST)
+    residuals = found.residuals.astype(np.float32)
+    drawn = sheet(residuals, found.system.numbers, found.system.rings(), "standard deviations", display)
+    write_png(drawn.picture, path.with_suffix(".png"))
+    print_answer(arguments, record, _lines(found, record, path))
+
+
+def _record(found: Calibration) -> dict[str, Any]:
+    """The calibration as JSON has it: no NaN, angles in rad."""
+    names = ("points", "covariance", "chi_square", "misfit", "used", "spread", "told", "detector_offset")
+    record = {name: _plain(getattr(found, name).tolist()) for name in names}
+    record |= {name: list(getattr(found, name)) for name in ("names", "misfitting", "gauge")}
+    geometry = {
+        "centers": found.system.centers,
+        "tilt": found.system.tilt,
+        "collimator_length": found.system.collimator_length,
+    }
+    numbers = {"numbers": found.system.numbers.tolist(), **{name: x.tolist() for name, x in geometry.items()}}
+    return {**numbers, **record, "untold": found.untold(), "units": "mm, rad"}
+
+
+def _plain(value: Any) -> Any:
+    return [_plain(each) for each in value] if isinstance(value, list) else None if value != value else value
+
+
+def _lines(found: Calibration, record: dict[str, Any], path: Path) -> Iterator[str]:
+    unit = np.where([name.startswith("tilt") for name in found.names], np.degrees(1.0), 1.0)
+    spread = np.sqrt((found.spread**2).mean(axis=0)) * unit
+    images = f"{found.used.sum()} of {found.used.size} images"
+    yield f"{path}: {counted(len(found.system), 'module')} by {counted(len(found.points), 'point')}, {images}"
+    for name, sd in zip(found.names, spread, strict=True):
+        yield f"  {name:12s} known to {sd:.3f} {'degrees' if name.startswith('tilt') else 'mm'}"
+    if found.gauge:
+        yield f"  {', '.join(found.gauge)} of the scanner as a whole: nominal, images of these sources do not tell them"
+    for line in found.untold():
+        yield f"  not told, {line}"
+    if np.isfinite(found.chi_square).any():
+        yield f"  chi-square {np.nanmin(found.chi_square):.2f} to {np.nanmax(found.chi_square):.2f} per degree of freedom"
+    yield " module  chi-square  misfit  images"
+    for m in np.argsort(-np.nan_to_num(found.misfit))[:_LISTED]:
+        yield f"{found.system.numbers[m]:7d} {found.chi_square[m]:11.2f} {found.misfit[m]:7.2f} {found.used[:, m].sum():7d}"
+    if found.misfitting:
+        yield f"  modules that do not fit: {', '.join(map(str, found.misfitting))}"
+    else:
+        yield "  all modules fit"

@@ -1,0 +1,91 @@
+"""Recipes of calibrations (TOML): the runs of which sources, what is fitted, what is thought beforehand."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..errors import InputError, naming
+from ..events.entries import by_key, flat, required, table
+from ..files import AnyPath
+from ..geometry.system import PinholeSystem
+from ..progress import Progress
+from ..projector.emission import Emission
+from ..runs.files import read_run
+from ..runs.recipe import Values
+from ..runs.run_recipe import recipe_model
+from ..runs.settings import Setting
+from ..toml import read_toml
+from ..validation import real_array
+from ..workbook import read_system
+from .bundle import LENGTH, OFFSET
+from .calibration import Calibration, calibrate
+
+_SD = "Standard deviation of "
+_ROWS = by_key((
+    Setting("runs.files", str, None, "Run files of counts, one of each acquisition", is_path=True, sizes=()),
+    Setting("system.file", str, None, "Workbook of the runs' scanner, of which a calibrated copy is written", "a new one",
+            is_path=True),
+    Setting(f"fit.{LENGTH}", bool, False, "Also find the collimators' lengths"),
+    Setting(f"fit.{OFFSET}", bool, False, "Also find where the pixels lie on the crystals"),
+    Setting("priors.position_sd", float, 5.0, _SD + "the pinholes from their nominal places", unit="mm", above=0),
+    Setting("priors.tilt_sd_degrees", float, 2.0, _SD + "the modules' tilts from the nominal ones", above=0),
+    Setting(f"priors.{LENGTH}_sd", float, 1.0, _SD + "the lengths", unit="mm", above=0),
+    Setting(f"priors.{OFFSET}_sd", float, 0.5, _SD + "the pixels' places", unit="mm", above=0),
+    Setting("priors.distance_sd", float, 0.02, _SD + "known distances between sources", unit="mm", above=0),
+))  # fmt: skip
+_SOURCES = ("points", "distances")
+
+
+class _Values(Values):
+    @property
+    def rows(self) -> Mapping[str, Setting]:
+        return _ROWS
+
+
+def run_calibration(path: AnyPath, progress: Progress | None = None) -> Calibration:
+    """The calibration that a recipe asks for; its paths are relative to its folder. `InputError` names file and entry."""
+    tables, folder = read_toml(path), Path(path).parent
+    with naming(path):
+        sources = table(tables, "sources")
+        for name in sources.keys() - set(_SOURCES):
+            raise InputError(f"sources.{name}: no such setting; expected {', '.join(_SOURCES)}")
+        tables.pop("sources", None)
+        recipe = _Values(flat(tables, _ROWS, *(name for name in tables if isinstance(tables[name], dict))))
+        files = required(recipe["runs.files"], "runs.files", "name a run file of each acquisition")
+        runs = [read_run(folder / name) for name in files]
+        workbook = recipe["system.file"]
+        system = runs[0].system if workbook is None else read_system(folder / workbook)
+        model = recipe_model(runs[0].recipe, system)
+        if not isinstance(system, PinholeSystem) or not isinstance(model, Emission):
+            raise InputError("runs.files: expected runs of counts of pinholes")
+        for name, run in zip(files, runs, strict=True):
+            if run.projections.shape != runs[0].projections.shape or not _same(run.system, system):
+                raise InputError(f"runs.files: {name}: expected the modules of {workbook or files[0]}")
+        priors = {key.partition(".")[2]: recipe[key] for key in _ROWS if key.startswith("priors.")}
+        return calibrate(
+            system, np.stack([run.projections for run in runs]), runs[0].views, sources.get("points"),
+            _distances(sources.get("distances"), len(runs)), model=replace(model, background=runs[0].background),
+            fit=[name for name in (LENGTH, OFFSET) if recipe[f"fit.{name}"]], **priors, progress=progress,
+        )  # fmt: skip
+
+
+def _same(one: Any, other: Any) -> bool:
+    return len(one) == len(other) and np.allclose(one.poses(), other.poses(), atol=1e-6)
+
+
+def _distances(listed: Any, n_k: int) -> Any:
+    """The table of distances (K, K) of a list of [first, second, mm], sources counted from 1."""
+    if listed is None:
+        return None
+    rows = real_array(listed, "sources.distances", (None, 3))
+    first, second = ends = rows[:, :2].astype(int).T
+    if (rows[:, :2] != ends.T).any() or ends.min() < 1 or ends.max() > n_k or (first == second).any():
+        raise InputError(f"sources.distances: expected [first, second, mm], sources from 1 to {n_k}")
+    distances = np.full((n_k, n_k), np.nan)
+    distances[first - 1, second - 1] = rows[:, 2]
+    return distances

@@ -277,7 +277,7 @@ class Projector(LinearOperator):
                 image = along_v @ image @ along_u.T
             for view, box, close, A in self._close_parts:
                 if view == m and (part := np.where(close, to_numpy(x[box], None), 0)).any():
-                    image = image + A(part, mu=mu)[0]
+                    image = image + cast_like(A(part, mu=mu)[0], image)
             yield self._finished(image, x)
 
     def _projected(self, execution: Execution, x: ArrayOrTensor, mu: ArrayOrTensor) -> Iterator[ArrayOrTensor]:
@@ -343,8 +343,8 @@ class Projector(LinearOperator):
         arguments = volume, to_numpy(images, None), *how, self._mu_field(mu)
         gradient: Array = self._depths.mu_gradient(*arguments)  # type: ignore[union-attr]
         for m, box, close, of_part in self._close_parts:
-            part = cast_like(np.where(close, to_numpy(x[box], None), 0), images)
-            gradient += to_numpy(of_part._mu_gradient(images[m : m + 1], part, mu), None)
+            part, image = cast_like(np.where(close, to_numpy(x[box], None), 0), x), cast_like(images[m : m + 1], x)
+            gradient += to_numpy(of_part._mu_gradient(image, part, mu), None)
         return gradient
 
     @functools.cached_property

@@ -147,6 +147,6 @@ def test_what_cannot_be_is_refused(rng):
     rays = mph.Projector(GRID, A.views, mph.Emission(SYSTEM, hole="rays"))
     refused(lambda: mph.geometry_gradient(rays, x, weights), "hole 'depth'", "emission_images")
     refused(lambda: mph.geometry_gradient(A, x, weights[1:]), "images", "3 x 15 x 13")
-    wide = mph.Grid.centered((9, 9, 9), 22.0)
+    wide = mph.Grid.centered((5, 5, 5), 130.0)
     near = mph.Projector(wide, A.views, mph.Emission(SYSTEM))
     refused(lambda: mph.geometry_gradient(near, np.ones(wide.shape), weights), "too close", "smaller grid")

@@ -261,12 +261,12 @@ def test_attenuation_given_in_the_call_is_that_of_the_model(backend, rng):
 def test_gradients_by_attenuation_are_central_differences(rng):
     """Also where some voxels are so close to a pinhole that rays project them."""
     torch = pytest.importorskip("torch")
-    grid = mph.Grid.centered((5, 5, 5), 30.0)
+    grid = mph.Grid.centered((5, 5, 5), 130.0)
     views, mu = SYSTEM.views((6, 6)), mph.Volume(np.zeros(grid.shape), grid, "mu")
     A = mph.Projector(grid, views, mph.Emission(SYSTEM, mu), double=True)
     assert A._close_parts
     given, weights = (
-        torch.tensor(rng.uniform(0, 0.01, grid.shape), requires_grad=True),
+        torch.tensor(rng.uniform(0, 0.001, grid.shape), requires_grad=True),
         torch.tensor(rng.random(A.shape_out)),
     )
     x, along, step = torch.tensor(rng.random(grid.shape)), torch.tensor(rng.random(grid.shape)), 1e-6

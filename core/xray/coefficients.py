@@ -15,7 +15,7 @@ _SYMBOLS = {next(iter(made.composition)): name for name, made in MATERIALS.items
 
 
 def attenuations(material: str, energies: Floats) -> Floats:
-    """Linear attenuation coefficients (n,), 1/mm, of one of `MATERIALS` or an element, such as "Al", at energies (n,), keV."""
+    """Linear attenuation coefficients (n,), 1/mm, of one of `MATERIALS`, or an element such as "Al", at energies, keV."""
     return _attenuations(_SYMBOLS.get(material, material), tuple(energies.tolist()))
 
 

@@ -16,6 +16,7 @@ from .spectral import SpectralTransmission
 _RAYS = 8192  # computed at once
 _PRECISION = 1e-9  # of paths, mm and relative
 _BOLDEST = 1.5  # change of a logarithm of counts in one step
+_DARKEST = 1e-200  # counts
 _DEEPEST = 2000.0  # mm of water
 
 
@@ -70,13 +71,13 @@ def _most_likely(counts: Floats, m: SpectralTransmission, scale: Floats, iterati
     depths = np.log(open_beam[:, None] * scale / np.maximum(counts, 0.5))
     paths = np.linalg.pinv(slopes) @ depths * 0.5  # towards thin rays, where the slopes hold
     left = np.arange(len(scale))
-    mean, jacobian = m.model(paths, scale)
+    mean, jacobian = _model(m, paths, scale)
     likely = _log_likelihood(counts, mean)
     share = np.ones(len(scale))
     for _ in range(iterations):
         step = _step(counts[:, left], mean, jacobian) * share
         trial = paths[:, left] + step
-        new_mean, new_jacobian = m.model(trial, scale[left])
+        new_mean, new_jacobian = _model(m, trial, scale[left])
         new = _log_likelihood(counts[:, left], new_mean)
         better = new >= likely - 1e-12 * np.abs(likely)
         paths[:, left[better]] = trial[:, better]
@@ -90,6 +91,12 @@ def _most_likely(counts: Floats, m: SpectralTransmission, scale: Floats, iterati
         if not len(left):
             break
     return paths, len(left)
+
+
+def _model(m: SpectralTransmission, paths: Floats, scale: Floats) -> tuple[Floats, Floats]:
+    """The model's means and derivatives, the means above 0 even where nothing passes."""
+    mean, jacobian = m.model(paths, scale)
+    return np.maximum(mean, _DARKEST), jacobian
 
 
 def _step(counts: Floats, mean: Floats, jacobian: Floats) -> Floats:
@@ -118,6 +125,22 @@ def virtual_monoenergetic(values: ArrayLike, materials: Sequence[str], energy: f
         raise InputError(f"values: expected a first axis of {len(materials)}, {', '.join(materials)}")
     at = real_array([energy], "energy", (1,))
     return np.tensordot(np.concatenate([attenuations(name, at) for name in materials]), given, axes=1)
+
+
+def decompose_images(images: ArrayLike, materials: Sequence[str], energies: ArrayLike) -> Floats:
+    """Volumes (materials, ...), relative to the materials' densities, from images of mu (images, ...), 1/mm, by least squares.
+
+    Each image is taken as one of the energy (images,), keV, that its bin has in effect, so beam hardening must have been
+    corrected: `decompose` needs neither. `InputError` where there are fewer images than materials.
+    """
+    at = real_array(energies, "energies", (None,))
+    given = real_array(images, "images", None)
+    if not given.ndim or len(given) != len(at) or len(at) < len(materials):
+        raise InputError(
+            f"images: expected {len(at)}, one for each energy, and at least {len(materials)} for as many materials"
+        )
+    mu = np.stack([attenuations(name, at) for name in materials], axis=1)
+    return np.tensordot(np.linalg.pinv(mu), given, axes=1)
 
 
 def correct_beam_hardening(counts: ArrayLike, m: SpectralTransmission, mAs: ArrayLike) -> Floats:

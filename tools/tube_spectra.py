@@ -12,8 +12,8 @@ TABLE = Path(__file__).resolve().parents[1] / "core" / "xray" / "tube_spectra.tx
 ANGLE, STEP, LOWEST = 12, 0.5, 10.0
 
 HEAD = f"""\
-# Spectra of tungsten tubes with an anode of {ANGLE} degrees, before any filter but the anode itself: on the central axis at 1 m,
-# without air, photons per mm^2 and mAs in steps of {STEP} keV, the first from {LOWEST:g} to {LOWEST + STEP:g} keV, the last up to kVp.
+# Spectra of tungsten tubes with an anode of {ANGLE} degrees, before any filter but the anode itself: on the central axis at
+# 1 m, without air, photons per mm^2 and mAs in steps of {STEP} keV from {LOWEST:g} keV up to kVp.
 #
 # Made by tools/tube_spectra.py with SpekPy {version("spekpy")} (MIT; G. Poludniowski, A. Omar, R. Bujila, P. Andreo, "SpekPy
 # v2.0: a software toolkit for modeling x-ray tube spectra", Medical Physics 48 (2021) 3630-3637), its model "casim".

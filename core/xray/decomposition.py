@@ -128,16 +128,16 @@ def virtual_monoenergetic(values: ArrayLike, materials: Sequence[str], energy: f
 
 
 def decompose_images(images: ArrayLike, materials: Sequence[str], energies: ArrayLike) -> Floats:
-    """Volumes (materials, ...), relative to the materials' densities, from images of mu (images, ...), 1/mm, by least squares.
+    """Volumes (materials, ...), relative to the materials' densities, from images of mu (images, ...), 1/mm.
 
-    Each image is taken as one of the energy (images,), keV, that its bin has in effect, so beam hardening must have been
+    They are those of least squares. Each image is taken as one of the energy (images,), keV, that its bin has in effect, so beam hardening must have been
     corrected: `decompose` needs neither. `InputError` where there are fewer images than materials.
     """
     at = real_array(energies, "energies", (None,))
     given = real_array(images, "images", None)
     if not given.ndim or len(given) != len(at) or len(at) < len(materials):
         raise InputError(
-            f"images: expected {len(at)}, one for each energy, and at least {len(materials)} for as many materials"
+            f"images: expected one for each of {len(at)} energies, and as many as materials, {len(materials)}"
         )
     mu = np.stack([attenuations(name, at) for name in materials], axis=1)
     return np.tensordot(np.linalg.pinv(mu), given, axes=1)

@@ -105,7 +105,9 @@ def absorbed_dose_rate(
 def absorbed_dose(
     rate: Volume, isotope: str, biological_half_life: float | None = None, duration: float | None = None
 ) -> Volume:
-    """Absorbed dose, mGy, of a dose rate that falls with the effective half-life: ``1 / T = 1 / T_physical + 1 / T_biological``.
+    """Absorbed dose, mGy, of a dose rate that falls with the effective half-life.
+
+    Rates of decay add: ``1 / T_effective = 1 / T_physical + 1 / T_biological``.
 
     Parameters
     ----------
@@ -194,7 +196,7 @@ def _self_kernel(linear: Floats, radial: Radial) -> float:
     ring = np.sqrt(1 - z**2)
     directions = np.stack([ring * np.cos(turn), ring * np.sin(turn), z], axis=1)  # in voxels
     farthest = 1 / np.abs(directions).max(axis=1)
-    nodes, weights = np.polynomial.legendre.leggauss(_NODES)
+    nodes, weights = np.polynomial.legendre.leggauss(_NODES)  # type: ignore[no-untyped-call]
     s = farthest[:, None] * (nodes + 1) / 2
     often = np.prod(1 - np.abs(s[..., None] * directions[:, None]), axis=-1)
     stretch = np.linalg.norm(directions @ linear.T, axis=1)[:, None]  # mm of one voxel in each direction

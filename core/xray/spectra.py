@@ -69,7 +69,7 @@ class Spectrum:
         """The spectrum in steps of `step` keV from 0 on, each at the mean energy of its photons: quicker to compute with."""
         which = np.floor(self.energies / positive(step, "step", "keV") + 1e-9).astype(int)
         which -= which[0]
-        photons = np.bincount(which, self.photons)
+        photons = np.bincount(which, self.photons).astype(np.float64)
         energy = np.bincount(which, self.photons * self.energies)
         there = photons > 0
         return Spectrum(energy[there] / photons[there], photons[there])
@@ -106,7 +106,8 @@ def tube_spectrum(kvp: float, filters: Mapping[str, float] = _FILTERS, angle: fl
         Tube voltage, kV, from 40 to 150.
     filters
         As for `Spectrum.filtered`: all that is between anode and patient, with what the tube's own window and oil are
-        worth. Photons below 10 keV, which tubes do not let out, are left out. Air absorbs, too: ``{"Al": 2.5, "air": 1000}``.
+        worth. Air absorbs, too: ``{"Al": 2.5, "air": 1000}``. Photons below 10 keV, which tubes do not let out, are left
+        out.
     angle
         The anode's, degrees. Other angles than 12 are calculated by SpekPy, if that is installed.
 

@@ -130,8 +130,9 @@ def virtual_monoenergetic(values: ArrayLike, materials: Sequence[str], energy: f
 def decompose_images(images: ArrayLike, materials: Sequence[str], energies: ArrayLike) -> Floats:
     """Volumes (materials, ...), relative to the materials' densities, from images of mu (images, ...), 1/mm.
 
-    They are those of least squares. Each image is taken as one of the energy (images,), keV, that its bin has in effect, so beam hardening must have been
-    corrected: `decompose` needs neither. `InputError` where there are fewer images than materials.
+    They are those of least squares. Each image is taken as one of the energy (images,), keV, that its bin has in effect:
+    beam hardening must have been corrected, which `decompose` does not need. `InputError` where there are fewer images
+    than materials.
     """
     at = real_array(energies, "energies", (None,))
     given = real_array(images, "images", None)

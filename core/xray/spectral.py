@@ -70,7 +70,7 @@ class SpectralTransmission:
         detector: Detector | None = None,
     ) -> None:
         instance(spectrum, Spectrum, "spectrum")
-        self.views = views if views is None or isinstance(views, Views) else views.views()
+        self.views = views if views is None or isinstance(views, Views) else _views_of(views)
         self.spectrum = spectrum
         self.materials = (materials,) if isinstance(materials, str) else tuple(materials)
         if not self.materials or len(set(self.materials)) < len(self.materials):
@@ -176,6 +176,12 @@ class SpectralTransmission:
             )
         arrays = (volume.array if isinstance(volume, Volume) else volume for volume in volumes)
         return np.stack([np.asarray(A(array), np.float64) for array in arrays])
+
+
+def _views_of(scanner: HasViews) -> Views:
+    if not callable(getattr(scanner, "views", None)):
+        raise InputError(f"views: expected Views, a scanner or None, got {type(scanner).__name__}")
+    return scanner.views()
 
 
 def _pixels(views: Views) -> Floats:

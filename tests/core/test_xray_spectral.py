@@ -139,6 +139,7 @@ def test_more_materials_than_bins_and_bins_that_overlap_are_refused():
             "materials: expected one or more, each once",
         ),
         (lambda: mph.PhotonCounter("cheese").response(np.array([60.0]), BINS), "detector: material 'cheese'"),
+        (lambda: mph.SpectralTransmission(TUBE, TUBE), "views: expected Views, a scanner or None, got Spectrum"),
         (lambda: three.expected([1.0, 2.0], 1.0), "paths: expected a first axis of 3, water, bone, iodine"),
         (lambda: three.expected([1.0, 2.0, 3.0], 0), "mAs: expected more than 0, got 0"),
     ):

@@ -34,7 +34,7 @@ class PhotonCounter:
     """A detector that counts photons in energy bins; as it is by default, all of them, in the bins of their energies.
 
     Photons cross the sensor at a right angle. What it absorbs it counts once, at the photon's energy: fluorescence that
-    escapes and charge that neighbours share are for `sharing` to say.
+    escapes and charge that neighbors share are for `sharing` to say.
 
     Attributes
     ----------

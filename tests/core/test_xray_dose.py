@@ -63,19 +63,38 @@ def test_a_sphere_absorbs_the_share_of_the_closed_form(energy, radius):
     assert absorbed == pytest.approx(expected, rel=0.02)
 
 
-def test_photons_give_the_published_voxel_s_values():
-    """N. Lanconelli et al., Physics in Medicine and Biology 57 (2012) 517-533: Lu-177, soft tissue, voxels of 2.21 mm.
-
-    mGy/(MBq s). Farther than the electrons go, which are absorbed where they are set free here.
-    """
-    published = {
-        (0, 0, 3): 3.24e-5, (0, 0, 4): 1.81e-5, (0, 0, 5): 1.18e-5, (1, 1, 3): 2.65e-5, (0, 2, 2): 3.66e-5,
-        (2, 2, 2): 2.42e-5, (0, 3, 3): 1.62e-5, (3, 3, 3): 1.09e-5, (0, 5, 5): 6.00e-6, (5, 5, 5): 3.98e-6,
-    }  # fmt: skip
-    grid = mph.Grid.centered(11, 2.21)
+@pytest.mark.parametrize(
+    # N. Lanconelli et al., Physics in Medicine and Biology 57 (2012) 517-533, and medphys.it: soft tissue, mGy/(MBq s).
+    # Farther than electrons go, which are absorbed here where they are set free; voxels' sides in mm.
+    ("isotope", "side", "published"),
+    [
+        (
+            "Lu-177",
+            2.21,
+            {(0, 0, 3): 3.24e-5, (1, 1, 3): 2.65e-5, (2, 2, 2): 2.42e-5, (0, 0, 5): 1.18e-5, (5, 5, 5): 3.98e-6},
+        ),
+        (
+            "Lu-177",
+            4.8,
+            {(0, 0, 2): 1.61e-5, (1, 1, 3): 5.93e-6, (2, 2, 2): 5.44e-6, (0, 0, 5): 2.68e-6, (5, 5, 5): 9.50e-7},
+        ),
+        (
+            "I-131",
+            3.0,
+            {(0, 0, 3): 2.04e-4, (1, 1, 3): 1.66e-4, (2, 2, 2): 1.51e-4, (0, 0, 5): 7.23e-5, (5, 5, 5): 2.37e-5},
+        ),
+        (
+            "I-131",
+            9.28,
+            {(1, 1, 1): 6.78e-5, (0, 0, 2): 4.88e-5, (2, 2, 2): 1.60e-5, (0, 0, 5): 7.57e-6, (5, 5, 5): 2.41e-6},
+        ),
+    ],
+)
+def test_photons_give_the_published_voxel_s_values(isotope, side, published):
+    grid = mph.Grid.centered(11, side)
     array = np.zeros(grid.shape)
-    array[5, 5, 5] = 1e3 / (grid.voxel_volume / 1e3)  # 1 MBq in the voxel, as kBq/mL
-    per_second = mph.absorbed_dose_rate(mph.Volume(array, grid), "Lu-177", density=1.04).array / 3600
+    array[5, 5, 5] = 1e6 / grid.voxel_volume  # 1 MBq in the voxel, as kBq/mL
+    per_second = mph.absorbed_dose_rate(mph.Volume(array, grid), isotope, density=1.04).array / 3600
     for (i, j, k), value in published.items():
         assert per_second[5 + i, 5 + j, 5 + k] == pytest.approx(value, rel=0.06), (i, j, k)
 

@@ -126,6 +126,8 @@ def tube_spectrum(kvp: float, filters: Mapping[str, float] = _FILTERS, angle: fl
     voltages, photons = _table()
     if not voltages[0] <= kvp <= voltages[-1]:
         raise InputError(f"kvp: expected {voltages[0]:g} to {voltages[-1]:g} kV, got {kvp:g}")
+    if angle >= 90:
+        raise InputError(f"angle: expected less than 90 degrees, got {angle:g}")
     if angle == _ANGLE:
         energies = _LOWEST + _STEP * (np.arange(photons.shape[1]) + 0.5)
         row = min(int((kvp - voltages[0]) / 2), len(voltages) - 2)

@@ -68,6 +68,7 @@ def test_what_is_no_spectrum_is_refused_in_one_line():
     for wrong, message in (
         (lambda: mph.tube_spectrum(39), "kvp: expected 40 to 150 kV, got 39"),
         (lambda: mph.tube_spectrum(151), "kvp: expected 40 to 150 kV, got 151"),
+        (lambda: mph.tube_spectrum(80, angle=95), "angle: expected less than 90 degrees, got 95"),
         (lambda: mph.tube_spectrum(80, {"Al": -1}), "filters: Al: expected 0 or more mm, got -1"),
         (lambda: mph.tube_spectrum(80, {"cheese": 1}), "filters: material 'cheese': expected one of"),
         (lambda: mph.Spectrum([60, 50], [1, 1]), "spectrum: energies: expected one or more, ascending"),

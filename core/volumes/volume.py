@@ -19,6 +19,8 @@ UNITS = {
     "modules": "1",
     "resolution": "mm",
     "completeness": "1",
+    "dose_rate": "mGy/h",  # absorbed dose (core.xray.dose)
+    "dose": "mGy",
     "backprojection": "images' unit",  # of what views say together (core.perspective.backprojection)
 }
 """The quantities that a volume may hold, and their units."""

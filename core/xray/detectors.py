@@ -1,0 +1,126 @@
+"""What detectors make of photons: counts in energy bins, or energy absorbed."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..arrays import Floats
+from ..errors import InputError, naming
+from ..validation import at_least_0, freeze, positive, real_array
+from .coefficients import attenuations
+
+Bins = Sequence[tuple[float, float]]
+"""Lower and upper energies, keV: ascending, not overlapping. A photon on a bin's lower edge is in it."""
+
+_SIGMA = 1 / math.sqrt(8 * math.log(2))
+"""Standard deviation of a Gaussian of full width at half maximum 1."""
+
+
+class Detector(Protocol):
+    """What a pixel makes of photons."""
+
+    def response(self, energies: Floats, bins: Bins | None) -> Floats:
+        """What a photon of each energy (n,), keV, that hits the pixel adds to each bin: (bins, n)."""
+
+
+@dataclass(frozen=True, eq=False)
+class PhotonCounter:
+    """A detector that counts photons in energy bins; as it is by default, all of them, in the bins of their energies.
+
+    Photons cross the sensor at a right angle. What it absorbs it counts once, at the photon's energy: fluorescence that
+    escapes and charge that neighbors share are for `sharing` to say.
+
+    Attributes
+    ----------
+    material : str or None
+        The sensor's, such as "CdTe" or "silicon"; None stops every photon.
+    thickness : float
+        The sensor's, mm.
+    energy_fwhm : float
+        Full width at half maximum, keV, of the Gaussian that blurs energies; 0 for none.
+    sharing : array (bins, bins) or None
+        Counts in bin i (row) for each photon that would be counted in bin j (column).
+    """
+
+    material: str | None = None
+    thickness: float = 2.0
+    energy_fwhm: float = 0.0
+    sharing: ArrayLike | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "thickness", positive(self.thickness, "detector: thickness", "mm"))
+        object.__setattr__(self, "energy_fwhm", at_least_0(self.energy_fwhm, "detector: energy_fwhm", "keV"))
+        if self.sharing is not None:
+            sharing = freeze(real_array(self.sharing, "detector: sharing", (None, None)))
+            if sharing.min() < 0:
+                raise InputError(f"detector: sharing: expected 0 or more, got {sharing.min():g}")
+            object.__setattr__(self, "sharing", sharing)
+
+    def response(self, energies: Floats, bins: Bins | None) -> Floats:
+        """Counts (bins, n) of a photon of each energy (n,), keV."""
+        if bins is None:
+            raise InputError("bins: a detector that counts photons needs them, such as ((20, 60), (60, 120))")
+        edges = checked_bins(bins)
+        if self.energy_fwhm:
+            deviations = (edges[:, :, None] - energies) / (self.energy_fwhm * _SIGMA * math.sqrt(2))
+            below = np.array([math.erf(x) for x in deviations.flat]).reshape(deviations.shape) / 2
+            counted = below[:, 1] - below[:, 0]
+        else:
+            counted = ((edges[:, :1] <= energies) & (energies < edges[:, 1:])).astype(float)
+        if self.sharing is not None:
+            counted = real_array(self.sharing, "detector: sharing", (len(edges), len(edges))) @ counted
+        return counted * absorbed(self.material, self.thickness, energies)
+
+
+@dataclass(frozen=True)
+class EnergyIntegrator:
+    """A panel without bins: its signal is the energy, keV, of the photons that its scintillator absorbs.
+
+    Attributes
+    ----------
+    material : str or None
+        The scintillator's, such as "CsI"; None stops every photon.
+    thickness : float
+        The scintillator's, mm.
+    """
+
+    material: str | None = "CsI"
+    thickness: float = 0.6
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "thickness", positive(self.thickness, "detector: thickness", "mm"))
+
+    def response(self, energies: Floats, bins: Bins | None) -> Floats:
+        """Energy absorbed (1, n), keV, of a photon of each energy (n,), keV."""
+        if bins is not None:
+            raise InputError("bins: a detector that integrates the energy has none: expected None")
+        return (energies * absorbed(self.material, self.thickness, energies))[None]
+
+
+def absorbed(material: str | None, thickness: float, energies: Floats) -> Floats:
+    """Shares (n,) of the photons that `thickness`, mm, of a material stops; None stops all."""
+    if material is None:
+        return np.ones(len(energies))
+    with naming("detector"):
+        return -np.expm1(-thickness * attenuations(material, energies))
+
+
+def checked_bins(bins: Bins) -> Floats:
+    """Bins as an array (bins, 2); `InputError` where one is empty, out of order, or overlaps the next."""
+    edges = real_array(bins, "bins", (None, 2))
+    if not len(edges):
+        raise InputError("bins: expected one or more, got none")
+    for i, (low, high) in enumerate(edges):
+        if not 0 <= low < high:
+            raise InputError(f"bins: bin {i}: expected a lower and a higher energy, keV, got {low:g} and {high:g}")
+        if i and low < edges[i - 1, 1]:
+            raise InputError(
+                f"bins: bins {i - 1} and {i} overlap or are out of order: {low:g} < {edges[i - 1, 1]:g} keV"
+            )
+    return edges

@@ -1,0 +1,213 @@
+"""Counts of a spectrum behind materials, and their derivatives by the materials' paths."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..arrays import Array, Floats
+from ..errors import InputError
+from ..geometry.views import Views
+from ..physics.ct_numbers import CT_ENERGY
+from ..projector import Projector
+from ..validation import freeze, instance, real_array
+from ..volumes.volume import Volume, require_quantity
+from .coefficients import attenuations
+from .detectors import Bins, Detector, PhotonCounter
+from .spectra import Spectrum
+
+_BINS = ((20.0, 60.0), (60.0, 120.0))
+_RAYS = 8192  # computed at once
+_METER = 1000.0  # mm
+
+
+class HasViews(Protocol):
+    """A scanner, whose views are asked for."""
+
+    def views(self) -> Views:
+        """Its views."""
+
+
+class SpectralTransmission:
+    """Expected counts of X rays of many energies behind materials: ``sum over E of photons response exp(-sum mu path)``.
+
+    Parameters
+    ----------
+    views
+        `Views`, or a scanner that has them: counts are of their pixels, whose areas and distances they give. None for
+        single rays: counts are then those of 1 mm^2 at 1 m.
+    spectrum
+        The photons, such as a `tube_spectrum`, or its `coarser` form, which is quicker.
+    materials
+        Names of `MATERIALS`, or elements such as "Cu".
+    bins
+        Lower and upper energies, keV; None for an `EnergyIntegrator`, whose one signal then stands for counts.
+    detector
+        A `PhotonCounter` or `EnergyIntegrator`. By default every photon is counted in the bin of its energy.
+
+    Attributes
+    ----------
+    weights : array (bins, n)
+        What the photons of each energy add to each bin where nothing attenuates, of 1 mm^2 at 1 m and 1 mAs.
+    mu : array (materials, n)
+        Attenuation coefficients, 1/mm.
+
+    Raises
+    ------
+    InputError
+        No such material, bins that overlap or that no photon reaches, parallel views.
+    """
+
+    def __init__(
+        self,
+        views: Views | HasViews | None,
+        spectrum: Spectrum,
+        materials: Sequence[str] = ("water", "bone"),
+        bins: Bins | None = _BINS,
+        detector: Detector | None = None,
+    ) -> None:
+        instance(spectrum, Spectrum, "spectrum")
+        self.views = views if views is None or isinstance(views, Views) else _views_of(views)
+        self.spectrum = spectrum
+        self.materials = (materials,) if isinstance(materials, str) else tuple(materials)
+        if not self.materials or len(set(self.materials)) < len(self.materials):
+            raise InputError(f"materials: expected one or more, each once, got {', '.join(self.materials) or 'none'}")
+        self.bins = bins
+        self.detector = PhotonCounter() if detector is None else detector
+        weights = self.detector.response(spectrum.energies, bins) * spectrum.photons
+        for i, row in enumerate(weights):
+            if not row.any():
+                raise InputError(f"bins: no photon reaches bin {i}: expected energies of the spectrum")
+        self.weights = freeze(weights)
+        self.mu = freeze(np.array([attenuations(name, spectrum.energies) for name in self.materials]))
+        self._pixels = None if self.views is None else _pixels(self.views)
+
+    def expected(self, paths: ArrayLike, mAs: ArrayLike) -> Floats:
+        """Expected counts (bins, ...) of rays with `paths` (materials, ...), mm of each material at its own density.
+
+        With views the paths are (materials, M, n_v, n_u), and `mAs` is a number or one for each view (M,).
+        """
+        given, scale = self._checked(paths, mAs)
+        return self._sums(given, self.weights) * scale
+
+    def jacobian(self, paths: ArrayLike, mAs: ArrayLike) -> Floats:
+        """Derivatives (bins, materials, ...) of the expected counts by the paths, counts per mm."""
+        given, scale = self._checked(paths, mAs)
+        sums = self._sums(given, self._slopes())
+        return sums.reshape(len(self.weights), *given.shape) * scale
+
+    def gradient(self, paths: ArrayLike, values: ArrayLike, mAs: ArrayLike) -> Floats:
+        """The adjoint of the `jacobian` of `values` (bins, ...): (materials, ...)."""
+        jacobian = self.jacobian(paths, mAs)
+        values = real_array(values, "values", (len(self.weights), *jacobian.shape[2:]))
+        return np.einsum("bm...,b...->m...", jacobian, values)
+
+    def fisher(self, paths: ArrayLike, mAs: ArrayLike) -> Floats:
+        """Fisher's information (materials, materials, ...) of Poisson counts on the paths, 1/mm^2.
+
+        Its inverse is the least covariance of unbiased estimates of the paths.
+        """
+        jacobian = self.jacobian(paths, mAs)
+        return np.einsum("bi...,bj...->ij...", jacobian, jacobian / self.expected(paths, mAs)[:, None])
+
+    def project(self, volumes: Sequence[Volume | Array] | Array, A: Projector, mAs: ArrayLike) -> Floats:
+        """Expected counts (bins, M, n_v, n_u) of material volumes, each relative to its material's own density.
+
+        `A` is the `Projector` of the volumes' grid into these views; its line integrals of the volumes are the paths.
+        """
+        return self.expected(self._paths(volumes, A), mAs)
+
+    def volume_gradient(
+        self, volumes: Sequence[Volume | Array] | Array, values: ArrayLike, A: Projector, mAs: ArrayLike
+    ) -> Array:
+        """The adjoint of the derivative of `project` by the volumes, of `values` (bins, M, n_v, n_u): (materials, *grid)."""
+        paths = self.gradient(self._paths(volumes, A), values, mAs)
+        return np.stack([A.T(path) for path in paths])
+
+    def scale(self, shape: tuple[int, ...], mAs: ArrayLike) -> Floats:
+        """What turns `weights` into the counts of rays of a `shape`: mAs, and pixels' areas and distances."""
+        exposure = real_array(mAs, "mAs", None)
+        if exposure.size and exposure.min() <= 0:
+            raise InputError(f"mAs: expected more than 0, got {exposure.min():g}")
+        if self._pixels is None:
+            if exposure.ndim:
+                raise InputError("mAs: expected one number where there are no views")
+            return np.full(shape, float(exposure))
+        if shape != self._pixels.shape:
+            raise InputError(f"rays: expected those of the views, {self._pixels.shape}, got {shape}")
+        if exposure.ndim and exposure.shape != (len(self._pixels),):
+            raise InputError(f"mAs: expected one number, or {len(self._pixels)}, one for each view")
+        return self._pixels * exposure.reshape(-1, 1, 1)
+
+    def model(self, paths: Floats, scale: Floats) -> tuple[Floats, Floats]:
+        """Counts (bins, N) and their derivatives (bins, materials, N) of N rays."""
+        n = len(self.weights)
+        sums = self._sums(paths, np.concatenate([self.weights, self._slopes()])) * scale
+        return sums[:n], sums[n:].reshape(n, *paths.shape)
+
+    def _slopes(self) -> Floats:
+        """Weights (bins * materials, n) of the derivatives."""
+        slopes = -self.weights[:, None] * self.mu
+        return slopes.reshape(-1, self.mu.shape[1])
+
+    def _sums(self, paths: Floats, weights: Floats) -> Floats:
+        """Sums over the energies, of each row of `weights` times what the paths let pass: (rows, ...)."""
+        rays = paths.reshape(len(paths), -1)
+        sums = np.empty((len(weights), rays.shape[1]))
+        for start in range(0, rays.shape[1], _RAYS):
+            part = slice(start, start + _RAYS)
+            sums[:, part] = weights @ np.exp(-(self.mu.T @ rays[:, part]))
+        return sums.reshape(len(weights), *paths.shape[1:])
+
+    def _checked(self, paths: ArrayLike, mAs: ArrayLike) -> tuple[Floats, Floats]:
+        given = real_array(paths, "paths", None)
+        if not given.ndim or len(given) != len(self.materials):
+            expected = f"first axis of {len(self.materials)}, {', '.join(self.materials)}"
+            raise InputError(f"paths: expected a {expected}; got shape {given.shape}")
+        return given, self.scale(given.shape[1:], mAs)
+
+    def _paths(self, volumes: Sequence[Volume | Array] | Array, A: Projector) -> Floats:
+        if len(volumes) != len(self.materials):
+            raise InputError(
+                f"volumes: expected {len(self.materials)}, {', '.join(self.materials)}; got {len(volumes)}"
+            )
+        arrays = (volume.array if isinstance(volume, Volume) else volume for volume in volumes)
+        return np.stack([np.asarray(A(array), np.float64) for array in arrays])
+
+
+def _views_of(scanner: HasViews) -> Views:
+    if not callable(getattr(scanner, "views", None)):
+        raise InputError(f"views: expected Views, a scanner or None, got {type(scanner).__name__}")
+    return scanner.views()
+
+
+def _pixels(views: Views) -> Floats:
+    """Photons (M, n_v, n_u) through each pixel for one per mm^2 at 1 m: its solid angle in units of 1 mm^2 at 1 m."""
+    views.require_pinholes("spectral transmission")
+    areas = np.cross(views.u_steps, views.v_steps)
+    pixels = np.empty((len(views), *views.shape))
+    for m, area in enumerate(areas):
+        sources, targets = views.rays(m)
+        rays = targets - sources
+        pixels[m] = (np.abs(rays @ area) * _METER**2 / np.linalg.norm(rays, axis=1) ** 3).reshape(views.shape)
+    return pixels
+
+
+def water_and_bone(ct: Volume) -> Floats:
+    """Water and cortical bone, relative to their own densities, from CT numbers: (2, n_x, n_y, n_z).
+
+    They attenuate as `hu_to_mu` says, at every energy, but for air's own coefficient: below 0 HU water thins out, above
+    it is replaced by bone. Denser than bone is bone alone, as dense as the CT number asks for at the CT's energy.
+    """
+    instance(ct, Volume, "water_and_bone")
+    require_quantity(ct.quantity, ("hu",), "water_and_bone")
+    water, bone = (float(attenuations(name, np.array([CT_ENERGY]))[0]) for name in ("water", "bone"))
+    hu = ct.array.astype(np.float64) / 1000
+    share = np.maximum(hu, 0) * water / (bone - water)
+    both = np.stack([1 + np.clip(hu, -1, 0) - share, share])
+    denser = share > 1
+    both[:, denser] = np.stack([0 * hu[denser], (1 + hu[denser]) * water / bone])
+    return both

@@ -11,7 +11,7 @@ Everything imported here is the public interface. Arguments that cannot be used 
 
 import types
 
-from . import events, learning
+from . import design, events, learning
 from .errors import InputError, InputWarning
 from .exchange import read_geometry, write_geometry
 from .geometry.checks import GeometryReport, check_geometry

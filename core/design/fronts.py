@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -13,9 +11,10 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputError
-from ..figures.page import Page
+from ..figures.page import SUFFIXES, Page
 from ..figures.parts import INK, Axes, heading, ticks
 from ..files import AnyPath, require_ending, write_bytes
+from ..geometry.system import PinholeSystem
 from ..physics.performance import resolution, sensitivity
 from ..progress import Progress, part_of
 from ..validation import one_of
@@ -39,33 +38,27 @@ class Front:
 
     def write(self, path: AnyPath) -> None:
         """Write the table (.csv, .json) or the plot (.png, .svg)."""
-        ending = require_ending(path, (".csv", ".json", ".png", ".svg"))
-        if ending == ".json":
-            write_bytes(path, json.dumps(list(self.rows), indent=1).encode())
-        elif ending == ".csv":
-            text = io.StringIO()
-            table = csv.DictWriter(text, list(self.rows[0]))
-            table.writeheader()
-            table.writerows(self.rows)
-            write_bytes(path, text.getvalue().encode())
-        else:
+        ending = require_ending(path, (".csv", ".json", *SUFFIXES))
+        if ending in SUFFIXES:
             self._page().write(path)
+            return
+        lines = [list(self.rows[0]), *(list(row.values()) for row in self.rows)]
+        text = "\n".join(",".join(map(str, line)) for line in lines)
+        write_bytes(path, (json.dumps(self.rows, indent=1) if ending == ".json" else text + "\n").encode())
 
     def _page(self) -> Page:
+        """One column of the table against another, each design with its value of the entry."""
         page = Page(900, 600)
-        em, (xs, ys) = page.em, ([float(row[name]) for row in self.rows] for name in (self.x, self.y))
-        (left, right), (low, high) = ((min(v) - 0.1 * _span(v), max(v) + 0.1 * _span(v)) for v in (xs, ys))
-        top = heading(page, f"{self.y} against {self.x}", [f"each design for one {next(iter(self.rows[0]))}"])
-        axes = Axes(
-            page, (7 * em, top + em, page.width - 10 * em, page.height - top - 6 * em), (left, right), (low, high), em
-        )
-        axes.draw(ticks(left, right, 8), ticks(low, high, 6), below=self.x)
-        order = np.argsort(xs)
-        axes.curve(np.array(xs)[order], np.array(ys)[order], "#2f6fb3", 0.16)
-        for x, y, row in zip(xs, ys, self.rows, strict=True):
-            at = axes.to(x, y)
+        em, rows = page.em, sorted(self.rows, key=lambda row: float(row[self.x]))
+        xs, ys = ([float(row[name]) for row in rows] for name in (self.x, self.y))
+        top = heading(page, f"{self.y} against {self.x}, of designs for {next(iter(rows[0]))}")
+        spans = [(min(v) - 0.1 * _span(v), max(v) + 0.1 * _span(v)) for v in (xs, ys)]
+        axes = Axes(page, (7 * em, top + em, page.width - 10 * em, page.height - top - 6 * em), spans[0], spans[1], em)
+        axes.draw(ticks(*spans[0], 8), ticks(*spans[1], 6), below=self.x)
+        axes.curve(xs, ys, "#2f6fb3", 0.16)
+        for x, y, row in zip(xs, ys, rows, strict=True):
             words = f"{next(iter(row.values())):g}" + ("" if row["passes"] else " fails")
-            page.text(words, at[0] + 0.4 * em, at[1] - 0.4 * em, 0.9 * em, INK)
+            page.text(words, axes.to(x, y)[0] + 0.4 * em, axes.to(x, y)[1] - 0.4 * em, 0.9 * em, INK)
         return page
 
 
@@ -80,28 +73,26 @@ def pareto(recipe: DesignRecipe | AnyPath, progress: Progress | None = None, fol
     if entry is None or not values:
         raise InputError("pareto: expected an entry, such as generator.modules, and its values")
     changed = [recipe.changed(entry, value) for value in values]
-    columns = list(_row(recipe, entry, 0.0, recipe.parameters.build(recipe.parameters.start)))
     for key in ("pareto.x", "pareto.y"):
-        one_of(recipe[key], [*columns, *recipe.names, "passes"], key)
+        one_of(recipe[key], (entry, *_COLUMNS, *recipe.goals), key)
     designs, rows = list[Design](), list[Mapping[str, Any]]()
     for number, (value, own) in enumerate(zip(values, changed, strict=True)):
         state = None if folder is None else Path(folder) / f"design-{number + 1}.json"
         designs.append(found := optimize(own, part_of(progress, number, len(values)), state))
         worth = {name: float(pair[1]) for name, pair in found.values.items()}
-        rows.append({**_row(own, entry, value, found.system), **worth, "passes": found.ok})
+        rows.append({entry: value, **_row(own, found.system), **worth, "passes": found.ok})
     return Front(designs, rows, recipe["pareto.x"], recipe["pareto.y"])
 
 
-def _row(recipe: DesignRecipe, entry: str, value: float, system: Any) -> dict[str, Any]:
+_COLUMNS = ("sensitivity", "resolution", "modules", "crystal area")
+
+
+def _row(recipe: DesignRecipe, system: PinholeSystem) -> dict[str, float]:
     points, optics = ball_points(system.region_radius(), 33), recipe.model(system).optics
-    counts = sensitivity(system, points, optics=optics)
-    squared = np.nan_to_num(resolution(system, points, optics=optics)) ** 2
-    seen = {
-        "sensitivity": 1e6 * counts.sum() / len(points),
-        "resolution": ((counts * squared).sum() / counts.sum()) ** 0.5,
-    }
-    area = float((system.detector_side**2).sum())
-    return {entry: value, **{k: float(v) for k, v in seen.items()}, "modules": len(system), "crystal area": area}
+    counts, blur = (of(system, points, optics=optics) for of in (sensitivity, resolution))
+    fwhm = np.sqrt((counts * np.nan_to_num(blur) ** 2).sum() / counts.sum())
+    numbers = 1e6 * counts.sum() / len(points), fwhm, len(system), (system.detector_side**2).sum()
+    return dict(zip(_COLUMNS, map(float, numbers), strict=True))
 
 
 def _span(values: Sequence[float]) -> float:

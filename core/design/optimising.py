@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -138,7 +139,7 @@ class _Search:
                 continue
             loss = self._loss(coarse, strength)
             if number == len(self._found):
-                x = self._first(number)
+                x = self._drawn(number) if number < self._starts else self._best()
                 self._found.append((loss(x)[0], x.tolist(), 0))
             if (done := self._found[-1][2]) < steps:
                 self._go_on(loss, number, steps - done)
@@ -148,7 +149,7 @@ class _Search:
         """The best until now."""
         values = Loss(self._free, ()).values_at(self._best())
         system = self._free.build(values)
-        wanted = zip(self._recipe.names, self._recipe.wanted(), strict=True)
+        wanted = zip(self._recipe.goals, self._recipe.wanted(), strict=True)
         worth = {name: (objective(self._system)[0], objective(system)[0]) for name, objective in wanted}
         numbers = dict(zip(self._free.names, values.tolist(), strict=True))
         return Design(
@@ -181,29 +182,24 @@ class _Search:
         bounds = [(0.0, 1.0)] * len(x0)
         self._minimize(at, x0, jac=True, method="L-BFGS-B", bounds=bounds, callback=after, options=options)
 
-    def _first(self, number: int) -> Floats:
-        """Where a search begins."""
-        if number >= self._starts:
-            return self._best()
+    def _drawn(self, number: int) -> Floats:
+        """The point that a search begins with: the recipe's, or one at random that is a scanner."""
         x0 = (self._free.start - self._free.low) / (self._free.high - self._free.low)
         draw = np.random.default_rng((self._recipe["search.seed"], number))
-        for _ in range(_TRIES if number else 0):
-            x = draw.random(len(x0))
-            try:
+        for x in draw.random((_TRIES if number else 0, len(x0))):
+            with suppress(InputError):
                 self._free.build(Loss(self._free, ()).values_at(x))
-            except InputError:  # no scanner
-                continue
-            return x
+                return x
         return x0
 
     def _best(self) -> Floats:
         """The point of the last search, or of the first ones the best."""
         those = self._found if len(self._found) <= self._starts else self._found[-1:]
-        return np.array(min(those)[1]) if those else self._first(0)
+        return np.array(min(those)[1]) if those else self._drawn(0)
 
     def _loss(self, coarse: int, strength: float) -> Loss:
         """What a search makes small: each objective is 1 for the start."""
-        wanted, weights = self._recipe.wanted(coarse), [each["weight"] for each in self._recipe.objectives]
+        wanted, weights = self._recipe.wanted(coarse), [goal["weight"] for goal in self._recipe.goals.values()]
         terms: list[tuple[float, Any]] = [(strength, constraint) for constraint in self._recipe.constraints]
         for weight, objective in zip(weights, wanted, strict=True):
             terms.append((-weight / sum(weights) / (abs(objective(self._system)[0]) or 1.0), objective))

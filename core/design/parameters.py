@@ -1,6 +1,5 @@
 """The free numbers of a design, within limits: arguments of what makes its scanner."""
 
-import inspect
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
@@ -50,50 +49,43 @@ def polygon_rings(modules: Any, sides: int, apothem: float, z: Any, *, rotation:
 
 def moved_modules(
     system: PinholeSystem,
-    by: str = "module",
-    length: str = "own",
-    radial: Any = 0.0,
-    along: Any = 0.0,
-    z: Any = 0.0,
-    tilt: Any = (0.0, 0.0, 0.0),
-    diameter: Any = 1.0,
-    lengthening: Any = 1.0,
+    group: Any,
+    length: str,
+    radial: Any,
+    along: Any,
+    z: Any,
+    tilt: Any,
+    diameter: Any,
+    longer: Any,
 ) -> PinholeSystem:
-    """The modules of a system, moved, tilted and with other holes and lengths.
-
-    Parameters
-    ----------
-    system
-        The modules.
-    by
-        What has numbers of its own: each ``"module"``, each ``"ring"``, or the ``"scanner"`` as a whole.
-    length
-        ``"own"``, or ``"formula"``: l follows the design formula.
-    radial, along, z
-        mm by which pinholes move away from the z axis, around it, and along it: one number, or one for each of those.
-    tilt
-        Change of the rotation vector about u, v and k, rad: (3,), or (…, 3).
-    diameter, lengthening
-        Factors of d and of l.
-    """
-    n, group = _groups(system, by)
-    given = (("radial", radial), ("along", along), ("z", z), ("diameter", diameter), ("lengthening", lengthening))
-    out, around, up, wider, longer = (np.broadcast_to(real_array(x, name, None), n)[group] for name, x in given)
+    """The modules of a system, moved, tilted and with other holes and lengths: see `workbook`."""
+    out, around, up, wider, lengthened = (
+        np.broadcast_to(x, group.max() + 1)[group] for x in (radial, along, z, diameter, longer)
+    )
     angle = np.arctan2(system.centers[:, 1], system.centers[:, 0])
     x, y = out * np.cos(angle) - around * np.sin(angle), out * np.sin(angle) + around * np.cos(angle)
     centers, d = system.centers + np.column_stack([x, y, up]), system.pinhole_diameter * wider
-    l = system.collimator_length * longer
+    l = system.collimator_length * lengthened
     if length == "formula":
         l = designed_length(np.linalg.norm(centers, axis=1), d, system.detector_side, system.roi_radius)
-    turned = system.tilt + np.broadcast_to(real_array(tilt, "tilt", None), (n, 3))[group]
+    turned = system.tilt + np.broadcast_to(tilt, (group.max() + 1, 3))[group]
     return replace(system, centers=centers, tilt=turned, pinhole_diameter=d, collimator_length=l, source=None)
 
 
-def _groups(system: PinholeSystem, by: str) -> tuple[int, Any]:
-    """How many things have numbers of their own, and which of them each module (M,) belongs to."""
-    group = {"module": np.arange(len(system)), "ring": system.rings(), "scanner": np.zeros(len(system), np.int64)}
-    one_of(by, group, "generator.by")
-    return int(group[by].max()) + 1, group[by]
+def workbook(system: PinholeSystem, by: str = "module", length: str = "own", **given: Any) -> dict[str, Any]:
+    """Arguments of `moved_modules`, at which the modules of a system are as they are.
+
+    Each ``"module"``, each ``"ring"``, or the ``"scanner"`` as a whole (`by`) has its own. Pinholes move by `radial`,
+    `along` and `z` mm: away from the z axis, around it, and along it. `tilt` is the change of the rotation vector about u, v
+    and k; `diameter` and `longer` are factors of d and of l. With `length` ``"formula"`` l follows the design formula.
+    """
+    one_of(length, ("own", "formula"), "generator.length")
+    groups = {"module": np.arange(len(system)), "ring": system.rings(), "scanner": np.zeros(len(system), np.int64)}
+    one_of(by, groups, "generator.by")
+    n = int(groups[by].max()) + 1
+    still = {name: np.zeros(n) for name in ("radial", "along", "z")}
+    same = {"tilt": np.zeros((n, 3)), "diameter": np.ones(n), "longer": np.ones(n)}
+    return {"system": system, "group": groups[by], "length": length, **still, **same, **given}
 
 
 GENERATORS: Mapping[str, Callable[..., PinholeSystem]] = {
@@ -111,38 +103,29 @@ def parameters(kind: str, given: Mapping[str, Any], free: Mapping[str, Any]) -> 
     `free` has the limits by an argument's name: two numbers for all of its numbers, or two for each of them.
     """
     one_of(kind, GENERATORS, "generator.kind")
-    own, start = inspect.signature(GENERATORS[kind]).parameters, dict(given)
-    known = {**inspect.signature(plate_rings).parameters, **own} if kind == "polygon" else own
-    for name in given:
-        if name not in known:
-            raise InputError(f"generator.{name}: {kind} has no such argument; expected {', '.join(known)}")
-    limits, names = [np.empty((0, 2))], list[str]()
+    names, starts, limits = list[str](), dict[str, Floats](), list[Floats]()
     for name, two in free.items():
-        if kind == "workbook" and name in own and name not in ("system", "by", "length"):
-            n, _ = _groups(start["system"], start.get("by", "module"))
-            whole = start.get(name, own[name].default)
-            start[name] = np.broadcast_to(whole, (n, 3) if name == "tilt" else n)
-        if name not in start:
+        if name not in given:
             raise InputError(f"free.{name}: expected generator.{name}, at which it starts")
-        values, own_limits = real_array(start[name], f"generator.{name}", None), real_array(two, f"free.{name}", None)
-        if own_limits.shape not in ((2,), (*values.shape, 2)):
-            raise InputError(f"free.{name}: expected two limits, or two for each of its {values.size} numbers")
-        start[name] = values
-        names += [f"{name} {i + 1}" for i in range(values.size)] if values.size > 1 else [name]
-        limits.append(np.broadcast_to(own_limits, (*values.shape, 2)).reshape(-1, 2))
-    low, high = np.concatenate(limits).T
+        starts[name] = start = real_array(given[name], f"generator.{name}", None)
+        own = real_array(two, f"free.{name}", None)
+        if own.shape not in ((2,), (*start.shape, 2)):
+            raise InputError(f"free.{name}: expected two limits, or two for each of its {start.size} numbers")
+        names += [f"{name} {i + 1}" for i in range(start.size)] if start.ndim else [name]
+        limits.append(np.broadcast_to(own, (*start.shape, 2)).reshape(-1, 2))
     if not names:
         raise InputError("free: expected the limits of one number or more")
 
     def build(values: Floats) -> PinholeSystem:
-        made, ends = dict(start), np.cumsum([np.size(start[name]) for name in free])
-        for name, part in zip(free, np.split(values, ends[:-1]), strict=True):
-            made[name] = part.reshape(np.shape(start[name]))
+        ends = np.cumsum([start.size for start in starts.values()])
+        parts = zip(starts.items(), np.split(values, ends[:-1]), strict=True)
+        made = {**given, **{name: part.reshape(start.shape) for (name, start), part in parts}}
         made |= {name: np.radians(made[name]) for name in _DEGREES if name in made}
         with naming("generator"):
             try:
                 return GENERATORS[kind](**made)
-            except TypeError as error:  # an argument is missing, which Python names
+            except TypeError as error:  # an argument is missing, or unknown: Python names it
                 raise InputError(str(error).partition("() ")[2]) from None
 
-    return Parameters(tuple(names), np.concatenate([np.ravel(start[name]) for name in free]), low, high, build)
+    low, high = np.concatenate(limits).T
+    return Parameters(tuple(names), np.concatenate([start.ravel() for start in starts.values()]), low, high, build)

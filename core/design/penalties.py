@@ -123,14 +123,17 @@ class Sight(Constraint):
 
 
 class Clearance(Constraint):
-    """No module enters the bore or the body: an elliptic cylinder along z whose semi-axes, mm, are the limit."""
+    """No module enters the bore or the body: an elliptic cylinder along z.
+
+    The limit, mm, is its semi-axes; and x and y of its middle, where that is not the isocentre.
+    """
 
     words = "reaches {:.3g} mm into the bore or the body"
 
     def _short(self, rows: Floats, members: NDArray[np.intp], system: PinholeSystem) -> Floats:
         points = _outline(rows, system.detector_thickness[members[:, 0]])
-        axes = np.broadcast_to(self.limit, 2)
-        return axes.min() * (1 - np.hypot(*(points[..., :2] / axes).transpose(2, 0, 1)))
+        axes, middle = np.broadcast_to(self.limit[:2], 2), self.limit[2:] or (0.0, 0.0)
+        return axes.min() * (1 - np.hypot(*((points[..., :2] - middle) / axes).transpose(2, 0, 1)))
 
 
 class SmallestHole(Constraint):

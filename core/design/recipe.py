@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Mapping
-from copy import deepcopy
-from dataclasses import dataclass, replace
-from functools import cached_property
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +25,7 @@ from ..toml import read_toml
 from ..validation import one_of
 from ..workbook import read_system
 from .objectives import Detail, Lesion, Regions, Sensitivity, ball_points
-from .parameters import Parameters, parameters
+from .parameters import Parameters, parameters, workbook
 from .penalties import Clearance, Constraint, CrystalArea, FieldOfView, Overlap, Sight, SmallestHole
 
 VERSION = 1
@@ -65,8 +64,8 @@ _ROWS = by_key((
     Setting("imaging.pixels", int, 32, "Pixels along each side of a crystal", least=2),
     Setting("constraints.gap", float, 0.5, "Between modules", unit="mm", least=0),
     Setting("constraints.bore", float, None, "Radius of a bore along z that no module enters", unit="mm", above=0),
-    Setting("constraints.body", float, None, "Semi-axes of an elliptic cylinder along z that no module enters", unit="mm",
-            above=0, sizes=(2,)),
+    Setting("constraints.body", float, None, "Semi-axes of an elliptic cylinder along z that no module enters; and x and y "
+            "of its middle, where that is not the isocentre", unit="mm", sizes=(2, 4)),
     Setting("constraints.smallest_hole", float, None, "Diameter", unit="mm", above=0),
     Setting("constraints.crystal_area", float, None, "Of all crystals together, at most", unit="mm2", above=0),
     Setting("search.starts", int, 3, "Starts: that of the recipe, and others at random", least=1),
@@ -88,95 +87,81 @@ _ROWS = by_key((
 _TABLES = tuple(dict.fromkeys(key.partition(".")[0] for key in _ROWS))
 
 
-class _Settings(Values):
-    rows = _ROWS  # type: ignore[assignment]
+class Objective(Values):
+    """The settings of what is wanted."""
 
-
-class _Objective(Values):
     @property
     def rows(self) -> Mapping[str, Setting]:
         """Those of its kind."""
+        one_of(self.given.get("kind"), _OBJECTIVES, "kind")
         weight = Setting("weight", float, 1.0, "Its share, each objective being 1 at the start", above=0)
         return by_key((Setting("kind", str, None, "What is wanted"), weight, *_OBJECTIVES[self.given["kind"]]))
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for key in ("resolution", "size", "body", "parts"):
+            if key in self.rows:
+                required(self[key], key, f"expected {self.rows[key].text}")
+
 
 @dataclass(frozen=True)
-class DesignRecipe:
-    """A design that is wanted; `InputError` names the entry that cannot be understood.
+class DesignRecipe(Values):
+    """A design that is wanted: values of settings by their keys, such as "search.starts", and three tables.
 
-    Parameters
-    ----------
-    values
-        The recipe's tables.
-    folder
-        The paths in the recipe are relative to it.
+    Made by `design_recipe` or `read_design_recipe`; `InputError` names the entry that cannot be understood.
     """
 
-    values: Mapping[str, Any]
+    generator: Mapping[str, Any] = field(default_factory=dict)
+    free: Mapping[str, Any] = field(default_factory=dict)
+    objectives: Sequence[Mapping[str, Any]] = ()
     folder: Path = Path()
 
+    rows = _ROWS  # type: ignore[assignment]
+
     def __post_init__(self) -> None:
-        known = ("version", "generator", "free", "objectives", *_TABLES)
-        if self.values.get("version") != VERSION:
-            raise InputError(f"version: expected {VERSION}, got {self.values.get('version')!r}")
-        for key in self.values:
-            one_of(key, known, "entry")
-        _ = self.settings, self.objectives
-
-    def __getitem__(self, key: str) -> Any:
-        """The value of a setting, such as "search.starts", or its default."""
-        return self.settings[key]
-
-    @cached_property
-    def settings(self) -> Values:
-        """The values of the tables but generator, free and objectives."""
-        return _Settings(flat({name: table(self.values, name) for name in _TABLES}, _ROWS, *_TABLES))
-
-    @cached_property
-    def objectives(self) -> list[Values]:
-        """The settings of what is wanted."""
-        entries = self.values.get("objectives")
-        if not isinstance(entries, list) or not entries or not all(isinstance(entry, dict) for entry in entries):
+        super().__post_init__()
+        if (
+            not isinstance(self.objectives, list)
+            or not self.objectives
+            or not all(isinstance(x, dict) for x in self.objectives)
+        ):
             raise InputError("objectives: expected one [[objectives]] or more")
-        found = list[Values]()
-        for number, entry in enumerate(entries, 1):
-            with naming(f"objectives {number}"):
-                one_of(entry.get("kind"), _OBJECTIVES, "kind")
-                found.append(_Objective(entry))
-                for key in ("resolution", "size", "body", "parts"):
-                    if key in found[-1].rows:
-                        required(found[-1][key], key, f"expected {found[-1].rows[key].text}")
-        return found
+        _ = self.goals
 
-    @property
-    def names(self) -> list[str]:
-        """What tables call the objectives."""
-        return [f"{each['kind']} {number}" for number, each in enumerate(self.objectives, 1)]
+    @cached_property
+    def goals(self) -> dict[str, Objective]:
+        """The settings of what is wanted, by the names that tables call it."""
+        found = {}
+        for number, entry in enumerate(self.objectives, 1):
+            with naming(f"objectives {number}"):
+                found[f"{entry.get('kind')} {number}"] = Objective(entry)
+        return found
 
     @cached_property
     def parameters(self) -> Parameters:
         """The free numbers, and the scanner that they make."""
-        given = dict(table(self.values, "generator"))
-        kind, file, modules = (given.pop(name, None) for name in ("kind", "file", "modules"))
+        given = dict(self.generator)
+        kind = given.pop("kind", "ellipse")
         if kind == "workbook":
-            file = required(file, "generator.file", "name the geometry workbook")
-            given["system"] = chosen_modules(read_system(self.folder / file), modules, "generator.modules")
-        elif modules is not None:
-            given["modules"] = modules
-        return parameters(kind or "ellipse", given, table(self.values, "free"))
+            file, modules = (
+                required(given.pop("file", None), "generator.file", "name the workbook"),
+                given.pop("modules", None),
+            )
+            given = workbook(chosen_modules(read_system(self.folder / file), modules, "generator.modules"), **given)
+        return parameters(kind, given, self.free)
 
     @property
     def constraints(self) -> list[Constraint]:
         """What must hold."""
-        area = self["constraints.crystal_area"]
-        limits = ((Clearance, self["constraints.bore"]), (Clearance, self["constraints.body"]),
+        bore, area = self["constraints.bore"], self["constraints.crystal_area"]
+        limits = ((Clearance, bore and (bore, bore)), (Clearance, self["constraints.body"]),
                   (SmallestHole, self["constraints.smallest_hole"]), (CrystalArea, area and area**0.5))  # fmt: skip
         always = [FieldOfView(margin=0.0), Overlap(margin=self["constraints.gap"]), Sight()]
         return [*always, *(kind(limit) for kind, limit in limits if limit is not None)]
 
     def model(self, system: PinholeSystem) -> Emission:
         """How a scanner counts."""
-        own = {key: value for key, value in self.settings.given.items() if key.startswith("model.")}
+        own = {key: value for key, value in self.given.items() if key.startswith("model.")}
         return recipe_model(Recipe({"model.kind": "emission", "model.hole": "depth", **own}), system)  # type: ignore[return-value]
 
     def grid(self, coarse: int = 1) -> Grid:
@@ -198,15 +183,13 @@ class DesignRecipe:
 
     def wanted(self, coarse: int = 1) -> list[Any]:
         """The objectives as functions of a system, with voxels and pixels so many times as large."""
-        return [self._wanted(own, own["kind"], coarse) for own in self.objectives]
+        return [self._wanted(own, own["kind"], coarse) for own in self.goals.values()]
 
-    def _wanted(self, own: Values, kind: str, coarse: int) -> Any:
+    def _wanted(self, own: Objective, kind: str, coarse: int) -> Any:
         if kind in ("lesion", "regions"):
             bodies = [volume for body in own["body"] for volume in self.volumes(body, coarse=coarse)]
-            parts = self.volumes(own["parts"], True, coarse)
-            return (Lesion if kind == "lesion" else Regions)(
-                lambda system: self.projector(system, coarse), bodies, parts, own["worst"]
-            )
+            images, parts = partial(self.projector, coarse=coarse), self.volumes(own["parts"], True, coarse)
+            return (Lesion if kind == "lesion" else Regions)(images, bodies, parts, own["worst"])
         start, radius = self.parameters.build(self.parameters.start), own["radius"]
         points = ball_points(start.region_radius() if radius is None else radius, own["points"])
         if kind == "sensitivity":
@@ -215,23 +198,36 @@ class DesignRecipe:
 
     def changed(self, entry: str, value: float) -> DesignRecipe:
         """The recipe with another number in an entry TABLE.NAME; of objectives in all that have it."""
-        values, (first, _, name) = deepcopy(dict(self.values)), entry.partition(".")
-        here = values.get(first)
-        places = [p for p in (here if isinstance(here, list) else [here]) if isinstance(p, dict) and name in p]
-        if not places:
+        first, _, name = entry.partition(".")
+        number = int(value) if float(value).is_integer() else value
+        if entry in self.rows:
+            return replace(self, given={**self.given, entry: number})
+        if first == "generator" and name in self.generator:
+            return replace(self, generator={**self.generator, name: number})
+        if first != "objectives" or not any(name in goal for goal in self.objectives):
             raise InputError(f"pareto.entry: expected one of the recipe, such as generator.modules, got {entry!r}")
-        for place in places:
-            place[name] = int(value) if isinstance(place[name], int) and float(value).is_integer() else value
-        return replace(self, values=values)
+        return replace(self, objectives=[{**goal, name: number} if name in goal else goal for goal in self.objectives])
 
     @property
     def fingerprint(self) -> str:
         """SHA-256 of all that decides over the design."""
-        told = {key: value for key, value in self.values.items() if key not in ("pareto", "evaluation")}
-        return hashlib.sha256(repr(sorted(told.items())).encode()).hexdigest()
+        own = sorted(
+            (key, value) for key, value in self.given.items() if not key.startswith(("pareto.", "evaluation."))
+        )
+        return hashlib.sha256(repr((own, self.generator, self.free, self.objectives)).encode()).hexdigest()
+
+
+def design_recipe(values: Mapping[str, Any], folder: Path = Path()) -> DesignRecipe:
+    """The recipe of a design in tables, as TOML gives them; paths in it are relative to `folder`."""
+    rest, own = dict(values), {name: table(values, name) for name in ("generator", "free")}
+    if rest.pop("version", None) != VERSION:
+        raise InputError(f"version: expected {VERSION}, got {values.get('version')!r}")
+    objectives = rest.pop("objectives", [])
+    settings = flat({name: value for name, value in rest.items() if name not in own}, _ROWS, *_TABLES)
+    return DesignRecipe(settings, **own, objectives=objectives, folder=folder)
 
 
 def read_design_recipe(path: str | os.PathLike[str]) -> DesignRecipe:
     """The recipe of a design in a TOML file; paths in it are relative to its folder. `InputError` names the entry."""
     with naming(path):
-        return DesignRecipe(read_toml(path), Path(path).absolute().parent)
+        return design_recipe(read_toml(path), Path(path).absolute().parent)

@@ -6,7 +6,7 @@ from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
-from mphdrr.core.design import DesignRecipe
+from mphdrr.core.design.recipe import DesignRecipe, design_recipe
 
 BODY = '[[shape]]\nkind = "sphere"\nradius = 20\nactivity = 50\n'
 PARTS = (
@@ -34,4 +34,4 @@ RECIPE: dict[str, Any] = {
 
 def small_design(folder: Path = Path(), **tables: Any) -> DesignRecipe:
     """The recipe with other tables."""
-    return DesignRecipe({**deepcopy(RECIPE), **tables}, folder)
+    return design_recipe({**deepcopy(RECIPE), **tables}, folder)

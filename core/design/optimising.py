@@ -152,9 +152,8 @@ class _Search:
         wanted = zip(self._recipe.goals, self._recipe.wanted(), strict=True)
         worth = {name: (objective(self._system)[0], objective(system)[0]) for name, objective in wanted}
         numbers = dict(zip(self._free.names, values.tolist(), strict=True))
-        return Design(
-            system, self._system, np.array(self._merits), numbers, worth, faults(system, self._recipe.constraints)
-        )
+        wrong = faults(system, self._recipe.constraints)
+        return Design(system, self._system, np.array(self._merits), numbers, worth, wrong)
 
     def _go_on(self, loss: Loss, number: int, steps: int) -> None:
         good = x0 = np.array(self._found[-1][1])

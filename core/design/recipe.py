@@ -47,18 +47,9 @@ _OBJECTIVES: Mapping[str, tuple[Setting, ...]] = {
     "regions": _BODIES,
 }  # fmt: skip
 """The kinds of objectives, and their settings."""
-_OPTICS = (
-    "time",
-    "isotope",
-    "window",
-    "aperture_mu",
-    "opening_angle_degrees",
-    "crystal_mu",
-    "intrinsic_fwhm",
-    "background",
-)
+_OPTICS = "time isotope window aperture_mu opening_angle_degrees crystal_mu intrinsic_fwhm background"
 _ROWS = by_key((
-    *(like(f"model.{name}", f"model.{name}") for name in _OPTICS),
+    *(like(f"model.{name}", f"model.{name}") for name in _OPTICS.split()),
     Setting("imaging.voxels", int, 32, "Voxels along x, y and z", least=1),
     Setting("imaging.spacing", float, 5.0, "Voxel size", unit="mm", above=0),
     Setting("imaging.pixels", int, 32, "Pixels along each side of a crystal", least=2),
@@ -120,11 +111,8 @@ class DesignRecipe(Values):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if (
-            not isinstance(self.objectives, list)
-            or not self.objectives
-            or not all(isinstance(x, dict) for x in self.objectives)
-        ):
+        are_tables = isinstance(self.objectives, list) and all(isinstance(entry, dict) for entry in self.objectives)
+        if not are_tables or not self.objectives:
             raise InputError("objectives: expected one [[objectives]] or more")
         _ = self.goals
 

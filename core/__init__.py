@@ -54,7 +54,16 @@ from .physics.optics import Optics
 from .physics.performance import ModulePerformance, isocentre_performance, magnification, resolution, seen, sensitivity
 from .physics.sampling import sampling_gaps
 from .progress import Cancelled, Progress
-from .projector import Emission, InverseSquareSum, Projector, Transmission, intensity, trace_rays
+from .projector import (
+    Emission,
+    GeometryGradient,
+    InverseSquareSum,
+    Projector,
+    Transmission,
+    geometry_gradient,
+    intensity,
+    trace_rays,
+)
 from .reconstruction.adapters import deepinv_physics, parallelproj_operator, pytomography_matrix, scipy_operator
 from .reconstruction.bsrem import bsrem
 from .reconstruction.expectation import mlem, osem

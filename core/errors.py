@@ -64,6 +64,27 @@ def reading(name: object, kind: str) -> Iterator[None]:
             raise InputError(f"cannot be read as {kind} ({first_line(error)})") from error
 
 
+@contextmanager
+def needing(what: str = "", of: str = "") -> Iterator[None]:
+    """Make the failed import of a package an input error that says how to install it, or `what` has it, such as an extra.
+
+    Before it the error names what the package is needed by, if that is said.
+    """
+    try:
+        yield
+    except ImportError as error:
+        package = (error.name or what).partition(".")[0]
+        found = f"{package} is missing: {installing(what or package)}"
+        raise InputError(f"{of}: {found}" if of else found) from None
+
+
+def installing(what: str) -> str:
+    """How to install packages: pip's command, or where it is told how they come into Blender's own Python."""
+    if __name__.startswith("bl_ext."):  # an extension's name
+        return 'see "Packages that Blender does not bring" in docs/first-steps.md'
+    return f'pip install "{what}"' if "[" in what else f"pip install {what}"
+
+
 def first_line(error: BaseException) -> str:
     """A library's error message, as one line."""
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]

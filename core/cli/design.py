@@ -6,10 +6,9 @@ from ..design.evaluating import evaluate
 from ..design.fronts import pareto
 from ..design.optimising import Design, optimize
 from ..design.recipe import TEMPLATE, read_design_recipe
-from ..errors import InputError
 from ..files import read_text, write_bytes
 from ..workbook import write_system
-from .options import add_command, add_run, output_path, print_answer, progress_bar, say
+from .options import add_command, add_run, new_recipe_path, output_path, print_answer, progress_bar, say
 
 
 def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
@@ -39,9 +38,7 @@ def _new(arguments: argparse.Namespace) -> None:
     if arguments.output is None:
         print(text, end="")
         return
-    path = output_path(arguments.output, (".toml",))
-    if path.exists():  # recipes are edited by hand
-        raise InputError(f"{path}: it exists; choose another name, or remove it first")
+    path = new_recipe_path(arguments.output)
     write_bytes(path, text.encode())
     print(f"{path}: edit it, then: mphdrr design optimize {path} -o scanner.xlsx")
 

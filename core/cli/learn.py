@@ -4,13 +4,13 @@ import argparse
 
 from .. import learning
 from ..errors import InputError
-from ..files import replacing
+from ..files import write_bytes
 from ..learning.judging.judge import judge
 from ..learning.judging.recipe import read_judge_recipe
 from ..learning.networks import NETWORKS
 from ..learning.recipe import template_text
 from ..progress import Progress
-from .options import add_command, add_run, output_path, progress_bar, say
+from .options import add_command, add_run, new_recipe_path, output_path, progress_bar, say
 
 
 def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
@@ -21,22 +21,20 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     new = add_run(actions, "new", _new)
     names = "\n".join(f"  {name:<13}{kind.label}: {kind.text}" for name, kind in NETWORKS.items())
     new.epilog = f"networks:\n{names}\n{new.epilog}"
-    text = "network to begin with; see the list below"
-    new.add_argument("--like", choices=tuple(NETWORKS), default="after-osem", metavar="NAME", help=text)
+    new.add_argument("--like", choices=tuple(NETWORKS), default="after-osem", metavar="NAME", help="one of those below")
     new.add_argument("-o", "--output", metavar="FILE", help="a new file (.toml); default: standard output")
     train = add_run(actions, "train", _train)
     train.add_argument("recipe", metavar="RECIPE", help="recipe of the training (.toml)")
     text = "the model file (.pt); samples and checkpoints are kept beside it"
     train.add_argument("-o", "--output", metavar="MODEL", required=True, help=text)
     train.add_argument("--workers", type=int, default=1, metavar="N", help="processes that prepare samples")
-    train.add_argument("--quiet", action="store_true", help="say nothing on standard error but warnings")
     judge = add_run(actions, "judge", _judge)
     judge.add_argument("recipe", metavar="RECIPE", help="recipe of the judge (.toml): tests, baselines and models")
     text = "for the table, the picture and the scores that are kept"
     judge.add_argument("-o", "--output", metavar="FOLDER", required=True, help=text)
-    text = "also write its rows of the table into each model's file"
-    judge.add_argument("--into-models", action="store_true", help=text)
-    judge.add_argument("--quiet", action="store_true", help="say nothing on standard error but warnings")
+    judge.add_argument("--into-models", action="store_true", help="also write its rows into each model's file")
+    for long in (train, judge):
+        long.add_argument("--quiet", action="store_true", help="say nothing on standard error but warnings")
 
 
 def _new(arguments: argparse.Namespace) -> None:
@@ -48,11 +46,8 @@ def _new(arguments: argparse.Namespace) -> None:
     if arguments.output is None:
         print(text, end="")
         return
-    path = output_path(arguments.output, (".toml",))
-    if path.exists():  # recipes are edited by hand
-        raise InputError(f"{path}: it exists; choose another name, or remove it first")
-    with replacing(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+    path = new_recipe_path(arguments.output)
+    write_bytes(path, text.encode())
     print(f"{path}: edit it, then: mphdrr learn train {path} -o model.pt")
 
 

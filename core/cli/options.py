@@ -129,6 +129,14 @@ def output_path(text: str, suffixes: tuple[str, ...] = ()) -> Path:
     return path
 
 
+def new_recipe_path(text: str) -> Path:
+    """`output_path` of a recipe (.toml) to begin with; one that is there was edited by hand, and is not overwritten."""
+    path = output_path(text, (".toml",))
+    if path.exists():
+        raise InputError(f"{path}: it exists; choose another name, or remove it first")
+    return path
+
+
 def numbered_path(path: Path, number: int, count: int) -> Path:
     """The name of one of `count` files: train-007.nii.gz for train.nii.gz, or `path` itself where it is the only one."""
     if count == 1:

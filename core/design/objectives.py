@@ -16,7 +16,7 @@ from ..arrays import Array, Floats
 from ..errors import InputError
 from ..geometry.system import PinholeSystem
 from ..physics.performance import Modules, resolution, sensitivity
-from ..projector import Emission, Projector
+from ..projector import Emission, Projector, geometry_gradient
 from .numbers import differences, parts_of, row_gradient, rows_of
 from .solvers import scipy_module
 
@@ -123,10 +123,8 @@ class _OfImages:
         inverse = [np.divide(1.0, body, out=np.zeros_like(body), where=body > 1e-12 * body.max()) for body in bodies]
         parts = np.stack([np.asarray(A(part), np.float64) for part in self.parts])
         value, weights_of_parts, weights_of_bodies = self._told(parts, inverse)
-        volumes = [*self.parts, *self.bodies]
-        found = [
-            A.geometry_gradient(v, w) for v, w in zip(volumes, [*weights_of_parts, *weights_of_bodies], strict=True)
-        ]  # type: ignore[attr-defined]
+        pairs = zip((*self.parts, *self.bodies), (*weights_of_parts, *weights_of_bodies), strict=True)
+        found = [geometry_gradient(A, volume, weights) for volume, weights in pairs]
         return value, np.sum([row_gradient(gradient, A.views.shape) for gradient in found], axis=0)
 
     def _told(self, parts: Floats, inverse: list[Floats]) -> tuple[float, list[Floats], list[Floats]]:

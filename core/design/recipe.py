@@ -12,7 +12,7 @@ from typing import Any
 
 from ..arrays import Array
 from ..errors import InputError, naming
-from ..events.entries import by_key, flat, like, required, table
+from ..events.entries import by_key, check_entries, flat, like, required, table
 from ..geometry.grid import Grid
 from ..geometry.system import PinholeSystem, chosen_modules
 from ..phantoms.language import parse_phantom, read_phantom
@@ -208,10 +208,9 @@ class DesignRecipe(Values):
 def design_recipe(values: Mapping[str, Any], folder: Path = Path()) -> DesignRecipe:
     """The recipe of a design in tables, as TOML gives them; paths in it are relative to `folder`."""
     rest, own = dict(values), {name: table(values, name) for name in ("generator", "free")}
-    if rest.pop("version", None) != VERSION:
-        raise InputError(f"version: expected {VERSION}, got {values.get('version')!r}")
+    check_entries(values, VERSION, ("version", *own, "objectives", *_TABLES))
     objectives = rest.pop("objectives", [])
-    settings = flat({name: value for name, value in rest.items() if name not in own}, _ROWS, *_TABLES)
+    settings = flat({name: value for name, value in rest.items() if name not in ("version", *own)}, _ROWS, *_TABLES)
     return DesignRecipe(settings, **own, objectives=objectives, folder=folder)
 
 

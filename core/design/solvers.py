@@ -3,12 +3,10 @@
 from importlib import import_module
 from typing import Any
 
-from ..errors import InputError
+from ..errors import needing
 
 
 def scipy_module(name: str) -> Any:
     """``scipy.<name>``, such as "optimize". Raises InputError where SciPy is missing."""
-    try:
+    with needing("mphdrr[design]"):
         return import_module(f"scipy.{name}")
-    except ModuleNotFoundError:
-        raise InputError('scipy is missing: pip install "mphdrr[design]"') from None

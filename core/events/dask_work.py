@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from ..errors import InputError
+from ..errors import InputError, needing
 from .folders import SetFolder
 from .pool import threads_each
 from .writing import EventWriter, Written
@@ -26,10 +26,8 @@ def in_cluster(target: SetFolder, numbers: Sequence[int], address: str, workers:
     `address` is that of Dask's scheduler, whose workers see the set's folder under the same path, or ``"local"`` for
     `workers` processes of this machine. `InputError` where Dask is missing, the cluster does not answer or a worker refuses.
     """
-    try:
+    with needing("mphdrr[dask]", "--dask"):
         from distributed import Client, KilledWorker, LocalCluster, as_completed
-    except ImportError:
-        raise InputError('--dask needs Dask, which is missing: pip install "mphdrr[dask]"') from None
     with contextlib.ExitStack() as stack:
         where: Any = address
         threads = None  # those of a worker of the cluster

@@ -1,7 +1,7 @@
 """The phantoms of an event recipe: their settings, values and draws."""
 
 import functools
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputError, naming
+from ..geometry.grid import Grid
 from ..phantoms.kinds import KINDS, Kind
 from ..phantoms.settings import setting_names
 from ..phantoms.torso import CardiacTorso
@@ -66,6 +67,25 @@ def required(value: Any, key: str, what: str) -> Any:
     if value is None:
         raise InputError(f"{key}: missing; {what}")
     return value
+
+
+def check_entries(values: Mapping[str, Any], version: int, known: Collection[str]) -> None:
+    """Raise `InputError` where a recipe is of another version of its language, or has what is not `known`."""
+    if "version" not in values:
+        raise InputError(f"version: missing; this mphDRR reads version = {version}")
+    if values["version"] != version or isinstance(values["version"], bool):
+        raise InputError(f"version: expected {version}, got {values['version']!r}; a newer mphDRR may read it")
+    for key in values:
+        if key not in known:
+            raise InputError(f"{key}: no such entry; expected {', '.join(known)}")
+
+
+def grid_of(values: Any, name: str) -> Grid:
+    """The voxels that a table of a recipe says by voxels, spacing and center; `InputError`, which names it, if it cannot."""
+    spacing = required(values[f"{name}.spacing"], f"{name}.spacing", "give the voxel size in mm")
+    with naming(name):
+        voxels = np.broadcast_to(values[f"{name}.voxels"], 3)
+        return Grid.centered(voxels, np.broadcast_to(spacing, 3), values[f"{name}.center"])
 
 
 def _as_earlier(row: Setting, value: Any) -> Any:

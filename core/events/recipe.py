@@ -19,7 +19,19 @@ from ..runs.recipe import Recipe
 from ..runs.settings import Setting, named
 from ..toml import parse_toml, toml_text
 from .draws import Drawn, DrawnValues, check_odds
-from .entries import PhantomEntry, by_key, flat, is_text, like, phantom_entry, plain_name, required, table
+from .entries import (
+    PhantomEntry,
+    by_key,
+    check_entries,
+    flat,
+    grid_of,
+    is_text,
+    like,
+    phantom_entry,
+    plain_name,
+    required,
+    table,
+)
 from .inputs import Input, original_input
 
 VERSION = 1
@@ -99,13 +111,7 @@ class EventRecipe:
     def __post_init__(self) -> None:
         with naming(self.name):
             values = self.values
-            if "version" not in values:
-                raise InputError(f"version: missing; this mphDRR reads version = {VERSION}")
-            if values["version"] != VERSION or isinstance(values["version"], bool):
-                raise InputError(f"version: expected {VERSION}, got {values['version']!r}; a newer mphDRR may read it")
-            for key in values:
-                if key not in _KNOWN:
-                    raise InputError(f"{key}: no such entry; expected {', '.join(_KNOWN)}")
+            check_entries(values, VERSION, _KNOWN)
             _ = self.seed, self.settings, self.system, self.grid, self.phantoms, self.models, self.radon, self.splits
 
     def __getitem__(self, key: str) -> Any:
@@ -143,9 +149,7 @@ class EventRecipe:
     @cached_property
     def grid(self) -> Grid:
         """The voxels of the truth."""
-        spacing = required(self["truth.spacing"], "truth.spacing", "give the voxel size in mm")
-        n_x, n_y, n_z = np.broadcast_to(self["truth.voxels"], 3).tolist()
-        return Grid.centered((n_x, n_y, n_z), np.broadcast_to(spacing, 3), self["truth.center"])
+        return grid_of(self, "truth")
 
     @cached_property
     def phantoms(self) -> tuple[PhantomEntry, ...]:

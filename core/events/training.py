@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Literal
 
-from ..errors import InputError
+from ..errors import InputError, needing
 from ..files import AnyPath
 from ..validation import instance, one_of, positive, seed_number, strict_whole
 from .event_set import EventSet
@@ -89,10 +89,8 @@ def torch_dataset(
     ...     for batch in loader:
     ...         batch["counts"], batch["truth"]  # (4, 80, 256, 256), (4, 256, 256, 256)
     """
-    try:
+    with needing(of="torch_dataset"):
         from .torch_events import TorchEvents
-    except ImportError:
-        raise InputError("torch_dataset: torch is missing: pip install torch") from None
 
     instance(events, EventSet, "torch_dataset")
     arrays = field_shapes(events)

@@ -11,13 +11,11 @@ tensor([[0.7071, 0.0000, 0.0000, 0.7071]])
 import torch
 from torch import Tensor
 
-from ..errors import InputError
+from ..errors import InputError, needing
 from ..validation import one_of, radians
 
-try:
+with needing(of="rotations"):
     import roma
-except ImportError:
-    raise InputError("rotations need roma: pip install roma") from None
 
 SIZES = {
     "axis_angle": 3,

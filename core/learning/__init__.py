@@ -5,11 +5,10 @@ commands and panels can say what is missing. `read_model`, `read_recipe` and `tr
 """
 
 from importlib import import_module
-from pathlib import Path
 from typing import Any
 
-from ..errors import InputError
-from ..reconstruction.methods import METHOD_FILES, Method
+from ..errors import needing
+from ..reconstruction.methods import METHOD_FILES
 
 _PUBLIC = {
     "read_model": "model_file",
@@ -25,19 +24,12 @@ _PUBLIC = {
 def __getattr__(name: str) -> Any:
     if name not in _PUBLIC:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    try:
+    with needing("mphdrr[learning]"):
         return getattr(import_module(f".{_PUBLIC[name]}", __name__), name)
-    except ModuleNotFoundError as error:
-        raise InputError(f'{error.name} is missing: pip install "mphdrr[learning]"') from None
 
 
 def __dir__() -> list[str]:
     return sorted(_PUBLIC)
 
 
-def _network(path: Path) -> Method:
-    found: Method = __getattr__("read_model")(path).method
-    return found
-
-
-METHOD_FILES[".pt"] = _network
+METHOD_FILES[".pt"] = lambda path: __getattr__("read_model")(path).method

@@ -17,7 +17,7 @@ import torch
 from numpy.typing import NDArray
 from torch.utils.data import DataLoader, Dataset
 
-from ..errors import InputError, warn
+from ..errors import InputError, naming, warn
 from ..events.event_set import COUNTED, Event, EventSet
 from ..events.noise_choice import mixed_seed
 from ..files import ensure_folder, remove_leftovers, write_bytes
@@ -54,9 +54,11 @@ class Source:
     @cached_property
     def events(self) -> EventSet:
         """All events of the set."""
-        found = EventSet(self.recipe.path("data.events"))
-        if not len(found):
-            raise InputError(f"data.events: {self.recipe.path('data.events')}: it holds no events")
+        path = self.recipe.path("data.events")
+        with naming("data.events"):
+            found = EventSet(path)
+            if not len(found):
+                raise InputError(f"{path}: it holds no events")
         return found
 
     @cached_property
@@ -64,7 +66,8 @@ class Source:
         """The model whose images are taken."""
         models = {name: model["model.kind"] for name, model in self.events.recipe.models.items()}
         counts = [name for name, kind in models.items() if kind == "emission"]
-        name = self.recipe["data.model"] or (counts[0] if len(counts) == 1 else None)
+        given = self.recipe["data.model"]
+        name = counts[0] if given is None and len(counts) == 1 else given
         if name not in counts:
             raise InputError(f"data.model: expected one of the set's models of counts, {', '.join(counts) or 'none'}")
         if self.events.recipe.models[name]["attenuation.of_phantom"]:
@@ -112,9 +115,10 @@ class Source:
     def draws(self, split: str) -> list[Draw]:
         """The samples of a split; of one for validation each event has one draw."""
         count = 1 if split == self.recipe["data.validation"] else self.recipe["data.draws"]
-        numbers = self.events.split(split).numbers
-        if not numbers:
-            raise InputError(f"data: the split {split!r} of {self.recipe.path('data.events')} holds no events")
+        with naming("data"):
+            numbers = self.events.split(split).numbers
+            if not numbers:
+                raise InputError(f"the split {split!r} of {self.recipe.path('data.events')} holds no events")
         return [(number, draw) for number in numbers for draw in range(count)]
 
     def sample(self, draw: Draw) -> Sample:
@@ -172,9 +176,6 @@ class Samples(Dataset[Sample]):
         record = self.record(index)
         return Sample(*(torch.from_numpy(np.array(record[name])) for name in Sample._fields))
 
-    def __getitems__(self, indices: Sequence[int]) -> list[Sample]:
-        return [self[index] for index in indices]
-
 
 def prepared(
     source: Source, beside: Path, splits: Sequence[str], workers: int = 1, progress: Progress | None = None
@@ -231,8 +232,3 @@ def _check_disk(folder: Path, size: int) -> None:
 
 def _path(folder: Path, draw: Draw) -> Path:
     return folder / f"{draw[0]:06d}-{draw[1]}.npy"
-
-
-def counts_of(samples: Samples) -> NDArray[np.float64]:
-    """The total counts of each sample; nothing else of it is read."""
-    return np.array([samples.record(i)["counts"].sum(dtype=float) for i in range(len(samples))])

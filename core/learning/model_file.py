@@ -7,7 +7,6 @@ texts and numbers in it are read.
 import hashlib
 import io
 import json
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -19,8 +18,8 @@ import torch
 from numpy.typing import ArrayLike
 
 from ..errors import InputError, naming, reading, warn
-from ..files import read_bytes, require_ending, write_bytes
-from ..geometry.grid import Grid
+from ..files import AnyPath, read_bytes, require_ending, write_bytes
+from ..geometry.grid import Grid, same_grid
 from ..progress import Progress, tell
 from ..projector import Projector
 from ..reconstruction.counts import CountData
@@ -62,9 +61,8 @@ class Contents:
     physics: str  # `Setup.physics`
     fixed: Mapping[str, Any]  # the network's arguments that followed from the setup
     counts: Sequence[float]  # fewest and most of a scan that it was trained on
-    trained_on: Mapping[
-        str, Any
-    ]  # events by their recipes' hashes; name of the set, hash, model, levels, number of samples
+    trained_on: Mapping[str, Any]
+    """Events by their recipes' hashes; name of the set, hash, model, levels, number of samples."""
     curve: Sequence[Mapping[str, float]]
     judgement: Mapping[str, Any] | None = None
     versions: Mapping[str, str] = field(default_factory=versions)
@@ -77,10 +75,9 @@ class Contents:
 
     def differing(self, setup: Setup) -> list[str]:
         """Which of `ALLOWED` are others than those that it was trained for."""
-        there, own = setup.A.grid, self.grid
         is_same = {
             "scanner": setup.scanner == self.scanner,
-            "grid": there.shape == own.shape and np.allclose(there.affine, own.affine, rtol=0, atol=1e-6),
+            "grid": same_grid(setup.A.grid, self.grid),
             "physics": _physics(setup.physics) == _physics(self.physics),
         }
         return [name for name in ALLOWED if not is_same[name]]
@@ -90,7 +87,7 @@ def _physics(text: str) -> dict[str, Any]:
     return {name: value for name, value in json.loads(text).items() if name not in _NO_PHYSICS}
 
 
-def write_model(contents: Contents, path: str | os.PathLike[str]) -> None:
+def write_model(contents: Contents, path: AnyPath) -> None:
     """Write a model file, sealed; `InputError` for another ending than .pt, or where it cannot be written."""
     require_ending(path, (".pt",))
     memory = io.BytesIO()
@@ -164,9 +161,9 @@ class TrainedNetwork:
     @cached_property
     def network(self) -> torch.nn.Module:
         """The network itself."""
-        fixed = {key: tuple(v) if isinstance(v, list) else v for key, v in self.contents.fixed.items()}
+        model = NETWORKS[self.recipe["network.kind"]].load()
         with reading(self.path, "weights of this version's network"):
-            network: torch.nn.Module = NETWORKS[self.recipe["network.kind"]].load()(**self.recipe.network, **fixed)
+            network: torch.nn.Module = model(**self.recipe.network, **self.contents.fixed)
             network.load_state_dict(dict(self.contents.weights))
         return network.eval()
 
@@ -276,13 +273,13 @@ class TrainedNetwork:
         return [f"{self.path.name} was trained on {fewest:.3g} to {most:.3g} counts, this scan has {counts:.3g}"]
 
 
-def read_model(path: str | os.PathLike[str]) -> TrainedNetwork:
+def read_model(path: AnyPath) -> TrainedNetwork:
     """The network of a model file; `InputError`, in one line, where the file is damaged or holds anything but data."""
     contents, digest = _read(Path(path))
     return TrainedNetwork(Path(path), digest, contents)
 
 
-def with_judgement(path: str | os.PathLike[str], judgement: Mapping[str, Any]) -> TrainedNetwork:
+def with_judgement(path: AnyPath, judgement: Mapping[str, Any]) -> TrainedNetwork:
     """Write its judge's table, anything JSON can hold, into a model file."""
     write_model(replace(read_model(path).contents, judgement=judgement), path)
     return read_model(path)

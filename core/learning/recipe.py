@@ -10,10 +10,9 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from ..errors import InputError, naming
-from ..events.entries import by_key, flat, like, required
+from ..events.entries import by_key, check_entries, flat, grid_of, like, required
+from ..files import AnyPath
 from ..geometry.grid import Grid
 from ..runs.recipe import Values
 from ..runs.settings import Setting, named
@@ -46,7 +45,7 @@ _ROWS = by_key((
             "random weights", is_path=True),
     Setting("training.steps", int, 3000, "How many steps", least=1),
     Setting("training.batch", int, 1, "Scans in each step, of all devices together", least=1),
-    Setting("training.rate", float, 1.5e-3, "Learning rate, at its largest", above=0),
+    Setting("training.rate", float, 1.5e-3, "Learning rate, at its largest", above=0, most=1),
     Setting("training.seed", int, 0, "Seed of weights, order and noise", least=0, most=2**31 - 1),
     Setting("training.precision", str, None, "Numbers that the network computes in", "bf16-mixed where the processor "
             "multiplies matrices of it, else 32", words=named(("32", "bf16-mixed", "16-mixed"))),
@@ -65,18 +64,14 @@ def network_settings(kind: str) -> Mapping[str, Setting]:
 
     `InputError` where torch or MONAI is missing.
     """
-    found = {}
-    for name, argument in inspect.signature(NETWORKS[kind].load()).parameters.items():
+    network, found, text = NETWORKS[kind].load(), [], f"Of {NETWORKS[kind].label}"
+    for name, argument in inspect.signature(network).parameters.items():
         if argument.kind is argument.KEYWORD_ONLY:
             continue
-        several = isinstance(argument.default, tuple)
-        one = argument.default[0] if several else argument.default
-        sizes = () if several else None
-        least = int(several) if type(one) is int else None  # several are channels of levels, and the like
-        key, text = f"network.{name}", f"Of {NETWORKS[kind].label}"
-        row = Setting(key, type(one), argument.default, text, least=least, sizes=sizes)
-        found[row.key] = row
-    return found
+        one, sizes = (argument.default[0], ()) if isinstance(argument.default, tuple) else (argument.default, None)
+        least = int(name not in network.may_be_0) if type(one) is int else None
+        found.append(Setting(f"network.{name}", type(one), argument.default, text, least=least, sizes=sizes))
+    return by_key(found)
 
 
 @dataclass(frozen=True)
@@ -90,10 +85,10 @@ class TrainingRecipe(Values):
     folder: Path = field(default_factory=Path)
 
     def __post_init__(self) -> None:
-        one_of(self.given.get("network.kind", _KIND), NETWORKS, "network.kind")
+        one_of(_ROWS["network.kind"].checked(self.given.get("network.kind", _KIND)), NETWORKS, "network.kind")
         super().__post_init__()
         required(self["data.events"], "data.events", "name the folder of an event set")
-        required(self["grid.spacing"], "grid.spacing", "give the voxel size in mm")
+        _ = self.grid
         if list(self["osem.after"]) != sorted(set(self["osem.after"])):
             raise InputError(f"osem.after: expected rising numbers, got {list(self['osem.after'])}")
         if self["training.batch"] % self.processes:
@@ -113,8 +108,7 @@ class TrainingRecipe(Values):
     @cached_property
     def grid(self) -> Grid:
         """The voxels of the network's volumes."""
-        n_x, n_y, n_z = np.broadcast_to(self["grid.voxels"], 3).tolist()
-        return Grid.centered((n_x, n_y, n_z), np.broadcast_to(self["grid.spacing"], 3), self["grid.center"])
+        return grid_of(self, "grid")
 
     @property
     def network(self) -> dict[str, Any]:
@@ -137,12 +131,12 @@ def parsed(text: str, name: str = "recipe", folder: Path | None = None) -> Train
     """The recipe in a text in TOML; messages call it `name`, and its paths are relative to `folder`."""
     with naming(name):
         values = parse_toml(text, name)
-        if values.pop("version", None) != VERSION:
-            raise InputError(f"version: expected version = {VERSION}; a newer mphDRR may read others")
+        check_entries(values, VERSION, ("version", *TABLES))
+        del values["version"]
         return TrainingRecipe(flat(values, _ROWS, *TABLES), text, folder or Path())
 
 
-def read_recipe(path: str | os.PathLike[str]) -> TrainingRecipe:
+def read_recipe(path: AnyPath) -> TrainingRecipe:
     """The recipe of a training in a TOML file; paths in it are relative to its folder. `InputError` names the entry."""
     return parsed(toml_text(path), str(path), Path(path).absolute().parent)
 

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ..errors import InputError
+from ..errors import InputError, naming
 from ..perspective.perspective_maps import PerspectiveMaps
 from ..projector import Emission, Projector
 from ..reconstruction.snapshots import Snapshots
@@ -89,7 +89,8 @@ class Setup:
 
     @cached_property
     def _snapshots(self) -> Snapshots:
-        return Snapshots(self.A, self.subsets)
+        with naming("osem"):
+            return Snapshots(self.A, self.subsets)
 
     def sample(
         self, counts: NDArray[np.float32], background: NDArray[np.float32], truth: NDArray[np.float32]

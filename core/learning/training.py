@@ -7,7 +7,6 @@ shares the work among GPUs and nodes, all of which is code that we need not writ
 import json
 import logging
 import math
-import os
 import signal
 import threading
 import time
@@ -22,14 +21,15 @@ import numpy as np
 import torch
 from lightning.pytorch.callbacks import Callback, EMAWeightAveraging, ModelCheckpoint
 from lightning.pytorch.loggers import TensorBoardLogger
+from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from numpy.typing import NDArray
 from torch import Tensor
 from torch.utils.data import DataLoader
 
-from ..errors import InputError, reading
-from ..files import ensure_folder, read_text, write_bytes
+from ..errors import InputError, first_line, naming, reading
+from ..files import AnyPath, ensure_folder, read_text, require_ending, write_bytes
 from ..progress import Progress, Stages
-from .data import Samples, Source, counts_of, prepared
+from .data import Samples, Source, prepared
 from .judging.sets import events_by_recipe, set_fingerprint
 from .model_file import Contents, TrainedNetwork, read_model, write_model
 from .networks import NETWORKS
@@ -38,6 +38,7 @@ from .setup import Sample, Setup
 
 _ON_THE_WAY = 0.3  # weight of estimates before the last
 _ROUNDS, _LONGEST = 20, 200  # rounds of a training, if they are not longer than so many steps
+_LAST = "last.ckpt"
 _VALIDATED = 32  # samples at the end of each round
 
 
@@ -67,7 +68,8 @@ class Trained(pl.LightningModule):
 
     def training_step(self, batch: Sample) -> Tensor:
         """The loss of a batch. Random numbers depend on the step alone, so that a stopped training goes on with the same."""
-        torch.manual_seed(_mixed(self.recipe["training.seed"], self.global_step))
+        random = np.random.SeedSequence((self.recipe["training.seed"], self.global_step))
+        torch.manual_seed(int(random.generate_state(1)[0]))
         estimates = self.network(self.told(), batch)
         self._losses.append(nrmse(estimates[-1].detach()[:, 0].float(), batch.truth))
         loss = loss_of(estimates, batch.truth)
@@ -163,10 +165,7 @@ class _Watch(Callback):
 
 
 def train(
-    recipe: TrainingRecipe,
-    path: str | os.PathLike[str],
-    workers: int = 1,
-    stages: Stages = lambda stage: None,
+    recipe: TrainingRecipe, path: AnyPath, workers: int = 1, stages: Stages = lambda stage: None
 ) -> TrainedNetwork:
     """Train a network, and write its model file.
 
@@ -193,18 +192,18 @@ def train(
         The events cannot be used, or the folder holds a training by another recipe.
     """
     path = Path(path)
-    if path.suffix.lower() != ".pt":
-        raise InputError(f"{path}: expected a name ending in .pt")
+    require_ending(path, (".pt",))
     folder = ensure_folder(path.absolute().with_name(f"{path.stem}-training"))
     source = Source(recipe)
     torch.set_num_threads(recipe["training.threads"] or torch.get_num_threads())
+    network = _begun(recipe, source)  # refused, if it is, before samples are prepared
     splits = recipe["data.train"], recipe["data.validation"]
     samples, validation = prepared(source, folder.parent, splits, workers, stages("preparing"))
     with _quiet():
         precision = _kept_precision(recipe, source, folder)
-        module = Trained(_begun(recipe, source), lambda: source.setup, recipe)
+        module = Trained(network, lambda: source.setup, recipe)
         length = min(_LONGEST, math.ceil(recipe["training.steps"] / _ROUNDS))
-        trainer, last = _trainer(recipe, folder, precision, length, stages("training")), folder / "last.ckpt"
+        trainer, last = _trainer(recipe, folder, precision, length, stages("training")), folder / _LAST
         _fit(trainer, module, _Rounds(samples, validation, recipe, length), last)
     if trainer.is_global_zero:
         write_model(_contents(recipe, source, samples, last), path)
@@ -218,10 +217,11 @@ def _begun(recipe: TrainingRecipe, source: Source) -> torch.nn.Module:
     cls: Any = NETWORKS[recipe["network.kind"]].load()
     network: torch.nn.Module = cls(**recipe.network, **cls.fixed(source.setup))
     if recipe["network.weights_from"] is not None:
-        known, own = read_model(recipe.path("network.weights_from")).contents.weights, network.state_dict()
-        taken = {name: values for name, values in known.items() if name in own and own[name].shape == values.shape}
-        if not taken:
-            raise InputError("network.weights_from: that model has no weights of the same names and shapes")
+        with naming("network.weights_from"):
+            known, own = read_model(recipe.path("network.weights_from")).contents.weights, network.state_dict()
+            taken = {name: values for name, values in known.items() if name in own and own[name].shape == values.shape}
+            if not taken:
+                raise InputError("that model has no weights of the same names and shapes")
         network.load_state_dict(own | taken)
     return network
 
@@ -229,7 +229,7 @@ def _begun(recipe: TrainingRecipe, source: Source) -> torch.nn.Module:
 def _kept_precision(recipe: TrainingRecipe, source: Source, folder: Path) -> str:
     """The numbers that a training computes in, kept in its folder; `InputError` where that is of another recipe."""
     path, known = folder / "plan.json", f"{recipe.fingerprint} {source.fingerprint}"
-    if not path.exists():
+    if not (folder / _LAST).exists():
         write_bytes(path, json.dumps({"recipe": known, "precision": _precision(recipe)}).encode())
     with reading(path, "the plan of a training"):
         plan = json.loads(read_text(path))
@@ -261,29 +261,28 @@ def _trainer(
     """Lightning's trainer of a recipe, whose rounds have so many steps."""
     steps = recipe["training.steps"]
     decay = 1 - 1 / min(max(steps / 50, 1), 1000)  # the mean is over the last steps, at a small rate
-    return pl.Trainer(
-        accelerator={"cuda": "gpu"}.get(_device(recipe).type, "cpu"),
-        devices=recipe["training.devices"],
-        num_nodes=recipe["training.nodes"],
-        strategy=recipe["training.strategy"],
-        precision=precision,
-        max_epochs=math.ceil(steps / length),
-        gradient_clip_val=1.0,
-        num_sanity_val_steps=0,
-        reload_dataloaders_every_n_epochs=1,
-        use_distributed_sampler=False,
-        enable_progress_bar=False,
-        enable_model_summary=False,
-        log_every_n_steps=10,
-        logger=TensorBoardLogger(folder, name="", version="tensorboard"),
-        callbacks=[
-            EMAWeightAveraging(decay=decay),
-            ModelCheckpoint(
-                folder, "last", every_n_epochs=1, save_on_train_epoch_end=True, enable_version_counter=False
-            ),
-            _Watch(folder, steps, progress),
-        ],
-    )
+    checkpoints = ModelCheckpoint(folder, "last", save_on_train_epoch_end=True, enable_version_counter=False)
+    try:
+        return pl.Trainer(
+            accelerator={"cuda": "gpu"}.get(_device(recipe).type, "cpu"),
+            devices=recipe["training.devices"],
+            num_nodes=recipe["training.nodes"],
+            strategy=recipe["training.strategy"],
+            precision=precision,
+            max_epochs=math.ceil(steps / length),
+            gradient_clip_val=1.0,
+            num_sanity_val_steps=0,
+            reload_dataloaders_every_n_epochs=1,
+            use_distributed_sampler=False,
+            enable_progress_bar=False,
+            enable_model_summary=False,
+            log_every_n_steps=10,
+            logger=TensorBoardLogger(folder, name="", version="tensorboard"),
+            callbacks=[EMAWeightAveraging(decay=decay), checkpoints, _Watch(folder, steps, progress)],
+        )
+    except (ImportError, ValueError, MisconfigurationException) as error:
+        keys = "accelerator, devices, nodes, strategy or precision"
+        raise InputError(f"training: Lightning refuses {keys}: {first_line(error)}") from None
 
 
 def _fit(trainer: pl.Trainer, module: Trained, rounds: "_Rounds", last: Path) -> None:
@@ -306,7 +305,8 @@ def _contents(recipe: TrainingRecipe, source: Source, samples: Samples, last: Pa
     """What the model file holds: the mean weights of the last checkpoint, and what it was trained for and on."""
     kept, prefix = torch.load(last, map_location="cpu", weights_only=True), "network."
     weights = {name.removeprefix(prefix): values for name, values in kept["state_dict"].items()}
-    counts, setup, grid = counts_of(samples), source.setup, recipe.grid
+    setup, grid = source.setup, recipe.grid
+    counts = [float(samples.record(i)["counts"].sum(dtype=float)) for i in range(len(samples))]
     seen = source.events.split(recipe["data.train"]) + source.events.split(recipe["data.validation"])
     network: Any = NETWORKS[recipe["network.kind"]].load()
     return Contents(
@@ -317,7 +317,7 @@ def _contents(recipe: TrainingRecipe, source: Source, samples: Samples, last: Pa
         affine=grid.affine.tolist(),
         physics=setup.physics,
         fixed=network.fixed(setup),
-        counts=(float(counts.min()), float(counts.max())),
+        counts=(min(counts), max(counts)),
         trained_on={
             "events": events_by_recipe(seen), "set": set_fingerprint(seen), "samples": source.fingerprint,
             "model": source.model, "levels": list(source.levels), "count": len(samples),
@@ -340,8 +340,3 @@ def _quiet() -> Iterator[None]:
         finally:
             for log, level in zip(logs, levels, strict=True):
                 log.setLevel(level)
-
-
-def _mixed(*numbers: int) -> int:
-    """A seed made of numbers."""
-    return int(np.random.SeedSequence(numbers).generate_state(1)[0])

@@ -14,7 +14,7 @@ from ..progress import Progress, part_of, tell
 from ..projector import backends
 from ..projector.bundles import Beam, Bundle, Bundles
 from ..projector.execution import Execution
-from ..projector.operator import LinearOperator
+from ..projector.linear_operator import LinearOperator
 from ..projector.parallel import thread_count
 from ..projector.rays import Fan
 from ..validation import instance, one_of

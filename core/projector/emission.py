@@ -203,9 +203,7 @@ class Emission(Model):
     def by_rays(self) -> Self:
         """The model for what can only be done with rays; `InputError` with hole "depth"."""
         if self.hole == "depth":
-            raise InputError(
-                "emission: hole 'depth' takes no backend 'cuda' and has no gradients by mu: use hole 'auto'"
-            )
+            raise InputError("emission: hole 'depth' takes no backend 'cuda': use hole 'auto'")
         return replace(self, hole="rays") if self.hole == "auto" else self
 
     def _set(self, name: str, value: Any) -> None:
@@ -305,7 +303,7 @@ class Emission(Model):
         pinhole, rays, scale = views.sources[m], view_rays(views, m), self._crystal_scale(views, m)
         # The pixels' places on the crystal, mm along u and v from its centre, point-inverted.
         middle = scale * (rays.corner - pinhole) - l * k
-        pitch_u, pitch_v = self._crystal_pitch(views, m)
+        pitch_u, pitch_v = self.crystal_pitch(views, m)
         n_v, n_u = views.shape
         along_v = (middle @ v + scale * (rays.row_step @ v) * np.arange(n_v))[:, None]
         along_u = (middle @ u + scale * (rays.column_step @ u) * np.arange(n_u))[None, :]
@@ -376,7 +374,7 @@ class Emission(Model):
         if not np.any(self.intrinsic_fwhm):
             return None
         sigma = self._optics_of(m).intrinsic_fwhm / _FWHM_PER_SIGMA
-        pitch_u, pitch_v = self._crystal_pitch(views, m)
+        pitch_u, pitch_v = self.crystal_pitch(views, m)
         n_v, n_u = views.shape
         return gaussian_blur(n_v, sigma / pitch_v), gaussian_blur(n_u, sigma / pitch_u)
 
@@ -392,7 +390,7 @@ class Emission(Model):
             (opening,) = everywhere.openings(m, 1)
             return everywhere.pixel_weights(m, u, v, (1.0, 1.0), float(self.system.collimator_length[m]), opening)
 
-        of_modules = self.system, self.effective_diameter, sides, weigh
+        of_modules = self._frames, self.system.collimator_length, self.effective_diameter, sides, weigh
         return WholeHoles(views, grid, *of_modules, self.mu, self.hole == "depth")
 
     def caution(self, views: Views, grid: Grid) -> str | None:
@@ -425,7 +423,7 @@ class Emission(Model):
         if self.hole == "point" or self.aperture_points is not None:
             return self.aperture_points or 1
         l, b = self.system.collimator_length[m], self.system.pinhole_distance[m]
-        pitch_u, pitch_v = self._crystal_pitch(views, m)
+        pitch_u, pitch_v = self.crystal_pitch(views, m)
         sigma = self._optics_of(m).intrinsic_fwhm / _FWHM_PER_SIGMA
         voxel = grid.voxel_volume ** (1 / 3) * l / b
         blur = math.hypot(voxel, _BOX_PER_SIGMA * sigma)
@@ -445,7 +443,7 @@ class Emission(Model):
         distance = (views.detector_centers[m] - views.sources[m]) @ self._frames[m, 2]
         return float(self.system.collimator_length[m] / distance)
 
-    def _crystal_pitch(self, views: Views, m: int) -> tuple[float, float]:
+    def crystal_pitch(self, views: Views, m: int) -> tuple[float, float]:
         """Size of a pixel on the crystal, mm along u and v."""
         scale = self._crystal_scale(views, m)
         return scale * float(np.linalg.norm(views.u_steps[m])), scale * float(np.linalg.norm(views.v_steps[m]))

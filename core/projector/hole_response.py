@@ -16,7 +16,6 @@ discs. M. Unser, A. Aldroubi, M. Eden, "B-spline signal processing", IEEE Transa
 821-833: kernels that make up for the spline.
 """
 
-import functools
 import itertools
 import math
 from collections.abc import Callable, Iterator
@@ -26,18 +25,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import Array, Floats32, cropped
+from ..arrays import Array, cropped
 from ..errors import InputError
 from ..geometry.frames import moved
 from ..geometry.grid import Grid
-from ..geometry.system import PinholeSystem
 from ..geometry.views import Views
-from ..physics.crystal import share_inside
 from ..volumes.volume import Volume
 from .depth_response import DepthResponse, Index
+from .hole_zone import Sums, ViewNumbers, Zone
+from .lattices import rounded_up
 from .parallel import in_order, run_all
 from .rays import view_rays
-from .transmittance import mean_transmittance
+from .transmittance import Field, VoxelRays
 
 VoxelBox = tuple[tuple[slice, ...], NDArray[np.bool_]]
 """A box of a grid, and which of its voxels."""
@@ -72,10 +71,12 @@ class WholeHoles:
 
     Parameters
     ----------
-    views, grid, system
-        The views, the volume's grid and the modules.
-    diameters
-        The holes', (M,), mm.
+    views, grid
+        The views, and the volume's grid.
+    frames
+        The modules' u, v and k, (M, 3, 3).
+    lengths, diameters
+        The collimators' and the holes', (M,), mm.
     sides
         Sides of the square on each crystal in which pixels count, (M,), mm.
     weigh
@@ -91,34 +92,35 @@ class WholeHoles:
         self,
         views: Views,
         grid: Grid,
-        system: PinholeSystem,
+        frames: Array,
+        lengths: Array,
         diameters: Array,
         sides: Array,
         weigh: Weigh,
-        mu: Volume | None,
+        mu: Volume | Field | None,
         is_strict: bool,
     ) -> None:
         self.n, self.pixels, self.grid, self.mu = len(views), views.shape, grid, mu
-        self._made: dict[tuple[int, float], DepthResponse] = {}
+        self._made: dict[tuple[int, float, type], DepthResponse] = {}
         self._zones: dict[int, list[tuple[float, float]]] = {}
-        self._parts: dict[tuple[int, Index, Index], list[Part]] = {}
+        self._parts: dict[tuple[int, Index, Index, type], list[Part]] = {}
         self._passing: dict[int, tuple[Index, Array]] = {}
         self._room = _KEPT
-        self._views, self._system, self._diameters, self._frames = views, system, diameters, system.frames()
+        self._views, self._frames, self._lengths, self._diameters = views, frames, lengths, diameters
         self._sides, self._weigh, self._is_strict = sides, weigh, is_strict
 
     def _module(self, m: int) -> tuple[Array, Array, float, float]:
         """Module m's pinhole, mm, its frame u, v, k, the collimator's length and the hole's diameter, mm."""
-        l, d = float(self._system.collimator_length[m]), float(self._diameters[m])
+        l, d = float(self._lengths[m]), float(self._diameters[m])
         return self._views.sources[m], self._frames[m], l, d
 
-    def images(self, volume: Array, functions: ModuleType, workers: int, mu: Volume | None = None) -> Iterator[Array]:
+    def images(self, volume: Array, functions: ModuleType, workers: int, mu: Field | None = None) -> Iterator[Array]:
         """The images of `volume` one by one; `mu` may attenuate in place of the usual."""
         (filled,), origin = cropped(volume)
-        filled = np.ascontiguousarray(filled)
+        filled, kind = np.ascontiguousarray(filled), volume.dtype.type
 
         def image(m: int) -> Array:
-            image, parts = np.zeros(self.pixels, volume.dtype), self._of_part(m, origin, filled.shape)
+            image, parts = np.zeros(self.pixels, volume.dtype), self._of_part(m, origin, filled.shape, kind)
             passes = self._passes(m, origin, filled, mu) if parts else None
             for of, pixels in parts:
                 cells = functions.voxels_to_cells(filled, of, passes)
@@ -133,13 +135,13 @@ class WholeHoles:
         functions: ModuleType,
         workers: int,
         report: Callable[[int], None],
-        mu: Volume | None = None,
+        mu: Field | None = None,
     ) -> Array:
         """The adjoint. Each thread has a slab of the volume, so the result does not depend on their number."""
         volume = np.zeros(self.grid.shape, images.dtype)
         layers = max(1, _SLAB // math.prod(volume.shape[1:]))
         slabs = [slice(x, x + layers) for x in range(0, len(volume), layers)]
-        whole = (0, 0, 0), self.grid.shape
+        whole = (0, 0, 0), self.grid.shape, images.dtype.type
 
         def give(m: int) -> tuple[Array | None, list[tuple[DepthResponse, Array]]]:
             given = [(of, functions.pixels_to_cells(images[m][pixels], of)) for of, pixels in self._of_part(m, *whole)]
@@ -161,46 +163,110 @@ class WholeHoles:
             report(first)
         return volume
 
-    def _of_part(self, m: int, origin: Index, shape: Index) -> list[Part]:
-        """View m's responses to a part of the volume, of the zones that it reaches into, and the pixels that may see it."""
-        found = self._parts.get((m, origin, shape))
+    def gradient(
+        self, volume: Array, images: Array, functions: ModuleType, workers: int
+    ) -> Iterator[tuple[Array, Array, ViewNumbers]]:
+        """Of the sum of `images` times those of `volume`, of one type, the derivatives by each view.
+
+        They are those by the pinhole's place (3,), by the module's frame (3, 3), and by the rest of the view's numbers.
+        """
+        (filled,), origin = cropped(volume)
+        filled, kind, affine = np.ascontiguousarray(filled), volume.dtype.type, self.grid.affine[:3]
+
+        def of_view(m: int) -> tuple[Array, Array, ViewNumbers]:
+            pinhole, frame, *_ = self._module(m)
+            numbers, by_passing = ViewNumbers.zero(), np.zeros_like(filled)
+            center: Array
+            parts = self._of_part(m, origin, filled.shape, kind)
+            passes = self._passes(m, origin, filled, None) if parts else None
+            for (of, pixels), zone in zip(parts, self._reached(m, origin, filled.shape), strict=True):
+                image, cells = np.ascontiguousarray(images[m][pixels]), functions.voxels_to_cells(filled, of, passes)
+                taken = functions.pixels_to_cells(image, of)
+                matrix, line = functions.differentiate_places(filled, taken, of, passes)
+                matrix[:, :3] += np.outer(line, of.line)
+                after = image * functions.cells_to_pixels(cells, of)
+                taps = functions.differentiate_taps(image, cells, of)
+                sums = Sums(matrix, line, (cells * taken).sum(axis=0), after, taps)
+                numbers = numbers.plus(self.make(m, *zone).gradient(of, pixels, origin, sums))
+                if passes is not None:
+                    functions.cells_to_voxels(by_passing, taken, of, None, slice(None))
+            by = numbers.to_camera
+            center, by_frame = -by[:, 3] @ frame, by[:, :3] @ affine[:, :3].T
+            by_frame += np.outer(by[:, 3], affine[:, 3] - pinhole)
+            if passes is not None and self.mu is not None:
+                center = center + self._rays(m, self.mu, origin, filled).gradient(by_passing * filled)
+            return center, by_frame, numbers
+
+        return in_order(of_view, range(self.n), workers)
+
+    def mu_gradient(self, volume: Array, images: Array, functions: ModuleType, workers: int, mu: Field) -> Array:
+        """Of the sum of `images` times those of `volume`, the derivatives by `mu`, on its grid."""
+        (filled,), origin = cropped(volume)
+        filled = np.ascontiguousarray(filled)
+
+        def of_view(m: int) -> Array:
+            by_passing = np.zeros_like(filled)
+            for of, pixels in self._of_part(m, origin, filled.shape, volume.dtype.type):
+                taken = functions.pixels_to_cells(np.ascontiguousarray(images[m][pixels]), of)
+                functions.cells_to_voxels(by_passing, taken, of, None, slice(None))
+            return self._rays(m, mu, origin, filled).mu_gradient(by_passing * filled)
+
+        total = np.zeros(mu.array.shape, volume.dtype)
+        for own in in_order(of_view, range(self.n), workers):
+            total += own
+        return total
+
+    def _of_part(self, m: int, origin: Index, shape: Index, kind: type) -> list[Part]:
+        """View m's responses to a part of the volume, of the zones that it reaches into, and the pixels that may see it.
+
+        Numbers are of this kind, numpy's float32 or float64.
+        """
+        key = m, origin, shape, kind
+        found = self._parts.get(key)
         if found is None:
-            found = self._make_part(m, origin, shape)
+            found = [self._response(m, *zone, kind).of_part(origin, shape) for zone in self._reached(m, origin, shape)]
             if len(self._parts) >= _PARTS_OF_VIEW * self.n:
                 self._parts.clear()
-            self._parts[m, origin, shape] = found
+            self._parts[key] = found
         return found
 
-    def _make_part(self, m: int, origin: Index, shape: Index) -> list[Part]:
+    def _reached(self, m: int, origin: Index, shape: Index) -> list[tuple[float, float]]:
+        """The zones of view m that a part of the volume reaches into."""
         row = self.depths(m)
         depths = [row @ (*np.add(origin, corner), 1) for corner in itertools.product(*((0, n - 1) for n in shape))]
         if m not in self._zones:
             self._zones[m] = self.zones(m)
-        reached = [(far, near) for far, near in self._zones[m] if max(depths) > near and min(depths) <= far]
-        return [self._response(m, far, near).of_part(origin, shape) for far, near in reached]
+        return [(far, near) for far, near in self._zones[m] if max(depths) > near and min(depths) <= far]
 
-    def _response(self, m: int, far: float, near: float) -> DepthResponse:
-        if (m, far) not in self._made:
-            self._made[m, far] = self.make(m, far, near)
-        return self._made[m, far]
+    def _response(self, m: int, far: float, near: float, kind: type) -> DepthResponse:
+        if (m, far, kind) not in self._made:
+            self._made[m, far, kind] = self.make(m, far, near).response(kind)
+        return self._made[m, far, kind]
 
-    def _passes(self, m: int, origin: Index, part: Array, mu: Volume | None) -> Array | None:
+    def _passes(self, m: int, origin: Index, part: Array, mu: Field | None) -> Array | None:
         """What attenuation leaves of the photons from each voxel of a part of the volume."""
         if mu is None and self.mu is None:
             return None
-        grid = self.grid.box(origin, part.shape)
         if mu is not None:
-            return self.transmittance(m, mu, grid).astype(part.dtype, copy=False)
+            return self._rays(m, mu, origin, part).passing
         start, kept = self._passing.get(m, (origin, None))
         first = np.subtract(origin, start)
-        if kept is None or first.min() < 0 or (first + part.shape > kept.shape).any():
+        is_there = kept is not None and kept.dtype == part.dtype and first.min() >= 0
+        if not is_there or (first + part.shape > kept.shape).any():  # type: ignore[union-attr]
             self._room += self._passing.pop(m)[1].nbytes if m in self._passing else 0
-            first, kept = np.zeros(3, int), self.transmittance(m, self.mu, grid)  # type: ignore[arg-type]
+            first, kept = np.zeros(3, int), self._rays(m, self.mu, origin, part).passing  # type: ignore[arg-type]
             if kept.nbytes <= self._room:
                 self._room -= kept.nbytes
                 self._passing[m] = origin, kept
         inside = tuple(slice(a, a + n) for a, n in zip(first.tolist(), part.shape, strict=True))
-        return np.ascontiguousarray(kept[inside], part.dtype)
+        return np.ascontiguousarray(kept[inside])  # type: ignore[index]
+
+    def _rays(self, m: int, mu: Volume | Field, origin: Index, part: Array) -> VoxelRays:
+        """Rays from view m's pinhole through a part of the volume."""
+        _, frame, l, d = self._module(m)
+        margin = d / 2 * (1 / l + 1 / self._limits(m)[1])
+        grid = self.grid.box(origin, part.shape)
+        return VoxelRays(mu, self.grid, grid, self._views, m, frame, margin, part.dtype.type)
 
     def depths(self, m: int) -> Array:
         """The row (4,) that gives the depth of a voxel (x, y, z, 1) before view m's pinhole, mm."""
@@ -213,8 +279,10 @@ class WholeHoles:
         """Depths of the farthest voxel and of the nearest one that is not too close to the pinhole, a little wider, mm."""
         pinhole, (_, _, k), l, _ = self._module(m)
         depths = (self.grid.corners() - pinhole) @ k
-        far = max(1.01 * float(depths.max()), l / 10)
-        near, nearest = l / (_MOST_RATIO * (1 + l / far) - 1), 0.99 * float(depths.min())
+        far = rounded_up(max(1.001 * float(depths.max()), l / 10))
+        near = rounded_up(l / (_MOST_RATIO * (1 + l / far) - 1))
+        first = float(depths.min())
+        nearest = 1 / rounded_up(1.001 / first) if first > 0 else first
         if nearest < near and self._is_strict:
             raise InputError(
                 "emission: hole 'depth' is for volumes at some distance from the pinholes, but the grid's depths before one "
@@ -227,7 +295,8 @@ class WholeHoles:
         *_, l, _ = self._module(m)
         smallest, largest = (1 + l / depth for depth in self._limits(m))
         n = max(1, round(math.log(largest / smallest) / math.log(_ZONE_RATIO) + 0.4))
-        return list(itertools.pairwise((l / (np.geomspace(smallest, largest, n + 1) - 1)).tolist()))
+        far, *inner, near = (l / (np.geomspace(smallest, largest, n + 1) - 1)).tolist()
+        return list(itertools.pairwise([far, *(rounded_up(depth) for depth in inner), near]))
 
     def close(self, m: int) -> VoxelBox | None:
         """Voxels before view m's pinhole that are nearer than all zones; None where it may see none."""
@@ -246,82 +315,54 @@ class WholeHoles:
         close = (depths > 0) & (depths <= near)
         return (tuple(map(slice, low.tolist(), high.tolist())), close) if close.any() else None
 
-    def transmittance(self, m: int, mu: Volume, part: Grid) -> Floats32:
-        """What `mu` leaves of the photons from each voxel of a part of the grid, on their way to view m's pinhole."""
-        _, frame, l, d = self._module(m)
-        margin = d / 2 * (1 / l + 1 / self._limits(m)[1])
-        return mean_transmittance(mu, self.grid, part, self._views, m, frame, margin)
-
-    def _weights(self, m: int, places: list[Array]) -> Array:
-        """What a mm^3 counts, times its squared depth by l^2, along lines to `places` (rows, columns) on the crystal, mm."""
-        v, u = places[0][:, None], places[1][None, :]
-        return self._weigh(m, u, v) * np.sqrt(1 + (u**2 + v**2) / self._module(m)[2] ** 2)
-
-    def make(self, m: int, far: float, near: float) -> DepthResponse:
+    def make(self, m: int, far: float, near: float) -> Zone:
         """View m's response to voxels in a zone from far to near, mm."""
         views, grid, (pinhole, frame, l, d) = self._views, self.grid, self._module(m)
         u, v, k = frame
         rays = view_rays(views, m)
         scale = l / float((views.detector_centers[m] - pinhole) @ k)
-        # The pixels' places on the crystal, mm along v and u, point-inverted: those of the first, and from pixel to pixel.
-        first = scale * (rays.corner - pinhole)
-        firsts = float(first @ v), float(first @ u)
-        pitches = scale * float(rays.row_step @ v), scale * float(rays.column_step @ u)
+        # The pixels' places on the crystal: those of the first, and from pixel to pixel.
+        corner = scale * (rays.corner - pinhole)
+        first = np.array([corner @ v, corner @ u])
+        pitch = scale * np.array([rays.row_step @ v, rays.column_step @ u])
         to_camera = frame @ grid.affine[:3]
         to_camera[:, 3] -= frame @ pinhole
-        pixels: list[Array] = [firsts[i] + pitches[i] * np.arange(views.shape[i], dtype=float) for i in range(2)]
         # Of the farthest voxel's image the widths, mm: of the hole's shadow and of the voxel's, where that is narrowest.
         across = np.linalg.svd(to_camera[:2, :3], compute_uv=False)
         widths = d * (1 + l / far), l / far * across[-1]
-        steps = _cells_of_pixel(abs(pitches[0]), *widths), _cells_of_pixel(abs(pitches[1]), *widths)
-        _, middle, largest = sorted((*widths, min(map(abs, pitches))))
+        steps = _cells_of_pixel(abs(pitch[0]), *widths), _cells_of_pixel(abs(pitch[1]), *widths)
+        _, middle, largest = sorted((*widths, np.abs(pitch).min()))
         sharpness = math.sqrt(middle * largest)
-        half = np.abs(to_camera[2, :3]).sum() / 2
+        half = float(np.linalg.norm(grid.spacing)) / 2
         farthest, nearest = 1 / (far + half), 1 / max(near - half, near / 2)  # of whole voxels, 1 / mm
         n_planes = 2 + int((nearest - farthest) * l * (d + min(across[0], _LARGEST)) / (_PLANE_APART * sharpness))
-        inverses = np.linspace(farthest, nearest, n_planes)
         # A voxel's places of one depth lie around a line: a box along it, and beside it what remains of the edges. Where
         # they are deep and across at once, this is true of small pieces only, or where the hole's shadow is wide.
-        slope = max(abs(place) for at in pixels for place in at[[0, -1]]) / l + d / 2 / near
+        ends = np.abs([first, first + pitch * (np.array(views.shape) - 1)])
+        slope = ends.max() / l + d / 2 / near
         skew = _SKEW * sharpness * near / l / max(slope, np.linalg.norm(_line(to_camera[:, :3])[:2]))
         largest_piece = min(max(skew, (skew / 2 * (d * (near / l + 1)) ** 2) ** (1 / 3)), _LARGEST)
-        counts = np.ceil(grid.spacing / largest_piece).astype(int)
-        pieces = (np.indices(tuple(counts)).reshape(3, -1).T + 0.5) / counts - 0.5
-        edges = to_camera[:, :3] / counts
-        along = edges[2] / counts / np.linalg.norm(edges[2])
-        shadows = (edges - np.outer(_line(edges), edges[2]))[1::-1] * np.sign(pitches)[:, None]
-        sizes = np.divide(pitches, steps)  # of the cells, mm along v and u
-        cell = np.abs(sizes).max() / sharpness
+        cell = float(np.abs(pitch / steps).max()) / sharpness
         cell /= 1 if widths[0] == largest else _LARGE_VOXELS
-        limits = _POINT_SMEAR / cell, _PAIR_SMEAR, cell / _PART_SMEAR
-        # A photon's direction, on which its counts depend, lies between that of the voxel and that of the pixel as seen from
-        # the hole's middle, l / (l + h) of the way: so the factors of either are powers that are 1 together.
-        share = l / (l + 2 / (1 / near + 1 / far))
-        bend = 1.5 * share * (1 - share)
-        kernel = _kernel(d, l * inverses, np.stack(shadows), np.abs(pitches), steps, bend / l**2)
-        # In all, a voxel counts (1 + t^2)^(-3/2) / h^2, t being its slope. The mean of this over the hole, and to second
-        # order that over the voxel, differ from what the powers make of it, by this share times (1 + t^2)^-2.
-        holes = (np.arange(16)[:, None] + 0.5) / 16 * (d / 2) ** 2  # squared distances from its middle, of equal areas
-        shadow = holes * (1 / l + inverses) ** 2
-        made = np.average((1 + shadow) ** (-1.5 * share), 0, 1 + bend * shadow)
-        of_voxel = -(1 - share) / 8 * np.square(shadows).sum() * inverses**2
-        second = ((1 + holes * inverses**2) ** -1.5).mean(axis=0) / made - 1 + of_voxel
-        kernel *= (1 + second - second.mean())[:, None, None]
-        margin = kernel.shape[1] // 2, kernel.shape[2] // 2
-        matrix = to_camera.copy()
-        for row, i in ((0, 1), (1, 0)):  # columns follow u, rows v
-            matrix[row] = l / sizes[i] * to_camera[row] + (margin[i] - firsts[i] / sizes[i]) * to_camera[2]
-        n_cells = [steps[i] * (views.shape[i] - 1 - (-kernel.shape[i + 1] - i) // steps[i]) for i in range(2)]
-        places: list[Array] = [
-            firsts[i] + sizes[i] * (np.arange(n_cells[i], dtype=float) - margin[i]) for i in range(2)
-        ]
-        of_direction, of_pixel = self._weights(m, places) ** (1 - share), self._weights(m, pixels) ** share
-        of_pixel *= np.outer(*(share_inside(pixels[i], abs(pitches[i]), self._sides[m]) for i in range(2)))
-        secant = 1 + (places[0][:, None] ** 2 + places[1] ** 2) / l**2
-        before = grid.voxel_volume / len(pieces) * l**2 * of_direction * (1 + second.mean() / secant**2)
-        before, kernel = before.astype(np.float32), np.pad(kernel.astype(np.float32), ((0, 0), (steps[0],) * 2, (0, 0)))
-        zone = near, far, farthest, (n_planes - 1) / (nearest - farthest)
-        return DepthResponse(matrix, pieces, along, *limits, *zone, before, kernel, steps, of_pixel)
+
+        def weigh(v: Array, u: Array) -> Array:
+            weights: Array = self._weigh(m, v, u) * np.sqrt(1 + (u**2 + v**2) / l**2)
+            return weights
+
+        return Zone(
+            ViewNumbers(to_camera, l, d, first, pitch),
+            views.shape,
+            weigh,
+            float(self._sides[m]),
+            grid.voxel_volume,
+            np.ceil(grid.spacing / largest_piece).astype(int),
+            near,
+            far,
+            np.linspace(farthest, nearest, n_planes),
+            steps,
+            (_POINT_SMEAR / cell, _PAIR_SMEAR, cell / _PART_SMEAR),
+            round(l / (l + 2 / (1 / near + 1 / far)), 2),
+        )
 
 
 def _line(edges: Array) -> Array:
@@ -335,51 +376,3 @@ def _cells_of_pixel(pitch: float, shadow: float, voxel: float) -> int:
     sharpness = math.sqrt(middle * largest)
     size = sharpness * (0.046 + 0.34 * min(small / sharpness, 0.35)) * (1 if shadow == largest else _LARGE_VOXELS)
     return max(2, round(pitch / size + 0.2))
-
-
-def _kernel(d: float, slopes: Array, edges: Array, pitches: Array, steps: tuple[int, ...], bend: float) -> Array:
-    """What a pixel counts of the cells around its middle, (planes, taps, taps), by the planes' l / h.
-
-    `edges` (2, 3) are a voxel's edges, mm along v and u, and `pitches` the pixels'. In Fourier space: the exact image, by
-    what the spline has blurred; and `bend`, mm^-2, times the squared distance more, which the powers of the directions miss.
-    It may not be negative anywhere, or expected counts would be.
-    """
-    size = pitches / steps
-    apart = slopes[1] - slopes[0]
-    slopes = np.concatenate([slopes[:1] - apart, slopes, slopes[-1:] + apart])
-    extent = d * (1 + slopes.max()) / 2 + pitches / 2 + np.abs(edges).sum(axis=1) * slopes.max() / 2
-    half = [math.ceil(reach) + 1 for reach in extent / size]
-    n = [2 ** math.ceil(math.log2(2 * h + 8)) for h in half]
-    f_v, f_u = np.fft.fftfreq(n[0], size[0])[:, None], np.fft.rfftfreq(n[1], size[1])
-    spline = (np.sinc(size[0] * f_v) * np.sinc(size[1] * f_u)) ** 3
-    pixel = np.sinc(pitches[0] * f_v) * np.sinc(pitches[1] * f_u) / spline
-    kernel = np.empty((len(slopes), 2 * half[0] + 1, 2 * half[1] + 1))
-    for slope, taps in zip(slopes, kernel, strict=True):
-        exact = pixel * _disc(d * (1 + slope) * np.hypot(f_v, f_u))
-        for edge in edges.T:
-            exact *= np.sinc(slope * (edge[0] * f_v + edge[1] * f_u))
-        image = np.fft.irfft2(exact, n)
-        taps[...] = np.roll(image, half, (0, 1))[: 2 * half[0] + 1, : 2 * half[1] + 1]
-    # Between planes there are straight lines: on the mean over depths they are right, not at the planes.
-    kernel = kernel[1:-1] - (kernel[2:] - 2 * kernel[1:-1] + kernel[:-2]) / 12
-    away = [(size[i] * np.arange(-half[i], half[i] + 1)) ** 2 for i in range(2)]
-    kernel *= 1 + bend * np.add.outer(*away)
-    kernel[kernel < 1e-4 * kernel.max(axis=(1, 2), keepdims=True)] = 0
-    for a in range(steps[0]):  # all counts of a cell go to the pixels
-        for b in range(steps[1]):
-            of_cell = kernel[:, (half[0] - a) % steps[0] :: steps[0], (half[1] - b) % steps[1] :: steps[1]]
-            of_cell /= of_cell.sum(axis=(1, 2), keepdims=True)
-    return kernel
-
-
-def _disc(x: Array) -> Array:
-    """The Fourier transform of a disc of diameter 1 and integral 1, ``2 J1(pi x) / (pi x)``."""
-    return np.interp(x, *_disc_table(2 ** math.ceil(math.log2(max(16.0, float(x.max()))))))
-
-
-@functools.lru_cache(maxsize=8)
-def _disc_table(most: int) -> tuple[Array, Array]:
-    ticks = np.linspace(0, most, 128 * most)
-    heights = np.cos(np.pi * (np.arange(4 * most) + 0.5) / (8 * most))  # of chords, by Gauss and Chebyshev
-    shares = 1 - heights**2
-    return ticks, np.cos(np.pi * np.outer(ticks, heights)) @ (shares / shares.sum())

@@ -14,6 +14,14 @@ from .rays import Attenuation, Ends, IndexFans, IndexRays, Rays, index_fans, ind
 
 Index = tuple[int, int, int]
 
+# By what share of it a size is rounded up at most.
+_ROUNDING = 0.01
+
+
+def rounded_up(size: float) -> float:
+    """A size as one of few, 1 % larger at most: what is laid out with it stays where it is when a view moves a little."""
+    return math.exp(math.ceil(math.log(size) / _ROUNDING) * _ROUNDING)
+
 
 @dataclass(frozen=True, eq=False)
 class Lattices:

@@ -1,13 +1,10 @@
-"""The projector and its adjoint as linear operators."""
+"""The projector as a linear operator."""
 
 from __future__ import annotations
 
 import copy
 import functools
-import math
-from abc import ABC, abstractmethod
 from collections.abc import Iterator
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -17,8 +14,8 @@ from ..arrays import Array, ArrayOrTensor, cast_like, checked, is_double, is_ten
 from ..errors import InputError, warn
 from ..geometry.grid import Grid
 from ..geometry.views import Views
-from ..memory import Requirements, require
-from ..progress import Progress, part_of, tell
+from ..memory import Requirements
+from ..progress import Progress, tell
 from ..recording import recorded_warnings
 from ..validation import freeze, shape_text
 from ..volumes.images import Images
@@ -28,135 +25,11 @@ from .bundles import Bundle, Bundles
 from .doubts import doubts
 from .execution import Execution
 from .lattices import require_no_negative, same_lattice
+from .linear_operator import LinearOperator
 from .models import Model, Transmission
 from .parallel import thread_count
 from .subsets import balanced_subsets
-
-
-class LinearOperator(ABC):
-    """``A(x)``, with the exact adjoint ``A.T(y)``; differentiable in torch.
-
-    Both take a batch: whatever axes come before those of `shape_in` come before those of `shape_out`.
-    """
-
-    def __call__(self, x: Volume | ArrayOrTensor, progress: Progress | None = None) -> ArrayOrTensor:
-        """Apply the operator.
-
-        Parameters
-        ----------
-        x
-            Numpy array or torch tensor (..., *shape_in); a projector also takes a `Volume`.
-        progress
-            Called as ``progress(views done, views)``, of a batch over all of it; what it raises stops the work.
-
-        Returns
-        -------
-        array or tensor (..., *shape_out)
-            A tensor on the device of `x` if that is a tensor (part of torch's graph if it requires a
-            gradient, for every backend), else a numpy array.
-
-        Raises
-        ------
-        InputError
-            Another grid, or more memory needed than there is.
-        """
-        return self._apply(self._check(x), progress)
-
-    def _apply(
-        self, x: ArrayOrTensor, progress: Progress | None = None, mu: ArrayOrTensor | None = None
-    ) -> ArrayOrTensor:
-        """Apply to a checked array or tensor, whose gradient follows; not that of mu."""
-        if not is_tensor(x):
-            return self._run(x, progress, mu)
-        from .autograd import linear
-
-        return linear(lambda x: self._run(x, progress, mu), lambda y: self.T._run(y, mu=mu), x)
-
-    _names = ("array", "array")  # what messages call what it takes, and what its adjoint takes
-    _float64 = False  # whether it computes in float64 whatever it is given
-
-    @functools.cached_property
-    def T(self) -> LinearOperator:
-        """The exact adjoint, <A x, y> = <x, A.T y>."""
-        return Adjoint(self)
-
-    @property
-    @abstractmethod
-    def shape_in(self) -> tuple[int, int, int]:
-        """Shape of what it takes."""
-
-    @property
-    @abstractmethod
-    def shape_out(self) -> tuple[int, int, int]:
-        """Shape of what it gives."""
-
-    def _check(self, x: Any) -> ArrayOrTensor:
-        return checked(x, self._names[0], self.shape_in, self._float64, batch=True)
-
-    def _run(
-        self, x: ArrayOrTensor, progress: Progress | None = None, mu: ArrayOrTensor | None = None
-    ) -> ArrayOrTensor:
-        """Apply to a checked array or tensor, one by one to those of a batch; nothing is recorded in a graph."""
-        batch = tuple(x.shape[:-3])
-        if not batch:
-            return self._run_one(x, progress, mu)
-        n = math.prod(batch)
-        require(
-            x.itemsize * n * math.prod(self.shape_out), f"a batch of {n} times {shape_text(self.shape_out)} numbers"
-        )
-        results = zeros((*batch, *self.shape_out), x)
-        for done, index in enumerate(np.ndindex(batch)):
-            results[index] = self._run_one(x[index], part_of(progress, done, n), mu)
-        return results
-
-    @abstractmethod
-    def _run_one(
-        self, x: ArrayOrTensor, progress: Progress | None = None, mu: ArrayOrTensor | None = None
-    ) -> ArrayOrTensor:
-        """Apply to an array or tensor of `shape_in`."""
-
-    @abstractmethod
-    def _run_back(
-        self, y: ArrayOrTensor, progress: Progress | None = None, mu: ArrayOrTensor | None = None
-    ) -> ArrayOrTensor:
-        """Apply the adjoint to an array or tensor of `shape_out`."""
-
-
-class Adjoint(LinearOperator):
-    """The adjoint of an operator, ``A.T``."""
-
-    def __init__(self, operator: LinearOperator) -> None:
-        self._operator = operator
-        self._names = operator._names[::-1]
-        self._float64 = operator._float64
-
-    @property
-    def T(self) -> LinearOperator:  # type: ignore[override]
-        """The operator."""
-        return self._operator
-
-    @property
-    def shape_in(self) -> tuple[int, int, int]:
-        """Shape of what the operator gives."""
-        return self._operator.shape_out
-
-    @property
-    def shape_out(self) -> tuple[int, int, int]:
-        """Shape of what the operator takes."""
-        return self._operator.shape_in
-
-    def __repr__(self) -> str:
-        return f"{self._operator!r}.T"
-
-    def _run_one(
-        self, x: ArrayOrTensor, progress: Progress | None = None, mu: ArrayOrTensor | None = None
-    ) -> ArrayOrTensor:
-        return self._operator._run_back(x, progress, mu)
-
-    def _run_back(
-        self, y: ArrayOrTensor, progress: Progress | None = None, mu: ArrayOrTensor | None = None
-    ) -> ArrayOrTensor:
-        return self._operator._run_one(y, progress, mu)
+from .transmittance import Field
 
 
 class Projector(LinearOperator):
@@ -179,6 +52,8 @@ class Projector(LinearOperator):
         Threads of cpu and numpy, by default one per core (torch has a setting of its own, cuda needs none). The images do
         not depend on it; the adjoint does by float32 rounding, and is the same every time for a given number.
         The adjoint takes a volume per thread, so it uses at most 8, and fewer when memory is short.
+    double : bool
+        Whether to compute in float64, whatever it is given; not with cuda.
 
     Raises
     ------
@@ -188,7 +63,8 @@ class Projector(LinearOperator):
     Notes
     -----
     The integral along a ray is exact for the piecewise constant volume (Siddon 1985), from source to target.
-    The results are float32; float64 for ``backend="numpy"``, and for tensors of float64 with all backends but cuda.
+    The results are float32; float64 with `double` or ``backend="numpy"``, and for tensors of float64 with all backends but
+    cuda.
     On a GPU the adjoint of the torch and cuda backends adds in no fixed order: it differs by float32 rounding from
     call to call. Up to 128 MiB of rays and their weights are kept from call to call.
 
@@ -207,7 +83,13 @@ class Projector(LinearOperator):
     _names = ("volume", "images")
 
     def __init__(
-        self, grid: Grid, views: Views, model: Model | None = None, backend: str = "auto", threads: int | None = None
+        self,
+        grid: Grid,
+        views: Views,
+        model: Model | None = None,
+        backend: str = "auto",
+        threads: int | None = None,
+        double: bool = False,
     ) -> None:
         model = Transmission() if model is None else model
         for value, kind, what in (
@@ -219,10 +101,15 @@ class Projector(LinearOperator):
                 raise InputError(f"projector: expected {what}, got {type(value).__name__}")
         self.grid, self.views = grid, views
         self._require = Requirements()
-        self._asked, self._auto = backend, backend == "auto"
+        self._auto = backend == "auto"
         self._backend = backends.choose(backend)
-        self._float64 = self._backend.always_float64 and not self._auto
+        self._float64 = double or (self._backend.always_float64 and not self._auto)
+        self._settings: dict[str, Any] = {"backend": backend, "threads": threads, "double": double}
         if self._backend.name == "cuda":
+            if double:
+                raise InputError(
+                    "projector: backend cuda computes in float32 alone: leave double out, or take another backend"
+                )
             model = model.by_rays()
         self.model = model
         model.check(views)
@@ -264,8 +151,6 @@ class Projector(LinearOperator):
         x = self._check(x)
         if self.model.mu is None:
             raise InputError("mu: the projector's model has none; give it one to say on which grid mu is")
-        if self._depths is not None and getattr(mu, "requires_grad", False):
-            return self._by_rays(x, progress, mu)
         x, mu = promote(x, require_no_negative(checked(mu, "mu", self.model.mu.grid.shape, self._float64)))
         if not getattr(mu, "requires_grad", False):
             return self._apply(x, progress, mu)
@@ -317,8 +202,8 @@ class Projector(LinearOperator):
         parts: list[Projector] = []
         with recorded_warnings():  # this projector has given them
             for which in balanced_subsets(self.views, n):
-                own = self.grid, self.views[which], self.model.of_views(which), self._asked, self.threads
-                parts.append(copy.copy(self) if n == 1 else Projector(*own))
+                own = self.grid, self.views[which], self.model.of_views(which)
+                parts.append(copy.copy(self) if n == 1 else Projector(*own, **self._settings))
                 parts[-1].which = freeze(which)
         return parts
 
@@ -367,7 +252,7 @@ class Projector(LinearOperator):
         tell(progress, 0, n)
         images = self._responded(images)
         if self._depths is not None:
-            arguments = *self._depth_arguments(images), lambda done: tell(progress, done, n), self._mu_volume(mu)
+            arguments = *self._depth_arguments(images), lambda done: tell(progress, done, n), self._mu_field(mu)
             volume = self._depths.backproject(*arguments)
             for m, box, close, of_part in self._close_parts:
                 volume[box] += np.where(close, of_part.T._run(to_numpy(given[m : m + 1], None), mu=mu), 0)
@@ -398,7 +283,7 @@ class Projector(LinearOperator):
     def _projected(self, execution: Execution, x: ArrayOrTensor, mu: ArrayOrTensor) -> Iterator[ArrayOrTensor]:
         """The images before the detector's response."""
         if self._depths is not None:
-            yield from self._depths.images(*self._depth_arguments(x), self._mu_volume(mu))
+            yield from self._depths.images(*self._depth_arguments(x), self._mu_field(mu))
             return
         if not self.model.weights_voxels:
             yield from execution.images(x, self._bundles, self._mu(mu))
@@ -413,7 +298,11 @@ class Projector(LinearOperator):
         total = zeros(mu.shape, images)
         for index in np.ndindex(x.shape[:-3]):
             responded = self._responded(execution.to_backend(images[index]))
-            gradient = execution.mu_gradient(responded, self._bundles, x[index].detach(), mu.detach())
+            own = x[index].detach(), mu.detach()
+            if self._depths is None:
+                gradient = execution.mu_gradient(responded, self._bundles, *own)
+            else:
+                gradient = self._depth_mu_gradient(responded, *own)
             total += to_caller(self._finished(gradient, images), images)
         return total
 
@@ -437,19 +326,26 @@ class Projector(LinearOperator):
         on_gpu = self._auto and is_tensor(x) and x.device.type != "cpu"
         backend = backends.for_tensor(x) if on_gpu else self._backend
         mu_grid = None if self.model.mu is None else self.model.mu.grid
-        return Execution(backend, self.grid, mu_grid, backend.always_float64 or is_double(x), self.threads)
+        return Execution(
+            backend, self.grid, mu_grid, self._float64 or backend.always_float64 or is_double(x), self.threads
+        )
 
     def _depth_arguments(self, x: ArrayOrTensor) -> tuple[ArrayOrTensor, Any, int]:
         """What `WholeHoles` takes: the array, the functions and the threads."""
-        double = self._backend.always_float64 or is_double(x)
+        double = self._float64 or self._backend.always_float64 or is_double(x)
         has_kernels = self._backend.name != "numpy" and backends.choose("auto").name == "cpu"
         functions = backends.load("cpu" if has_kernels else "reference_depth")
         return np.ascontiguousarray(to_numpy(x, np.float64 if double else np.float32)), functions, self.threads
 
-    @functools.cached_property
-    def _by_rays(self) -> Projector:
-        """What projects where only rays can."""
-        return Projector(self.grid, self.views, self.model.by_rays(), self._asked, self.threads)
+    def _depth_mu_gradient(self, images: ArrayOrTensor, x: ArrayOrTensor, mu: ArrayOrTensor) -> Array:
+        """The gradient by mu of the depth-dependent response, and of the voxels that are too close to a pinhole for it."""
+        volume, *how = self._depth_arguments(x)
+        arguments = volume, to_numpy(images, None), *how, self._mu_field(mu)
+        gradient: Array = self._depths.mu_gradient(*arguments)  # type: ignore[union-attr]
+        for m, box, close, of_part in self._close_parts:
+            part = cast_like(np.where(close, to_numpy(x[box], None), 0), images)
+            gradient += to_numpy(of_part._mu_gradient(images[m : m + 1], part, mu), None)
+        return gradient
 
     @functools.cached_property
     def _close_parts(self) -> list[tuple[int, Any, NDArray[np.bool_], Projector]]:
@@ -462,12 +358,12 @@ class Projector(LinearOperator):
                 grid, which = self.grid.box([each.start for each in box], close.shape), np.array([m])
                 model = self.model.of_views(which).by_rays()
                 with recorded_warnings():
-                    parts.append((m, box, close, Projector(grid, self.views[which], model, self._asked, self.threads)))
+                    parts.append((m, box, close, Projector(grid, self.views[which], model, **self._settings)))
         return parts
 
-    def _mu_volume(self, mu: ArrayOrTensor) -> Volume | None:
+    def _mu_field(self, mu: ArrayOrTensor) -> Field | None:
         """`mu` on the grid of the model's."""
-        return None if mu is None else replace(self.model.mu, array=to_numpy(mu, np.float32))  # type: ignore[type-var]
+        return None if mu is None else Field(to_numpy(mu, None), self.model.mu.grid)  # type: ignore[union-attr]
 
     def _mu(self, mu: ArrayOrTensor) -> ArrayOrTensor:
         return self.model.mu.array if mu is None and self.model.mu is not None else mu

@@ -7,7 +7,7 @@ the same, part of torch's graph. Needs torch.
 import functools
 import itertools
 import math
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -19,6 +19,7 @@ from ..geometry.views import Views
 from ..physics.optics import Optics, chosen_optics
 from ..validation import positive, whole_shape
 from ..volumes.volume import Volume, require_quantity
+from .depth_images import Holes, depth_images
 from .pixel_points import TOLERANCE, lattice, lattices, points_needed, require_points, shadow_edges
 from .tracing import trace_fans
 
@@ -156,6 +157,7 @@ def emission_images(
     time: Numbers = 1.0,
     mu: Volume | Tensor | None = None,
     mu_grid: Grid | None = None,
+    hole: Literal["rays", "depth"] = "rays",
     backend: str = "auto",
     grid: Grid | None = None,
     optics: Optics | None = None,
@@ -190,6 +192,9 @@ def emission_images(
         The acquisition's, s, (...) or one number.
     mu, mu_grid
         What attenuates, as in `trace_rays`.
+    hole
+        "rays": through its points. "depth": the depth-dependent response, with the blur of the whole hole and the limits
+        that it has in `Emission`; on the processor. It has no derivatives by what the crystal stops and where it ends.
     backend, grid
         The same as in `trace_rays`.
     optics, settings
@@ -226,6 +231,18 @@ def emission_images(
     for name, x in (("collimator_length", l), ("diameter", diameter), ("pitch", pitch)):
         if bool((x <= 0).any()):
             raise InputError(f"emission images: {name}: expected more than 0 mm, got {float(x.min()):g}")
+
+    if hole not in ("rays", "depth"):
+        raise InputError(f"emission images: hole: expected 'rays' or 'depth', got {hole!r}")
+    if hole == "depth":
+        if aperture_points != 1 or pixel_points is not None or optics.edge == "path" or optics.depth_layers > 1:
+            raise InputError(
+                "emission images: hole 'depth' takes no aperture_points, pixel_points, edge 'path' and depth_layers"
+            )
+        sided = side if optics.within_crystal or optics.within_walls else None
+        optics = optics.with_numbers(dict(zip(given, own, strict=True)))
+        holes = Holes(l, diameter, sided, thickness, pitch, offset)
+        return depth_images(volume, within, (positions, rotations), holes, (n_v, n_u), time, mu, mu_grid, optics)
 
     # To the plane through the grid's farthest corner, in pinhole to crystal distances.
     corners = positions.new_tensor(within.corners()) - positions.detach()[..., None, :]

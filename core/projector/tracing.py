@@ -256,6 +256,13 @@ def _by_geometry(gradient: Floats, parts: list[tuple[Part, Floats]], bundles: Bu
     return total
 
 
+def gradient_by_fans(execution: Execution, bundles: Bundles, volume: Floats, mu: Floats | None) -> Floats:
+    """The gradient (4, 3), by its source, corner, row step and column step, of the sum of a fan's integrals."""
+    parts = execution.derivatives(volume, bundles, mu)
+    gradient: Floats = _by_geometry(np.ones((1, *bundles.image_shape)), parts, bundles, execution)[0]
+    return gradient
+
+
 def _of_kind(integrals: ArrayOrTensor, volume: Any, *geometry: Any) -> ArrayOrTensor:
     """`integrals` of the type of the geometry's tensors, or else of the volume, on the device of the first tensor."""
     given = [x for x in (volume, *geometry) if is_tensor(x)]

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from ..arrays import Array
-from ..errors import InputError, reading
+from ..errors import InputError, needing, reading
 from ..files import AnyPath, require_ending, require_file, write_bytes
 from ..geometry.grid import Grid
 from ..geometry.scanner import Scanner, scanner_kind
@@ -226,10 +226,8 @@ def _read_pt(path: Path) -> _Contents:
 
 
 def _torch() -> Any:
-    try:
+    with needing(of=".pt files, unlike .h5 and .npz"):
         import torch
-    except ImportError:
-        raise InputError(".pt files need torch, which is missing: pip install torch, or use .h5 or .npz") from None
     return torch
 
 

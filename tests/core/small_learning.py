@@ -17,6 +17,8 @@ from .small_recipes import TRAINING
 class Toy(nn.Module):
     """Corrects OSEM's last volume by a convolution."""
 
+    may_be_0 = ()
+
     def __init__(
         self, channels: int = 2, kernels: tuple[int, ...] = (3,), leaky: bool = True, *, volumes: int = 1
     ) -> None:

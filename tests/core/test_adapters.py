@@ -2,13 +2,16 @@
 
 import copy
 import importlib.util
+import re
 import sys
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 import mphdrr.core as mph
+from mphdrr.core import errors
 from mphdrr.core.reconstruction import adapters
 
 from .conftest import emission
@@ -224,6 +227,14 @@ def test_a_missing_package_is_named_with_what_installs_it(problem, package, monk
     monkeypatch.setattr(adapters.importlib, "import_module", missing)
     with pytest.raises(mph.InputError, match=f"^{package}: {package} is missing: pip install {package}$"):
         make(problem.A)
+
+
+def test_in_blender_a_missing_package_refers_to_a_section_that_there_is(monkeypatch):
+    monkeypatch.setattr(errors, "__name__", "bl_ext.user_default.mphdrr.core.errors")
+    with pytest.raises(mph.InputError) as refusal, errors.needing("mphdrr[learning]"):
+        raise ModuleNotFoundError("No module named 'torch'", name="torch.nn")
+    title, page = re.fullmatch(r'torch is missing: see "(.*)" in (docs/.*)', str(refusal.value)).groups()
+    assert f"# {title}\n" in (Path(mph.__file__).parents[1] / page).read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize(

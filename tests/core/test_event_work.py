@@ -98,7 +98,7 @@ def test_a_cluster_that_does_not_answer_is_one_line(tmp_path, capsys, monkeypatc
     assert "mphdrr: --dask tcp://127.0.0.1:1: no scheduler answers there" in capsys.readouterr().err
     monkeypatch.setitem(sys.modules, "distributed", None)
     assert main([*command, "--dask", "local"]) == 1
-    assert 'Dask, which is missing: pip install "mphdrr[dask]"' in capsys.readouterr().err
+    assert '--dask: distributed is missing: pip install "mphdrr[dask]"' in capsys.readouterr().err
 
 
 def test_parts_of_a_set_are_the_whole(tmp_path, undisturbed):

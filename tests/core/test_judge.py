@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 
 import mphdrr.core as mph
-from mphdrr.core.learning.judging.judge import judge, judge_recipe
+from mphdrr.core.learning.judging.judge import judge
 from mphdrr.core.learning.judging.methods import Family, JudgedMethod, smoothed
+from mphdrr.core.learning.judging.recipe import read_judge_recipe
 from mphdrr.core.learning.judging.scoring import Case
 from mphdrr.core.learning.judging.sets import SETS, events_by_recipe, set_fingerprint, set_text
-from mphdrr.core.phantoms import painting
+from mphdrr.core.phantoms import painting, shapes
 
 from .conftest import WORKBOOK
 from .small_events import TEXT, small_recipe
@@ -35,7 +36,7 @@ name = "rods"
 events = "rods"
 scoring = "rods"
 levels = [1.0, 0.25]
-draws = 3
+draws = 2
 drawn_events = 1
 tuned_on_itself = true
 """
@@ -62,7 +63,7 @@ def folder(tmp_path_factory):
 def short_recipe(folder, text=SHORT_TEST):
     """The judge's recipe with other tests."""
     (folder / "short.toml").write_text(JUDGE + text)
-    return judge_recipe(folder / "short.toml")
+    return read_judge_recipe(folder / "short.toml")
 
 
 def truth(run):
@@ -80,7 +81,7 @@ METHODS = [JudgedMethod("truth", truth, "truth-1"), JudgedMethod("half", halved,
 
 
 def test_the_truth_has_no_error_and_half_of_it_half(folder, tmp_path):
-    found = judge(judge_recipe(folder / "judge.toml"), tmp_path, METHODS)
+    found = judge(read_judge_recipe(folder / "judge.toml"), tmp_path, METHODS)
     rows = {(row["method"], row["level"]): row for row in found.rows}
     assert len(found.rows) == 2 * 4
     for level in (1.0, 0.25):
@@ -132,7 +133,11 @@ position = [{ from = -5, to = 5 }, 0, 0]
 
 
 def test_the_observer_finds_the_defect_in_the_truth_and_not_in_an_even_volume(tmp_path, monkeypatch):
-    monkeypatch.setattr(painting, "_SAMPLES_OF_OVERLAP", 1 << 13)  # totals to some percent are enough
+    for module, name, number in (
+        (painting, "_SAMPLES_OF_OVERLAP", 1 << 13), (painting, "_MAX_SAMPLES", 1 << 7),
+        (shapes, "_LINES", 64), (shapes, "_FEWER_LINES", 32),
+    ):  # fmt: skip
+        monkeypatch.setattr(module, name, number)  # totals to some percent are enough
     mph.events.make(small_recipe(tmp_path / "recipe", HEARTS), tmp_path / "hearts", 12)
     text = JUDGE.replace("voxels = 12", "voxels = 16")
     mph.events.make(
@@ -148,13 +153,13 @@ def test_the_observer_finds_the_defect_in_the_truth_and_not_in_an_even_volume(tm
         return mph.Volume(noise.astype(np.float32), run.volume.grid, "activity")
 
     methods = [JudgedMethod("true", true, "true-1"), JudgedMethod("even", even, "even-1")]
-    *_, best, worst = judge(judge_recipe(tmp_path / "judge.toml"), tmp_path / "out", methods).rows
+    *_, best, worst = judge(read_judge_recipe(tmp_path / "judge.toml"), tmp_path / "out", methods).rows
     assert best["auc"].value == 1 and best["contrast"] == pytest.approx(1)
     assert worst["auc"].low < 0.5 < worst["auc"].high and abs(worst["contrast"]) < 0.2
 
 
 def test_interrupted_work_goes_on_where_it_stopped(folder, tmp_path):
-    asked, recipe = [], judge_recipe(folder / "judge.toml")
+    asked, recipe = [], short_recipe(folder, RODS_TEST.replace("tuned_on_itself = true", ""))
 
     def counted(run):
         asked.append(run.settings["event"])
@@ -170,12 +175,10 @@ def test_interrupted_work_goes_on_where_it_stopped(folder, tmp_path):
     first = len(asked)
     told = []
     found = judge(recipe, tmp_path, methods, lambda done, total: told.append((done, total)))
-    assert (
-        first > 0 and len(asked) == 6 + 2 * 3 + 1
-    )  # each event and level, three draws of one event twice, one picture
-    assert told[-1] == (3 * 6, 3 * 6)
+    assert first > 0 and len(asked) == 6 + 2 * 2 + 1  # each event and level, two draws of one event twice, one picture
+    assert told[-1] == (2 * 6, 2 * 6)
     again = judge(recipe, tmp_path, methods)
-    assert len(asked) == 6 + 2 * 3 + 2  # the picture alone
+    assert len(asked) == 6 + 2 * 2 + 2  # the picture alone
     assert again.rows == found.rows and again.tuning == found.tuning
 
 
@@ -183,11 +186,11 @@ def test_a_method_that_was_trained_on_the_test_is_refused(folder, tmp_path):
     events = mph.events.EventSet(folder / "rods")
     trained = JudgedMethod("net", halved, "net-1", events_by_recipe(events[1:2]))
     with pytest.raises(mph.InputError, match="net: it was trained on events of the test rods: 1"):
-        judge(judge_recipe(folder / "judge.toml"), tmp_path, [trained])
+        judge(read_judge_recipe(folder / "judge.toml"), tmp_path, [trained])
     assert set_fingerprint(events) != set_fingerprint(events[:2])
     (folder / "tuned.toml").write_text((JUDGE + RODS_TEST).replace('"validation"', '"rods"'))
     with pytest.raises(mph.InputError, match="baselines: it was trained on events of the test rods: 0, 1, 2"):
-        judge(judge_recipe(folder / "tuned.toml"), tmp_path, [])
+        judge(read_judge_recipe(folder / "tuned.toml"), tmp_path, [])
     other = JudgedMethod("net", halved, "net-1", events_by_recipe(mph.events.EventSet(folder / "validation")))
     assert judge(short_recipe(folder), tmp_path, [other]).rows
 
@@ -227,16 +230,14 @@ def test_methods_are_told_the_geometry_that_is_believed(folder, tmp_path):
     system = mph.events.EventSet(folder / "rods").system
     moved = mph.write_system(mph.read_system(WORKBOOK)[:24], tmp_path / "believed.xlsx")
     assert moved is not None and len(system) == 8
-    text = (folder / "judge.toml").read_text().replace('scoring = "rods"', f'believed = "{tmp_path / "believed.xlsx"}"')
-    text = text.replace("[1.0, 0.25]", "[1.0]").replace("draws = 3", "draws = 0")
-    (folder / "believed.toml").write_text(text)
+    recipe = short_recipe(folder, SHORT_TEST + f'believed = "{tmp_path / "believed.xlsx"}"\n')
     told = []
 
     def method(run):
         told.append(run)
         return halved(run)
 
-    judge(judge_recipe(folder / "believed.toml"), tmp_path / "found", [JudgedMethod("told", method, "told-1")])
+    judge(recipe, tmp_path / "found", [JudgedMethod("told", method, "told-1")])
     assert {run.workbook for run in told} == {"believed.xlsx"}
     assert all(run.recipe["system.file"].endswith("believed.xlsx") and len(run.system) == 8 for run in told)
 
@@ -268,7 +269,7 @@ def test_one_reconstruction_gives_all_stops_and_filters(folder):
 def test_entries_that_cannot_be_understood_are_named(folder, old, new, message):
     (folder / "wrong.toml").write_text((JUDGE + RODS_TEST).replace(old, new))
     with pytest.raises(mph.InputError, match=message) as refused:
-        judge_recipe(folder / "wrong.toml")
+        read_judge_recipe(folder / "wrong.toml")
     assert "\n" not in str(refused.value)
 
 

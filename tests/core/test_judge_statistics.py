@@ -25,7 +25,7 @@ def coverage(draws, interval, truth):
 
 
 def test_paired_intervals_hold_the_truth_about_95_times_of_100(monkeypatch):
-    monkeypatch.setattr(statistics, "_RESAMPLES", 1000)  # enough for the coverage, and four times as fast
+    monkeypatch.setattr(statistics, "_RESAMPLES", 400)  # enough for the coverage, and ten times as fast
     rng = np.random.default_rng(1)
     hardness = rng.lognormal(0, 0.5, (300, 50))
     pairs = [(0.8 * h * rng.normal(1, 0.1, 50), h * rng.normal(1, 0.1, 50)) for h in hardness]
@@ -83,7 +83,7 @@ def images_of_noise(rng, count, blur, signal):
 
 @pytest.mark.parametrize("sigma", [0.0, 1.0])
 def test_the_observer_reaches_the_ideal_snr_in_gaussian_noise(sigma):
-    n, count, rng = 23, 40_000, np.random.default_rng(6)
+    n, count, rng = 23, 20_000, np.random.default_rng(6)
     axis = np.arange(n) - n // 2
     square = axis[:, None] ** 2 + axis**2
     signal = 0.5 * np.exp(-square / (2 * 3.0**2))

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -62,19 +64,62 @@ def same(one: mph.learning.TrainedNetwork, other: mph.learning.TrainedNetwork) -
         ("batch = 2", "batches = 2", "training.batches: no such setting; expected steps, batch, rate"),
         ('kind = "toy"', 'kind = "toys"', "network.kind 'toys': expected one of after-osem, "),
         ('kind = "toy"', 'kind = "toy"\ndepth = 3', "network.depth: no such setting; expected kind, permuted, weights_from"),
-        ('kind = "toy"', 'kind = "toy"\nchannels = 2.5', "network.channels: expected a whole number of 0 or more, got 2.5"),
-        ('kind = "toy"', 'kind = "toy"\nchannels = -1', "network.channels: expected a whole number of 0 or more, got -1"),
+        ('kind = "toy"', 'kind = ["toy"]', "network.kind: expected a text, got ['toy']"),
         ('kind = "toy"', 'kind = "toy"\nkernels = [3, 0]', "network.kernels: expected a whole number of 1 or more, got 0"),
         ("spacing = 12.0", "", "grid.spacing: missing; give the voxel size in mm"),
         ("after = [1, 2]", "after = [2, 1]", "osem.after: expected rising numbers, got [2, 1]"),
-        ("version = 1", "version = 2", "version: expected version = 1; a newer mphDRR may read others"),
-        ("[training]", "[trainings]", "trainings: expected TABLE.NAME with a table of data, grid, osem, network, training"),
+        ("version = 1", "version = 2", "version: expected 1, got 2; a newer mphDRR may read it"),
+        ("[training]", "[trainings]", "trainings: no such entry; expected version, data, grid, osem, network, training"),
     ],
 )  # fmt: skip
 def test_a_recipe_that_cannot_be_used_is_refused_in_a_line(recipe, before, after, words):
     with pytest.raises(mph.InputError) as refusal:
         changed(recipe, before, after)
     assert str(refusal.value).startswith(f"training.toml: {words}")
+
+
+_WRONG = {bool: (0, "x"), int: (0, -1, 1.5, "x"), float: (0, -1.0, float("inf"), "x"), str: (3, False)}
+"""What a setting of a type is not."""
+_MAY_BE_0 = ("network.features", "network.neighbours", "network.permuted", "training.seed")
+
+
+@pytest.mark.parametrize("kind", ["after-osem", "cameras", "parallel", "unrolled", "channels"])
+def test_nonsense_in_any_setting_of_any_network_is_refused_with_its_table_and_name(recipe, kind):
+    given = {**recipe.given, "network.kind": kind}
+    rows = dataclasses.replace(recipe, given=given).rows
+    assert len(rows) > 20
+    for key, row in rows.items():
+        for wrong in _WRONG[row.kind]:
+            if key == "grid.center" or (wrong == 0 and key in _MAY_BE_0):
+                continue
+            with pytest.raises(mph.InputError, match=f"^{key}: expected ") as refusal:
+                dataclasses.replace(recipe, given={**given, key: wrong if row.sizes is None else [wrong]})
+            assert "\n" not in str(refusal.value)
+
+
+@pytest.mark.parametrize(
+    ("kind", "setting", "words"),
+    [
+        ("cameras", "network.camera_channels = [8, 8]", "network.camera_channels: expected three levels or more"),
+        ("parallel", "network.neighbours = 97", "network.neighbours: expected at most the 96 angles, got 97"),
+        ("after-osem", 'network.weights_from = "no.pt"', "network.weights_from: .*: no such file"),
+        ("toy", "training.rate = 2.0", "training.rate: expected a number above 0 and at most 1, got 2"),
+        ("toy", 'training.strategy = "words"', "training: Lightning refuses accelerator, .* strategy"),
+        ("toy", "osem.subsets = 9", "osem: subsets: expected at most the 8 views, got 9"),
+        ("toy", "grid.spacing = 1e300", "grid: "),
+        ("toy", 'data.train = ""', "data: split '': there are test, train"),
+        ("toy", 'data.model = ""', "data.model: expected one of the set's models of counts, emission"),
+    ],
+)  # fmt: skip
+def test_what_a_scanner_a_set_or_lightning_does_not_take_is_refused_by_the_command(
+    recipe, tmp_path, capsys, kind, setting, words
+):
+    table, _, line = setting.partition(".")
+    kept = [text for text in recipe.text.splitlines() if text.partition(" ")[0] != line.partition(" ")[0]]
+    text = "\n".join(kept).replace(f"[{table}]", f"[{table}]\n{line}").replace('kind = "toy"', f'kind = "{kind}"')
+    (tmp_path / "wrong.toml").write_text(text, encoding="utf-8")
+    said = refused(capsys, "train", tmp_path / "wrong.toml", "-o", tmp_path / "m.pt", "--quiet")
+    assert re.search(words, said)
 
 
 def test_a_network_takes_the_settings_that_its_class_has(recipe):
@@ -215,7 +260,9 @@ def test_a_stopped_and_resumed_training_gives_the_same_weights_bit_for_bit(recip
 
 
 def test_a_folder_of_another_training_is_not_gone_on_with(recipe, tmp_path):
-    mph.learning.train(recipe, tmp_path / "m.pt")
+    with pytest.raises(mph.InputError, match="Lightning refuses"):
+        mph.learning.train(changed(recipe, "batch = 2", 'batch = 2\nstrategy = "words"'), tmp_path / "m.pt")
+    mph.learning.train(recipe, tmp_path / "m.pt")  # nothing was trained there by the other
     other = changed(recipe, "batch = 2", "batch = 1")
     with pytest.raises(mph.InputError, match=r"plan\.json: of a training by another recipe: remove its folder"):
         mph.learning.train(other, tmp_path / "m.pt")

@@ -7,8 +7,8 @@ from pathlib import Path
 from ...errors import InputError
 from ...events.templates import TEMPLATES, template_text
 from ...example import EXAMPLE
-from ...files import replacing
-from ..options import add_run, output_path, print_answer
+from ...files import write_bytes
+from ..options import add_run, new_recipe_path, print_answer
 
 
 def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
@@ -35,12 +35,9 @@ def _run(arguments: argparse.Namespace) -> None:
         text = template_text(arguments.like, workbook.absolute())
         print_answer(arguments, {"file": None, "recipe": text}, [text.removesuffix("\n")])
         return
-    path = output_path(arguments.output, (".toml",))
-    if path.exists():  # recipes are edited by hand
-        raise InputError(f"{path}: it exists; choose another name, or remove it first")
-    with replacing(path) as temporary:
-        text = template_text(arguments.like, _seen_from(path.parent, workbook))
-        temporary.write_text(text, encoding="utf-8")
+    path = new_recipe_path(arguments.output)
+    text = template_text(arguments.like, _seen_from(path.parent, workbook))
+    write_bytes(path, text.encode())
     advice = f"{path}: edit it, then: mphdrr events make SET --recipe {path} -n 1000"
     print_answer(arguments, {"file": str(path), "recipe": text}, [advice])
 

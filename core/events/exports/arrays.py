@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from ...arrays import Array
-from ...errors import InputError
+from ...errors import needing
 
 
 def npy(array: Array) -> bytes:
@@ -19,10 +19,8 @@ def npy(array: Array) -> bytes:
 
 def pt(array: Array) -> bytes:
     """An array as a .pt file: one tensor, which ``torch.load(path, weights_only=True)`` gives."""
-    try:
+    with needing(of="files of tensors (.pt)"):
         import torch
-    except ImportError:
-        raise InputError("files of tensors (.pt) need torch, which is missing: pip install torch") from None
     buffer = io.BytesIO()  # torch writes a file's own name into it, and that of a temporary one is random
     torch.save(torch.from_numpy(np.array(array, order="C")), buffer)
     return buffer.getvalue()

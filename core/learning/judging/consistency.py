@@ -1,15 +1,12 @@
 """Whether a volume explains the counts: Poisson deviance by what it is for the true means."""
 
-from __future__ import annotations
-
 from functools import cache
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ...arrays import Floats
 from ...errors import InputError
-
-Floats = NDArray[np.float64]
 
 _LEAST, _MANY = 1e-8, 50.0
 """Counts: fewer are expected nowhere, as a pixel that has counted must not say infinitely much; above, a series is exact

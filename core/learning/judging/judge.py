@@ -2,33 +2,28 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import cache, cached_property
+from functools import cache, cached_property, partial
 from pathlib import Path
 from typing import Any
 
 from ...errors import InputError, naming
 from ...events.event_set import Event, EventSet
-from ...files import ensure_folder, locked, remove_leftovers
+from ...files import AnyPath, ensure_folder, locked, remove_leftovers
 from ...geometry.system import chosen_modules
 from ...progress import Progress, tell
 from ...reconstruction.scores.images import bias_and_deviation, nrmse
 from ...validation import one_of
 from ...volumes.volume import Volume
 from ...workbook import read_scanner
-from .judgement import BASELINE, METHOD, ORACLE, Judgement
 from .methods import Family, JudgedMethod, tuned
 from .recipe import JudgeRecipe, Test
-from .recipe import read_judge_recipe as judge_recipe
-from .records import Key, Records, read_json, write_json
-from .report import write_report
+from .records import Records, read_json, write_json
+from .report import BASELINE, METHOD, ORACLE, Judgement, write_report
 from .scoring import Case, Scores, defect_of, measured, told
 from .sets import events_by_recipe, refuse_trained_on, set_fingerprint, short_hash
 from .summary import compared, means_of, told_of
-
-__all__ = ["JudgeRecipe", "JudgedMethod", "Judgement", "judge", "judge_recipe"]
 
 Row = dict[str, Any]
 
@@ -38,10 +33,7 @@ _PICTURES = 3
 
 
 def judge(
-    recipe: JudgeRecipe,
-    folder: str | os.PathLike[str],
-    methods: Sequence[JudgedMethod] = (),
-    progress: Progress | None = None,
+    recipe: JudgeRecipe, folder: AnyPath, methods: Sequence[JudgedMethod] = (), progress: Progress | None = None
 ) -> Judgement:
     """Judge methods beside baselines, and write ``judgement.md``, ``.json`` and ``.png`` into a folder.
 
@@ -164,7 +156,8 @@ class _Judging:
             ((tested.events, 0, tested.scores), (tested.drawn, _SEVERAL, tested.draws))
         ):
             for event in events:
-                cases, key = tested.cases(event, level), tested.key(event, level, draw)
+                cases = cache(partial(tested.case, event, level))  # by the draw of noise, made once for all methods
+                key = event.recipe.fingerprint, event.number, level, draw
                 for method, kept, rows in zip(methods, records, found, strict=True):
                     if key not in kept:
                         with naming(f"{tested.name}: event {event.number}: {method.name}"):
@@ -219,18 +212,10 @@ class _Tested:
         own = {name: self.test[name] for name in ("scoring", "levels", "believed", "believed_model")}
         return {"set": set_fingerprint(self.events), "events": len(self.events), "fingerprint": self.fingerprint, **own}
 
-    def key(self, event: Event, level: float, draw: int) -> Key:
-        """What the scores of an event are kept by."""
-        return event.recipe.fingerprint, event.number, level, draw
-
     @property
     def drawn(self) -> EventSet:
         """The events of which bias and deviation over draws of noise are taken."""
         return self.events[: self.test["drawn_events"] if self.test["draws"] > 1 else 0]
-
-    def cases(self, event: Event, level: float) -> Callable[[int], Case]:
-        """An event as methods are asked for it, by the draw of noise; each is made once."""
-        return cache(lambda draw: self.case(event, level, draw))
 
     def case(self, event: Event, level: float, draw: int = 0) -> Case:
         """An event as methods are asked for it."""

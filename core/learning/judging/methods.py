@@ -1,7 +1,5 @@
 """Methods that are judged, and the baselines among them, which are tuned on validation data alone."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any

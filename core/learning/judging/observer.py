@@ -1,20 +1,17 @@
 """The channelised Hotelling observer: how well the best linear observer of a few channels sees a signal."""
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ...arrays import Floats
 from ...errors import InputError
 from ...validation import positive, real_array, whole_number
 from ...volumes.resampling import values_at
 from ...volumes.volume import Volume
 from .statistics import Estimate, area_under_curve
-
-Floats = NDArray[np.float64]
 
 CHANNELS = 5
 _FOLDS = 10

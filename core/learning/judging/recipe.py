@@ -1,25 +1,22 @@
 """Recipes of the judge: tests, validation data, baselines and models, in TOML."""
 
-from __future__ import annotations
-
-import os
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import product
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from ...errors import InputError, naming
-from ...events.entries import by_key, flat, like, plain_name, required, table
+from ...events.entries import by_key, check_entries, flat, grid_of, like, plain_name, required, table
 from ...events.event_set import EventSet
+from ...files import AnyPath
 from ...geometry.grid import Grid
 from ...runs.recipe import Values
 from ...runs.settings import Setting, named
 from ...toml import read_toml
 from .methods import Family
+from .scoring import SCORINGS
 
 VERSION = 1
 
@@ -31,7 +28,7 @@ _TEST = by_key((
     Setting("name", str, None, "What the table calls it"),
     Setting("models", str, None, "Names of the models that are judged on it", "all", sizes=()),
     Setting("scoring", str, "volumes", "What is scored besides the voxels",
-            words=named(("volumes", "rods", "pairs", "defect"))),
+            words=named(SCORINGS)),
     Setting("levels", float, (1.0,), "Shares of the acquisition time", above=0, sizes=()),
     Setting("believed", str, None, "Workbook of the geometry that methods are told", "that which made the images",
             is_path=True),
@@ -58,10 +55,6 @@ _ROWS = by_key((
 _TABLES = ("grid", "baselines", "judge")
 
 
-class _Settings(Values):
-    rows = _ROWS  # type: ignore[assignment]
-
-
 class Test(Values):
     """A test: events, and what is scored of them."""
 
@@ -70,44 +63,31 @@ class Test(Values):
 
 
 @dataclass(frozen=True)
-class JudgeRecipe:
-    """What the judge does; `InputError` names the entry that cannot be understood.
+class JudgeRecipe(Values):
+    """What the judge does: values of settings by their keys, and tables; `InputError` names what cannot be understood.
 
     Parameters
     ----------
+    given
+        The values of settings, such as that of "baselines.subsets".
     values
-        The recipe's tables.
+        The recipe's tables, of which those of tests, validation and models are read here.
     folder
         The paths in the recipe are relative to it.
     """
 
-    values: Mapping[str, Any]
+    rows = _ROWS  # type: ignore[assignment]
+    values: Mapping[str, Any] = field(default_factory=dict)
     folder: Path = Path()
 
     def __post_init__(self) -> None:
-        known = ("version", "tests", "models", "validation", *_TABLES)
-        if self.values.get("version") != VERSION:
-            raise InputError(f"version: expected {VERSION}, got {self.values.get('version')!r}")
-        for key in self.values:
-            if key not in known:
-                raise InputError(f"{key}: no such entry; expected {', '.join(known)}")
-        _ = self.settings, self.grid, self.tests, self.validation, self.models, self.families
-
-    def __getitem__(self, key: str) -> Any:
-        """The value of a setting, such as "baselines.subsets", or its default."""
-        return self.settings[key]
-
-    @cached_property
-    def settings(self) -> Values:
-        """The values of the tables but tests and models."""
-        return _Settings(flat({name: table(self.values, name) for name in _TABLES}, _ROWS, *_TABLES))
+        super().__post_init__()
+        _ = self.grid, self.tests, self.validation, self.models, self.families
 
     @cached_property
     def grid(self) -> Grid:
         """The voxels that all methods give."""
-        spacing = required(self["grid.spacing"], "grid.spacing", "give the voxel size in mm")
-        n_x, n_y, n_z = np.broadcast_to(self["grid.voxels"], 3).tolist()
-        return Grid.centered((n_x, n_y, n_z), np.broadcast_to(spacing, 3), self["grid.center"])
+        return grid_of(self, "grid")
 
     @cached_property
     def tests(self) -> list[Test]:
@@ -159,7 +139,10 @@ class JudgeRecipe:
             return found
 
 
-def read_judge_recipe(path: str | os.PathLike[str]) -> JudgeRecipe:
+def read_judge_recipe(path: AnyPath) -> JudgeRecipe:
     """The judge's recipe in a TOML file; paths in it are relative to its folder. `InputError` names the entry."""
     with naming(path):
-        return JudgeRecipe(read_toml(path), Path(path).absolute().parent)
+        values = read_toml(path)
+        check_entries(values, VERSION, ("version", "tests", "models", "validation", *_TABLES))
+        given = flat({name: table(values, name) for name in _TABLES}, _ROWS, *_TABLES)
+        return JudgeRecipe(given, values, Path(path).absolute().parent)

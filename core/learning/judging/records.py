@@ -1,7 +1,5 @@
 """What the judge has done so far: every single event's scores, in files that are whole at any time."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

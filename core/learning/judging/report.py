@@ -1,8 +1,6 @@
-"""The judge's table, in Markdown and JSON, and its picture."""
+"""What the judge has found: its table, in Markdown and JSON, and its picture."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -13,53 +11,55 @@ from ...figures.parts import FAINT, INK, Axes, heading, number
 from ...files import write_bytes
 from ...runs.display import Display
 from ...volumes.volume import Volume
-from .judgement import BASELINE, METHOD, ORACLE, Judgement
 from .records import write_json
 
+BASELINE, ORACLE, METHOD = "baseline", "tuned on the set", "method"
+"""Kinds of rows."""
 _WIDTH, _ROW, _LINE = 1800, 330, 26  # pixels: the page, a row of slices, a ratio
 _COLORS = {BASELINE: FAINT, ORACLE: "#a06c10", METHOD: "#b8433a"}
 
-Row = dict[str, Any]
-
-
-def _interval(name: str, digits: int = 3) -> Callable[[Row], str]:
-    def text(row: Row) -> str:
-        value, low, high = row[name]
-        return f"{value:.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]"
-
-    return text
-
-
-def _ratio(name: str) -> Callable[[Row], str]:
-    return lambda row: _interval("ratio", 3)(row[name])
-
-
-def _plain(name: str, form: str) -> Callable[[Row], str]:
-    return lambda row: format(row[name], form)
-
-
-_COLUMNS: tuple[tuple[str, str, Callable[[Row], str]], ...] = (
-    ("NRMSE", "nrmse", _plain("nrmse", ".3f")),
-    ("by the best baseline", "best_baseline", _ratio("best_baseline")),
-    ("by the best tuned on the set", "best_on_itself", _ratio("best_on_itself")),
-    ("SSIM", "ssim", _plain("ssim", ".3f")),
-    ("bias", "bias", _plain("bias", ".3f")),
-    ("SD", "deviation", _plain("deviation", ".3f")),
-    ("contrast", "contrast", _plain("contrast", ".2f")),
-    ("rods seen", "sensitivity", _interval("sensitivity")),
-    ("false rods", "false_rods", _interval("false_rods")),
-    ("AUC", "auc", _interval("auc")),
-    ("observer's SNR", "snr", _plain("snr", ".2f")),
-    ("deviance", "deviance", _plain("deviance", ".3f")),
-    ("s", "seconds", _plain("seconds", ".2f")),
-    ("MB", "megabytes", _plain("megabytes", ".0f")),
+_COLUMNS = (
+    ("NRMSE", "nrmse", "{:.3f}"),
+    ("by the best baseline", "best_baseline", "{[ratio]}"),
+    ("by the best tuned on the set", "best_on_itself", "{[ratio]}"),
+    ("SSIM", "ssim", "{:.3f}"),
+    ("bias", "bias", "{:.3f}"),
+    ("SD", "deviation", "{:.3f}"),
+    ("contrast", "contrast", "{:.2f}"),
+    ("rods seen", "sensitivity", "{}"),
+    ("false rods", "false_rods", "{}"),
+    ("AUC", "auc", "{}"),
+    ("observer's SNR", "snr", "{:.2f}"),
+    ("deviance", "deviance", "{:.3f}"),
+    ("s", "seconds", "{:.2f}"),
+    ("MB", "megabytes", "{:.0f}"),
 )
+"""Heading, key of a row and how its value is written; an `Estimate` writes itself."""
 _LEGEND = """NRMSE: root mean square error by the truth's root mean square. SSIM: in three dimensions, a Gaussian window of
 1.5 voxels, 11 wide; range: the truth's. Bias, SD: over draws of noise, root mean squares by the truth's. Contrast: 1 is the
 truth's. Rods seen, false rods: shares of sites with and without a rod where more than half of its contrast is (Wilson). AUC:
 channelised Hotelling observer, 5 Laguerre-Gauss channels, ten folds. Deviance: of the counts from the volume's images, by
 its mean for true means: 1 is right. Intervals are of 95 %; ratios are of mean NRMSE on the same events (paired bootstrap).
 """
+
+
+@dataclass(frozen=True, eq=False)
+class Judgement:
+    """What the judge has found."""
+
+    rows: list[dict[str, Any]]
+    """One for each test, level and method."""
+    tests: dict[str, dict[str, Any]]
+    """By name: the set's hash, its number of events, scoring, what methods are told."""
+    tuning: dict[str, Any]
+    """What was chosen of each family of baselines, for each level."""
+    pictures: list[tuple[str, list[tuple[str, Volume]]]] = field(default_factory=list)
+    """Of the first event of some tests: a title, and volumes by name, the truth first."""
+
+    @property
+    def record(self) -> dict[str, Any]:
+        """All but the pictures, as JSON holds it; intervals are lists of value, low and high."""
+        return {"version": 1, "tests": self.tests, "tuning": self.tuning, "rows": self.rows}
 
 
 def write_report(found: Judgement, folder: Path) -> None:
@@ -77,7 +77,7 @@ def markdown(found: Judgement) -> str:
     for row in found.rows:
         name = row["method"] + (f", {ORACLE}" if row["kind"] == ORACLE else "")
         cells = [row["test"], f"{row['level']:g}", name]
-        cells += [text(row) if key in row else "" for _, key, text in columns]
+        cells += [form.format(row[key]) if key in row else "" for _, key, form in columns]
         lines.append(f"| {' | '.join(cells)} |")
     sets = [f"- {name}: {test['events']} events, set {test['set']}" for name, test in found.tests.items()]
     sets += [f"- {name}: methods are told {test['believed']}" for name, test in found.tests.items() if test["believed"]]
@@ -110,7 +110,7 @@ def _slices(page: Page, title: str, volumes: list[tuple[str, Volume]], top: int)
         page.image(display.colored(values.T[::-1], window), left, top + 30, side, side)
 
 
-def _ratios(page: Page, rows: list[Row], top: int) -> None:
+def _ratios(page: Page, rows: list[dict[str, Any]], top: int) -> None:
     ends = [end for row in rows for end in row["best_baseline"]["ratio"]]
     low, high = min(0.7, *ends), max(1.1, *ends)
     axes = Axes(page, (700, top, page.width - 800, _LINE * len(rows)), (low, high), (len(rows), 0), page.em)

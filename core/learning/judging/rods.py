@@ -1,16 +1,13 @@
 """Single rods: how much of its contrast a volume shows at a place where a rod is, or where one could be."""
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ...arrays import Floats
 from ...geometry.frames import moved
 from ...phantoms.derenzo import DerenzoPhantom
 from ...volumes.resampling import values_at
 from ...volumes.volume import Volume
-
-Floats = NDArray[np.float64]
 
 PRESENT = 0.5
 """A rod is seen where more than this share of its contrast is."""

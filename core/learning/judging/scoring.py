@@ -1,19 +1,16 @@
 """What one volume of one event is worth: scores by kind of test."""
 
-from __future__ import annotations
-
 import dataclasses
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...arrays import Floats
 from ...errors import InputError
 from ...events.event_set import Event
 from ...events.planning import PlannedEvent
@@ -33,12 +30,11 @@ from .consistency import relative_deviance
 from .observer import channel_outputs
 from .rods import PRESENT, rod_contrasts
 
-Floats = NDArray[np.float64]
 Scores = dict[str, Any]
 _EVERY = 0.005  # s, between looks at the memory
 
 
-@dataclass(frozen=True, eq=False)
+@dataclasses.dataclass(frozen=True, eq=False)
 class Case:
     """One event at one level and draw of noise, as methods are asked for it."""
 

@@ -1,10 +1,7 @@
 """The judge's sets of events: recipes to begin with, and what names a set."""
 
-from __future__ import annotations
-
 import hashlib
 import json
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
@@ -14,6 +11,7 @@ from ...errors import InputError, several
 from ...events.event_set import EventSet
 from ...events.templates import with_workbook
 from ...example import EXAMPLE
+from ...files import AnyPath
 from ...validation import one_of
 
 _FOLDER = Path(__file__).parents[1] / "templates"
@@ -28,7 +26,7 @@ SETS: Mapping[str, str] = MappingProxyType({
 """What each recipe is for, by name."""
 
 
-def set_text(name: str, workbook: str | os.PathLike[str] = EXAMPLE) -> str:
+def set_text(name: str, workbook: AnyPath = EXAMPLE) -> str:
     """The text of a recipe (TOML) of events, with a workbook's path as the recipe's folder sees it."""
     one_of(name, SETS, "set of events")
     return with_workbook((_FOLDER / f"{name}.toml").read_text(encoding="utf-8"), workbook)

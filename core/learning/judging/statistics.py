@@ -1,18 +1,15 @@
 """Intervals of what a few events or sites say: ratios, differences, shares and areas under curves."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ...arrays import Floats
 from ...errors import InputError
 from ...validation import real_array
-
-Floats = NDArray[np.float64]
 
 Z95 = 1.959963984540054
 """How many standard deviations of a normal distribution hold 95 % of it."""

@@ -1,7 +1,5 @@
 """From single events' scores to the rows of the judge's table."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

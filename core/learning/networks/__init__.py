@@ -3,8 +3,9 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import import_module
+from typing import Any
 
-from ...errors import InputError
+from ...errors import needing
 
 
 @dataclass(frozen=True)
@@ -15,12 +16,10 @@ class Kind:
     text: str  # one line of help
     file: str  # beside this one
 
-    def load(self) -> type:
+    def load(self) -> Any:
         """Its class; `InputError` where torch or MONAI is missing."""
-        try:
-            return import_module(f".{self.file}", __name__).Model  # type: ignore[no-any-return]
-        except ImportError as error:
-            raise InputError(f'{error.name} is missing: pip install "mphdrr[learning]"') from None
+        with needing("mphdrr[learning]"):
+            return import_module(f".{self.file}", __name__).Model
 
 
 NETWORKS: Mapping[str, Kind] = {

@@ -31,6 +31,8 @@ class Model(Network):
         By OSEM.
     """
 
+    may_be_0 = ("features",)
+
     def __init__(
         self,
         cameras: int = 5,

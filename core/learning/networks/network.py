@@ -1,7 +1,7 @@
 """What all networks share: the interface, the U-Net, what counts say of a volume, and how values stay at least 0."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Any
 
 import torch
@@ -24,6 +24,9 @@ class Network(nn.Module, ABC):
     else of a scanner: `setup` is given with each call, so that a network that is told the geometry works with any. What
     needs a fixed number of views or voxels (`channels`) says so with `InputError`.
     """
+
+    may_be_0: Collection[str] = ()
+    """Arguments that may be 0; other whole numbers are 1 or more."""
 
     @classmethod
     def fixed(cls, setup: Setup) -> dict[str, Any]:
@@ -48,17 +51,8 @@ class UNet(nn.Module):
             raise InputError(f"network.{name}: expected three levels or more, each of 1 or more, got {list(channels)}")
         strides = (1, *[2] * (len(channels) - 1))
         self.divisor = 2 ** (len(channels) - 1)
-        self.net = DynUNet(
-            dimensions,
-            inputs,
-            outputs,
-            [3] * len(channels),
-            strides,
-            strides[1:],
-            filters=list(channels),
-            norm_name="",
-            act_name=LEAKY,
-        )
+        kernels, like = [3] * len(channels), {"norm_name": "", "act_name": LEAKY}
+        self.net = DynUNet(dimensions, inputs, outputs, kernels, strides, strides[1:], filters=list(channels), **like)
         last = self.net.output_block.conv.conv
         nn.init.zeros_(last.weight)
         nn.init.zeros_(last.bias)

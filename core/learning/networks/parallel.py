@@ -7,6 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ...errors import InputError
 from ...geometry.grid import Grid
 from ...geometry.parallel_views import parallel_views
 from ...projector import Projector
@@ -33,10 +34,14 @@ class Model(Network):
         By OSEM.
     """
 
+    may_be_0 = ("neighbours",)
+
     def __init__(
         self, angles: int = 96, neighbours: int = 1, channels: Sequence[int] = (16, 32, 48), *, volumes: int = 3
     ):
         super().__init__()
+        if neighbours > angles:
+            raise InputError(f"network.neighbours: expected at most the {angles} angles, got {neighbours}")
         self.angles, self.neighbours = angles, neighbours
         self.net = UNet((volumes + 1) * (2 * neighbours + 1), 1, channels, dimensions=2)
 
@@ -44,9 +49,8 @@ class Model(Network):
         """See `Network`."""
         beam, x = parallel_beam(setup.A.grid, self.angles), middle(sample)
         update = x * spread(setup, surplus(setup, sample, x))
-        images = (
-            beam.project(torch.cat([sample.osem, 5 * update], 1)) / beam.length
-        )  # (B, volumes + 1, angles, n_v, n_u)
+        volumes = torch.cat([sample.osem, 5 * update], 1)
+        images = beam.project(volumes) / beam.length  # (B, volumes + 1, angles, n_v, n_u)
         correction = self.net(self._stacks(images).flatten(0, 1)).view(len(x), self.angles, *images.shape[-2:])
         return [positive(beam.fbp(images[:, sample.osem.shape[1] // 2] + correction)[:, None] * beam.length)]
 

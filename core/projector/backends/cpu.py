@@ -23,7 +23,7 @@ from ..rays import Attenuation, IndexFans, IndexRays, Rays
 LEVEL_VARIABLE = "MPHDRR_CPU_LEVEL"
 """Environment variable that names a lower level of processor, `levels`, than this one's."""
 
-_CONTRACT = 7
+_CONTRACT = 8
 _NAMES = {"win32": "siddon.dll", "darwin": "libsiddon.dylib"}
 _MOST_VOXELS = 2**31 - 1  # their indices are of 32 bits
 _PRODUCT = 2  # in kernels.h
@@ -68,6 +68,7 @@ class _DepthJob(Structure):
         ("planes_per_inverse", c_double), ("passes", c_void_p), ("cells", c_void_p), ("planes", c_int64),
         ("rows", c_int64), ("columns", c_int64), ("kernel", c_void_p), ("bounds", c_void_p),
         ("taps", c_int64 * 2), ("step", c_int64 * 2), ("image", c_void_p), ("row", c_int64), ("pixels", c_int64 * 2),
+        ("gradient", c_void_p),
     ]  # fmt: skip
 
 
@@ -82,7 +83,14 @@ class _PlacesJob(Structure):
 
 _KERNELS = {
     _Job: ("forward", "backproject", "differentiate", "differentiate_by_mu"),
-    _DepthJob: ("voxels_to_cells", "cells_to_voxels", "cells_to_pixels", "pixels_to_cells"),
+    _DepthJob: (
+        "voxels_to_cells",
+        "cells_to_voxels",
+        "cells_to_pixels",
+        "pixels_to_cells",
+        "differentiate_places",
+        "differentiate_taps",
+    ),
     _PlacesJob: ("take_at", "give_at"),
 }
 
@@ -302,15 +310,41 @@ def cells_to_pixels(cells: Array, of: DepthResponse) -> Array:
 
 def pixels_to_cells(image: Array, of: DepthResponse) -> Array:
     """The adjoint of `cells_to_pixels`."""
+    sorted_cells = _sorted_cells(of, image.dtype)
+    _run_pixels(_library.pixels_to_cells, of, sorted_cells, _padded(image, of))
+    cells = np.empty(of.shape, image.dtype)
+    np.multiply(sorted_cells, _by_place(of.before, of), out=_by_place(cells, of), casting="same_kind")
+    return cells
+
+
+def differentiate_places(
+    volume: Array, cells: Array, of: DepthResponse, passes: Array | None = None
+) -> tuple[Floats, Floats]:
+    """Of the sum of `volume` times what `voxels_to_cells`' adjoint gives: by `of.matrix` (3, 4), and by its line (3,)."""
+    gradient = np.zeros(3 + 12 * len(of.pieces))
+    _run_voxels(_library.differentiate_places, of, cells, volume, passes, gradient=gradient)
+    by_shifts = gradient[3:].reshape(-1, 4, 3)  # and times the voxels' indices
+    by_matrix = np.concatenate([by_shifts[:, 1:].sum(axis=0).T, by_shifts[:, 0].sum(axis=0)[:, None]], axis=1)
+    by_matrix[:, :3] += by_shifts[:, 0].T @ of.pieces
+    return by_matrix, gradient[:3]
+
+
+def differentiate_taps(image: Array, cells: Array, of: DepthResponse) -> Floats:
+    """Of the sum of `image` times `cells_to_pixels`: by `of.kernel`, (planes, taps, taps)."""
+    gradient = np.zeros(of.kernel.shape)
+    sorted_cells = _sorted_cells(of, cells.dtype)
+    sorted_cells[...] = _by_place(cells * of.before, of)
+    _run_pixels(_library.differentiate_taps, of, sorted_cells, _padded(image, of), gradient)
+    return gradient
+
+
+def _padded(image: Array, of: DepthResponse) -> Array:
+    """`image` times `of.after`, with the zeros around it that kernels read."""
     n_v, n_u = image.shape
     before, together = (of.kernel.shape[2] - 1) // of.steps[1], of.shape[2] // of.steps[1]
     padded = np.zeros((n_v, before + -(-together // _READ_ON) * _READ_ON), image.dtype)
     padded[:, before : before + n_u] = image * of.after
-    sorted_cells = _sorted_cells(of, image.dtype)
-    _run_pixels(_library.pixels_to_cells, of, sorted_cells, padded[:, before:])
-    cells = np.empty(of.shape, image.dtype)
-    np.multiply(sorted_cells, _by_place(of.before, of), out=_by_place(cells, of), casting="same_kind")
-    return cells
+    return padded[:, before:]
 
 
 def _by_place(cells: Array, of: DepthResponse) -> Array:
@@ -322,11 +356,19 @@ def _sorted_cells(of: DepthResponse, kind: Any) -> Array:
     """Room for cells as `_by_place` has them, in a row, with what kernels read beyond."""
     planes, rows, columns = of.shape
     shape = planes, rows, of.steps[1], columns // of.steps[1]
-    return np.empty(math.prod(shape) + _READ_ON, kind)[:-_READ_ON].reshape(shape)
+    room = np.empty(math.prod(shape) + _READ_ON, kind)
+    room[-_READ_ON:] = 0
+    return room[:-_READ_ON].reshape(shape)
 
 
 def _run_voxels(
-    kernel: Any, of: DepthResponse, cells: Array, volume: Array, passes: Array | None, slab: slice = slice(None)
+    kernel: Any,
+    of: DepthResponse,
+    cells: Array,
+    volume: Array,
+    passes: Array | None,
+    slab: slice = slice(None),
+    gradient: Floats | None = None,
 ) -> None:
     """Run a kernel between the voxels and the cells of one view."""
     if passes is not None and (passes.shape != volume.shape or passes.dtype != cells.dtype):
@@ -340,11 +382,14 @@ def _run_voxels(
         parts_per_cell=of.parts_per_cell, nearest=of.nearest, farthest=of.farthest, first_plane=of.first_plane,
         planes_per_inverse=of.planes_per_inverse, passes=None if passes is None else passes.ctypes.data,
         cells=cells.ctypes.data, planes=of.shape[0], rows=of.shape[1], columns=of.shape[2], step=of.steps,
+        gradient=None if gradient is None else gradient.ctypes.data,
     )  # fmt: skip
     kernel(level, job)
 
 
-def _run_pixels(kernel: Any, of: DepthResponse, sorted_cells: Array, image: Array) -> None:
+def _run_pixels(
+    kernel: Any, of: DepthResponse, sorted_cells: Array, image: Array, gradient: Floats | None = None
+) -> None:
     """Run a kernel between the sorted cells and the pixels of one view."""
     taps = of.padded.astype(image.dtype, copy=False)
     job = _DepthJob(
@@ -352,5 +397,6 @@ def _run_pixels(kernel: Any, of: DepthResponse, sorted_cells: Array, image: Arra
         cells=sorted_cells.ctypes.data, planes=of.shape[0], rows=of.shape[1], columns=of.shape[2],
         kernel=taps.ctypes.data, bounds=of.bounds.ctypes.data, taps=of.kernel.shape[1:], step=of.steps,
         image=image.ctypes.data, row=image.strides[0] // image.itemsize, pixels=of.after.shape,
+        gradient=None if gradient is None else gradient.ctypes.data,
     )  # fmt: skip
     kernel(level, job)

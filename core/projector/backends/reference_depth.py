@@ -3,11 +3,15 @@
 import itertools
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 
 from ...arrays import Array
 from ..depth_response import DepthResponse
+
+# Steps of central differences, by the largest of their kind.
+_STEP = 1e-6
 
 
 def voxels_to_cells(volume: Array, of: DepthResponse, passes: Array | None = None) -> Array:
@@ -95,3 +99,32 @@ def _shares(of: DepthResponse, shape: tuple[int, ...], x: int) -> Iterator[tuple
 def _spline(offset: Array) -> tuple[Array, Array, Array]:
     """The quadratic B-spline's shares of the cell before, the nearest and the one after."""
     return (0.5 - offset) ** 2 / 2, 0.75 - offset**2, (0.5 + offset) ** 2 / 2
+
+
+def differentiate_places(
+    volume: Array, cells: Array, of: DepthResponse, passes: Array | None = None
+) -> tuple[Array, Array]:
+    """Of the sum of `volume` times what the adjoint of `voxels_to_cells` gives: by `of.matrix` (3, 4), and by its line (3,).
+
+    By central differences, which say no more than the images themselves.
+    """
+    numbers = np.concatenate([of.matrix.ravel(), of.matrix[:, :3] @ of.line])
+    scale = np.concatenate([np.repeat(np.abs(of.matrix[:, :3]).max(axis=1), 4), np.abs(numbers[12:])])
+
+    def total(numbers: Array) -> float:
+        matrix = numbers[:12].reshape(3, 4)
+        line = np.linalg.solve(matrix[:, :3], numbers[12:])
+        return float((voxels_to_cells(volume, replace(of, matrix=matrix, line=line), passes) * cells).sum())
+
+    by = np.array([(total(numbers + step) - total(numbers - step)) for step in _STEP * np.diag(scale)])
+    by /= 2 * _STEP * scale
+    return by[:12].reshape(3, 4), by[12:]
+
+
+def differentiate_taps(image: Array, cells: Array, of: DepthResponse) -> Array:
+    """Of the sum of `image` times `cells_to_pixels`: by `of.kernel`, (planes, taps, taps)."""
+    fine = np.zeros(of.shape[1:])
+    fine[_pixels(of)] = image * of.after
+    spectrum = np.fft.rfft2(cells * of.before) * np.fft.rfft2(fine).conj()
+    taps = np.fft.irfft2(spectrum, of.shape[1:])
+    return taps[:, : of.kernel.shape[1], : of.kernel.shape[2]]

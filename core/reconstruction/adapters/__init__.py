@@ -8,9 +8,9 @@ import importlib
 import warnings
 from typing import Any
 
-from ...errors import InputError
+from ...errors import needing
 from ...projector import Projector
-from ...projector.operator import LinearOperator
+from ...projector.linear_operator import LinearOperator
 from ...validation import instance
 from .parallelproj_operator import ParallelprojOperator
 
@@ -141,8 +141,5 @@ def parallelproj_operator(A: LinearOperator) -> ParallelprojOperator:
 
 def _module(name: str, package: str) -> Any:
     """A module of this folder, which imports the package; `InputError` where that, or something it needs, is missing."""
-    try:
+    with needing(of=package):
         return importlib.import_module(f".{name}", __package__)
-    except ModuleNotFoundError as error:
-        missing = (error.name or package).partition(".")[0]
-        raise InputError(f"{package}: {missing} is missing: pip install {missing}") from None

@@ -16,6 +16,9 @@ typedef struct {
     F across[2][3];   // shares of their rows: a quadratic B-spline
     F nearer;         // share of the nearer plane
     F weight;         // 1 / depth^2; 0 outside the image
+    // For derivatives: 1 / depth; column and row before rounding, and how many of them the line covers; where on the line the part is;
+    // and how much more than 1 the mean of 1 / depth^2 on a point's line is, by 1 / depth^2.
+    F inverse, at[2], covers[2], off, deep;
 } Places;
 
 enum { MOST_PARTS = 1 << 12 }; // only close before the pinhole's plane would there be more
@@ -43,13 +46,17 @@ INLINE void find_places(
     const I is_one = smear <= (F)(REAL)job->of_pair;
     p->is_pair = (is_one & (smear > (F)(REAL)job->of_point)) ? (F)0.5 : (F)0;
     p->parts = is_one ? (F)1 : 2 + AS(F, AS(I, in_zone ? more : (F)0));
-    F deep = line[2] * inverse, weight = 1 + deep * deep * (F)0.25; // the mean of 1 / depth^2 on the line
+    const F slope = line[2] * inverse;
+    p->deep = slope * slope * (F)0.25, p->off = 0;
+    F weight = 1 + p->deep; // the mean of 1 / depth^2 on the line
     if (ANY(!is_one)) {
         const F n = p->parts, off = ((F)(REAL)number - (n - 1) * (F)0.5) / __builtin_elementwise_sqrt(MAX(n * n - 1, (F)1));
-        EACH_AXIS(a) at[a] += is_one ? (F)0 : off * line[a];
+        p->off = is_one ? (F)0 : off, p->deep = is_one ? p->deep : (F)0;
+        EACH_AXIS(a) at[a] += p->off * line[a];
         inverse = 1 / (in_zone ? at[2] : (F)1), u = at[0] * inverse, v = at[1] * inverse;
         weight = is_one ? weight : 1 / n;
     }
+    p->inverse = inverse, p->at[0] = u, p->at[1] = v, p->covers[0] = wide, p->covers[1] = high;
     const I inside = in_zone & (p->parts > (F)(REAL)number) & (u >= (F)1) & (u <= (F)(job->columns - 3)) & (v >= (F)1) &
                      (v <= (F)(job->rows - 2));
     u = inside ? u : (F)1, v = inside ? v : (F)1;
@@ -127,6 +134,88 @@ INLINE void between(const DepthJob *job, const int gathers) {
                     if (gathers) taken[0] += nearer[i] * (taken[1] - taken[0]), voxels[z + i] += (taken[0].x + taken[0].y) + taken[0].z;
                 }
             }
+        }
+    }
+}
+
+// What cells have at a point, and by how much more that is from column to column, row to row and plane to plane.
+typedef struct {
+    REAL sum, by[3];
+} Taken;
+
+INLINE Taken take(const DepthJob *job, const REAL *cells, REAL along, const REAL *across, REAL nearer) {
+    const Cells once = {-0.5, 0, 0.5, 0}, twice = {1, -2, 1, 0}, given = shares(along), more = once + along * twice;
+    const REAL offset = across[2 * LANES] - across[0], rise[3] = {offset - (REAL)0.5, -2 * offset, offset + (REAL)0.5};
+    Cells taken[2][3] = {0};
+    UNROLLED for (int k = 0; k < 2; k++, cells += job->rows * job->columns) UNROLLED for (int a = 0; a < 3; a++) {
+        const Cells row = *(const Cells *)(cells + a * job->columns);
+        taken[k][0] += across[a * LANES] * row, taken[k][1] += rise[a] * row;
+    }
+    const Cells both = taken[0][0] + nearer * (taken[1][0] - taken[0][0]), up = taken[0][1] + nearer * (taken[1][1] - taken[0][1]);
+#define TOTAL(three) ((three).x + (three).y + (three).z)
+    return (Taken){
+        TOTAL(both * given), {TOTAL(both * more), TOTAL(up * given), TOTAL((taken[1][0] - taken[0][0]) * given)}
+    };
+#undef TOTAL
+}
+
+INLINE void add_lanes(double *sum, F x) { EACH_LANE(i) *sum += x[i]; }
+
+// Of some voxels' part, all that is summed: by where they are, and by the line.
+INLINE void add_gradient(const DepthJob *job, const Places *p, F value, const F taken[2][4], double sums[4][3], double xyz[3], F lane) {
+    const F deep = (F)(REAL)job->line[2], inverse = p->inverse;
+    const F sum = value * (taken[0][0] + taken[1][0]), by_weight = sum / (1 + p->deep);
+    F at[3], line[3];
+    at[2] = -2 * inverse * (sum + by_weight * p->deep) -
+            value * (taken[0][3] + taken[1][3]) * (F)(REAL)job->planes_per_inverse * inverse * inverse;
+    line[2] = p->parts == (F)1 ? by_weight * deep * inverse * inverse * (F)0.5 : (F)0;
+    UNROLLED for (int a = 0; a < 2; a++) {
+        const F by = value * (taken[0][a + 1] + taken[1][a + 1]) * inverse;
+        const F apart = value * p->is_pair * (F)0.57735026918962576 * (taken[1][a + 1] - taken[0][a + 1]) * inverse;
+        at[a] = by - apart * deep * inverse, line[a] = apart;
+        at[2] -= by * p->at[a] + apart * (p->covers[a] - p->at[a] * deep * inverse);
+        line[2] -= apart * p->at[a];
+    }
+    EACH_AXIS(a) {
+        double along = 0, whole = 0, by_line = 0;
+        add_lanes(&whole, at[a]), add_lanes(&along, at[a] * lane), add_lanes(&by_line, line[a] + p->off * at[a]);
+        sums[0][a] += whole, sums[1][a] += whole * xyz[0], sums[2][a] += whole * xyz[1], sums[3][a] += whole * xyz[2] + along;
+        job->gradient[a] += by_line;
+    }
+}
+
+// Of the sum of all that voxels take from cells, times their numbers, the derivatives by matrix, shifts and line.
+void KERNEL(differentiate_places)(const DepthJob *job) {
+    const int64_t *n = job->volume.n;
+    F lane;
+    EACH_LANE(i) lane[i] = i;
+    for (int64_t x = job->first; x < job->last; x++) for (int64_t y = 0; y < n[1]; y++) for (int64_t z = 0; z < n[2]; z += LANES) {
+        const int64_t of_row = (x * n[1] + y) * n[2];
+        const int lanes = (int)MIN((int64_t)LANES, n[2] - z);
+        F f = some((REAL *)job->volume.voxels + of_row + z, lanes);
+        if (!ANY(f != (F)0)) continue;
+        if (job->passes) f *= some((const REAL *)job->passes + of_row + z, lanes);
+        double start[3], xyz[3] = {x, y, z};
+        EACH_AXIS(a) start[a] = job->matrix[a][0] * x + job->matrix[a][1] * y + job->matrix[a][3];
+        Places p;
+        for (int64_t piece = 0; piece < job->pieces; piece++) for (int number = 0; !number || ANY(p.parts > (F)(REAL)number); number++) {
+            find_places(job, start, (F)(REAL)z + lane, job->shifts[piece], number, &p);
+            const F value = p.weight * f * (p.is_pair != (F)0 ? p.is_pair : (F)1);
+            if (!ANY(value != (F)0)) continue;
+            F taken[2][4] = {0};
+            const REAL *values = (const REAL *)&value, *is_pair = (const REAL *)&p.is_pair, *nearer = (const REAL *)&p.nearer;
+            const REAL *along = (const REAL *)&p.along, *across = (const REAL *)p.across;
+            const __typeof__(p.cell[0]) *first = (const void *)&p.cell;
+            for (int i = 0; i < lanes; i++) {
+                if (values[i] == 0) continue;
+                for (int point = 0; point < (is_pair[i] != 0 ? 2 : 1); point++) {
+                    const REAL *cells = (const REAL *)job->cells + first[i];
+                    const Taken of = take(job, cells, along[point * LANES + i], across + 3 * point * LANES + i, nearer[i]);
+                    taken[point][0][i] = of.sum;
+                    EACH_AXIS(a) taken[point][a + 1][i] = of.by[a];
+                }
+            }
+            add_gradient(job, &p, value, taken, (double(*)[3])(job->gradient + 3 + 12 * piece), xyz, lane);
         }
     }
 }
@@ -237,6 +326,23 @@ void KERNEL(cells_to_pixels)(const DepthJob *job) {
 #define SUM(wide) sum_cells(&plane, i, j, wide)
             EACH_RUN(j, job->pixels[1], SUM);
 #undef SUM
+        }
+    }
+}
+
+// Of the sum of the pixels of cells_to_pixels, each times its number in `image`, the derivatives by the taps.
+void KERNEL(differentiate_taps)(const DepthJob *job) {
+    const int64_t *taps = job->taps, *step = job->step;
+    for (int64_t number = 0; number < job->planes; number++) {
+        const Plane plane = plane_of(job, number);
+        for (int64_t a = 0; a < taps[0]; a++) for (int64_t b = plane.bounds[a][0]; b < plane.bounds[a][1]; b++) {
+            Run sum = {0};
+            for (int64_t i = 0; i < job->pixels[0]; i++) {
+                const REAL *pixels = (const REAL *)job->image + i * job->row; // zeros come after it
+                const REAL *cells = plane.cells + (i * step[0] + a) * job->columns + b % step[1] * plane.together + b / step[1];
+                for (int64_t j = 0; j < job->pixels[1]; j += LANES) sum += *(const Run *)(pixels + j) * *(const Run *)(cells + j);
+            }
+            add_lanes(job->gradient + (number * taps[0] + a) * taps[1] + b, sum);
         }
     }
 }

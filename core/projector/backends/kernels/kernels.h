@@ -13,7 +13,7 @@
 #pragma once
 #include <stdint.h>
 
-#define CONTRACT 7 // counted up with every change of this file: cpu.py takes no other
+#define CONTRACT 8 // counted up with every change of this file: cpu.py takes no other
 
 // Voxels (n[0], n[1], n[2]) in C order, of a job's kind of number.
 typedef struct {
@@ -85,6 +85,8 @@ typedef struct {
                                    // zeros after it until there are columns / step[1] numbers, rounded up to a multiple of 16
     int64_t row;                   // from a row of the image to the next
     int64_t pixels[2];
+    double *gradient;              // what derivatives are added to: (planes, taps[0], taps[1]), or by `line` (3), and for each piece (4, 3): by
+                                   // its `shifts`, and the same times x, y and z of the voxels
 } DepthJob;
 
 // Arrays that are interpolated linearly at the places of a lattice's points, or that are given the points' numbers, shared out with
@@ -139,6 +141,11 @@ void cells_to_voxels(int64_t level, const DepthJob *job);
 // image = weighted sums of cells, and the adjoint: cells += image, with the same weights
 void cells_to_pixels(int64_t level, const DepthJob *job);
 void pixels_to_cells(int64_t level, const DepthJob *job);
+
+// Derivatives: of the sum of the voxels times what they take from cells, by their places; and of the sum of the image times
+// weighted sums of cells, by the taps. Cells read beyond their last must be numbers, and zeros come after the image's rows.
+void differentiate_places(int64_t level, const DepthJob *job);
+void differentiate_taps(int64_t level, const DepthJob *job);
 
 // points = points combined with what all arrays have at their places, array by array
 void take_at(int64_t level, const PlacesJob *job);

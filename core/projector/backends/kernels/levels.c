@@ -48,6 +48,8 @@ DISPATCH(voxels_to_cells, DepthJob)
 DISPATCH(cells_to_voxels, DepthJob)
 DISPATCH(cells_to_pixels, DepthJob)
 DISPATCH(pixels_to_cells, DepthJob)
+DISPATCH(differentiate_places, DepthJob)
+DISPATCH(differentiate_taps, DepthJob)
 DISPATCH(take_at, PlacesJob)
 DISPATCH(give_at, PlacesJob)
 

@@ -1,0 +1,145 @@
+"""Pinhole images by the depth-dependent response in torch, part of its graph. Needs torch."""
+
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..arrays import is_tensor
+from ..errors import InputError
+from ..geometry.grid import Grid
+from ..geometry.views import Views
+from ..physics.optics import Optics
+from ..volumes.volume import Volume
+from . import autograd, backends
+from .hole_response import WholeHoles
+from .lattices import require_no_negative
+from .parallel import thread_count
+from .transmittance import Field
+
+
+class Holes(NamedTuple):
+    """Numbers of cameras (...), as tensors."""
+
+    length: Tensor
+    diameter: Tensor
+    side: Tensor | None  # the crystal's, if nothing is counted beyond
+    thickness: Tensor
+    pitch: Tensor  # (..., 2): u, v
+    offset: Tensor  # (..., 2)
+
+
+def depth_images(
+    volume: Volume | Tensor,
+    grid: Grid,
+    poses: tuple[Tensor, Tensor],
+    holes: Holes,
+    shape: tuple[int, int],
+    time: Tensor,
+    mu: Volume | Tensor | None,
+    mu_grid: Grid | None,
+    optics: Optics,
+) -> Tensor:
+    """`emission_images` by hole "depth", of numbers that it has checked; `optics` has those of the cameras (...)."""
+    positions, rotations = poses
+    cameras = positions.shape[:-1]
+    for name, number in {"crystal_thickness": holes.thickness, "crystal_side": holes.side, **optics.numbers}.items():
+        if name not in ("aperture_mu", "opening_angle", "photons_per_decay") and getattr(
+            number, "requires_grad", False
+        ):
+            raise InputError(
+                f"emission images: hole 'depth' has no derivatives by {name}: take hole 'rays', or detach it"
+            )
+    factors = time * optics.photons_per_decay
+    plain = optics.with_numbers({"photons_per_decay": 1.0})
+    effective = plain.effective_diameter(holes.diameter)
+    array: Any = volume.array if isinstance(volume, Volume) else volume
+    attenuation: Any = mu.array if isinstance(mu, Volume) else mu
+    mu_grid = mu.grid if isinstance(mu, Volume) else mu_grid or grid
+
+    def run(needs: Any) -> Any:
+        given = array.detach().cpu().numpy() if is_tensor(array) else array
+        kind = np.float64 if np.float64 in (given.dtype, _numpy(positions).dtype) else np.float32
+        given = np.require(given, kind, ["C"])
+        on_mu = None
+        if attenuation is not None:
+            own = attenuation.detach().cpu().numpy() if is_tensor(attenuation) else attenuation
+            on_mu = Field(require_no_negative(np.asarray(own, kind)), mu_grid)
+        model = _whole_holes(grid, poses, holes, effective, shape, plain, on_mu)
+        functions = backends.load("cpu" if backends.choose("auto").name == "cpu" else "reference_depth")
+        threads = thread_count(None)
+        images = np.stack(list(model.images(given, functions, threads))).reshape(*cameras, *shape)
+
+        def gradients(gradient: Tensor, needs: Any) -> list[Tensor | None]:
+            weights = np.require(gradient.numpy(force=True), kind, ["C"]).reshape(-1, *shape)
+            found: list[Any] = [None] * 8
+            if needs[0]:
+                found[0] = model.backproject(weights, functions, threads, lambda done: None)
+            if needs[1] and on_mu is not None:
+                found[1] = model.mu_gradient(given, weights, functions, threads, on_mu)
+            if any(needs[2:]):
+                found[2:] = _by_cameras(model, given, weights, functions, threads)
+            wanted = (array, attenuation, positions, rotations, holes.length, effective, holes.pitch, holes.offset)
+            return [
+                torch.as_tensor(own).reshape(like.shape).to(like) if need else None
+                for own, like, need in zip(found, wanted, needs, strict=True)
+            ]
+
+        return torch.from_numpy(images).to(positions), gradients
+
+    inputs = positions, rotations, holes.length, effective, holes.pitch, holes.offset
+    return autograd.step(run, array, attenuation, *inputs) * factors[..., None, None]
+
+
+def _numpy(tensor: Tensor) -> Any:
+    return tensor.numpy(force=True)
+
+
+def _whole_holes(
+    grid: Grid,
+    poses: tuple[Tensor, Tensor],
+    holes: Holes,
+    effective: Tensor,
+    shape: tuple[int, int],
+    optics: Optics,
+    mu: Field | None,
+) -> WholeHoles:
+    """The model of cameras that stand still."""
+    n = poses[0][..., 0].numel()
+
+    def each(number: Tensor, *last: int) -> Any:
+        return _numpy(number).astype(np.float64).reshape(n, *last)
+
+    position, rotation = each(poses[0], 3), each(poses[1], 3, 3)
+    length, pitch, offset = each(holes.length), each(holes.pitch, 2), each(holes.offset, 2)
+    u, v, k = frames = rotation.transpose(2, 0, 1)
+    centers = position + length[:, None] * k + offset[:, :1] * u + offset[:, 1:] * v
+    views = Views(position, centers, pitch[:, :1] * u, pitch[:, 1:] * v, shape)
+    sides = np.full(n, np.inf) if holes.side is None else each(holes.side)
+    thickness, hole = each(holes.thickness), each(holes.diameter)
+    numbers = {name: each(x) if is_tensor(x) else x for name, x in optics.numbers.items()}
+    plain = replace(optics.with_numbers(numbers), within_crystal=False, within_walls=False)
+
+    def weigh(m: int, along_v: Any, along_u: Any) -> Any:
+        own = plain.of_modules(m, n)
+        (opening,) = own.openings(hole[m])
+        return own.pixel_weights((along_u, along_v), (1.0, 1.0), length[m], np.inf, thickness[m], opening)
+
+    return WholeHoles(views, grid, frames.transpose(1, 0, 2), length, each(effective), sides, weigh, mu, True)
+
+
+def _by_cameras(model: WholeHoles, volume: Any, weights: Any, functions: Any, threads: int) -> list[Any]:
+    """Derivatives by positions, rotations, lengths, effective diameters, pitches and offsets."""
+    found = list(model.gradient(volume, weights, functions, threads))
+    first, pitch = (np.array([getattr(numbers, name) for *_, numbers in found]) for name in ("first", "pitch"))
+    pitch = pitch - (np.array(model.pixels) - 1) / 2 * first
+    return [
+        np.array([center for center, *_ in found]),
+        np.array([frame for _, frame, _ in found]).transpose(0, 2, 1),
+        np.array([numbers.length for *_, numbers in found]),
+        np.array([numbers.diameter for *_, numbers in found]),
+        pitch[:, ::-1].copy(),
+        first[:, ::-1].copy(),
+    ]

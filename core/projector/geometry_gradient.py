@@ -1,0 +1,123 @@
+"""How images move with the geometry: derivatives by the modules' places, frames, collimators, holes and pixels."""
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from ..arrays import Array, Floats, Floats32, checked
+from ..errors import InputError
+from ..geometry.frames import module_frames, tilted
+from ..geometry.system import PinholeSystem
+from ..volumes.volume import Volume
+from .emission import Emission
+from .operator import Projector
+
+# Steps of central differences of what is smooth and quickly made: relative, or rad.
+_STEP = 1e-5
+
+
+class GeometryGradient(NamedTuple):
+    """Derivatives of a sum over the images of M modules; each is at constant other numbers."""
+
+    centers: Floats
+    """(M, 3): by the pinholes' places, 1/mm, the modules' frames being held."""
+    frames: Floats
+    """(M, 3, 3): by the entries of ``system.frames()``, rows u, v, k."""
+    collimator_length: Floats
+    """(M,), 1/mm, with the pixels of the crystal as they are, as the others."""
+    pinhole_diameter: Floats
+    """(M,), 1/mm."""
+    pitch: Floats
+    """(M, 2): by the pixels' sizes along u and v on the crystal, 1/mm, around the image's middle."""
+    offset: Floats
+    """(M, 2): by the image's middle along u and v on the crystal, 1/mm; that of a virtual detector is point-inverted."""
+
+    def by_columns(self, system: PinholeSystem) -> tuple[Floats, Floats]:
+        """Derivatives by ``system.centers``, with which frames turn, and by ``system.tilt``: (M, 3), 1/mm and 1/rad."""
+        by_centers, by_tilt = self.centers.copy(), np.empty_like(self.centers)
+        for axis, step in enumerate(_STEP * np.eye(3)):
+            far = step * system.pinhole_distance[:, None]
+            aimed = tilted(module_frames(system.centers + far), system.tilt)
+            aimed = aimed - tilted(module_frames(system.centers - far), system.tilt)
+            nominal = module_frames(system.centers)
+            turned = tilted(nominal, system.tilt + step) - tilted(nominal, system.tilt - step)
+            by_centers[:, axis] += np.einsum("mij,mij->m", self.frames, aimed) / (2 * far[:, axis])
+            by_tilt[:, axis] = np.einsum("mij,mij->m", self.frames, turned) / (2 * _STEP)
+        return by_centers, by_tilt
+
+
+def geometry_gradient(A: Projector, volume: Volume | Floats | Floats32, images: Floats | Floats32) -> GeometryGradient:
+    """Of the sum of `images` times ``A(volume)``, the derivatives by the geometry.
+
+    They are exact derivatives of what `A` computes, but for the few places where the number of a voxel's parts, of cells or
+    of planes changes. Attenuated, there are more such places: at each, rays pass from voxel to voxel. With float64 they hold
+    to 1e-8 (``Projector(..., double=True)``), else as far as float32 does.
+
+    Parameters
+    ----------
+    A
+        Of `Emission` by its depth-dependent response (hole "auto" or "depth"), in numpy.
+    volume, images
+        (n_x, n_y, n_z), or a `Volume`; and (M, n_v, n_u).
+
+    Raises
+    ------
+    InputError
+        Another model or shape; voxels so close to a pinhole that rays project them.
+    """
+    holes, model = A._depths, A.model
+    if holes is None or not isinstance(model, Emission):
+        raise InputError(
+            "geometry gradient: expected a projector of Emission by hole 'depth'; those by rays are in `emission_images`"
+        )
+    if A._close_parts:
+        raise InputError(
+            f"geometry gradient: voxels before pinhole {model.system.numbers[A._close_parts[0][0]]} are too close to it; "
+            "take a smaller grid"
+        )
+    array, given = A._check(volume, batch=False), checked(images, "images", A.shape_out, A._float64)
+    volume_, functions, threads = A._depth_arguments(array)
+    responded = np.asarray(A._responded(given.astype(volume_.dtype, copy=False)))
+    each = list(holes.gradient(volume_, responded, functions, threads))
+    numbers = [own for *_, own in each]
+    first, pitch = (np.array([getattr(own, name) for own in numbers]) for name in ("first", "pitch"))
+    # The image's middle is half its pixels from its first; along a real detector, steps go backwards.
+    pitch -= (np.array(A.views.shape) - 1) / 2 * first
+    u, v, _ = model.system.frames().transpose(1, 0, 2)
+    signs = np.sign([np.einsum("mi,mi->m", s, a) for s, a in ((A.views.v_steps, v), (A.views.u_steps, u))]).T
+    return GeometryGradient(
+        np.array([center for center, *_ in each]),
+        np.array([frame for _, frame, _ in each]),
+        np.array([own.length for own in numbers]),
+        np.array([own.diameter for own in numbers]) * _effective_rise(model),
+        (pitch * signs)[:, ::-1] + _by_blur(A, volume_, given),
+        (first * signs)[:, ::-1],
+    )
+
+
+def _effective_rise(model: Emission) -> Floats:
+    """The derivative of the effective diameter by the diameter (M,)."""
+    d = model.system.pinhole_diameter
+    more, less = (model.optics.effective_diameter(d * scale) for scale in (1 + _STEP, 1 - _STEP))
+    rise: Floats = (more - less) / (2 * _STEP * d)
+    return rise
+
+
+def _by_blur(A: Projector, volume: Array, images: Array) -> Array:
+    """Derivatives through the detector's blur by the pixels' sizes along u and v, (M, 2)."""
+    by, holes, views, model = np.zeros((len(images), 2)), A._depths, A.views, A.model
+    if holes is None or not isinstance(model, Emission) or model.response(views, 0) is None:
+        return by
+    wide, narrow = (
+        replace(views, u_steps=a * views.u_steps, v_steps=a * views.v_steps) for a in (1 + _STEP, 1 - _STEP)
+    )
+    for m, image in enumerate(holes.images(volume, *A._depth_arguments(volume)[1:])):
+        (v, u), more, less = (model.response(each, m) for each in (views, wide, narrow))  # type: ignore[misc]
+        rise_v, rise_u = ((a - b) / (2 * _STEP) for a, b in zip(more, less, strict=True))  # type: ignore[arg-type]
+        pitch = model.crystal_pitch(views, m)
+        by[m] = (
+            (images[m] * (v @ image @ rise_u.T)).sum() / pitch[0],
+            (images[m] * (rise_v @ image @ u.T)).sum() / pitch[1],
+        )
+    return by

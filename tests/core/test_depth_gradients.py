@@ -1,0 +1,152 @@
+"""Derivatives by the geometry of the depth-dependent response: central differences, in numpy and in torch."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import mphdrr.core as mph
+
+from .conftest import WORKBOOK, refused
+
+SYSTEM = mph.read_system(WORKBOOK)[[0, 21, 47]]
+SYSTEM = SYSTEM.replace(tilt=0.02 * np.random.default_rng(1).normal(size=(3, 3)))
+GRID = mph.Grid.centered((9, 8, 7), 7.0, center=(4.0, -3.0, 2.0))
+SHAPE, PITCH, OFFSET = (15, 13), np.array([3.2, 3.4]), np.array([1.0, 2.0])
+PHYSICS = {"aperture_mu": 3.0, "crystal_mu": 0.3, "photons_per_decay": 0.9}
+
+
+def projector(system=SYSTEM, detector="real", pitch=PITCH, offset=OFFSET, double=True, **model):
+    scale = 1 if detector == "real" else 10
+    views = system.views(SHAPE, detector, 10.0, scale * pitch, scale * offset)
+    return mph.Projector(GRID, views, mph.Emission(system, hole="depth", **{**PHYSICS, **model}), double=double)
+
+
+def numbers(rng):
+    return rng.random(GRID.shape), rng.random((3, *SHAPE))
+
+
+def difference(sums, step):
+    return (sums(step) - sums(-step)) / (2 * step)
+
+
+@pytest.mark.parametrize("settings", [
+    {}, {"detector": "virtual"}, {"intrinsic_fwhm": 3.0}, {"within_crystal": True},
+])  # fmt: skip
+def test_derivatives_are_central_differences(settings, rng):
+    """By places, tilts, collimators, holes, pixels and the image's middle, each within 1e-6 of the largest of its kind."""
+    x, weights = numbers(rng)
+
+    def sums(system=SYSTEM, **changes):
+        return (projector(system, **{**settings, **changes})(x) * weights).sum(axis=(1, 2))
+
+    gradient = mph.geometry_gradient(projector(**settings), x, weights)
+    by_centers, by_tilt = gradient.by_columns(SYSTEM)
+    found = {"l": gradient.collimator_length, "d": gradient.pinhole_diameter}
+    expected = {
+        "l": difference(lambda e: sums(SYSTEM.replace(collimator_length=SYSTEM.collimator_length + e)), 1e-3),
+        "d": difference(lambda e: sums(SYSTEM.replace(pinhole_diameter=SYSTEM.pinhole_diameter + e)), 1e-5),
+    }
+    for i, axis in enumerate(np.eye(3)):
+        found |= {f"center {i}": by_centers[:, i], f"tilt {i}": by_tilt[:, i]}
+        expected[f"center {i}"] = difference(
+            lambda e, a=axis: sums(SYSTEM.replace(centers=SYSTEM.centers + e * a)), 1e-4
+        )
+        expected[f"tilt {i}"] = difference(lambda e, a=axis: sums(SYSTEM.replace(tilt=SYSTEM.tilt + e * a)), 1e-6)
+    for i, axis in enumerate(np.eye(2)):
+        found |= {f"pitch {i}": gradient.pitch[:, i], f"offset {i}": gradient.offset[:, i]}
+        expected[f"pitch {i}"] = difference(lambda e, a=axis: sums(pitch=PITCH + e * a), 1e-5)
+        expected[f"offset {i}"] = difference(lambda e, a=axis: sums(offset=OFFSET + e * a), 1e-4)
+    for name, own in found.items():
+        np.testing.assert_allclose(own, expected[name], rtol=0, atol=1e-6 * np.abs(expected[name]).max(), err_msg=name)
+
+
+def test_attenuated_too(rng):
+    """What passes moves with the pinhole alone. The step is small: rays pass from voxel to voxel at many places."""
+    x, weights = numbers(rng)
+    grid = mph.Grid.centered((5, 6, 5), 11.0)
+    mu = mph.Volume(rng.uniform(0, 0.02, grid.shape), grid, "mu")
+
+    def sums(**changes):
+        return (projector(SYSTEM.replace(**changes), mu=mu)(x) * weights).sum(axis=(1, 2))
+
+    by_centers, by_tilt = mph.geometry_gradient(projector(mu=mu), x, weights).by_columns(SYSTEM)
+    plain, _ = mph.geometry_gradient(projector(), x, weights).by_columns(SYSTEM)
+    for i, axis in enumerate(np.eye(3)):
+        centers = difference(lambda e, a=axis: sums(centers=SYSTEM.centers + e * a), 1e-7)
+        tilt = difference(lambda e, a=axis: sums(tilt=SYSTEM.tilt + e * a), 1e-6)
+        np.testing.assert_allclose(by_centers[:, i], centers, atol=2e-6 * np.abs(by_centers).max())
+        np.testing.assert_allclose(by_tilt[:, i], tilt, atol=2e-6 * np.abs(by_tilt).max())
+    assert np.abs(plain - by_centers).max() > 0.1 * np.abs(by_centers).max()
+
+
+def test_the_reference_and_float32_agree_with_it(rng):
+    x, weights = numbers(rng)
+    A = projector()
+    exact = mph.geometry_gradient(A, x, weights)
+    reference = mph.Projector(GRID, A.views, A.model, "numpy")
+    for other, bound in ((reference, 1e-7), (projector(double=False), 1e-4)):
+        for name, own, expected in zip(exact._fields, mph.geometry_gradient(other, x, weights), exact, strict=True):
+            np.testing.assert_allclose(own, expected, atol=bound * np.abs(expected).max(), err_msg=name)
+
+
+def test_a_part_of_the_volume_has_its_part_of_them(rng):
+    x, weights = numbers(rng)
+    part = np.zeros_like(x)
+    part[2:5, 3:7, 1:4] = x[2:5, 3:7, 1:4]
+    A = projector()
+    for parts in zip(*(mph.geometry_gradient(A, each, weights) for each in (part, x - part, x)), strict=True):
+        np.testing.assert_allclose(parts[0] + parts[1], parts[2], atol=1e-6 * np.abs(parts[2]).max())
+
+
+def test_in_torch_all_numbers_have_gradients(rng):
+    """Gradcheck of the images by activity, mu, place, turn, l, d, pixels, the image's middle, time and penetration."""
+    torch = pytest.importorskip("torch")
+    from mphdrr.core.projector.poses import emission_images
+
+    grid, mu_grid = mph.Grid.centered((2, 2, 2), 12.0), mph.Grid.centered((2, 2, 2), 15.0)
+    given = [
+        rng.random(grid.shape), rng.uniform(0, 0.01, mu_grid.shape), [[0.7, 0.3, -80.0], [2.0, 1.0, -85.0]],
+        [[0.01, 0.02, 0.1], [0.1, -0.03, 0.02]], [60.0, 50.0], [3.0, 2.5], [[5.0, 5.2], [5.4, 5.0]],
+        [[0.1, 0.2], [0.3, -0.4]], [2.0, 3.0], 3.0,
+    ]  # fmt: skip
+    given = [torch.tensor(np.array(each), requires_grad=True) for each in given]
+
+    def images(x, mu, place, turn, l, d, pitch, offset, time, aperture_mu):
+        a, b, c = turn.unbind(-1)
+        o = torch.zeros_like(a)
+        cross = torch.stack([o, -c, b, c, o, -a, -b, a, o], -1).reshape(-1, 3, 3)
+        return emission_images(
+            x, place, torch.linalg.matrix_exp(cross), l, pitch, (5, 4), offset, diameter=d, time=time,
+            mu=mu, mu_grid=mu_grid, grid=grid, hole="depth", aperture_mu=aperture_mu, photons_per_decay=0.9,
+        )  # fmt: skip
+
+    assert torch.autograd.gradcheck(images, given, eps=1e-7, rtol=1e-5, atol=1e-7)
+    assert torch.autograd.gradcheck(
+        lambda x, *more: images(x, None, *more), [given[0], *given[2:]], rtol=1e-6, atol=1e-8
+    )
+
+
+def test_in_torch_it_is_the_projector(rng):
+    torch = pytest.importorskip("torch")
+    from mphdrr.core.projector.poses import emission_images
+
+    x, _ = numbers(rng)
+    poses = torch.tensor(SYSTEM.poses())
+    images = emission_images(
+        torch.tensor(x), poses[:, :3, 3], poses[:, :3, :3], SYSTEM.collimator_length, torch.tensor(PITCH), SHAPE,
+        torch.tensor(OFFSET), diameter=SYSTEM.pinhole_diameter, crystal_thickness=SYSTEM.detector_thickness, grid=GRID,
+        hole="depth", **PHYSICS,
+    )  # fmt: skip
+    np.testing.assert_allclose(images, projector(detector="virtual")(x), rtol=1e-9)
+
+
+def test_what_cannot_be_is_refused(rng):
+    x, weights = numbers(rng)
+    A = projector()
+    rays = mph.Projector(GRID, A.views, mph.Emission(SYSTEM, hole="rays"))
+    refused(lambda: mph.geometry_gradient(rays, x, weights), "hole 'depth'", "emission_images")
+    refused(lambda: mph.geometry_gradient(A, x, weights[1:]), "images", "3 x 15 x 13")
+    wide = mph.Grid.centered((9, 9, 9), 22.0)
+    near = mph.Projector(wide, A.views, mph.Emission(SYSTEM))
+    refused(lambda: mph.geometry_gradient(near, np.ones(wide.shape), weights), "too close", "smaller grid")

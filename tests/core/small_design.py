@@ -1,4 +1,4 @@
-"""Small recipes of designs, and phantoms for them."""
+"""A small recipe of a design, and phantoms for it."""
 
 from __future__ import annotations
 
@@ -7,29 +7,58 @@ from pathlib import Path
 from typing import Any
 
 from mphdrr.core.design.recipe import DesignRecipe, design_recipe
+from mphdrr.core.toml import parse_toml
 
 BODY = '[[shape]]\nkind = "sphere"\nradius = 20\nactivity = 50\n'
 PARTS = (
     '[[shape]]\nkind = "sphere"\nradius = 7\nposition = [8, 0, 3]\nactivity = 20\n'
     '[[shape]]\nkind = "sphere"\nradius = 6\nposition = [-9, 5, -4]\nactivity = 30\n'
 )
+TEXT = """
+version = 1
 
-RECIPE: dict[str, Any] = {
-    "version": 1,
-    "generator": {
-        "kind": "ellipse", "modules": 3, "semi_axes": [150.0, 140.0], "center": [4.0, -3.0], "start": 10.0, "end": 250.0,
-        "z": [-28.0, 31.0], "pinhole_diameter": 4.0, "collimator_length": 60.0, "detector_side": 50.0,
-        "detector_thickness": 8.0, "roi_radius": 26.0,
-    },
-    "free": {
-        "semi_axes": [[110.0, 200.0], [110.0, 200.0]], "z": [[-60.0, -20.0], [20.0, 60.0]], "start": [0.0, 30.0],
-        "pinhole_diameter": [1.0, 9.0], "collimator_length": [40.0, 90.0],
-    },
-    "objectives": [{"kind": "detail", "size": 8.0, "points": 5}],
-    "model": {"intrinsic_fwhm": 2.0, "time": 60.0, "background": 0.01},
-    "imaging": {"voxels": 12, "spacing": 5.0, "pixels": 8},
-    "search": {"starts": 2, "coarse_steps": 6, "steps": 4},
-}  # fmt: skip
+[generator]
+kind = "ellipse"
+modules = 3
+semi_axes = [150, 140]
+center = [4, -3]
+start = 10
+end = 250
+z = [-28, 31]
+pinhole_diameter = 4
+collimator_length = 60
+detector_side = 50
+detector_thickness = 8
+roi_radius = 26
+
+[free]
+semi_axes = [[110, 200], [110, 200]]
+z = [[-60, -20], [20, 60]]
+start = [0, 30]
+pinhole_diameter = [1, 9]
+collimator_length = [40, 90]
+
+[[objectives]]
+kind = "detail"
+size = 8
+points = 5
+
+[model]
+intrinsic_fwhm = 2
+time = 60
+background = 0.01
+
+[imaging]
+voxels = 12
+spacing = 5
+pixels = 8
+
+[search]
+starts = 2
+coarse_steps = 5
+steps = 3
+"""
+RECIPE: dict[str, Any] = parse_toml(TEXT, "recipe")
 
 
 def small_design(folder: Path = Path(), **tables: Any) -> DesignRecipe:

@@ -55,8 +55,8 @@ pixels = 8
 
 [search]
 starts = 2
-coarse_steps = 5
-steps = 3
+coarse_steps = 4
+steps = 1
 """
 RECIPE: dict[str, Any] = parse_toml(TEXT, "recipe")
 

@@ -88,7 +88,7 @@ class Detail(_AtPoints):
     The hole blurs as a uniform disc (MTF ``2 J1(x) / x``) or as a Gaussian of the same FWHM, the detector as a Gaussian. In
     the noise of a uniform background the ideal observer's SNR^2 of a sinusoid is in proportion to counts and to MTF^2 (H. H.
     Barrett, K. J. Myers, "Foundations of Image Science", 2004, chapter 13). Best are a Gaussian of FWHM 0.750 size, and a
-    disc with ``d (1 + b / l) = 1.172 size``, where J1' is 0.
+    disc with ``d (1 + b / l) = 1.172 size``, where J1' is 0. Rods that a disc shows as gaps count as negative.
     """
 
     size: float
@@ -99,11 +99,11 @@ class Detail(_AtPoints):
         hole = resolution(modules, self.points, optics=optics, intrinsic_fwhm=0.0)
         squared = resolution(modules, self.points, optics=optics) ** 2
         x = math.pi * hole / (2 * self.size)
-        disc = 1.0
+        disc: Any = 1.0
         if self.hole == "disc":
             disc, squared = 2 * special.j1(x) / x, squared - hole**2
         gaussian = np.exp(-squared * (math.pi / (4 * self.size)) ** 2 / math.log(2))
-        return sensitivity(modules, self.points, optics=optics) * (disc * gaussian) ** 2
+        return sensitivity(modules, self.points, optics=optics) * disc * abs(disc) * gaussian**2
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,7 +11,7 @@ Everything imported here is the public interface. Arguments that cannot be used 
 
 import types
 
-from . import events, learning
+from . import design, events, learning
 from .design.calibration import Calibration, calibrate
 from .design.point_images import point_images
 from .errors import InputError, InputWarning

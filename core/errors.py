@@ -19,6 +19,8 @@ class Cancelled(Exception):
 
     reconstruction: Any = None
     """Of an iterative reconstruction: the `Reconstruction` after its last whole iteration, which can be resumed."""
+    design: Any = None
+    """Of a search for a design: the best `Design` until then."""
 
 
 class InputWarning(UserWarning):

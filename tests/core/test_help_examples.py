@@ -17,6 +17,7 @@ import pytest
 import mphdrr.core as mph
 from mphdrr.addon.cli import demo, figure, main, scene
 from mphdrr.core.cli import build_parser
+from mphdrr.core.design.recipe import TEMPLATE
 
 from .conftest import WORKBOOK
 from .dicom_files import write_series
@@ -79,6 +80,9 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "training.toml").write_text(training.replace('"toy"', '"after-osem"\nchannels = [4, 4, 4]'))
     test = '[[tests]]\nname = "rods"\nevents = "set"\nsplit = "train"\ncount = 1\n'
     (folder / "judge.toml").write_text(JUDGE.replace('"validation"', '"set"\nsplit = "test"') + test)
+    design = TEMPLATE.read_text().replace("steps = 15", "steps = 1").replace("starts = 3", "starts = 1")
+    (folder / "design.toml").write_text(design)
+    (folder / "front.toml").write_text(design + '[pareto]\nentry = "objectives.size"\nvalues = [6, 8]\n')
     run(folder, "mphdrr phantom derenzo --voxels 24 --spacing 4 -o heart.nii.gz")
     heart = "mphdrr project scanner.xlsx --volume heart.nii.gz --emission --time 600 --set model.intrinsic_fwhm=2"
     run(folder, f"{heart} --size 24 24 --write-recipe heart.toml")

@@ -1,0 +1,86 @@
+"""``mphdrr design new|optimize|pareto``: scanners that are designed by gradients."""
+
+import argparse
+
+from ..design.evaluating import evaluate
+from ..design.fronts import pareto
+from ..design.optimising import Design, optimize
+from ..design.recipe import TEMPLATE, read_design_recipe
+from ..files import read_text, write_bytes
+from ..workbook import write_system
+from .options import add_command, add_run, new_recipe_path, output_path, print_answer, progress_bar, say
+
+
+def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
+    """Add the command."""
+    example = "mphdrr design new -o design.toml\nexample: mphdrr design optimize design.toml -o new.xlsx"
+    parser = add_command(subparsers, "design", "design a scanner by gradients", example)
+    actions = parser.add_subparsers(metavar="ACTION", required=True)
+    new = add_run(actions, "new", _new)
+    new.add_argument("-o", "--output", metavar="FILE", help="a new file (.toml); default: standard output")
+    for name, run, ending in (("optimize", _optimize, "the scanner (.xlsx)"), ("pareto", _pareto, "table and plot")):
+        action = add_run(actions, name, run)
+        action.add_argument("recipe", metavar="RECIPE", help="recipe of the design (.toml)")
+        several = {"nargs": "+"} if run is _pareto else {}
+        action.add_argument("-o", "--output", metavar="FILE", required=True, help=ending, **several)  # type: ignore[arg-type]
+        action.add_argument("--json", action="store_true", help="print the result as JSON")
+        action.add_argument("--quiet", action="store_true", help="show no progress")
+    text = "also judge the gain by reconstructions, as the recipe's [evaluation] says"
+    actions.choices["optimize"].add_argument("--evaluate", action="store_true", help=text)
+
+
+def _new(arguments: argparse.Namespace) -> None:
+    """Write a commented recipe of a design to begin with.
+
+    mphdrr design new -o design.toml
+    """
+    text = read_text(TEMPLATE)
+    if arguments.output is None:
+        print(text, end="")
+        return
+    path = new_recipe_path(arguments.output)
+    write_bytes(path, text.encode())
+    print(f"{path}: edit it, then: mphdrr design optimize {path} -o scanner.xlsx")
+
+
+def _optimize(arguments: argparse.Namespace) -> None:
+    """Find the scanner that a recipe wants and write its workbook; the same command goes on with what was interrupted.
+
+    mphdrr design optimize design.toml -o new.xlsx
+    """
+    path = output_path(arguments.output, (".xlsx",))
+    recipe, state = read_design_recipe(arguments.recipe), path.with_suffix(".design.json")
+    try:
+        found = optimize(recipe, None if arguments.quiet else progress_bar("designing"), state)
+    except KeyboardInterrupt:
+        say(f"{state}: what was done is kept; the same command goes on")
+        raise
+    write_system(found.system, path)
+    record = {"parameters": found.parameters, "objectives": found.values, "faults": found.faults}
+    lines = [f"{name} {value:.6g}" for name, value in found.parameters.items()]
+    lines += [f"{name}: {first:.5g} at the start, now {last:.5g}" for name, (first, last) in found.values.items()]
+    if arguments.evaluate:
+        gain = evaluate(recipe, found.start, found.system, None if arguments.quiet else progress_bar("evaluating"))
+        record["evaluation"] = gain._asdict()
+        lines.append(f"{gain.score}: {gain.start:.4g} at the start, now {gain.found:.4g}; better by {gain.gain:.1%}, "
+                     f"95 % interval {gain.low:.1%} to {gain.high:.1%}")  # fmt: skip
+    print_answer(arguments, record, [*lines, f"{path}: {_words(found)}"], found.faults)
+
+
+def _pareto(arguments: argparse.Namespace) -> None:
+    """Find a scanner for each value of an entry of the recipe: a table (.csv, .json), a plot (.png, .svg), or both.
+
+    mphdrr design pareto front.toml -o front.csv front.png
+    """
+    paths = [output_path(name, (".csv", ".json", ".png", ".svg")) for name in arguments.output]
+    found = pareto(arguments.recipe, None if arguments.quiet else progress_bar("designing"))
+    for path in paths:
+        found.write(path)
+    lines = ["  ".join(f"{name} {value:.5g}" for name, value in row.items()) for row in found.rows]
+    print_answer(arguments, list(found.rows), lines)
+
+
+def _words(found: Design) -> str:
+    if found.ok:
+        return f"{len(found.system)} modules that pass every check"
+    return f"it fails {len(found.faults)} checks: not a good scanner"

@@ -10,6 +10,7 @@ import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import fields
+from inspect import signature
 from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
@@ -20,6 +21,7 @@ from ..errors import InputError
 from ..system_source import SystemSource
 from ..validation import freeze, one_of, real_array
 from .columns import ColumnTable, Values
+from .finding import Finding
 from .module_parts import ModulePart
 from .views import Views
 
@@ -108,7 +110,7 @@ class Scanner(ABC):
     @classmethod
     def of(cls, values: Mapping[str, Any]) -> Self:
         """The scanner with these attributes, of which some may be columns without a field of the class."""
-        own = {f.name for f in fields(cls)}  # type: ignore[arg-type]
+        own = signature(cls).parameters
         more = {name: value for name, value in values.items() if name not in own}
         return cls(**{name: value for name, value in values.items() if name in own}, more=more)  # type: ignore[call-arg]
 
@@ -193,6 +195,10 @@ class Scanner(ABC):
         A module has at most one part of each kind.
         """
         return ()
+
+    def findings(self, others: Sequence[Scanner] = (), construction: Any = None) -> Sequence[Finding]:
+        """What is wrong with its modules in one room with `others`, whose solids are built as a `construction` says."""
+        raise InputError(f"there are no checks of a scanner of the kind {self.kind}")
 
     def rings(self) -> NDArray[np.int64]:
         """Index (M,) of each module's group, from 0; all are one by default."""

@@ -1,0 +1,186 @@
+"""An X-ray system in one room with other scanners: what stands in the way of cones, of panels and of the patient.
+
+Modules' parts count as convex bodies, as in `core.geometry.checks.hulls`. A cone is a lattice of `RAYS` x `RAYS` rays from the
+focal spot to the panel, each of which stands for the same area of it. The tubes have no known size and are no bodies.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..arrays import Floats
+from ..geometry.checks.field_of_view import find_blocked, hits
+from ..geometry.checks.hulls import TOUCH, Hulls
+from ..geometry.checks.overlaps import penetration_depths
+from ..geometry.finding import Finding
+from ..geometry.module_parts import ModulePart
+from ..geometry.scanner import Scanner
+from ..geometry.system import PinholeSystem
+from ..validation import instance, positive
+from .system import XraySystem
+
+RAYS = 48
+_SHOWN = 4  # of the bodies in a cone's way, those that shadow most of it
+
+
+@dataclass(frozen=True)
+class ShadowedCone(Finding):
+    """Bodies stand in the way of a fraction `share` of the rays from a source to its panel."""
+
+    module: int
+    share: float
+    bodies: tuple[tuple[str, float], ...]  # each with its own share, the largest first
+    message = "source {0.module}: {0.share:.2%} of its cone is blocked, {1}"
+
+    def __str__(self) -> str:
+        more = f" and {len(self.bodies) - _SHOWN} more" if len(self.bodies) > _SHOWN else ""
+        largest = ", ".join(f"{share:.2%} by {body}" for body, share in self.bodies[:_SHOWN])
+        return self.message.format(self, largest + more)
+
+
+@dataclass(frozen=True)
+class PanelOverlap(Finding):
+    """A panel is `depth` mm inside another body."""
+
+    module: int
+    body: str
+    depth: float
+    message = "source {0.module}: its panel and {0.body} overlap, {0.depth:.4g} mm deep"
+
+
+@dataclass(frozen=True)
+class SwallowedSource(Finding):
+    """A focal spot lies `depth` mm below the surface of a body."""
+
+    module: int
+    body: str
+    depth: float
+    message = "source {0.module}: its focal spot lies {0.depth:.4g} mm inside {0.body}"
+
+
+@dataclass(frozen=True)
+class PanelInView(Finding):
+    """A panel stands in the way of a fraction `share` of the rays from a pinhole module's ROI."""
+
+    module: int
+    pinhole: int
+    share: float
+    message = "source {0.module}: its panel blocks {0.share:.2%} of the rays from the ROI of module {0.pinhole}"
+
+
+@dataclass(frozen=True)
+class InBore(Finding):
+    """A source or its panel is nearer to the z axis than the bore's `radius`, mm."""
+
+    module: int
+    part: str
+    distance: float  # mm, of its nearest point from the axis
+    radius: float
+    message = "source {0.module}: its {0.part} is {0.distance:.4g} mm from the axis, inside the bore of {0.radius:.4g} mm"
+
+
+def find_in_room(
+    system: XraySystem, others: Sequence[Scanner] = (), *, bore: float | None = None, construction: object = None
+) -> tuple[Finding, ...]:
+    """What is wrong with an X-ray system beside other scanners, such as pinhole modules; their order is the sources'.
+
+    Found are cones of which bodies block a part, panels that overlap with other panels or with modules, sources inside a
+    body, panels between a module and its ROI, and sources and panels in the patient's bore, a cylinder around the z axis of
+    radius `bore`, mm, if it is given. `construction` is that of the modules' collimators.
+    """
+    instance(system, XraySystem, "find_in_room")
+    panels = [part for part in system.parts() if part.kind == "panel"]
+    bodies = [(f"the panel of source {panel.number}", panel) for panel in panels]
+    for other in others:
+        built = other.parts(construction if isinstance(other, PinholeSystem) else None)
+        bodies += [(f"module {p.number}'s {p.kind}", p) for p in built if p.kind != "source"]
+    hulls, names = Hulls.of([part for _, part in bodies]), [name for name, _ in bodies]
+    found: list[Finding] = [*_shadowed(system, hulls, names), *_overlaps(system, hulls, names)]
+    for other in others:
+        if isinstance(other, PinholeSystem):
+            found += _in_view(system, other, panels)
+    if bore is not None:
+        found += _in_bore(system, panels, positive(bore, "bore", "mm"))
+    order = {number: m for m, number in enumerate(system.numbers.tolist())}
+    return tuple(sorted(found, key=lambda finding: order[finding.modules[0]]))
+
+
+def _shadowed(system: XraySystem, hulls: Hulls, names: Sequence[str]) -> list[Finding]:
+    found: list[Finding] = []
+    views = system.views((RAYS, RAYS))
+    for m, number in enumerate(system.numbers.tolist()):
+        source, targets = system.sources[m], views.rays(m)[1]
+        ways = targets - source
+        lengths = np.linalg.norm(ways, axis=1)
+        directions = ways / lengths[:, None]
+        blocked, shares = np.zeros(len(ways), bool), dict[str, float]()
+        for p in _candidates(hulls, source, directions, lengths.max()):
+            if p != m and (hit := hits(hulls, p, source, directions, lengths)).any():
+                blocked |= hit
+                shares[names[p]] = float(hit.mean())
+        if shares:
+            largest_first = sorted(shares.items(), key=lambda item: -item[1])
+            found.append(ShadowedCone(number, float(blocked.mean()), tuple(largest_first)))
+    return found
+
+
+def _candidates(hulls: Hulls, source: Floats, directions: Floats, farthest: float) -> list[int]:
+    """The hulls whose bounding spheres meet the cone around all rays from a source."""
+    axis = directions.mean(axis=0)
+    axis /= np.linalg.norm(axis)
+    half = np.arccos(np.clip((directions @ axis).min(), -1, 1))
+    to = hulls.centers - source
+    distance = np.linalg.norm(to, axis=1)
+    width = np.arcsin(np.minimum(hulls.radii / np.maximum(distance, TOUCH), 1.0))
+    angle = np.arccos(np.clip(to @ axis / np.maximum(distance, TOUCH), -1, 1))
+    meets = (distance <= hulls.radii) | ((angle < half + width) & (distance - hulls.radii < farthest))
+    return np.flatnonzero(meets).tolist()
+
+
+def _overlaps(system: XraySystem, hulls: Hulls, names: Sequence[str]) -> list[Finding]:
+    """Panels, which are the first hulls, in bodies after them, and sources in any."""
+    found: list[Finding] = []
+    for m, number in enumerate(system.numbers.tolist()):
+        distance = np.linalg.norm(hulls.centers[m + 1 :] - hulls.centers[m], axis=1)
+        near = m + 1 + np.flatnonzero(distance < hulls.radii[m + 1 :] + hulls.radii[m])
+        depths = penetration_depths(hulls, np.full(len(near), m), near) if len(near) else np.zeros(0)
+        found += [PanelOverlap(number, names[p], float(d)) for p, d in zip(near, depths, strict=True) if d > TOUCH]
+        inside = (hulls.offsets - hulls.normals @ system.sources[m]).min(axis=1)
+        found += [SwallowedSource(number, names[p], float(inside[p])) for p in np.flatnonzero(inside > TOUCH)]
+    return found
+
+
+def _in_view(system: XraySystem, pinholes: PinholeSystem, panels: Sequence[ModulePart]) -> list[Finding]:
+    hulls = Hulls.of(panels)
+    hulls.numbers[:] = -1 - np.arange(len(panels))  # unlike those of the modules
+    blocked = find_blocked(pinholes, hulls)
+    return [PanelInView(int(system.numbers[-1 - one.by]), one.module, one.share) for one in blocked]
+
+
+def _in_bore(system: XraySystem, panels: Sequence[ModulePart], radius: float) -> list[Finding]:
+    places = [("focal spot", system.sources[:, None])] + [("panel", np.stack([p.vertices for p in panels]))]
+    return [
+        InBore(number, part, distance, radius)
+        for part, corners in places
+        for number, distance in zip(system.numbers.tolist(), map(_distance_from_axis, corners), strict=True)
+        if distance < radius - TOUCH
+    ]
+
+
+def _distance_from_axis(corners: Floats) -> float:
+    """Distance, mm, of a convex body with these corners (V, 3) from the z axis."""
+    flat = corners[:, :2]
+    angles = np.sort(np.arctan2(flat[:, 1], flat[:, 0]))
+    if np.diff(angles, append=angles[0] + 2 * np.pi).max() < np.pi:  # the axis is within
+        return 0.0
+    ends = [(flat[i], flat[j] - flat[i]) for i, j in combinations(range(len(flat)), 2)] or [(flat[0], np.zeros(2))]
+    return float(min(np.linalg.norm(a + _nearest(a, way) * way) for a, way in ends))
+
+
+def _nearest(start: Floats, way: Floats) -> float | NDArray[np.float64]:
+    """Where on the way from `start`, from 0 to 1, the origin is nearest."""
+    square = way @ way
+    return 0.0 if square == 0 else np.clip(-(start @ way) / square, 0.0, 1.0)

@@ -15,13 +15,13 @@ import numpy as np
 from ..geometry.collimator import Construction, EdgePlace, angle_from_degrees
 from ..geometry.module_parts import ModulePart
 from ..geometry.part_colors import LOOKS
-from ..geometry.system import PinholeSystem
+from ..geometry.scanner import Scanner
 from ..geometry.views import Views
 from ..validation import one_of
 from ..version import VERSION
 from .format import Format
 
-_KINDS = {"collimators": ("collimator",), "crystals": ("crystal",), "all": ("collimator", "crystal")}
+_KINDS = {"collimators": ("collimator",), "crystals": ("crystal",), "all": tuple(LOOKS)}
 _Save = Callable[[Path, list[ModulePart]], None]
 
 
@@ -29,7 +29,7 @@ def _solid_format(name: str, title: str, suffixes: tuple[str, ...], save: _Save)
     """A format of the chosen parts, written by `save`."""
 
     def write(
-        system: PinholeSystem,
+        system: Scanner,
         views: Views,
         temporary: Path,
         *,

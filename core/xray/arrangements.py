@@ -1,7 +1,9 @@
 """X-ray systems from a few parameters: sources on an arc or a ring, and opposite each of them its panel.
 
 Without arguments, both give 24 sources that suit the users' scanner, whose modules fill the azimuths from 14.3 to 255.6
-degrees within 100 mm of the plane z = 0. Azimuths are polar angles about the isocentre, rad, from +x towards +y.
+degrees within 120 mm of the plane z = 0, and see a sphere of 75 mm: an arc in the open side, whose cones pass below the modules
+opposite as far as they can, and a ring above all modules. Neighbouring panels overlap: they stand for what each source sees of
+one detector. Azimuths are polar angles about the isocentre, rad, from +x towards +y.
 """
 
 import math
@@ -20,13 +22,13 @@ from .system import XraySystem
 def xray_arc(
     n: int = 24,
     *,
-    start: float = math.radians(262.0),
-    end: float = math.radians(368.0),
+    start: float = math.radians(-98.0),
+    end: float = math.radians(8.0),
     source_radius: float = 300.0,
-    panel_radius: float = 180.0,
-    panel_size: ArrayLike = (240.0, 240.0),
+    panel_radius: float = 400.0,
+    panel_size: ArrayLike = 350.0,
     shape: tuple[int, int] = (128, 128),
-    z: float = 0.0,
+    z: float = 200.0,
     kvp: ArrayLike = 80.0,
     mas: ArrayLike = 1.0,
     filters: Any = "Al 2.5",
@@ -70,10 +72,10 @@ def xray_arc(
     return XraySystem(sources, centers, width / n_u * u, tall / n_v * v, (n_v, n_u), kvp, mas, **own)  # type: ignore[arg-type]
 
 
-def xray_ring(n: int = 24, *, z: float = 200.0, start: float = 0.0, **settings: Any) -> XraySystem:
+def xray_ring(n: int = 24, *, z: float = 310.0, start: float = 0.0, **settings: Any) -> XraySystem:
     """A closed ring of sources above the modules, or below with z < 0, and tilted panels on the other side.
 
     `start` is the azimuth of the first source, rad; the settings are those of `xray_arc`.
     """
-    usual = {"source_radius": 300.0, "panel_radius": 180.0, "panel_size": (120.0, 180.0)}
+    usual = {"source_radius": 400.0, "panel_size": 300.0}
     return xray_arc(n, z=z, start=start, end=start + FULL_TURN, **{**usual, **settings})

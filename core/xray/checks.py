@@ -1,10 +1,11 @@
 """An X-ray system in one room with other scanners: what stands in the way of cones, of panels and of the patient.
 
-Modules' parts count as convex bodies, as in `core.geometry.checks.hulls`. A cone is a lattice of `RAYS` x `RAYS` rays from the
+Modules' parts count as convex bodies, as in `core.geometry.checks.hulls`. Sources may share a panel: equal ones are one body.
+A panel that overlaps with a source's own is found as such, and not once more as standing in its cone's way. A cone is a lattice of `RAYS` x `RAYS` rays from the
 focal spot to the panel, each of which stands for the same area of it. The tubes have no known size and are no bodies.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -12,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import Floats
+from ..errors import several
 from ..geometry.checks.field_of_view import find_blocked, hits
 from ..geometry.checks.hulls import TOUCH, Hulls
 from ..geometry.checks.overlaps import penetration_depths
@@ -43,12 +45,15 @@ class ShadowedCone(Finding):
 
 @dataclass(frozen=True)
 class PanelOverlap(Finding):
-    """A panel is `depth` mm inside another body."""
+    """A panel is inside other bodies, at most `depth` mm deep."""
 
     module: int
-    body: str
+    bodies: tuple[str, ...]  # the deepest first
     depth: float
-    message = "source {0.module}: its panel and {0.body} overlap, {0.depth:.4g} mm deep"
+    message = "source {0.module}: its panel overlaps with {1}, up to {0.depth:.4g} mm deep"
+
+    def __str__(self) -> str:
+        return self.message.format(self, several(self.bodies, _SHOWN))
 
 
 @dataclass(frozen=True)
@@ -98,7 +103,10 @@ def find_in_room(
         built = other.parts(construction if isinstance(other, PinholeSystem) else None)
         bodies += [(f"module {p.number}'s {p.kind}", p) for p in built if p.kind != "source"]
     hulls, names = Hulls.of([part for _, part in bodies]), [name for name, _ in bodies]
-    found: list[Finding] = [*_shadowed(system, hulls, names), *_overlaps(system, hulls, names)]
+    depths = [_depths(hulls, m) for m in range(len(system))]
+    found: list[Finding] = []
+    for m in range(len(system)):
+        found += [*_shadow(system, m, hulls, names, depths[m]), *_overlaps(system, m, hulls, names, depths[m])]
     for other in others:
         if isinstance(other, PinholeSystem):
             found += _in_view(system, other, panels)
@@ -108,23 +116,23 @@ def find_in_room(
     return tuple(sorted(found, key=lambda finding: order[finding.modules[0]]))
 
 
-def _shadowed(system: XraySystem, hulls: Hulls, names: Sequence[str]) -> list[Finding]:
-    found: list[Finding] = []
-    views = system.views((RAYS, RAYS))
-    for m, number in enumerate(system.numbers.tolist()):
-        source, targets = system.sources[m], views.rays(m)[1]
-        ways = targets - source
-        lengths = np.linalg.norm(ways, axis=1)
-        directions = ways / lengths[:, None]
-        blocked, shares = np.zeros(len(ways), bool), dict[str, float]()
-        for p in _candidates(hulls, source, directions, lengths.max()):
-            if p != m and (hit := hits(hulls, p, source, directions, lengths)).any():
-                blocked |= hit
-                shares[names[p]] = float(hit.mean())
-        if shares:
-            largest_first = sorted(shares.items(), key=lambda item: -item[1])
-            found.append(ShadowedCone(number, float(blocked.mean()), tuple(largest_first)))
-    return found
+def _shadow(
+    system: XraySystem, m: int, hulls: Hulls, names: Sequence[str], depths: dict[int, float]
+) -> Iterator[ShadowedCone]:
+    """What of the cone of source m, whose panel overlaps with the hulls of `depths`, the others block."""
+    source, targets = system.sources[m], system[m].views((RAYS, RAYS)).rays(0)[1]
+    ways = targets - source
+    lengths = np.linalg.norm(ways, axis=1)
+    directions = ways / lengths[:, None]
+    blocked, shares = np.zeros(len(ways), bool), dict[str, float]()
+    for p in _candidates(hulls, source, directions, lengths.max()):
+        own = p == m or (p < len(system) and p in depths)
+        if not own and (hit := hits(hulls, p, source, directions, lengths)).any():
+            blocked |= hit
+            shares[names[p]] = float(hit.mean())
+    if shares:
+        largest_first = tuple(sorted(shares.items(), key=lambda item: -item[1]))
+        yield ShadowedCone(int(system.numbers[m]), float(blocked.mean()), largest_first)
 
 
 def _candidates(hulls: Hulls, source: Floats, directions: Floats, farthest: float) -> list[int]:
@@ -140,17 +148,26 @@ def _candidates(hulls: Hulls, source: Floats, directions: Floats, farthest: floa
     return np.flatnonzero(meets).tolist()
 
 
-def _overlaps(system: XraySystem, hulls: Hulls, names: Sequence[str]) -> list[Finding]:
-    """Panels, which are the first hulls, in bodies after them, and sources in any."""
-    found: list[Finding] = []
-    for m, number in enumerate(system.numbers.tolist()):
-        distance = np.linalg.norm(hulls.centers[m + 1 :] - hulls.centers[m], axis=1)
-        near = m + 1 + np.flatnonzero(distance < hulls.radii[m + 1 :] + hulls.radii[m])
-        depths = penetration_depths(hulls, np.full(len(near), m), near) if len(near) else np.zeros(0)
-        found += [PanelOverlap(number, names[p], float(d)) for p, d in zip(near, depths, strict=True) if d > TOUCH]
-        inside = (hulls.offsets - hulls.normals @ system.sources[m]).min(axis=1)
-        found += [SwallowedSource(number, names[p], float(inside[p])) for p in np.flatnonzero(inside > TOUCH)]
-    return found
+def _depths(hulls: Hulls, m: int) -> dict[int, float]:
+    """How deep, mm, hull m is inside others, by their index."""
+    distance = np.linalg.norm(hulls.centers - hulls.centers[m], axis=1)
+    near = np.flatnonzero(distance < hulls.radii + hulls.radii[m])
+    near = near[near != m]
+    depths = penetration_depths(hulls, np.full(len(near), m), near) if len(near) else np.zeros(0)
+    return {p: depth for p, depth in zip(near.tolist(), depths.tolist(), strict=True) if depth > TOUCH}
+
+
+def _overlaps(
+    system: XraySystem, m: int, hulls: Hulls, names: Sequence[str], depths: dict[int, float]
+) -> Iterator[Finding]:
+    number = int(system.numbers[m])
+    others = [p for p in depths if np.abs(hulls.vertices[p] - hulls.vertices[m]).max() > TOUCH]
+    if others:
+        others.sort(key=lambda p: -depths[p])
+        yield PanelOverlap(number, tuple(names[p] for p in others), depths[others[0]])
+    inside = (hulls.offsets - hulls.normals @ system.sources[m]).min(axis=1)
+    for p in np.flatnonzero(inside > TOUCH):
+        yield SwallowedSource(number, names[p], float(inside[p]))
 
 
 def _in_view(system: XraySystem, pinholes: PinholeSystem, panels: Sequence[ModulePart]) -> list[Finding]:

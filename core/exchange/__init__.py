@@ -30,9 +30,7 @@ FORMATS: dict[str, Format] = {format.name: format for format in _FORMATS if form
 FORMAT_NUMBERS: dict[str, int] = {format.name: number for number, format in enumerate(_FORMATS) if format}
 
 
-def write_geometry(
-    system: Scanner, path: AnyPath, format: str, *, views: Views | None = None, **options: Any
-) -> None:
+def write_geometry(system: Scanner, path: AnyPath, format: str, *, views: Views | None = None, **options: Any) -> None:
     """Write the scanner's geometry for another program.
 
     Parameters

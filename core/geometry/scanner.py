@@ -185,6 +185,11 @@ class Scanner(ABC):
     ) -> Views:
         """The modules' images, of n_v rows and n_u columns, as the settings of a run ask for them."""
 
+    @property
+    def pixels(self) -> tuple[int, int] | None:
+        """The pixels (n_v, n_u) of its images, if it has any of its own; runs have them unless their settings say others."""
+        return None
+
     def fields(self) -> Floats:
         """What each module's camera sees, (M, 5), mm: `Views.fields` of its image."""
         return self.views((1, 1)).fields(self.poses())

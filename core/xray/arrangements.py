@@ -1,9 +1,9 @@
 """X-ray systems from a few parameters: sources on an arc or a ring, and opposite each of them its panel.
 
 Without arguments, both give 24 sources that suit the users' scanner, whose modules fill the azimuths from 14.3 to 255.6
-degrees within 120 mm of the plane z = 0, and see a sphere of 75 mm: an arc in the open side, whose cones pass below the modules
-opposite as far as they can, and a ring above all modules. Neighbouring panels overlap: they stand for what each source sees of
-one detector. Azimuths are polar angles about the isocentre, rad, from +x towards +y.
+degrees within 120 mm of the plane z = 0, and see a sphere of 75 mm: an arc in the open side, so high that most of each cone
+passes below the modules opposite, and a ring above all modules. Neighbouring panels overlap: they stand for what each source
+sees of one detector. Azimuths are polar angles about the isocentre, rad, from +x towards +y.
 """
 
 import math
@@ -58,7 +58,9 @@ def xray_arc(
     first, last = (float(radians(value, name)) for value, name in ((start, "start"), (end, "end")))
     closed = abs(last - first) >= FULL_TURN - 1e-9
     if abs(last - first) > FULL_TURN + 1e-9:
-        raise InputError(f"start and end: expected at most a full turn apart, got {math.degrees(abs(last - first)):g} degrees")
+        raise InputError(
+            f"start and end: expected at most a full turn apart, got {math.degrees(abs(last - first)):g} degrees"
+        )
     distance, height = positive(source_radius, "source_radius", "mm"), float(real_array(z, "z", ()))
     if abs(height) >= distance:
         raise InputError(f"z: expected less than the sources' {distance:g} mm from the isocentre, got {height:g}")

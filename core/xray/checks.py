@@ -1,8 +1,8 @@
 """An X-ray system in one room with other scanners: what stands in the way of cones, of panels and of the patient.
 
-Modules' parts count as convex bodies, as in `core.geometry.checks.hulls`. Sources may share a panel: equal ones are one body.
-A panel that overlaps with a source's own is found as such, and not once more as standing in its cone's way. A cone is a lattice of `RAYS` x `RAYS` rays from the
-focal spot to the panel, each of which stands for the same area of it. The tubes have no known size and are no bodies.
+Modules' parts count as convex bodies, as in `core.geometry.checks.hulls`; the tubes have no known size and are no bodies.
+Sources may share a panel: equal ones are one body. A panel that overlaps with a source's own is found as such, and does not
+stand in its cone's way as well. A cone is a lattice of `RAYS` x `RAYS` rays from the focal spot to equal shares of the panel.
 """
 
 from collections.abc import Iterator, Sequence
@@ -84,7 +84,9 @@ class InBore(Finding):
     part: str
     distance: float  # mm, of its nearest point from the axis
     radius: float
-    message = "source {0.module}: its {0.part} is {0.distance:.4g} mm from the axis, inside the bore of {0.radius:.4g} mm"
+    message = (
+        "source {0.module}: its {0.part} is {0.distance:.4g} mm from the axis, inside the bore of {0.radius:.4g} mm"
+    )
 
 
 def find_in_room(
@@ -178,7 +180,7 @@ def _in_view(system: XraySystem, pinholes: PinholeSystem, panels: Sequence[Modul
 
 
 def _in_bore(system: XraySystem, panels: Sequence[ModulePart], radius: float) -> list[Finding]:
-    places = [("focal spot", system.sources[:, None])] + [("panel", np.stack([p.vertices for p in panels]))]
+    places = [("focal spot", system.sources[:, None]), ("panel", np.stack([p.vertices for p in panels]))]
     return [
         InBore(number, part, distance, radius)
         for part, corners in places

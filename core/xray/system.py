@@ -25,6 +25,7 @@ PANEL_THICKNESS = 10.0
 """mm, of the solid that stands for a panel, behind its pixels."""
 _TUBE = 12.0  # mm: side of the cube behind the focal spot by which a source is seen and grabbed
 _SQUARE = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
+_ROUNDING = 1e-14  # of a rotation's matrix
 _SKEW = 1e-6  # cosine of the angle between rows and columns of pixels that are taken to be at right angles
 _FILTER = re.compile(r"\s*([A-Za-z][\w -]*?)\s+(\d+\.?\d*(?:[eE][-+]?\d+)?)\s*")
 
@@ -54,10 +55,8 @@ XRAY_COLUMNS = ColumnTable(
             "nu", "pixel_columns", "O", "columns of pixels", "columns", kind="whole", plausible=(1, 10_000), hints="columns"
         ),
         _scalar("kVp", "kvp", "P", "tube voltage, kV", "kV", kind="number", plausible=(10, 500), hints="kv voltage"),
-        _scalar("mAs", "mas", "Q", "charge of an exposure, mAs", kind="number", plausible=(1e-6, 1e4), hints="current"),
-        _scalar(
-            "spot", "focal_spot", "R", "size of the focal spot", "focal-spot size", blank=0.0, plausible=(0, 10), hints="spot"
-        ),
+        _scalar("mAs", "mas", "Q", "charge of an exposure, mAs", kind="number", plausible=(1e-6, 1e4), hints="mas"),
+        _scalar("spot", "focal_spot", "R", "size of the focal spot", blank=0.0, plausible=(0, 10), hints="spot"),
         _scalar(
             "filter", "filters", "S", 'filters, mm, such as "Al 2.5 + Cu 0.1"', "filter material", kind="text", blank="",
             hints="filter",
@@ -149,7 +148,9 @@ class XraySystem(Scanner):
             own["more"] = {**self.more, "pixel_rows": rows, "pixel_columns": columns}
         given = self.filters
         alone = isinstance(given, str | Mapping)
-        own["filters"] = filter_text(given) if alone else [filter_text(one) for one in np.asarray(given, object).tolist()]
+        own["filters"] = (
+            filter_text(given) if alone else [filter_text(one) for one in np.asarray(given, object).tolist()]
+        )
         super().__post_init__()
         self._refuse(self.focal_spot < 0, "focal_spot must be 0 mm or more, got {focal_spot:g}")
         self._refuse(_skew(self.panel_u, self.panel_v), _NO_PIXELS)
@@ -178,19 +179,19 @@ class XraySystem(Scanner):
         return next(iter(pairs))
 
     def poses(self) -> Floats:
-        """World-from-module poses (N, 4, 4): columns u and v along the pixels, k across the panel, and the focal spot, mm."""
+        """World-from-module poses (N, 4, 4): columns u and v along the pixels, k across them, and the focal spot, mm."""
         u = _unit(self.panel_u)
         k = _unit(np.cross(u, self.panel_v))
         return affine_matrix(np.stack([u, np.cross(k, u), k], axis=2), self.sources)
 
     def attributes_at(self, poses: Floats) -> dict[str, Array]:
         """Sources with their panels, turned about them."""
-        turns = poses[:, :3, :3] @ self.poses()[:, :3, :3].transpose(0, 2, 1)
-        arms = {name: getattr(self, name) for name in ("panel_u", "panel_v")}
-        arms["panel_centers"] = self.panel_centers - self.sources
-        turned = {name: np.einsum("mij,mj->mi", turns, arm) for name, arm in arms.items()}
-        turned["panel_centers"] += poses[:, :3, 3]
-        return {"sources": poses[:, :3, 3], **turned}
+        turns = poses[:, :3, :3] @ self.poses()[:, :3, :3].transpose(0, 2, 1) - np.eye(3)
+        turns[np.abs(turns).max(axis=(1, 2)) < _ROUNDING] = 0.0  # only moved: to the last digit
+        arms = {"panel_u": self.panel_u, "panel_v": self.panel_v, "panel_centers": self.panel_centers - self.sources}
+        found = {name: getattr(self, name) + np.einsum("mij,mj->mi", turns, arm) for name, arm in arms.items()}
+        found["panel_centers"] += poses[:, :3, 3] - self.sources
+        return {"sources": poses[:, :3, 3], **found}
 
     def views(
         self,
@@ -220,7 +221,9 @@ class XraySystem(Scanner):
         """A cube behind each focal spot, which stands for its tube, and the panel, `PANEL_THICKNESS` deep."""
         poses, parts = self.poses(), []
         poses[:, :3, [0, 2]] *= -1  # camera space is X = -u, Y = v, Z = -k
-        for number, pose, (x, y, depth, *sides) in zip(self.numbers.tolist(), poses, self.fields().tolist(), strict=True):
+        for number, pose, (x, y, depth, *sides) in zip(
+            self.numbers.tolist(), poses, self.fields().tolist(), strict=True
+        ):
             tube = _box((0.0, 0.0), (_TUBE, _TUBE), (0.0, _TUBE))
             panel = _box((x, y), (abs(sides[0]), abs(sides[1])), (-depth - PANEL_THICKNESS, -depth))
             parts.append(ModulePart(number, "source", f"Source {number:02d}", (tube, BOX_FACES), pose))

@@ -2,7 +2,7 @@
 
 Modules' parts count as convex bodies, as in `core.geometry.checks.hulls`; the tubes have no known size and are no bodies.
 Sources may share a panel: equal ones are one body. A panel that overlaps with a source's own is found as such, and does not
-stand in its cone's way as well. A cone is a lattice of `RAYS` x `RAYS` rays from the focal spot to equal shares of the panel.
+stand in its cone's way as well. A cone is a lattice of `RAYS` x `RAYS` rays, each to an equal share of the panel.
 """
 
 from collections.abc import Iterator, Sequence

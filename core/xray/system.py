@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import InitVar, dataclass, field
 from typing import Any, ClassVar, Self
@@ -19,7 +18,7 @@ from ..geometry.module_parts import BOX_FACES, ModulePart
 from ..geometry.scanner import Detector, Fault, Scanner, first
 from ..geometry.views import Views
 from ..system_source import SystemSource
-from ..validation import lengths, one_of, positive, real_array, whole_shape
+from ..validation import lengths, positive, real_array, whole_shape
 
 PANEL_THICKNESS = 10.0
 """mm, of the solid that stands for a panel, behind its pixels."""
@@ -27,7 +26,8 @@ _TUBE = 12.0  # mm: side of the cube behind the focal spot by which a source is 
 _SQUARE = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
 _ROUNDING = 1e-14  # of a rotation's matrix
 _SKEW = 1e-6  # cosine of the angle between rows and columns of pixels that are taken to be at right angles
-_FILTER = re.compile(r"\s*([A-Za-z][\w -]*?)\s+(\d+\.?\d*(?:[eE][-+]?\d+)?)\s*")
+_FILTER = r"[A-Za-z][\w -]* \d+\.?\d*(?:e[-+]?\d+)?"
+_FILTERS = rf"(?:{_FILTER}(?: ?\+ ?{_FILTER})*)?"
 
 Filters = str | Mapping[str, float]
 """Material -> thickness, mm; as a text "Al 2.5 + Cu 0.1"."""
@@ -59,7 +59,7 @@ XRAY_COLUMNS = ColumnTable(
         _scalar("spot", "focal_spot", "R", "size of the focal spot", blank=0.0, plausible=(0, 10), hints="spot"),
         _scalar(
             "filter", "filters", "S", 'filters, mm, such as "Al 2.5 + Cu 0.1"', "filter material", kind="text", blank="",
-            hints="filter",
+            hints="filter", pattern=(_FILTERS, "materials with their mm, such as Al 2.5 + Cu 0.1"),
         ),
     )
 )  # fmt: skip
@@ -67,25 +67,20 @@ XRAY_COLUMNS = ColumnTable(
 
 
 def filter_text(filters: Filters) -> str:
-    """Filters as a text, "Al 2.5 + Cu 0.1", or `InputError`; a text is only checked."""
+    """Filters as a text, "Al 2.5 + Cu 0.1"."""
     if isinstance(filters, str):
-        filter_thicknesses(filters)
         return filters
     if not isinstance(filters, Mapping):
         raise InputError(f"filters: expected material and mm such as {{'Al': 2.5}}, got {filters!r:.60}")
-    text = " + ".join(f"{material} {positive(mm, f'filter {material}', 'mm')!r}" for material, mm in filters.items())
-    filter_thicknesses(text)
-    return text
+    return " + ".join(f"{name} {positive(mm, f'filter {name}', 'mm')!r}" for name, mm in filters.items())
 
 
 def filter_thicknesses(text: str) -> dict[str, float]:
-    """Material -> thickness, mm, of a text such as "Al 2.5 + Cu 0.1"; none of an empty one."""
+    """Material -> thickness, mm, of a text such as "Al 2.5 + Cu 0.1"; of a material that stands there twice, of both."""
     found: dict[str, float] = {}
-    for part in text.split("+") if text.strip() else ():
-        match = _FILTER.fullmatch(part)
-        if match is None or match[1] in found or not float(match[2]) > 0:
-            raise InputError(f"filters {text!r}: expected each material once with its mm, such as 'Al 2.5 + Cu 0.1'")
-        found[match[1]] = float(match[2])
+    for part in text.split("+") if text else ():
+        name, _, mm = part.strip().rpartition(" ")
+        found[name.strip()] = found.get(name.strip(), 0.0) + float(mm)
     return found
 
 
@@ -146,11 +141,10 @@ class XraySystem(Scanner):
         if shape is not None or "pixel_rows" not in self.more:
             rows, columns = whole_shape(shape, "shape", 2)
             own["more"] = {**self.more, "pixel_rows": rows, "pixel_columns": columns}
-        given = self.filters
-        alone = isinstance(given, str | Mapping)
-        own["filters"] = (
-            filter_text(given) if alone else [filter_text(one) for one in np.asarray(given, object).tolist()]
-        )
+        if isinstance(self.filters, str | Mapping):
+            own["filters"] = filter_text(self.filters)
+        else:
+            own["filters"] = [filter_text(one) for one in np.atleast_1d(np.asarray(self.filters, object))]
         super().__post_init__()
         self._refuse(self.focal_spot < 0, "focal_spot must be 0 mm or more, got {focal_spot:g}")
         self._refuse(_skew(self.panel_u, self.panel_v), _NO_PIXELS)
@@ -207,7 +201,8 @@ class XraySystem(Scanner):
         place (x0, y0) of the image's middle there, mm. A panel stands in front of its source, where it is: there is no
         "real" detector behind it, and `magnification` changes nothing.
         """
-        one_of(detector, ("virtual",), "detector of an X-ray system")
+        if detector != "virtual":
+            raise InputError(f"detector {detector!r}: a panel stands in front of its source, expected 'virtual'")
         n_v, n_u = self.pixels if shape is None else whole_shape(shape, "image shape", 2)
         u = self.panel_u * (self.pixel_columns / n_u)[:, None]
         v = self.panel_v * (self.pixel_rows / n_v)[:, None]

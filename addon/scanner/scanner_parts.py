@@ -39,7 +39,7 @@ class NewScanner:
         for number, ring, pose, matrix, field in zip(
             system.numbers.tolist(), rings.tolist(), poses, cameras.matrices_of(poses), fields.tolist(), strict=True
         ):
-            name = ids.module_name(number, len(system))
+            name = ids.module_name(number, len(system), system.word)
             data = self._keep(bpy.data.cameras.new(name), name)
             cameras.set_up_camera(data, tuple(field), float(np.linalg.norm(pose[:3, 3])))
             camera = self._keep(bpy.data.objects.new(name, data), name)
@@ -52,7 +52,7 @@ class NewScanner:
     def _make_parts(self, system: Scanner, parts: Sequence[ModulePart]) -> None:
         for part in parts:
             camera, kind = self.cameras[part.number], part.kind.upper()
-            name = ids.part_name(ids.module_name(part.number, len(system)), kind)
+            name = ids.part_name(ids.module_name(part.number, len(system), system.word), kind)
             mesh = self._keep(collimators.new_mesh(name, part.solid, self._materials[kind]), name)
             child = self._keep(new_part(camera, kind, name, mesh), name)
             self.rings[camera.mphdrr_module.ring].objects.link(child)

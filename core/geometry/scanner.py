@@ -51,6 +51,8 @@ class Scanner(ABC):
     """Its name in run files and in the scene: "pinhole"."""
     sheet: ClassVar[str] = ""
     """The one sheet of a workbook that holds it; "": those whose headings say so."""
+    word: ClassVar[str] = "Module"
+    """What its modules are called in the scene: "Module 07"."""
     columns: ClassVar[ColumnTable]
     numbers: NDArray[np.int64]
     source: SystemSource | None

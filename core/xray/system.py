@@ -120,6 +120,7 @@ class XraySystem(Scanner):
 
     kind: ClassVar[str] = "x-ray"
     sheet: ClassVar[str] = "X-ray"
+    word: ClassVar[str] = "X-ray"
     columns: ClassVar[ColumnTable] = XRAY_COLUMNS
 
     sources: Floats

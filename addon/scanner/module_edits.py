@@ -12,12 +12,13 @@ from numpy.typing import NDArray
 from ...core import InputError, PinholeSystem, ring_order
 from ...core.geometry.frames import affine_matrix, rotations
 from ...core.geometry.module_parts import ModulePart
-from ...core.geometry.scanner import Scanner
+from ...core.geometry.scanner import SCANNERS, Scanner
 from ..blender import ids, objects, updates
 from . import cameras, collimators, following, module_values, pinholes, scanner
 from .scanner_parts import clear, new_part, parts_and_others
 
-_OURS = re.compile(r"(Module|Collimator|Crystal) \d+(\.\d+)?")  # a name that the extension gave
+_WORDS = (*(kind.word for kind in SCANNERS.values()), *(part.capitalize() for part in collimators.PARTS))
+_OURS = re.compile(rf"({'|'.join(dict.fromkeys(_WORDS))}) \d+(\.\d+)?")  # a name that the extension gave
 
 
 def copied_cameras(collection: bpy.types.Collection) -> list[bpy.types.Object]:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import Floats
-from ..errors import several
+from ..errors import InputError, several
 from ..geometry.checks.field_of_view import find_blocked, hits
 from ..geometry.checks.hulls import TOUCH, Hulls
 from ..geometry.checks.overlaps import penetration_depths
@@ -22,7 +22,6 @@ from ..geometry.module_parts import ModulePart
 from ..geometry.scanner import Scanner
 from ..geometry.system import PinholeSystem
 from ..validation import instance, positive
-from .system import XraySystem
 
 RAYS = 48
 _SHOWN = 4  # of the bodies in a cone's way, those that shadow most of it
@@ -90,7 +89,7 @@ class InBore(Finding):
 
 
 def find_in_room(
-    system: XraySystem, others: Sequence[Scanner] = (), *, bore: float | None = None, construction: object = None
+    system: Scanner, others: Sequence[Scanner] = (), *, bore: float | None = None, construction: object = None
 ) -> tuple[Finding, ...]:
     """What is wrong with an X-ray system beside other scanners, such as pinhole modules; their order is the sources'.
 
@@ -98,8 +97,10 @@ def find_in_room(
     body, panels between a module and its ROI, and sources and panels in the patient's bore, a cylinder around the z axis of
     radius `bore`, mm, if it is given. `construction` is that of the modules' collimators.
     """
-    instance(system, XraySystem, "find_in_room")
+    instance(system, Scanner, "find_in_room")
     panels = [part for part in system.parts() if part.kind == "panel"]
+    if len(panels) != len(system):
+        raise InputError(f"find_in_room: expected an X-ray system, got a {system.kind} system")
     bodies = [(f"the panel of source {panel.number}", panel) for panel in panels]
     for other in others:
         built = other.parts(construction if isinstance(other, PinholeSystem) else None)
@@ -118,11 +119,15 @@ def find_in_room(
     return tuple(sorted(found, key=lambda finding: order[finding.modules[0]]))
 
 
+def _sources(system: Scanner) -> Floats:
+    return system.poses()[:, :3, 3]
+
+
 def _shadow(
-    system: XraySystem, m: int, hulls: Hulls, names: Sequence[str], depths: dict[int, float]
+    system: Scanner, m: int, hulls: Hulls, names: Sequence[str], depths: dict[int, float]
 ) -> Iterator[ShadowedCone]:
     """What of the cone of source m, whose panel overlaps with the hulls of `depths`, the others block."""
-    source, targets = system.sources[m], system[m].views((RAYS, RAYS)).rays(0)[1]
+    source, targets = _sources(system)[m], system[m].views((RAYS, RAYS)).rays(0)[1]
     ways = targets - source
     lengths = np.linalg.norm(ways, axis=1)
     directions = ways / lengths[:, None]
@@ -160,27 +165,27 @@ def _depths(hulls: Hulls, m: int) -> dict[int, float]:
 
 
 def _overlaps(
-    system: XraySystem, m: int, hulls: Hulls, names: Sequence[str], depths: dict[int, float]
+    system: Scanner, m: int, hulls: Hulls, names: Sequence[str], depths: dict[int, float]
 ) -> Iterator[Finding]:
     number = int(system.numbers[m])
     others = [p for p in depths if np.abs(hulls.vertices[p] - hulls.vertices[m]).max() > TOUCH]
     if others:
         others.sort(key=lambda p: -depths[p])
         yield PanelOverlap(number, tuple(names[p] for p in others), depths[others[0]])
-    inside = (hulls.offsets - hulls.normals @ system.sources[m]).min(axis=1)
+    inside = (hulls.offsets - hulls.normals @ _sources(system)[m]).min(axis=1)
     for p in np.flatnonzero(inside > TOUCH):
         yield SwallowedSource(number, names[p], float(inside[p]))
 
 
-def _in_view(system: XraySystem, pinholes: PinholeSystem, panels: Sequence[ModulePart]) -> list[Finding]:
+def _in_view(system: Scanner, pinholes: PinholeSystem, panels: Sequence[ModulePart]) -> list[Finding]:
     hulls = Hulls.of(panels)
     hulls.numbers[:] = -1 - np.arange(len(panels))  # unlike those of the modules
     blocked = find_blocked(pinholes, hulls)
     return [PanelInView(int(system.numbers[-1 - one.by]), one.module, one.share) for one in blocked]
 
 
-def _in_bore(system: XraySystem, panels: Sequence[ModulePart], radius: float) -> list[Finding]:
-    places = [("focal spot", system.sources[:, None]), ("panel", np.stack([p.vertices for p in panels]))]
+def _in_bore(system: Scanner, panels: Sequence[ModulePart], radius: float) -> list[Finding]:
+    places = [("focal spot", _sources(system)[:, None]), ("panel", np.stack([p.vertices for p in panels]))]
     return [
         InBore(number, part, distance, radius)
         for part, corners in places

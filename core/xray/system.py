@@ -19,6 +19,7 @@ from ..geometry.scanner import Detector, Fault, Scanner, first
 from ..geometry.views import Views
 from ..system_source import SystemSource
 from ..validation import lengths, positive, real_array, whole_shape
+from .checks import find_in_room
 
 PANEL_THICKNESS = 10.0
 """mm, of the solid that stands for a panel, behind its pixels."""
@@ -228,8 +229,6 @@ class XraySystem(Scanner):
 
     def findings(self, others: Sequence[Scanner] = (), construction: Any = None) -> tuple[Finding, ...]:
         """`checks.find_in_room`: cones that are shadowed, and panels in modules, in each other or in the modules' view."""
-        from .checks import find_in_room
-
         return find_in_room(self, others, construction=construction)
 
 

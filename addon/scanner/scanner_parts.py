@@ -20,7 +20,9 @@ class NewScanner:
         self.cameras: dict[int, bpy.types.Object] = {}
         self.rings: list[bpy.types.Collection] = []
         self._named: list[tuple[bpy.types.ID, str]] = []  # names are free only after the old scanner has gone
-        self._materials = {part: collimators.part_material(part) for part in collimators.LOOKS}
+        self._materials = {
+            kind: collimators.part_material(kind) for kind in ("ROI", *(part.kind.upper() for part in parts))
+        }
         try:
             self._make_cameras(system)
             self._make_parts(system, parts)

@@ -249,7 +249,7 @@ def check_geometry(collection: bpy.types.Collection) -> tuple[list[str], list[bp
     else:
         others = [c for c in scanners(bpy.context.scene) if c.mphdrr_scanner.kind != system.kind]
         built = [pinholes.construction(c.mphdrr_scanner) for c in others if pinholes.has_pinholes(kind_of(c))]
-        findings = system.findings([read_scanner(c) for c in others], *built[:1])
+        findings = system.findings([read_scanner(c) for c in others], next(iter(built), None))
     with following.writing():
         collection.mphdrr_scanner.findings = json.dumps([str(finding) for finding in findings])
         for camera in found:

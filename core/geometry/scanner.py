@@ -203,8 +203,13 @@ class Scanner(ABC):
         """
         return ()
 
-    def findings(self, others: Sequence[Scanner] = (), construction: Any = None) -> Sequence[Finding]:
-        """What is wrong with its modules in one room with `others`, whose solids are built as a `construction` says."""
+    def findings(
+        self, others: Sequence[Scanner] = (), construction: Any = None, bore: float | None = None
+    ) -> Sequence[Finding]:
+        """What is wrong with its modules in one room with `others`, whose solids are built as a `construction` says.
+
+        The patient lies within `bore`, mm, of the z axis, if that is given.
+        """
         raise InputError(f"there are no checks of a scanner of the kind {self.kind}")
 
     def rings(self) -> NDArray[np.int64]:

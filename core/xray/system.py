@@ -227,9 +227,11 @@ class XraySystem(Scanner):
             parts.append(ModulePart(number, "panel", f"Panel {number:02d}", (panel, BOX_FACES), pose))
         return parts
 
-    def findings(self, others: Sequence[Scanner] = (), construction: Any = None) -> tuple[Finding, ...]:
-        """`checks.find_in_room`: cones that are shadowed, and panels in modules, in each other or in the modules' view."""
-        return find_in_room(self, others, construction=construction)
+    def findings(
+        self, others: Sequence[Scanner] = (), construction: Any = None, bore: float | None = None
+    ) -> tuple[Finding, ...]:
+        """What `checks.find_in_room` finds: shadowed cones, and panels in bodies, in the modules' view or in the bore."""
+        return find_in_room(self, others, bore=bore, construction=construction)
 
 
 def _box(middle: tuple[float, float], sides: Sequence[float], ends: tuple[float, float]) -> Floats:

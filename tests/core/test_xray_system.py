@@ -268,6 +268,8 @@ def test_the_command_line_makes_shows_edits_checks_and_exports_it(workbook, tmp_
     assert " 120 " in capsys.readouterr().out
     assert main(["geometry", "check", edited, *kind]) == 0
     assert "of its cone is blocked" in capsys.readouterr().out
+    assert main(["geometry", "check", edited, *kind, "--bore", "260"]) == 0
+    assert "inside the bore of 260 mm" in capsys.readouterr().out
     assert main(["geometry", "epipolar", edited, *kind, "--pixel", "1:16,32"]) == 0
     assert main(["geometry", "export", edited, *kind, "--format", "astra", "-o", str(tmp_path / "a.npz")]) == 0
     with np.load(tmp_path / "a.npz") as astra:
@@ -276,6 +278,7 @@ def test_the_command_line_makes_shows_edits_checks_and_exports_it(workbook, tmp_
     for command, said in (
         (["performance", made, *kind], "its scanner is of the kind x-ray, expected one with pinholes"),
         (["set", made, "--kvp", "90", "-o", edited], "--kvp: is no column of a pinhole scanner"),
+        (["check", made, "--bore", "200"], "--bore is of X-ray systems"),
         (["set", made, *kind, "--length", "90", "-o", edited], "--length: only pinhole modules have a collimator"),
     ):
         assert main(["geometry", *command]) == 1

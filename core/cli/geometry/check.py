@@ -27,6 +27,7 @@ def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     add("--edge-at", choices=get_args(EdgePlace), default="middle", help=place)
     add_edge(parser)
     add("--isotope", metavar="NAME", help=f"{', '.join(ISOTOPES)}: its photons must be stopped by the plates")
+    add("--bore", type=float, metavar="MM", help="of X-ray systems: radius of the patient's bore around the z axis")
     add("--strict", action="store_true", help="exit with status 1 if there is any warning or finding")
 
 
@@ -43,12 +44,13 @@ def _run(arguments: argparse.Namespace) -> None:
         others = [] if isinstance(system, PinholeSystem) else _others(arguments, system)
     parts = {"plate_thickness": arguments.plate, "wall_thickness": arguments.wall, "edge_at": arguments.edge_at}
     if isinstance(system, PinholeSystem):
+        refuse(arguments, ("bore",), "is of X-ray systems")
         optics = optics_of(arguments, system)
         report = check_geometry(system, **parts, aperture_mu=optics.aperture_mu, opening_angle=optics.opening_angle)
         findings, geometry = report.messages(), report.as_dict()
     else:
         angle = angle_from_degrees(arguments.opening_angle, "--opening-angle")
-        found = system.findings(others, Construction(**parts, opening_angle=angle))
+        found = system.findings(others, Construction(**parts, opening_angle=angle), arguments.bore)
         findings, geometry = [str(one) for one in found], {"ok": not found}
     total = f"{counted(len(messages), 'warning')} of the workbook, {counted(len(findings), 'finding')} in the geometry"
     summary = _summary(system)

@@ -170,13 +170,14 @@ class WholeHoles:
 
         They are those by the pinhole's place (3,), by the module's frame (3, 3), and by the rest of the view's numbers.
         """
-        volumes, origin = cropped(*volumes)
-        filled, kind = [np.ascontiguousarray(volume) for volume in volumes], images.dtype.type
+        filled, origin = cropped(*volumes)
+        kind = images.dtype.type
         shape, affine = filled[0].shape, self.grid.affine[:3]
 
         def of_view(m: int) -> tuple[Array, Array, ViewNumbers]:
             pinhole, frame, *_ = self._module(m)
-            numbers, by_passing = ViewNumbers.zero(), np.zeros(shape, kind)
+            numbers = ViewNumbers.zero()
+            by_passing: Array = np.zeros(shape, kind)
             parts = self._of_part(m, origin, shape, kind)
             passes = self._passes(m, origin, filled[0], None) if parts else None
             for (of, pixels), zone in zip(parts, self._reached(m, origin, shape), strict=True):
@@ -197,8 +198,8 @@ class WholeHoles:
                 if sums is not None:
                     numbers = numbers.plus(self.make(m, *zone).gradient(of, pixels, origin, sums))
             by = numbers.to_camera
-            center, by_frame = -by[:, 3] @ frame, by[:, :3] @ affine[:, :3].T
-            by_frame += np.outer(by[:, 3], affine[:, 3] - pinhole)
+            center: Array = -(by[:, 3] @ frame)
+            by_frame: Array = by[:, :3] @ affine[:, :3].T + np.outer(by[:, 3], affine[:, 3] - pinhole)
             if passes is not None and self.mu is not None:
                 center = center + self._rays(m, self.mu, origin, filled[0]).gradient(by_passing)
             return center, by_frame, numbers

@@ -11,10 +11,12 @@ ORDER_EVENTS, ORDER_EXPORT = 28, 30
 
 # --- Datablocks ---------------------------------------------------------------------------------------------
 SCANNER = "Scanner"  # default name of a scanner's collection
-PARTS = ("NONE", "CAMERA", "COLLIMATOR", "CRYSTAL", "ROI", "PLANE")  # `Object.mphdrr_module.part`
+PARTS = ("NONE", "CAMERA", "COLLIMATOR", "CRYSTAL", "ROI", "PLANE", "ARROWS")  # `Object.mphdrr_module.part`
 MOSAIC = "mphDRR mosaic"
 DIFFERENCE = "mphDRR difference"
 RECONSTRUCTION = "mphDRR reconstruction"  # slices of the last one, and its objective
+RESIDUALS = "mphDRR residuals"  # of the last calibration
+ARROWS = "Calibration"  # the object of the arrows from nominal to found pinholes
 PLANES = "mphDRR projections"  # the collection of the planes that show them
 PERSPECTIVES = "mphDRR perspective"  # the collection of volumes in modules' coordinates (`frustums.py`)
 STUDIO = "mphDRR studio"  # the collection of the lights, and a world

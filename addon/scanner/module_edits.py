@@ -265,6 +265,25 @@ def renumber(collection: bpy.types.Collection, order: Literal["RINGS", "LIST"] =
     return int(np.count_nonzero(system.numbers[places] != ordered.numbers))
 
 
+def move_to(collection: bpy.types.Collection, system: PinholeSystem) -> None:
+    """Move and turn modules, with their lengths, to where `system` has those of their numbers.
+
+    From then on the scanner does not keep its modules aimed, if one is tilted. Raises InputError, and moves none, where
+    it lacks a module.
+    """
+    found = [scanner.module(collection, number) for number in system.numbers.tolist()]
+    with following.writing():
+        for camera, matrix, length in zip(
+            found, cameras.matrices_of(system.poses()), system.collimator_length.tolist(), strict=True
+        ):
+            objects.set_world_matrix(camera, matrix)
+            camera.mphdrr_module.collimator_length = length
+            camera.mphdrr_module.length_mode = module_values.TYPED
+        if module_values.off_aim(collection, found):
+            collection.mphdrr_scanner.keep_aimed = False
+    following.refresh(collection)
+
+
 def make_single_users(collection: bpy.types.Collection) -> None:
     """Give every module a camera and meshes of its own, which can be reshaped."""
     for item in collection.all_objects:

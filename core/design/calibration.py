@@ -41,6 +41,8 @@ class Calibration:
     ----------
     system : PinholeSystem
         The modules at their places with their tilts, and with their lengths if these were fitted.
+    nominal : PinholeSystem
+        The geometry that was given.
     views : Views
         Theirs: the given ones moved with the modules, and their pixels by the detectors' offset.
     points : array (K, 3)
@@ -74,6 +76,7 @@ class Calibration:
     """
 
     system: PinholeSystem
+    nominal: PinholeSystem
     views: Views
     points: Floats
     covariance: Floats
@@ -97,6 +100,25 @@ class Calibration:
                 which = "all modules" if len(numbers) == len(told) else f"modules {several(numbers, 12)}"
                 weak.setdefault(which, []).append(name)
         return [f"{which}: {', '.join(names)}" for which, names in weak.items()]
+
+    def summary(self) -> list[str]:
+        """How far modules are from their nominal places and tilts, what does not fit and what images do not tell, in lines."""
+        shifts = np.linalg.norm(self.system.centers - self.nominal.centers, axis=1)
+        turns = np.degrees(np.linalg.norm(self.system.tilt - self.nominal.tilt, axis=1))
+        moved, worst = (shifts > 0) | (turns > 0), int(np.argmax(shifts))
+        rms = [float(np.sqrt((each[moved] ** 2).mean())) if moved.any() else 0.0 for each in (shifts, turns)]
+        lines = [f"{moved.sum()} of {len(moved)} modules moved, RMS {rms[0]:.2f} mm and {rms[1]:.2f} degrees"]
+        if moved.any():
+            lines.append(
+                f"farthest: module {self.system.numbers[worst]}, {shifts[worst]:.2f} mm and {turns[worst]:.2f} degrees"
+            )
+        odd = several(self.misfitting, 12)
+        lines.append(f"modules that do not fit: {odd}" if odd else "all modules fit")
+        if self.gauge:
+            lines.append(
+                f"{', '.join(self.gauge)} of the scanner as a whole: nominal, images of these sources do not tell them"
+            )
+        return [*lines, *(f"not told, {line}" for line in self.untold())]
 
 
 def calibrate(
@@ -288,7 +310,7 @@ def _result(views: Views, bundle: Bundle, x: Floats, spots: Spots, lattice: Latt
     names = (*_NAMES, *(name for kind in bundle.fit for name in extras[kind]))
     gauge = ("shift", "turn", "scale")[: len(bundle.gauge()) // 3 + len(bundle.gauge()) % 3]
     return Calibration(
-        nominal.replace(centers=now.centers, tilt=now.tilt, collimator_length=now.length),
+        nominal.replace(centers=now.centers, tilt=now.tilt, collimator_length=now.length), nominal,
         _moved_views(views, nominal, now), now.points, covariance[:, :6, :6], chi_square, misfit,
         tuple(nominal.numbers[odd].tolist()), used, names,
         np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)), told, gauge, now.offset, over / np.sqrt(np.maximum(total, 1)),

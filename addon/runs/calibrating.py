@@ -1,0 +1,84 @@
+"""Calibration in the window: modules move to where images of point sources have them."""
+
+import json
+from pathlib import Path
+
+import bpy
+import numpy as np
+
+from ...core.design.calibration import Calibration
+from ...core.design.calibration_recipe import run_calibration
+from ...core.design.residuals import residual_sheet
+from ...core.errors import InputError
+from ...core.progress import Progress, stages_of, tell
+from ...core.runs.mosaic import png
+from ..blender import ids, jobs
+from ..pictures import images
+from ..scanner import arrows, following, module_edits, scanner
+
+_FAR = 25.0  # mm: a module that is as far from the recipe's is another scanner's
+_PNG_LEVEL = 1  # fast
+
+
+def calibrating(context: bpy.types.Context, path: Path, apply: bool = True, exaggeration: float = 0.0) -> jobs.Job:
+    """The job that calibrates the active scanner as a recipe (.toml) says, by the same numbers as `run_calibration`.
+
+    With `apply` the modules move and turn to what is found. Arrows lead from nominal to found pinholes, `exaggeration`
+    times as long, or, if 0, the longest about 50 mm. Modules that do not fit are marked. Raises InputError where there is no
+    scanner of pinholes.
+    """
+    collection = scanner.required_scanner(context.scene)
+    scanner.read_pinholes(collection)
+    uid = collection.session_uid
+
+    def work(progress: Progress) -> tuple[Calibration, bytes]:
+        stages = stages_of(progress)
+        spots = stages("finding spots")
+
+        def seen(done: int, total: int) -> None:
+            tell(spots, done, total)
+            if done == total:
+                stages("finding modules")
+
+        found = run_calibration(path, seen)
+        return found, png(residual_sheet(found).picture, _PNG_LEVEL)
+
+    def finish(result: tuple[Calibration, bytes]) -> str:
+        found, picture = result
+        collection = jobs.found_again(bpy.data.collections, uid)
+        if collection is None:
+            raise InputError("the scanner that was calibrated is gone")
+        _require_same(collection, found)
+        if apply:
+            module_edits.move_to(collection, found.system)
+        factor = arrows.show(collection, found.nominal.centers, found.system.centers, exaggeration)
+        lines = found.summary()
+        _mark(collection, found, [*lines, *([f"arrows: {factor:g} times as long"] if factor else [])])
+        images.show_below(images.store_drawn(ids.RESIDUALS, picture), bpy.context)
+        return f"{'Calibrated' if apply else 'Not applied'}: {'; '.join(lines[:3])}"
+
+    return jobs.Job("Calibrating", work, finish)
+
+
+def _require_same(collection: bpy.types.Collection, found: Calibration) -> None:
+    """Refuse a recipe of another scanner: its modules, or their places, are others."""
+    places = dict(zip((system := scanner.read_pinholes(collection)).numbers.tolist(), system.centers, strict=True))
+    for number, *known in zip(found.system.numbers.tolist(), found.nominal.centers, found.system.centers, strict=True):
+        if number not in places:
+            raise InputError(f"scanner '{collection.name}' has no module {number}: the recipe is of another scanner")
+        away = np.linalg.norm(known - places[number], axis=1).min()
+        if away > _FAR:
+            raise InputError(
+                f"module {number} of scanner '{collection.name}' is {away:.0f} mm from where the recipe's workbook has it: "
+                "the recipe is of another scanner"
+            )
+
+
+def _mark(collection: bpy.types.Collection, found: Calibration, lines: list[str]) -> None:
+    """Note what was found at the scanner, and at its modules whether they fit."""
+    misfits = dict(zip(found.system.numbers.tolist(), found.misfit.tolist(), strict=True))
+    with following.writing():
+        collection.mphdrr_scanner.calibration = json.dumps(lines)
+        for number, misfit in misfits.items():
+            text = f"Does not fit its calibration: misfit {misfit:.1f}, expected about 1"
+            scanner.module(collection, number).mphdrr_module.finding = text if number in found.misfitting else ""

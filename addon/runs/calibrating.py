@@ -62,7 +62,8 @@ def calibrating(context: bpy.types.Context, path: Path, apply: bool = True, exag
 
 def _require_same(collection: bpy.types.Collection, found: Calibration) -> None:
     """Refuse a recipe of another scanner: its modules, or their places, are others."""
-    places = dict(zip((system := scanner.read_pinholes(collection)).numbers.tolist(), system.centers, strict=True))
+    system = scanner.read_pinholes(collection)
+    places = dict(zip(system.numbers.tolist(), system.centers, strict=True))
     for number, *known in zip(found.system.numbers.tolist(), found.nominal.centers, found.system.centers, strict=True):
         if number not in places:
             raise InputError(f"scanner '{collection.name}' has no module {number}: the recipe is of another scanner")
@@ -76,9 +77,9 @@ def _require_same(collection: bpy.types.Collection, found: Calibration) -> None:
 
 def _mark(collection: bpy.types.Collection, found: Calibration, lines: list[str]) -> None:
     """Note what was found at the scanner, and at its modules whether they fit."""
-    misfits = dict(zip(found.system.numbers.tolist(), found.misfit.tolist(), strict=True))
     with following.writing():
         collection.mphdrr_scanner.calibration = json.dumps(lines)
-        for number, misfit in misfits.items():
-            text = f"Does not fit its calibration: misfit {misfit:.1f}, expected about 1"
-            scanner.module(collection, number).mphdrr_module.finding = text if number in found.misfitting else ""
+        for number, misfit in zip(found.system.numbers.tolist(), found.misfit.tolist(), strict=True):
+            why = f"misfit {misfit:.1f}, where 1 is usual" if np.isfinite(misfit) else "its images fit no place nearby"
+            text = f"Does not fit its calibration: {why}" if number in found.misfitting else ""
+            scanner.module(collection, number).mphdrr_module.finding = text

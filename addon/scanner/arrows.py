@@ -5,11 +5,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core.geometry.frames import module_frames
+from ...core.geometry.module_parts import Solid
 from ..blender import ids, objects
 from . import collimators
 
 _SIDES = 12
-_RADII = np.array([0.8, 0.8, 2.4, 0.0])  # mm, of the circles from the shaft's end to the tip
+_RADII = np.array([0.0, 0.8, 0.8, 2.4, 0.0])  # mm, of the circles from the start to the tip
 _HEAD = 8.0  # mm, at most half of the arrow
 _LONGEST = 50.0  # mm, about
 
@@ -36,19 +37,18 @@ def show(
     return factor
 
 
-def _solid(starts: NDArray[np.float64], ways: NDArray[np.float64]) -> tuple[NDArray[np.float64], list[list[int]]]:
-    """Points and faces of arrows: four circles each, the last of which is the tip."""
+def _solid(starts: NDArray[np.float64], ways: NDArray[np.float64]) -> Solid:
+    """Points and faces of arrows: circles one after the other, of which the first and the last are points."""
     lengths = np.linalg.norm(ways, axis=1)
-    neck = lengths - np.minimum(_HEAD, lengths / 2)
-    along = np.stack([np.zeros_like(neck), neck, neck, lengths], axis=1)
+    neck, zero = lengths - np.minimum(_HEAD, lengths / 2), np.zeros_like(lengths)
+    along = np.stack([zero, zero, neck, neck, lengths], axis=1)
     angles = 2 * np.pi * np.arange(_SIDES) / _SIDES
-    u, v, k = module_frames(-ways).swapaxes(0, 1)
-    circles = np.cos(angles)[:, None] * u[:, None] + np.sin(angles)[:, None] * v[:, None]
-    middles = starts[:, None] + along[..., None] * k[:, None]
+    u, v, k = module_frames(-ways).swapaxes(0, 1)[:, :, None]
+    circles = np.cos(angles)[:, None] * u + np.sin(angles)[:, None] * v
+    middles = starts[:, None] + along[..., None] * k
     points = middles[:, :, None] + _RADII[:, None, None] * circles[:, None]
-    ring = np.arange(len(_RADII) * _SIDES).reshape(-1, _SIDES)
+    ring = np.arange(len(_RADII) * _SIDES, dtype=np.int32).reshape(-1, _SIDES)
     after = np.roll(ring, -1, axis=1)
     sides = np.stack([ring[:-1], after[:-1], after[1:], ring[1:]], axis=-1).reshape(-1, 4)
-    first = ring.size * np.arange(len(ways))[:, None]
-    faces = (first[..., None] + sides).reshape(-1, 4).tolist() + (first + ring[0, ::-1]).tolist()
-    return points.reshape(-1, 3), faces
+    arrows = ring.size * np.arange(len(ways), dtype=np.int32)
+    return points.reshape(-1, 3), (arrows[:, None, None] + sides).reshape(-1, 4)

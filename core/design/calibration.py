@@ -30,6 +30,7 @@ _OUTLYING = 6.0  # standard deviations from where the geometry has a spot
 _FAR = 5.0  # standard deviations of what was thought of a module's numbers
 _ROUNDS = 20
 _CHANCE = 1e-3  # that any module of a right model is said not to fit
+_STAYS = 1e-6  # mm, degrees: rounding
 _TOLD = 0.75  # of a number's variance that images must take away
 
 
@@ -102,10 +103,10 @@ class Calibration:
         return [f"{which}: {', '.join(names)}" for which, names in weak.items()]
 
     def summary(self) -> list[str]:
-        """How far modules are from their nominal places and tilts, what does not fit and what images do not tell, in lines."""
+        """How far modules are from their nominal places and tilts, what does not fit and what is not told, in lines."""
         shifts = np.linalg.norm(self.system.centers - self.nominal.centers, axis=1)
         turns = np.degrees(np.linalg.norm(self.system.tilt - self.nominal.tilt, axis=1))
-        moved, worst = (shifts > 0) | (turns > 0), int(np.argmax(shifts))
+        moved, worst = (shifts > _STAYS) | (turns > _STAYS), int(np.argmax(shifts))
         rms = [float(np.sqrt((each[moved] ** 2).mean())) if moved.any() else 0.0 for each in (shifts, turns)]
         lines = [f"{moved.sum()} of {len(moved)} modules moved, RMS {rms[0]:.2f} mm and {rms[1]:.2f} degrees"]
         if moved.any():

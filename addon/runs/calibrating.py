@@ -53,7 +53,7 @@ def calibrating(context: bpy.types.Context, path: Path, apply: bool = True, exag
             module_edits.move_to(collection, found.system)
         factor = arrows.show(collection, found.nominal.centers, found.system.centers, exaggeration)
         lines = found.summary()
-        _mark(collection, found, [*lines, *([f"arrows: {factor:g} times as long"] if factor else [])])
+        _mark(collection, found, [*lines, *([f"arrows: {factor:g} times the shift"] if factor else [])])
         images.show_below(images.store_drawn(ids.RESIDUALS, picture), bpy.context)
         return f"{'Calibrated' if apply else 'Not applied'}: {'; '.join(lines[:3])}"
 

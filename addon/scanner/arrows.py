@@ -10,8 +10,8 @@ from ..blender import ids, objects
 from . import collimators
 
 _SIDES = 12
-_RADII = np.array([0.0, 0.8, 0.8, 2.4, 0.0])  # mm, of the circles from the start to the tip
-_HEAD = 8.0  # mm, at most half of the arrow
+_RADII = np.array([0.0, 1.5, 1.5, 4.0, 0.0])  # mm, of the circles from the start to the tip
+_HEAD = 12.0  # mm, at most half of the arrow
 _LONGEST = 50.0  # mm, about
 
 

@@ -109,8 +109,8 @@ def test_arrows_are_closed_and_face_outwards(collection):
     arrows.show(collection, np.zeros((2, 3)), np.array([[0.0, 0, 3], [1, 2, 2]]), 10.0)
     mesh = bpy.data.objects[ids.ARROWS].data
     volume = sum(f.area * np.dot(f.center, f.normal) for f in mesh.polygons) / 3
-    cone = np.pi * 2.4**2 * 8 / 3
-    assert volume == pytest.approx(2 * (np.pi * 0.8**2 * 22 + cone), rel=0.06)  # of 12 sides
+    cone = np.pi * 4**2 * 12 / 3
+    assert volume == pytest.approx(2 * (np.pi * 1.5**2 * 18 + cone), rel=0.06)  # of 12 sides
     assert arrows.show(collection, np.ones((1, 3)), np.ones((1, 3))) == 0 and ids.ARROWS not in bpy.data.objects
 
 

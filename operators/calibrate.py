@@ -19,12 +19,11 @@ class MPHDRR_OT_calibrate(jobs.JobOperator, bpy.types.Operator):
     filepath: file_properties.file_property("Recipe of the calibration")
     filter_glob: file_properties.shown_files([".toml"])
     apply: BoolProperty(
-        name="Apply", description="Move and turn the modules to what is found. Otherwise only show it", default=True,
-        options={"SKIP_SAVE"},
+        name="Apply", description="Move the modules to what is found, not only show it", default=True, options={"SKIP_SAVE"},
     )  # fmt: skip
     exaggeration: FloatProperty(
-        name="Exaggeration", description="How many times as long as the ways from nominal to found pinholes the arrows are; "
-        "0: the longest is about 50 mm", default=0.0, min=0.0, soft_max=1000.0,
+        name="Exaggeration", min=0.0, soft_max=1000.0,
+        description="Length of the arrows in units of the shifts; 0: the longest arrow is about 50 mm",
     )  # fmt: skip
 
     def job(self, context: bpy.types.Context) -> jobs.Job:

@@ -272,10 +272,9 @@ def move_to(collection: bpy.types.Collection, system: PinholeSystem) -> None:
     it lacks a module.
     """
     found = [scanner.module(collection, number) for number in system.numbers.tolist()]
+    matrices, lengths = cameras.matrices_of(system.poses()), system.collimator_length.tolist()
     with following.writing():
-        for camera, matrix, length in zip(
-            found, cameras.matrices_of(system.poses()), system.collimator_length.tolist(), strict=True
-        ):
+        for camera, matrix, length in zip(found, matrices, lengths, strict=True):
             objects.set_world_matrix(camera, matrix)
             camera.mphdrr_module.collimator_length = length
             camera.mphdrr_module.length_mode = module_values.TYPED

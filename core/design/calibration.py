@@ -13,7 +13,7 @@ from ..arrays import Floats
 from ..errors import InputError, several
 from ..geometry.system import PinholeSystem
 from ..geometry.views import Views
-from ..progress import Progress
+from ..progress import Progress, stages_of
 from ..projector.emission import Emission
 from ..validation import instance, one_of, positive, real_array, shape_text
 from .bundle import LENGTH, OFFSET, Bundle, Moved
@@ -106,20 +106,16 @@ class Calibration:
         """How far modules are from their nominal places and tilts, what does not fit and what is not told, in lines."""
         shifts = np.linalg.norm(self.system.centers - self.nominal.centers, axis=1)
         turns = np.degrees(np.linalg.norm(self.system.tilt - self.nominal.tilt, axis=1))
-        moved, worst = (shifts > _STAYS) | (turns > _STAYS), int(np.argmax(shifts))
-        rms = [float(np.sqrt((each[moved] ** 2).mean())) if moved.any() else 0.0 for each in (shifts, turns)]
-        lines = [f"{moved.sum()} of {len(moved)} modules moved, RMS {rms[0]:.2f} mm and {rms[1]:.2f} degrees"]
-        if moved.any():
-            lines.append(
-                f"farthest: module {self.system.numbers[worst]}, {shifts[worst]:.2f} mm and {turns[worst]:.2f} degrees"
-            )
-        odd = several(self.misfitting, 12)
-        lines.append(f"modules that do not fit: {odd}" if odd else "all modules fit")
-        if self.gauge:
-            lines.append(
-                f"{', '.join(self.gauge)} of the scanner as a whole: nominal, images of these sources do not tell them"
-            )
-        return [*lines, *(f"not told, {line}" for line in self.untold())]
+        moved, worst = int(((shifts > _STAYS) | (turns > _STAYS)).sum()), int(np.argmax(shifts))
+        mm, degrees = (np.sqrt((each**2).sum() / max(1, moved)) for each in (shifts, turns))
+        odd, whole = several(self.misfitting, 12), ", ".join(self.gauge)
+        return [
+            f"{moved} of {len(shifts)} modules moved, RMS {mm:.2f} mm and {degrees:.2f} degrees",
+            f"farthest: module {self.system.numbers[worst]}, {shifts[worst]:.2f} mm and {turns[worst]:.2f} degrees",
+            f"modules that do not fit: {odd}" if odd else "all modules fit",
+            *([f"{whole} of the scanner as a whole: nominal, these images do not tell them"] if whole else []),
+            *(f"not told, {line}" for line in self.untold()),
+        ]
 
 
 def calibrate(
@@ -197,7 +193,9 @@ def calibrate(
         raise InputError("calibrate: give points or distances, not both")
     lattice = Lattice.of(model, views)
     radii = model.effective_diameter / 2 * (1 + system.collimator_length / system.pinhole_distance)
-    spots = find_spots(images, each_pixel(model), lattice, radii, progress)
+    stages = stages_of(progress)
+    spots = find_spots(images, each_pixel(model), lattice, radii, stages("finding spots"))
+    stages("finding modules")
     _require_spots(spots.seen, 2 if points is None else 1)
     places = lattice.first + lattice.step * spots.pixels
     covariance = spots.covariance * lattice.step[:, :, None] * lattice.step[:, None, :]

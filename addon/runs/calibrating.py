@@ -24,9 +24,11 @@ def calibrating(context: bpy.types.Context, path: Path, apply: bool = True, exag
 
     With `apply` the modules move and turn to what is found. Arrows lead from nominal to found pinholes, `exaggeration`
     times as long, or, if 0, the longest about 50 mm. Modules that do not fit are marked. Raises InputError where there is no
-    scanner.
+    scanner of pinholes.
     """
-    uid = scanner.required_scanner(context.scene).session_uid
+    collection = scanner.required_scanner(context.scene)
+    scanner.read_pinholes(collection)  # or an error before the work begins
+    uid = collection.session_uid
 
     def work(progress: Progress) -> tuple[Calibration, bytes]:
         found = run_calibration(path, progress)

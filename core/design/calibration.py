@@ -53,7 +53,7 @@ class Calibration:
         (``system.tilt``), rad.
     chi_square : array (M,)
         Pearson's, per degree of freedom, of the pixels around the spots, with the spots where the geometry has them: about 1
-        if the model is right. NaN where no image was used.
+        if the model is right. NaN where nothing was seen.
     misfit : array (M,)
         Squared distances of spots from where the geometry has them, in units of their variance, per degree of freedom.
     misfitting : tuple of int
@@ -300,8 +300,7 @@ def _result(views: Views, bundle: Bundle, x: Floats, spots: Spots, lattice: Latt
     off, (pearson, freedom) = bundle.off(x) ** 2, spots.pearson(lattice)
     of_middles, of_pixels = (2 * used - leverages).sum(axis=0), (seen * (freedom + 2) - leverages).sum(axis=0)
     sums = ((used * off).sum(axis=0), of_middles), ((seen * (pearson + off)).sum(axis=0), of_pixels)
-    told_of = used.any(axis=0) & (of_middles > 0.5)
-    misfit, chi_square = (np.where(told_of, total / np.where(told_of, of, 1.0), np.nan) for total, of in sums)
+    misfit, chi_square = (np.where(of > 0.5, total / np.maximum(of, 0.5), np.nan) for total, of in sums)
     odd = (seen & ~used).any(axis=0) | _improbable(misfit, of_middles) | _improbable(chi_square, of_pixels)
     expected = spots.expected(lattice, (now.seen() - lattice.first) / lattice.step)
     over, total = ((seen[..., None, None] * each).sum(axis=0) for each in (spots.windows - expected, expected))

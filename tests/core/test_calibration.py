@@ -195,6 +195,18 @@ def test_a_module_with_wrong_images_is_named_and_spoils_no_other(some, fault):
     assert found.chi_square[others].mean() == pytest.approx(1, abs=0.08)
 
 
+def test_a_known_distance_does_not_hide_a_wrong_module(scanner):
+    """All of its modules, which the distance alone holds to their scale."""
+    measured = Measured(scanner[::2])
+    images = measured.images()
+    images[:, 5] = images[:, 5, ::-1]
+    distances = np.full((len(measured.points),) * 2, np.nan)
+    distances[0, 1] = np.linalg.norm(measured.points[0] - measured.points[1])
+    found = measured.calibrated(images, distances=distances)
+    assert found.misfitting == (scanner.numbers[10],) and found.chi_square[5] > 100
+    assert found.used.sum() == images.shape[0] * (len(scanner[::2]) - 1)
+
+
 def test_what_images_do_not_tell_stays_nominal(some):
     measured = Measured(some)
     images = measured.images()

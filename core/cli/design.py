@@ -77,4 +77,3 @@ def _pareto(arguments: argparse.Namespace) -> None:
         found.write(path)
     lines = ["  ".join(f"{name} {value:.5g}" for name, value in row.items()) for row in found.rows]
     print_answer(arguments, list(found.rows), lines)
-

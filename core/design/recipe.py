@@ -203,7 +203,9 @@ class DesignRecipe(Values):
         own = sorted(
             (key, value) for key, value in self.given.items() if not key.startswith(("pareto.", "evaluation."))
         )
-        bodies = [text for goal in self.goals.values() if "parts" in goal.rows for text in (*goal["body"], goal["parts"])]
+        bodies = [
+            text for goal in self.goals.values() if "parts" in goal.rows for text in (*goal["body"], goal["parts"])
+        ]
         files = [text for text in (self.generator.get("file"), *bodies) if text and "\n" not in text]
         contents = [read_bytes(self.folder / name) for name in files]
         return hashlib.sha256(repr((own, self.generator, self.free, self.objectives, contents)).encode()).hexdigest()

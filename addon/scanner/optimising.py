@@ -3,7 +3,7 @@
 import itertools
 import json
 import threading
-from collections.abc import Callable, Iterable
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -18,12 +18,8 @@ from ...core.progress import Progress, stages_of, tell
 from ..blender import jobs
 from . import following, module_edits, scanner
 
-_SCENE = {
-    "render": ("resolution_x", "resolution_y", "resolution_percentage", "pixel_aspect_x", "pixel_aspect_y"),
-    "unit_settings": ("system", "scale_length", "length_unit"),
-    "mphdrr_geometry": ("scanner", "active_index"),
-}
-"""What building a scanner sets."""
+_RENDER = ("resolution_x", "resolution_y", "resolution_percentage", "pixel_aspect_x", "pixel_aspect_y")
+_UNITS = ("system", "scale_length", "length_unit")
 _PLACE = ("location", "rotation_euler", "rotation_quaternion", "rotation_axis_angle", "scale")
 
 
@@ -71,7 +67,8 @@ class _Shown:
         self._scene, self._name = scene.session_uid, name
         self._uid = 0 if active is None else active.session_uid
         self._latest: PinholeSystem | None = None  # found by the thread
-        self._back: Callable[[], None] | None = None
+        self._kept: dict[Any, dict[str, Any]] = {}
+        self._is_new = False
 
     def note(self, system: PinholeSystem, objective: float) -> None:
         """Take the best until now, in the thread."""
@@ -87,78 +84,56 @@ class _Shown:
         """Make the scanner the one found; the first call decides whether it is the one that was active."""
         scene = jobs.scene_again(self._scene, "the design is")
         collection = jobs.found_again(bpy.data.collections, self._uid)
-        if self._back is None and (collection is None or not module_edits.can_become(collection, system)):
-            collection, self._back = None, self._removing(scene)
-        if collection is None:  # or the user has deleted it
-            collection = scanner.build_scanner(scene, system, _free_name(scene, self._name))
-            self._uid = collection.session_uid
+        if not self._kept:
+            self._is_new = collection is None or not module_edits.can_become(collection, system)
+            collection = None if self._is_new else collection
+            self._kept = {key: _values(owner, names) for key, owner, names in _changed(scene, collection)}
+        if collection is not None:
+            module_edits.become(collection, system)
             return collection
-        self._back = self._back or _restoring(collection)
-        module_edits.become(collection, system)
+        names = itertools.chain([self._name], (f"{self._name} {number}" for number in itertools.count(2)))
+        name = next(each for each in names if scanner.find_scanner(scene, each) is None)
+        collection = scanner.build_scanner(scene, system, name)
+        self._uid = collection.session_uid
         return collection
 
     def take_back(self) -> None:
         """Leave the scene as it was."""
-        if self._back is not None:
-            self._back()
-
-    def _removing(self, scene: bpy.types.Scene) -> Callable[[], None]:
-        """What removes the new scanner, and sets the scene as it is now."""
-        camera, kept = scene.camera, {owner: _values(getattr(scene, owner), names) for owner, names in _SCENE.items()}
-
-        def remove() -> None:
-            scene = jobs.found_again(bpy.data.scenes, self._scene)
-            collection = jobs.found_again(bpy.data.collections, self._uid)
-            if scene is None or collection is None:
-                return
-            module_edits.remove_scanner(scene, collection)
-            with suppress(ReferenceError), following.writing():  # an undo in between
-                scene.camera = camera
-                for owner, values in kept.items():
-                    _set(getattr(scene, owner), values)
-
-        return remove
-
-
-def _restoring(collection: bpy.types.Collection) -> Callable[[], None]:
-    """What makes a scanner and its modules again what they are now."""
-    uid, own = collection.session_uid, _values(collection.mphdrr_scanner)
-    modules = {
-        camera.session_uid: (_values(camera, _PLACE), _values(camera.mphdrr_module))
-        for camera in scanner.modules(collection)
-    }
-
-    def restore() -> None:
-        collection = jobs.found_again(bpy.data.collections, uid)
-        if collection is None:
+        scene = jobs.found_again(bpy.data.scenes, self._scene)
+        collection = jobs.found_again(bpy.data.collections, self._uid)
+        if not self._kept or scene is None or collection is None:
             return
-        with following.writing():
-            for camera in scanner.modules(collection):
-                place, values = modules.get(camera.session_uid, ({}, {}))
-                _set(camera, place)
-                _set(camera.mphdrr_module, values)
-            _set(collection.mphdrr_scanner, own)
-        following.refresh(collection, aim=False)
-
-    return restore
-
-
-def _values(owner: Any, names: Iterable[str] = ()) -> dict[str, Any]:
-    """Properties by their names; by default all that can be set."""
-    known = owner.bl_rna.properties
-    names = names or [property.identifier for property in known if not property.is_readonly]
-    return {
-        name: getattr(owner, name)[:] if getattr(known[name], "is_array", False) else getattr(owner, name)
-        for name in names
-    }
+        if self._is_new:
+            module_edits.remove_scanner(scene, collection)
+            collection = None
+        with following.writing(), suppress(ReferenceError):  # an undo has taken what was there
+            for key, owner, _ in _changed(scene, collection):
+                for name, value in self._kept.get(key, {}).items():
+                    setattr(owner, name, value)
+        if collection is not None:
+            following.refresh(collection, aim=False)
 
 
-def _set(owner: Any, values: dict[str, Any]) -> None:
-    for name, value in values.items():
-        setattr(owner, name, value)
+def _changed(
+    scene: bpy.types.Scene, collection: bpy.types.Collection | None
+) -> Iterator[tuple[Any, Any, Sequence[str]]]:
+    """What a new scanner changes in the scene, or what modules that move change: keys, owners, names of properties."""
+    if collection is None:
+        yield "scene", scene, ("camera",)
+        yield "render", scene.render, _RENDER
+        yield "units", scene.unit_settings, _UNITS
+        yield "chosen", scene.mphdrr_geometry, ("scanner", "active_index")
+        return
+    yield "scanner", collection.mphdrr_scanner, ()
+    for camera in scanner.modules(collection):
+        yield camera.session_uid, camera, _PLACE
+        yield -camera.session_uid, camera.mphdrr_module, ()
 
 
-def _free_name(scene: bpy.types.Scene, name: str) -> str:
-    """A name that no scanner has yet: such as "design", or "design 2"."""
-    names = itertools.chain([name], (f"{name} {number}" for number in itertools.count(2)))
-    return next(each for each in names if scanner.find_scanner(scene, each) is None)
+def _values(owner: Any, names: Sequence[str]) -> dict[str, Any]:
+    """Values of properties; without names of all that can be set."""
+    known, found = owner.bl_rna.properties, {}
+    for name in names or [property.identifier for property in known if not property.is_readonly]:
+        value = getattr(owner, name)
+        found[name] = value[:] if getattr(known[name], "is_array", False) else value
+    return found

@@ -48,7 +48,8 @@ class MPHDRR_PT_design(ScannerPanel, bpy.types.Panel):
         column = layouts.invoking(layout.column(align=True))
         column.operator("mphdrr.optimise", text="Optimise", icon="OPTIONS")
         jobs.draw_job(column)
-        _draw_found(layout, properties.design)
+        for text in json.loads(properties.design or "[]"):
+            draw_text(column, text, icon="DOT")
 
 
 class MPHDRR_PT_scanner_design(ScannerPanel, bpy.types.Panel):
@@ -84,16 +85,6 @@ class MPHDRR_PT_scanner_design(ScannerPanel, bpy.types.Panel):
         column.operator("mphdrr.export_for_program", text="Export for a Program", icon="EXPORT")
         column.separator()
         column.operator("mphdrr.remove_scanner", icon="TRASH")
-
-
-def _draw_found(layout: bpy.types.UILayout, design: str) -> None:
-    """Draw what the last design found, and what is wrong with it."""
-    lines, faults = json.loads(design or "[[], []]")
-    box = layout.box().column(align=True) if lines else layout
-    for text in lines:
-        draw_text(box, text, icon="DOT")
-    for text in faults[:_MOST_FINDINGS]:
-        draw_text(box, text)
 
 
 def _draw_pinholes(layout: bpy.types.UILayout, column: bpy.types.UILayout, properties: bpy.types.PropertyGroup) -> None:

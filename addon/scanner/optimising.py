@@ -14,7 +14,7 @@ from ...core.design.optimising import Design, optimize
 from ...core.design.recipe import read_design_recipe
 from ...core.errors import Cancelled, warn
 from ...core.geometry.system import PinholeSystem
-from ...core.progress import Progress, stages_of, tell
+from ...core.progress import Progress, stages_of
 from ..blender import jobs
 from . import following, module_edits, scanner
 
@@ -32,15 +32,8 @@ def optimizing(scene: bpy.types.Scene, path: Path) -> jobs.Job:
     recipe, shown = read_design_recipe(path), _Shown(scene, path.stem)
 
     def work(progress: Progress) -> Design:
-        designing = stages_of(progress)("designing")
-
-        def step(done: int, total: int) -> None:
-            tell(designing, done, total)  # raises Cancelled where the user does not want it
-            if shown.enough.is_set():
-                raise Cancelled
-
         try:
-            return optimize(recipe, step, callback=shown.note)
+            return optimize(recipe, stages_of(progress)("designing"), callback=shown.note)
         except Cancelled as stop:
             if not shown.enough.is_set():
                 raise
@@ -50,7 +43,7 @@ def optimizing(scene: bpy.types.Scene, path: Path) -> jobs.Job:
         collection = shown.show(found.system)
         scanner.check_geometry(collection)
         lines, stopped = found.summary(), f", stopped after {len(found.objective)} steps" * shown.enough.is_set()
-        collection.mphdrr_scanner.design = json.dumps([lines, found.faults])
+        collection.mphdrr_scanner.design = json.dumps([*lines, *found.faults])
         for fault in found.faults:
             warn(fault)
         return f"Optimised '{collection.name}'{stopped}: {'; '.join(lines[len(found.parameters) :])}"
@@ -71,8 +64,10 @@ class _Shown:
         self._is_new = False
 
     def note(self, system: PinholeSystem, objective: float) -> None:
-        """Take the best until now, in the thread."""
+        """Take the best until now, in the thread; raises Cancelled where that is enough."""
         self._latest = system
+        if self.enough.is_set():
+            raise Cancelled
 
     def look(self) -> None:
         """Show what the thread has found since."""

@@ -105,11 +105,14 @@ from .workbook.column_map import ColumnMap, MappedColumn, MappedTable
 from .workbook.draft import ColumnMapDraft, draft_column_map, preview_workbook
 from .workbook.reader import kinds_in, read_scanner, read_system
 from .workbook.writer import WrittenWorkbook, write_system
+from .xray.arrangements import xray_arc, xray_ring
+from .xray.checks import find_in_room
 from .xray.decomposition import correct_beam_hardening, decompose, decompose_images, virtual_monoenergetic
 from .xray.detectors import EnergyIntegrator, PhotonCounter
 from .xray.dose import absorbed_dose, absorbed_dose_rate
 from .xray.spectra import Spectrum, tube_spectrum
 from .xray.spectral import SpectralTransmission, water_and_bone
+from .xray.system import XraySystem
 
 __all__ = [
     name for name, value in globals().items() if not (name.startswith("_") or isinstance(value, types.ModuleType))

@@ -11,7 +11,7 @@ from ..addon.figures import studio
 from ..addon.scanner import column_maps, scanner, scanner_files
 from ..core import ColumnMap, InputError, PinholeSystem, kinds_in, read_scanner
 from ..core.geometry.collimator import Construction
-from ..core.geometry.scanner import SCANNERS, Scanner
+from ..core.geometry.scanner import Scanner
 from . import column_map_dialog
 
 
@@ -74,7 +74,9 @@ class MPHDRR_OT_import_geometry(bpy.types.Operator):
                 column_maps.fill(form, self._workbook(), self._columns())
                 return self._ask_columns(context)
             with reports.warnings_reported(self):
-                system = read_scanner(self._workbook(), self._kind(), self._columns())
+                first, *more = self._kinds()
+                system = read_scanner(self._workbook(), first, self._columns())
+                self._others = [read_scanner(self._workbook(), kind) for kind in more]
         except InputError as error:
             if self._dialog_can_help(form, error):
                 return self._ask_columns(context)
@@ -93,6 +95,11 @@ class MPHDRR_OT_import_geometry(bpy.types.Operator):
         return reports.run_reported(self, lambda: self._build(context, system))
 
     def _build(self, context: bpy.types.Context, system: Scanner) -> str:
+        camera = context.scene.camera
+        for other in self._others:
+            named = f"{self.name} {other.kind}" if self.name else ""
+            scanner.build_scanner(context.scene, other, named, replace=self.replace)
+        context.scene.camera = camera  # which may be none: then the first of the scanner that is built last
         collection = scanner.build_scanner(
             context.scene,
             system,
@@ -105,7 +112,8 @@ class MPHDRR_OT_import_geometry(bpy.types.Operator):
         context.view_layer.update()  # so that scripts find the children's matrix_world in place
         self._dialog = ""
         column_maps.clear(context.window_manager.mphdrr_columns)
-        return f"Imported {len(system)} modules into '{collection.name}'"
+        more = "".join(f" and {len(other)} of the kind {other.kind}" for other in self._others)
+        return f"Imported {len(system)} modules{more} into '{collection.name}'"
 
     def cancel(self, context: bpy.types.Context) -> None:
         column_maps.clear(context.window_manager.mphdrr_columns)
@@ -128,6 +136,7 @@ class MPHDRR_OT_import_geometry(bpy.types.Operator):
 
     _dialog: Literal["", "COLUMNS", "REPLACE"] = ""  # which one is open
     _losses: list[str] | tuple[str, ...] = ()
+    _others: list[Scanner]
 
     def _has_window(self) -> bool:
         return self.options.is_invoke and not bpy.app.background
@@ -137,10 +146,9 @@ class MPHDRR_OT_import_geometry(bpy.types.Operator):
             raise InputError("no file given: set filepath to a workbook (.xlsx)")
         return Path(bpy.path.abspath(self.filepath))
 
-    def _kind(self) -> str:
-        """The kind of scanner in the workbook: the first that it holds, where several are known."""
-        found = kinds_in(self._workbook()) if len(SCANNERS) > 1 and self._columns() is None else ()
-        return next(iter(found), PinholeSystem.kind)
+    def _kinds(self) -> tuple[str, ...]:
+        """The kinds of scanners in the workbook; a column map is of pinholes."""
+        return (kinds_in(self._workbook()) if self._columns() is None else ()) or (PinholeSystem.kind,)
 
     def _columns(self) -> ColumnMap | None:
         if self.chosen_columns:

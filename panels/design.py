@@ -146,3 +146,16 @@ def _label(column: module_values.Column, mixed: Sequence[str]) -> str:
     if column.field in mixed:
         return iface("{name}, mixed").format(name=name)
     return iface("{name} (mm)").format(name=name) if column.kind == "length" else name
+
+
+class MPHDRR_PT_calibration(ScannerPanel, bpy.types.Panel):
+    """Where the modules are, by measurement, and what the last calibration found."""
+
+    def draw_scanner(self, context: bpy.types.Context, collection: bpy.types.Collection) -> None:
+        layout = layouts.invoking(self.layout)
+        layout.operator("mphdrr.calibrate", icon="TRACKER")
+        jobs.draw_job(layout)
+        lines = json.loads(collection.mphdrr_scanner.calibration or "[]")
+        box = layout.box().column() if lines else layout
+        for line in lines:
+            draw_text(box, line, icon="ERROR" if "not fit" in line else "DOT")

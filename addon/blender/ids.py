@@ -1,5 +1,7 @@
 """Prefixes, names of datablocks, and what follows from the names of classes: idnames and labels. Needs no Blender."""
 
+import re
+
 PREFIX = "mphdrr"
 CATEGORY = "mphDRR"  # the sidebar tab
 
@@ -9,10 +11,12 @@ ORDER_EVENTS, ORDER_EXPORT = 28, 30
 
 # --- Datablocks ---------------------------------------------------------------------------------------------
 SCANNER = "Scanner"  # default name of a scanner's collection
-PARTS = ("NONE", "CAMERA", "COLLIMATOR", "CRYSTAL", "ROI", "PLANE")  # `Object.mphdrr_module.part`
+PARTS = ("NONE", "CAMERA", "COLLIMATOR", "CRYSTAL", "ROI", "PLANE", "ARROWS")  # `Object.mphdrr_module.part`
 MOSAIC = "mphDRR mosaic"
 DIFFERENCE = "mphDRR difference"
 RECONSTRUCTION = "mphDRR reconstruction"  # slices of the last one, and its objective
+RESIDUALS = "mphDRR residuals"  # of the last calibration
+ARROWS = "Calibration"  # the object of the arrows from nominal to found pinholes
 PLANES = "mphDRR projections"  # the collection of the planes that show them
 PERSPECTIVES = "mphDRR perspective"  # the collection of volumes in modules' coordinates (`frustums.py`)
 STUDIO = "mphDRR studio"  # the collection of the lights, and a world
@@ -31,14 +35,14 @@ def label(class_name: str) -> str:
     return " ".join(word if word in _SMALL else word.capitalize() for word in words)
 
 
-def module_name(number: int, n_modules: int = 80) -> str:
+def module_name(number: int, n_modules: int = 80, word: str = "Module") -> str:
     """Name of a module's camera object: "Module 07", padded so that names sort as numbers do."""
-    return f"Module {number:0{max(2, len(str(n_modules)))}d}"
+    return f"{word} {number:0{max(2, len(str(n_modules)))}d}"
 
 
 def part_name(module: str, part: str) -> str:
     """Name of a part of the module called `module`: "Crystal 07"."""
-    return module.replace("Module", part.capitalize())
+    return re.sub(r"^[\w-]+(?= \d)", part.capitalize(), module)
 
 
 def ring_name(ring: int) -> str:

@@ -7,7 +7,17 @@ from typing import Any
 
 import numpy as np
 
-from ...core import Grid, InputError, ProjectionRun, euler_pose, read_phantom, read_recipe, read_system, read_volume
+from ...core import (
+    Grid,
+    InputError,
+    ProjectionRun,
+    euler_pose,
+    kinds_in,
+    read_phantom,
+    read_recipe,
+    read_scanner,
+    read_volume,
+)
 from ...core.cli.options import add_command, output_path, progress_bar, refuse
 from ...core.figures.kinds import KINDS, FigureKind, figure_kind
 from ...core.figures.page import SUFFIXES, Page
@@ -149,7 +159,7 @@ def _read(arguments: argparse.Namespace, file: str, scanner: Any) -> dict[str, A
     """What one of the files holds, by the names of `Subject`'s fields."""
     suffix = Path(file).suffix.lower()
     if suffix in _WORKBOOKS:
-        return {"scanner": read_system(file)}
+        return {"scanner": read_scanner(file, next(iter(kinds_in(file)), "pinhole"))}
     if suffix == ".toml" and "shape" not in read_toml(file):
         (run,) = run_recipe(read_recipe(file), scanner, stages=progress_bar)
         return _of_run(run)

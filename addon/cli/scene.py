@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ...core import InputError, read_run
-from ...core.cli.options import add_command, add_workbook, chosen_modules, output_path, read_workbook
+from ...core.cli.options import add_command, add_workbook, chosen_modules, output_path, read_any
 from ...core.volumes.volume_files import read_volume, read_volume_of
 
 if TYPE_CHECKING:
@@ -44,7 +44,7 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
 
 def _run(arguments: argparse.Namespace) -> None:
     path = output_path(arguments.output, (".blend",))
-    system = chosen_modules(read_workbook(arguments), arguments.modules)
+    system = chosen_modules(read_any(arguments), arguments.modules)
     volume = read_volume(arguments.volume) if arguments.volume else None
     mu = read_volume_of(arguments.mu, "mu") if arguments.mu else None
     run = read_run(arguments.run_file) if arguments.run_file else None

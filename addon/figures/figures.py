@@ -25,11 +25,12 @@ from ...core.figures.page import SUFFIXES, Page, box
 from ...core.figures.parts import heading, heading_height
 from ...core.figures.subject import Subject, require
 from ...core.geometry.collimator import Construction
+from ...core.geometry.scanner import Scanner
 from ...core.runs.resizing import resized
 from ..blender import compat, ids, jobs, storage, timers
 from ..blender.choices import items
 from ..phantoms import phantoms
-from ..scanner import collimators, module_values, pinholes, scanner, selection
+from ..scanner import collimators, pinholes, scanner, selection
 from ..volumes import looks, volumes
 from . import studio
 
@@ -90,7 +91,7 @@ def figure_job(
     if kind.one_module and modules is None and active is not None:
         modules = str(active.mphdrr_module.number)
     known: dict[str, Any] = {"modules": modules, "display": scene.mphdrr_display.display()}
-    if collection is not None and module_values.kind_of(collection) is PinholeSystem:
+    if collection is not None:
         known["scanner"] = scanner.read_scanner(collection)
         known["construction"] = pinholes.construction(collection.mphdrr_scanner)
     later: dict[str, Callable[[], Any]] = {}
@@ -142,7 +143,7 @@ def rendering(
         studio.furnish(scene)
         scene.frame_set(bpy.context.scene.frame_current)
         _put_modules(scene, system, subject.construction)
-        radius = float(subject.scanner.roi_radius.max())
+        radius = subject.scanner.region_radius()
         roi = _put(scene, collimators.new_sphere(ids.STUDIO, radius, collimators.part_material("ROI")))
         roi.visible_shadow = False
         drawn: list[bpy.types.Object] = []
@@ -187,21 +188,21 @@ def _volume_item(context: bpy.types.Context) -> bpy.types.Object | None:
     return known[0] if known else None
 
 
-def _titles(subject: Subject, system: PinholeSystem, shown: Studio) -> tuple[str, list[str]]:
+def _titles(subject: Subject, system: Scanner, shown: Studio) -> tuple[str, list[str]]:
     """What is written on a rendered figure: a title and lines below it."""
     numbers = system.numbers
     runs = np.split(numbers, np.flatnonzero(np.diff(numbers) != 1) + 1)
     listed = ", ".join(f"{run[0]}–{run[-1]}" if len(run) > 1 else str(run[0]) for run in runs[:_MOST_RUNS])
     listed += " …" if len(runs) > _MOST_RUNS else ""
     title = f"Modules {listed}" if len(system) > 1 else f"Module {listed}"
-    within = f"ROI of radius {float(system.roi_radius.max()):g} mm"
+    within = f"ROI of radius {system.region_radius():g} mm"
     what = [f"{subject.name}, {within}" if shown.volume and subject.name else within]
     return title, what
 
 
-def _cut(system: PinholeSystem) -> PinholeSystem:
+def _cut(system: Scanner) -> Scanner:
     """The modules that do not stand between the isocentre and the viewer."""
-    front = -system.principal_rays @ np.array(_DIRECTION)
+    front = -system.frames()[:, 2] @ np.array(_DIRECTION)
     return system[front < _CUT] if np.any(front < _CUT) else system
 
 
@@ -212,10 +213,10 @@ def _put(scene: bpy.types.Scene, data: bpy.types.ID) -> bpy.types.Object:
     return item
 
 
-def _put_modules(scene: bpy.types.Scene, system: PinholeSystem, construction: Construction) -> None:
+def _put_modules(scene: bpy.types.Scene, system: Scanner, construction: Construction) -> None:
     """All collimators as one object, and all crystals."""
     parts = system.parts(construction)
-    for kind in ("collimator", "crystal"):
+    for kind in dict.fromkeys(part.kind for part in parts):
         solids = [(part.vertices, part.solid[1]) for part in parts if part.kind == kind]
         firsts = np.cumsum([0, *(len(vertices) for vertices, _ in solids)])
         faces = np.concatenate([faces + first for (_, faces), first in zip(solids, firsts[:-1], strict=True)])
@@ -225,11 +226,11 @@ def _put_modules(scene: bpy.types.Scene, system: PinholeSystem, construction: Co
         _put(scene, mesh)
 
 
-def _rays(system: PinholeSystem) -> bpy.types.Curve:
+def _rays(system: Scanner) -> bpy.types.Curve:
     """The principal rays, from each pinhole to the isocentre, as thin shining tubes."""
     curve = bpy.data.curves.new(ids.STUDIO, "CURVE")
     curve.dimensions, curve.bevel_depth = "3D", _RAY_RADIUS
-    for center in system.centers:
+    for center in system.poses()[:, :3, 3]:
         spline = curve.splines.new("POLY")
         spline.points.add(1)
         spline.points[0].co = (*center, 1.0)
@@ -240,7 +241,7 @@ def _rays(system: PinholeSystem) -> bpy.types.Curve:
     return curve
 
 
-def _corners(system: PinholeSystem, radius: float) -> NDArray[np.float64]:
+def _corners(system: Scanner, radius: float) -> NDArray[np.float64]:
     """Points (N, 3), mm, around all modules and the ROI."""
     parts = system.parts()
     return np.concatenate([radius * _BALL, *(part.vertices for part in parts)])

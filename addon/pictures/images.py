@@ -236,9 +236,9 @@ def store_difference(drawn: Sheet, numbers: list[int], unit: str, text: str) -> 
     return image
 
 
-def store_reconstruction(file: bytes) -> bpy.types.Image:
-    """Make the image of a reconstruction, a PNG of it, until other projections are shown."""
-    image = _store(ids.RECONSTRUCTION, file)
+def store_drawn(name: str, file: bytes) -> bpy.types.Image:
+    """Make the image of that name, of a PNG, until other projections are shown: of a reconstruction, or of residuals."""
+    image = _store(name, file)
     windows.redraw("IMAGE_EDITOR")
     return image
 

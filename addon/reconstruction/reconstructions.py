@@ -126,7 +126,7 @@ class _Shelf:
             self._item = item.session_uid
         else:
             volumes.replace_stored(item, shown.stored)
-        images.store_reconstruction(shown.picture)
+        images.store_drawn(ids.RECONSTRUCTION, shown.picture)
         settings = scene.mphdrr_reconstruction
         settings.volume, settings.record = item, json.dumps(shown.record)
         plots.forget()
@@ -153,7 +153,7 @@ class _Shelf:
                 settings.volume, settings.record = self._before
             image = bpy.data.images.get(ids.RECONSTRUCTION)
             if self._picture is not None:
-                images.store_reconstruction(self._picture)
+                images.store_drawn(ids.RECONSTRUCTION, self._picture)
             elif image is not None:
                 bpy.data.images.remove(image)
             plots.forget()

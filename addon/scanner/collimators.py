@@ -13,6 +13,7 @@ LOOKS = {kind.upper(): (f"mphDRR {kind}", look) for kind, look in part_colors.LO
 PARTS = tuple(LOOKS)
 """What hangs on a module's camera."""
 LOOKS["ROI"] = "mphDRR ROI", part_colors.Look((0.25, 0.62, 1.0, 0.12), metallic=0.0, roughness=0.5)  # pale blue
+LOOKS["ARROWS"] = "mphDRR arrows", part_colors.Look((1.0, 0.3, 0.0, 1.0), metallic=0.0, roughness=0.6)  # orange
 
 
 def new_mesh(name: str, solid: Solid, material: bpy.types.Material) -> bpy.types.Mesh:

@@ -12,12 +12,13 @@ from numpy.typing import NDArray
 from ...core import InputError, PinholeSystem, ring_order
 from ...core.geometry.frames import affine_matrix, rotations
 from ...core.geometry.module_parts import ModulePart
-from ...core.geometry.scanner import Scanner
+from ...core.geometry.scanner import SCANNERS, Scanner
 from ..blender import ids, objects, updates
 from . import cameras, collimators, following, module_values, pinholes, scanner
 from .scanner_parts import clear, new_part, parts_and_others
 
-_OURS = re.compile(r"(Module|Collimator|Crystal) \d+(\.\d+)?")  # a name that the extension gave
+_WORDS = (*(kind.word for kind in SCANNERS.values()), *(part.capitalize() for part in collimators.PARTS))
+_OURS = re.compile(rf"({'|'.join(dict.fromkeys(_WORDS))}) \d+(\.\d+)?")  # a name that the extension gave
 
 
 def copied_cameras(collection: bpy.types.Collection) -> list[bpy.types.Object]:
@@ -91,7 +92,7 @@ def adopt(collection: bpy.types.Collection, camera: bpy.types.Object, module: Sc
     module_values.remember([camera], module or _read(collection, camera))
     camera.mphdrr_module.number, camera.mphdrr_module.added = number, True
     camera.mphdrr_module.index = max(o.mphdrr_module.index for o in found) + 1
-    camera.name = ids.module_name(number, len(found) + 1)
+    camera.name = ids.module_name(number, len(found) + 1, module_values.kind_of(collection).word)
     if camera.data.users > 1:
         camera.data = camera.data.copy()
     camera.data.name = camera.name
@@ -245,7 +246,7 @@ def renumber(collection: bpy.types.Collection, order: Literal["RINGS", "LIST"] =
     with following.writing():
         for index, camera in enumerate(found[place] for place in places):
             camera.mphdrr_module.number, camera.mphdrr_module.index = index + 1, index
-            name = ids.module_name(index + 1, len(found))
+            name = ids.module_name(index + 1, len(found), system.word)
             names += [(camera, name), (camera.data, name)]
             for part in parts[camera]:
                 part.mphdrr_module.number = index + 1
@@ -289,6 +290,24 @@ def become(collection: bpy.types.Collection, system: Scanner) -> None:
             collection.mphdrr_scanner.keep_aimed = False
     scanner.remember_source(collection, system)
     following.refresh(collection, aim=False)
+
+
+def move_to(collection: bpy.types.Collection, system: PinholeSystem) -> None:
+    """Move and turn modules, with their lengths, to where `system` has those of their numbers.
+
+    From then on the scanner does not keep its modules aimed, if one is tilted. Raises InputError, and moves none, where
+    it lacks a module.
+    """
+    found = [scanner.module(collection, number) for number in system.numbers.tolist()]
+    matrices, lengths = cameras.matrices_of(system.poses()), system.collimator_length.tolist()
+    with following.writing():
+        for camera, matrix, length in zip(found, matrices, lengths, strict=True):
+            objects.set_world_matrix(camera, matrix)
+            camera.mphdrr_module.collimator_length = length
+            camera.mphdrr_module.length_mode = module_values.TYPED
+        if module_values.off_aim(collection, found):
+            collection.mphdrr_scanner.keep_aimed = False
+    following.refresh(collection)
 
 
 def make_single_users(collection: bpy.types.Collection) -> None:

@@ -21,6 +21,7 @@ from . import following, module_edits, scanner
 _RENDER = ("resolution_x", "resolution_y", "resolution_percentage", "pixel_aspect_x", "pixel_aspect_y")
 _UNITS = ("system", "scale_length", "length_unit")
 _PLACE = ("location", "rotation_euler", "rotation_quaternion", "rotation_axis_angle", "scale")
+_MOST = 12  # free numbers, or faults, that the panel shows
 
 
 def optimizing(scene: bpy.types.Scene, path: Path) -> jobs.Job:
@@ -42,10 +43,11 @@ def optimizing(scene: bpy.types.Scene, path: Path) -> jobs.Job:
     def finish(found: Design) -> str:
         collection = shown.show(found.system)
         scanner.check_geometry(collection)
-        lines, stopped = found.summary(), f", stopped after {len(found.objective)} steps" * shown.enough.is_set()
-        collection.mphdrr_scanner.design = json.dumps([*lines, *found.faults])
+        lines, many = found.summary(), len(found.parameters) > _MOST  # then the modules say what they are
+        collection.mphdrr_scanner.design = json.dumps([*lines[many * len(found.parameters) :], *found.faults[:_MOST]])
         for fault in found.faults:
             warn(fault)
+        stopped = f", stopped after {len(found.objective)} steps" * shown.enough.is_set()
         return f"Optimised '{collection.name}'{stopped}: {'; '.join(lines[len(found.parameters) :])}"
 
     return jobs.Job("Optimising", work, finish, shown.take_back, shown.look, shown.enough)

@@ -1,6 +1,5 @@
 """What of a scanner in the scene only pinholes have: collimators' construction, the ROI sphere, readouts, checks."""
 
-import json
 from collections.abc import Sequence
 from dataclasses import asdict
 
@@ -11,6 +10,7 @@ from numpy.typing import NDArray
 from ...core import InputError, PinholeSystem, isocentre_performance, resolution, sensitivity
 from ...core.geometry import checks
 from ...core.geometry.collimator import Construction, EdgePlace
+from ...core.geometry.finding import Finding
 from ...core.geometry.scanner import Scanner
 from ..blender.decimals import typed
 from . import collimators, module_values
@@ -97,10 +97,6 @@ def write_totals(scanner: bpy.types.PropertyGroup, modules: Sequence[bpy.types.P
     scanner.n_covering = sum(module.sees_roi for module in modules)
 
 
-def check(scanner: bpy.types.PropertyGroup, system: PinholeSystem, modules: Sequence[bpy.types.Object]) -> list[str]:
-    """Check a system for overlaps, blocked holes and ROIs that are not seen; stores and returns the findings."""
-    report = checks.check_geometry(system, **asdict(Construction(*construction_values(scanner))))
-    scanner.findings = json.dumps(report.messages())
-    for camera in modules:
-        camera.mphdrr_module.finding = "; ".join(report.messages(camera.mphdrr_module.number))
-    return report.messages()
+def check(scanner: bpy.types.PropertyGroup, system: PinholeSystem) -> tuple[Finding, ...]:
+    """What a check for overlaps, blocked holes and ROIs that are not seen finds."""
+    return checks.check_geometry(system, **asdict(Construction(*construction_values(scanner)))).findings

@@ -5,7 +5,7 @@ children are its parts: its collimator and its crystal.
 """
 
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
@@ -15,6 +15,7 @@ from mathutils import Quaternion
 
 from ...core import InputError, PinholeSystem
 from ...core.geometry.collimator import Construction
+from ...core.geometry.finding import Finding
 from ...core.geometry.scanner import SCANNERS, Scanner
 from ...core.workbook import ColumnMap, QuantityCells, SystemSource
 from ..blender import ids, objects
@@ -119,8 +120,9 @@ def _write_source(properties: bpy.types.PropertyGroup, system: Scanner) -> None:
 
 
 def default_name(system: Scanner) -> str:
-    """Name of a system's scanner when none is given: its workbook's, without the suffix."""
-    return ids.SCANNER if system.source is None else system.source.path.stem or ids.SCANNER
+    """Name of a system's scanner when none is given: its workbook's, without the suffix; and its kind, unless pinhole."""
+    name = ids.SCANNER if system.source is None else system.source.path.stem or ids.SCANNER
+    return name if isinstance(system, PinholeSystem) else f"{name} {system.kind}"
 
 
 def quick_ranges(system: Scanner) -> list[tuple[int, int]]:
@@ -237,14 +239,23 @@ def read_module(collection: bpy.types.Collection, camera: bpy.types.Object) -> S
 
 
 def check_geometry(collection: bpy.types.Collection) -> tuple[list[str], list[bpy.types.Object]]:
-    """Check the scanner for overlaps, blocked holes and ROIs that are not seen, and store the findings at its modules.
+    """Check the scanner as its kind is checked, beside the scene's scanners of other kinds, and store the findings.
 
     Returns the findings, and the camera objects of the modules concerned.
     """
-    system, found = read_pinholes(collection), modules(collection)
+    system, found = read_scanner(collection), modules(collection)
+    if isinstance(system, PinholeSystem):
+        findings: Sequence[Finding] = pinholes.check(collection.mphdrr_scanner, system)
+    else:
+        others = [c for c in scanners(bpy.context.scene) if c.mphdrr_scanner.kind != system.kind]
+        built = [pinholes.construction(c.mphdrr_scanner) for c in others if pinholes.has_pinholes(kind_of(c))]
+        findings = system.findings([read_scanner(c) for c in others], next(iter(built), None))
     with following.writing():
-        findings = pinholes.check(collection.mphdrr_scanner, system, found)
-    return findings, [camera for camera in found if camera.mphdrr_module.finding]
+        collection.mphdrr_scanner.findings = json.dumps([str(finding) for finding in findings])
+        for camera in found:
+            own = (str(finding) for finding in findings if camera.mphdrr_module.number in finding.modules)
+            camera.mphdrr_module.finding = "; ".join(own)
+    return [str(finding) for finding in findings], [camera for camera in found if camera.mphdrr_module.finding]
 
 
 def aim_modules(collection: bpy.types.Collection) -> list[int]:

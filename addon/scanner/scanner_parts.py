@@ -20,7 +20,9 @@ class NewScanner:
         self.cameras: dict[int, bpy.types.Object] = {}
         self.rings: list[bpy.types.Collection] = []
         self._named: list[tuple[bpy.types.ID, str]] = []  # names are free only after the old scanner has gone
-        self._materials = {part: collimators.part_material(part) for part in collimators.LOOKS}
+        self._materials = {
+            kind: collimators.part_material(kind) for kind in ("ROI", *(part.kind.upper() for part in parts))
+        }
         try:
             self._make_cameras(system)
             self._make_parts(system, parts)
@@ -39,7 +41,7 @@ class NewScanner:
         for number, ring, pose, matrix, field in zip(
             system.numbers.tolist(), rings.tolist(), poses, cameras.matrices_of(poses), fields.tolist(), strict=True
         ):
-            name = ids.module_name(number, len(system))
+            name = ids.module_name(number, len(system), system.word)
             data = self._keep(bpy.data.cameras.new(name), name)
             cameras.set_up_camera(data, tuple(field), float(np.linalg.norm(pose[:3, 3])))
             camera = self._keep(bpy.data.objects.new(name, data), name)
@@ -52,7 +54,7 @@ class NewScanner:
     def _make_parts(self, system: Scanner, parts: Sequence[ModulePart]) -> None:
         for part in parts:
             camera, kind = self.cameras[part.number], part.kind.upper()
-            name = ids.part_name(ids.module_name(part.number, len(system)), kind)
+            name = ids.part_name(ids.module_name(part.number, len(system), system.word), kind)
             mesh = self._keep(collimators.new_mesh(name, part.solid, self._materials[kind]), name)
             child = self._keep(new_part(camera, kind, name, mesh), name)
             self.rings[camera.mphdrr_module.ring].objects.link(child)

@@ -13,12 +13,13 @@ from typing import Any
 
 from ..errors import InputError
 from ..files import ensure_folder, refuse_folder, require_ending
+from ..geometry.scanner import SCANNERS, Scanner
 from ..geometry.system import PinholeSystem
 from ..geometry.system import chosen_modules as chosen_modules
 from ..progress import Progress
 from ..validation import shape_text
 from ..volumes.volume import Volume
-from ..workbook import read_system
+from ..workbook import kinds_in, read_scanner
 
 _HANGING = 15 * " "  # under the second column of lists in descriptions
 
@@ -89,11 +90,27 @@ def add_workbook(parser: argparse.ArgumentParser, name: str = "workbook", defaul
         help="column map (.toml): which cells hold what, where the headings do not say it; geometry show --write-columns "
         "makes a draft",
     )
+    kinds = "kind of the scanner, of a workbook that holds several; default: the first that it holds"
+    parser.add_argument("--scanner-kind", choices=SCANNERS, metavar="KIND", help=f"{kinds}, of {', '.join(SCANNERS)}")
+
+
+def kind_of(arguments: argparse.Namespace) -> str:
+    """The kind of scanner that the options of `add_workbook` ask for."""
+    found = () if arguments.scanner_kind or arguments.columns else kinds_in(arguments.workbook)
+    return arguments.scanner_kind or next(iter(found), PinholeSystem.kind)
+
+
+def read_any(arguments: argparse.Namespace) -> Scanner:
+    """The scanner of the workbook of `add_workbook`, of any kind."""
+    return read_scanner(arguments.workbook, kind_of(arguments), arguments.columns)
 
 
 def read_workbook(arguments: argparse.Namespace) -> PinholeSystem:
-    """The scanner of the workbook of `add_workbook`."""
-    return read_system(arguments.workbook, columns=arguments.columns)
+    """The pinholes of the workbook of `add_workbook`; `InputError` of another kind of scanner."""
+    system = read_any(arguments)
+    if not isinstance(system, PinholeSystem):
+        raise InputError(f"{arguments.workbook}: its scanner is of the kind {system.kind}, expected one with pinholes")
+    return system
 
 
 def described(volume: Volume) -> str:

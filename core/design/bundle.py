@@ -141,11 +141,16 @@ class Bundle:
         for scale in _LOSSES if robust else (1.0,):
             accuracy = 1e-10 if not robust else 1e-6 if scale == _LOSSES[-1] else 1e-3
             found = scipy_module("optimize").least_squares(
-                self.residuals, x, self.jacobian, (-most, most), x_scale="jac", loss="soft_l1" if robust else "linear",
+                self.residuals, x, self.jacobian, (-most, most), x_scale="jac", loss=self._loss if robust else "linear",
                 f_scale=scale, xtol=accuracy, ftol=accuracy, max_nfev=100, tr_solver="lsmr", tr_options=lsmr,
             )  # fmt: skip
             x = np.asarray(found.x)
         return x
+
+    def _loss(self, z: Floats) -> Floats:
+        """Of squared residuals, SciPy's "soft_l1" of the places, with two derivatives: the others are taken as they are."""
+        places, root = np.arange(len(z)) < 2 * self.used.sum(), np.sqrt(1 + z)
+        return np.stack([np.where(places, 2 * root - 2, z), np.where(places, 1 / root, 1.0), places * -0.5 / root**3])
 
     def off(self, x: Floats) -> Floats:
         """Distances (K, M) of spots from where x has them, in standard deviations."""

@@ -13,7 +13,7 @@ from ..arrays import Floats
 from ..errors import InputError, several
 from ..geometry.system import PinholeSystem
 from ..geometry.views import Views
-from ..progress import Progress
+from ..progress import Progress, stages_of
 from ..projector.emission import Emission
 from ..validation import instance, one_of, positive, real_array, shape_text
 from .bundle import LENGTH, OFFSET, Bundle, Moved
@@ -30,6 +30,7 @@ _OUTLYING = 6.0  # standard deviations from where the geometry has a spot
 _FAR = 5.0  # standard deviations of what was thought of a module's numbers
 _ROUNDS = 20
 _CHANCE = 1e-3  # that any module of a right model is said not to fit
+_STAYS = 1e-6  # mm, degrees: rounding
 _TOLD = 0.75  # of a number's variance that images must take away
 
 
@@ -41,6 +42,8 @@ class Calibration:
     ----------
     system : PinholeSystem
         The modules at their places with their tilts, and with their lengths if these were fitted.
+    nominal : PinholeSystem
+        The geometry that was given.
     views : Views
         Theirs: the given ones moved with the modules, and their pixels by the detectors' offset.
     points : array (K, 3)
@@ -50,7 +53,7 @@ class Calibration:
         (``system.tilt``), rad.
     chi_square : array (M,)
         Pearson's, per degree of freedom, of the pixels around the spots, with the spots where the geometry has them: about 1
-        if the model is right. NaN where no image was used.
+        if the model is right. NaN where nothing was seen.
     misfit : array (M,)
         Squared distances of spots from where the geometry has them, in units of their variance, per degree of freedom.
     misfitting : tuple of int
@@ -74,6 +77,7 @@ class Calibration:
     """
 
     system: PinholeSystem
+    nominal: PinholeSystem
     views: Views
     points: Floats
     covariance: Floats
@@ -97,6 +101,21 @@ class Calibration:
                 which = "all modules" if len(numbers) == len(told) else f"modules {several(numbers, 12)}"
                 weak.setdefault(which, []).append(name)
         return [f"{which}: {', '.join(names)}" for which, names in weak.items()]
+
+    def summary(self) -> list[str]:
+        """How far modules are from their nominal places and tilts, what does not fit and what is not told, in lines."""
+        shifts = np.linalg.norm(self.system.centers - self.nominal.centers, axis=1)
+        turns = np.degrees(np.linalg.norm(self.system.tilt - self.nominal.tilt, axis=1))
+        moved, worst = int(((shifts > _STAYS) | (turns > _STAYS)).sum()), int(np.argmax(shifts))
+        mm, degrees = (np.sqrt((each**2).sum() / max(1, moved)) for each in (shifts, turns))
+        odd, whole = several(self.misfitting, 12), ", ".join(self.gauge)
+        return [
+            f"{moved} of {len(shifts)} modules moved, RMS {mm:.2f} mm and {degrees:.2f} degrees",
+            f"farthest: module {self.system.numbers[worst]}, {shifts[worst]:.2f} mm and {turns[worst]:.2f} degrees",
+            f"modules that do not fit: {odd}" if odd else "all modules fit",
+            *([f"{whole} of the scanner as a whole: nominal, these images do not tell them"] if whole else []),
+            *(f"not told, {line}" for line in self.untold()),
+        ]
 
 
 def calibrate(
@@ -174,7 +193,9 @@ def calibrate(
         raise InputError("calibrate: give points or distances, not both")
     lattice = Lattice.of(model, views)
     radii = model.effective_diameter / 2 * (1 + system.collimator_length / system.pinhole_distance)
-    spots = find_spots(images, each_pixel(model), lattice, radii, progress)
+    stages = stages_of(progress)
+    spots = find_spots(images, each_pixel(model), lattice, radii, stages("finding spots"))
+    stages("finding modules")
     _require_spots(spots.seen, 2 if points is None else 1)
     places = lattice.first + lattice.step * spots.pixels
     covariance = spots.covariance * lattice.step[:, :, None] * lattice.step[:, None, :]
@@ -279,8 +300,7 @@ def _result(views: Views, bundle: Bundle, x: Floats, spots: Spots, lattice: Latt
     off, (pearson, freedom) = bundle.off(x) ** 2, spots.pearson(lattice)
     of_middles, of_pixels = (2 * used - leverages).sum(axis=0), (seen * (freedom + 2) - leverages).sum(axis=0)
     sums = ((used * off).sum(axis=0), of_middles), ((seen * (pearson + off)).sum(axis=0), of_pixels)
-    told_of = used.any(axis=0) & (of_middles > 0.5)
-    misfit, chi_square = (np.where(told_of, total / np.where(told_of, of, 1.0), np.nan) for total, of in sums)
+    misfit, chi_square = (np.where(of > 0.5, total / np.maximum(of, 0.5), np.nan) for total, of in sums)
     odd = (seen & ~used).any(axis=0) | _improbable(misfit, of_middles) | _improbable(chi_square, of_pixels)
     expected = spots.expected(lattice, (now.seen() - lattice.first) / lattice.step)
     over, total = ((seen[..., None, None] * each).sum(axis=0) for each in (spots.windows - expected, expected))
@@ -288,7 +308,7 @@ def _result(views: Views, bundle: Bundle, x: Floats, spots: Spots, lattice: Latt
     names = (*_NAMES, *(name for kind in bundle.fit for name in extras[kind]))
     gauge = ("shift", "turn", "scale")[: len(bundle.gauge()) // 3 + len(bundle.gauge()) % 3]
     return Calibration(
-        nominal.replace(centers=now.centers, tilt=now.tilt, collimator_length=now.length),
+        nominal.replace(centers=now.centers, tilt=now.tilt, collimator_length=now.length), nominal,
         _moved_views(views, nominal, now), now.points, covariance[:, :6, :6], chi_square, misfit,
         tuple(nominal.numbers[odd].tolist()), used, names,
         np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)), told, gauge, now.offset, over / np.sqrt(np.maximum(total, 1)),

@@ -123,9 +123,8 @@ class _OfImages:
         inverse = [np.divide(1.0, body, out=np.zeros_like(body), where=body > 1e-12 * body.max()) for body in bodies]
         parts = np.stack([np.asarray(A(part), np.float64) for part in self.parts])
         value, weights_of_parts, weights_of_bodies = self._told(parts, inverse)
-        pairs = zip((*self.parts, *self.bodies), (*weights_of_parts, *weights_of_bodies), strict=True)
-        found = [geometry_gradient(A, volume, weights) for volume, weights in pairs]
-        return value, np.sum([row_gradient(gradient, A.views.shape) for gradient in found], axis=0)
+        weights = np.stack([*weights_of_parts, *weights_of_bodies])
+        return value, row_gradient(geometry_gradient(A, np.stack([*self.parts, *self.bodies]), weights), A.views.shape)
 
     def _told(self, parts: Floats, inverse: list[Floats]) -> tuple[float, list[Floats], list[Floats]]:
         """The value, and its derivatives by the images of parts and of bodies; `inverse` is 1 / the latter."""

@@ -9,7 +9,7 @@ from typing import Any
 
 from ..errors import InputError
 from ..files import AnyPath, new_folder, replacing, require_ending
-from ..geometry.system import PinholeSystem
+from ..geometry.scanner import Scanner
 from ..geometry.views import Views
 from ..validation import instance, one_of
 from .cameras import ASTRA, KORNIA, LEAP, NERF, OPENCV, PYTORCH3D, RTK
@@ -30,9 +30,7 @@ FORMATS: dict[str, Format] = {format.name: format for format in _FORMATS if form
 FORMAT_NUMBERS: dict[str, int] = {format.name: number for number, format in enumerate(_FORMATS) if format}
 
 
-def write_geometry(
-    system: PinholeSystem, path: AnyPath, format: str, *, views: Views | None = None, **options: Any
-) -> None:
+def write_geometry(system: Scanner, path: AnyPath, format: str, *, views: Views | None = None, **options: Any) -> None:
     """Write the scanner's geometry for another program.
 
     Parameters
@@ -52,7 +50,7 @@ def write_geometry(
     -----
     Where the format cannot express a geometry, it is refused and an existing file stays.
     """
-    instance(system, PinholeSystem, "write_geometry")
+    instance(system, Scanner, "write_geometry")
     one_of(format, FORMATS, "format")
     views = system.views() if views is None else views
     instance(views, Views, "views")

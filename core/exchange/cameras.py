@@ -15,7 +15,7 @@ from ..arrays import Floats
 from ..errors import InputError
 from ..geometry.frames import affine_matrix
 from ..geometry.grid import Grid
-from ..geometry.system import PinholeSystem
+from ..geometry.scanner import Scanner
 from ..geometry.views import Views
 from ..validation import instance
 from .format import Format
@@ -27,7 +27,7 @@ _TOLERANCE = 1e-3
 def _array_format(name: str, title: str, arrays: Callable[..., dict[str, Any]]) -> Format:
     """A format of ``arrays(views, **options)``, the arguments of the program's own function: NumPy's .npz, or JSON."""
 
-    def write(system: PinholeSystem, views: Views, temporary: Path, **options: Any) -> None:
+    def write(system: Scanner, views: Views, temporary: Path, **options: Any) -> None:
         named = arrays(views, **options)
         if temporary.name.lower().endswith(".json"):
             lists = {key: np.asarray(value).tolist() for key, value in named.items()}
@@ -126,7 +126,7 @@ _RTK_PARAMETERS = (
 )
 
 
-def _rtk(system: PinholeSystem, views: Views, temporary: Path) -> None:
+def _rtk(system: Scanner, views: Views, temporary: Path) -> None:
     """ThreeDCircularProjectionGeometry, XML version 3 (https://docs.openrtk.org, "3D projection geometry").
 
     Nine parameters a view, and the matrix from world mm to detector mm that follows from them.
@@ -179,7 +179,7 @@ def _euler_angles(rotation: Floats) -> tuple[float, float, float]:
     return float(gantry), float(out), float(-np.arctan2(rest[1, 0], rest[0, 0]))
 
 
-def _nerf(system: PinholeSystem, views: Views, temporary: Path, *, pictures: str = "images/view_{}.png") -> None:
+def _nerf(system: Scanner, views: Views, temporary: Path, *, pictures: str = "images/view_{}.png") -> None:
     """``transforms.json`` of nerfstudio (https://docs.nerf.studio/quickstart/data_conventions.html) and instant-ngp.
 
     Cameras +X right, +Y up, looking along -Z, of pictures as the pinhole sees them (`mosaic.as_seen`).

@@ -187,6 +187,7 @@ def build_setup(system: PinholeSystem, simulation: Simulation) -> Setup:
     and in it, as air, the channel and the hole, a cone on each side of the knife edge. A collimator
     may not begin inside the phantom.
     """
+    instance(system, PinholeSystem, "a simulation by GATE")
     poses = system.poses()
     bodies = system.collimators(simulation.construction)
     l, side, thickness = system.collimator_length, system.detector_side, system.detector_thickness

@@ -15,13 +15,13 @@ import numpy as np
 from ..geometry.collimator import Construction, EdgePlace, angle_from_degrees
 from ..geometry.module_parts import ModulePart
 from ..geometry.part_colors import LOOKS
-from ..geometry.system import PinholeSystem
+from ..geometry.scanner import Scanner
 from ..geometry.views import Views
 from ..validation import one_of
 from ..version import VERSION
 from .format import Format
 
-_KINDS = {"collimators": ("collimator",), "crystals": ("crystal",), "all": ("collimator", "crystal")}
+_KINDS = {"collimators": ("collimator",), "crystals": ("crystal",), "all": tuple(LOOKS)}
 _Save = Callable[[Path, list[ModulePart]], None]
 
 
@@ -29,7 +29,7 @@ def _solid_format(name: str, title: str, suffixes: tuple[str, ...], save: _Save)
     """A format of the chosen parts, written by `save`."""
 
     def write(
-        system: PinholeSystem,
+        system: Scanner,
         views: Views,
         temporary: Path,
         *,
@@ -73,8 +73,8 @@ _RELATIONSHIPS = """<?xml version="1.0" encoding="UTF-8"?>
 
 def _save_3mf(temporary: Path, parts: list[ModulePart]) -> None:
     """3MF (Core Specification 1.2) in millimetres, a named object for each part."""
-    bases = []
-    for kind, look in LOOKS.items():  # whose colours are linear, while 3MF's are sRGB
+    bases, looks = [], {kind: look for kind, look in LOOKS.items() if any(p.kind == kind for p in parts)}
+    for kind, look in looks.items():  # whose colours are linear, while 3MF's are sRGB
         shares = (1.055 * x ** (1 / 2.4) - 0.055 if x > 0.0031308 else 12.92 * x for x in look.color[:3])
         color = "".join(f"{round(255 * share):02X}" for share in shares)
         bases.append(f'<base name="{kind}" displaycolor="#{color}"/>')
@@ -86,7 +86,7 @@ def _save_3mf(temporary: Path, parts: list[ModulePart]) -> None:
     ]
     numbered = list(enumerate(parts, start=2))  # the materials are resource 1
     for number, p in numbered:
-        material = list(LOOKS).index(p.kind)
+        material = list(looks).index(p.kind)
         lines.append(f'<object id="{number}" type="model" name="{p.name}" pid="1" pindex="{material}"><mesh><vertices>')
         lines += [f'<vertex x="{x:.7f}" y="{y:.7f}" z="{z:.7f}"/>' for x, y, z in p.vertices.tolist()]
         lines.append("</vertices><triangles>")

@@ -6,7 +6,8 @@ from dataclasses import dataclass, field
 from ..arrays import Floats
 from ..errors import InputError
 from ..geometry.collimator import Construction
-from ..geometry.system import AnyScanner, PinholeSystem, chosen_modules
+from ..geometry.scanner import Scanner
+from ..geometry.system import AnyScanner, chosen_modules
 from ..runs.display import Display
 from ..runs.run import ProjectionRun
 from ..volumes.volume import Volume
@@ -26,7 +27,7 @@ def require(needs: Sequence[str], have: Container[str], figure: str, missing: Ma
 class Subject:
     """A scanner, a volume and projections, each only where there is one."""
 
-    scanner: PinholeSystem | None = None
+    scanner: Scanner | None = None
     construction: Construction = field(default_factory=Construction)
     """How the scanner's collimators are built."""
     volume: Volume | None = None

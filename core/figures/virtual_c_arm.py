@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..errors import InputError
 from ..geometry.presets import c_arm_views
 from ..geometry.system import PinholeSystem
 from ..geometry.views import Views
@@ -115,7 +116,8 @@ def _fan(views: Views, module: PinholeSystem) -> _Fan:
 
 def draw(page: Page, subject: Subject) -> None:
     """The first of the chosen modules, in a plane through its principal ray."""
-    assert subject.scanner is not None
+    if not isinstance(subject.scanner, PinholeSystem):
+        raise InputError("figure c-arm: expected a scanner with pinholes")
     module = subject.chosen(subject.scanner)[:1]
     lengths = ("pinhole_distance", "collimator_length", "detector_side", "detector_thickness", "roi_radius")
     m = _Module(*(float(getattr(module, name)[0]) for name in lengths))

@@ -5,6 +5,7 @@ units, limits and help from here.
 """
 
 import math
+import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -67,6 +68,8 @@ class Column:
     """The value of a blank cell, or a function of the needed columns that gives it (M,); None: each must be given."""
     choices: tuple[str, ...] = ()
     """The words that a choice may be."""
+    pattern: tuple[str, str] = ("", "")
+    """The regular expression that a text must match as a whole, if any, and what such a text is, for messages."""
     help: str = ""
     """What it is, for help texts and tooltips."""
     rounded_with: str = ""
@@ -90,11 +93,17 @@ class Column:
     @property
     def expected(self) -> str:
         """What a cell of it must hold, for messages."""
-        words = {"whole": "a whole number", "text": "a text", "choice": f"one of {', '.join(self.choices)}"}
+        words = {
+            "whole": "a whole number",
+            "text": self.pattern[1] or "a text",
+            "choice": f"one of {', '.join(self.choices)}",
+        }
         return words.get(self.kind, "a number")
 
     def word(self, text: str) -> str | None:
-        """What a text in a cell is: itself, or the word of a choice whatever its case; None if it is none of these."""
+        """What a text in a cell is: itself, or the word of a choice whatever its case; None if it is no such text."""
+        if self.pattern[0] and not re.fullmatch(self.pattern[0], text):
+            return None
         if self.kind != "choice" or text == self.blank:
             return text
         return next((word for word in self.choices if word.casefold() == text.casefold()), None)

@@ -10,6 +10,7 @@ import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import fields
+from inspect import signature
 from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
@@ -20,6 +21,7 @@ from ..errors import InputError
 from ..system_source import SystemSource
 from ..validation import freeze, one_of, real_array
 from .columns import ColumnTable, Values
+from .finding import Finding
 from .module_parts import ModulePart
 from .views import Views
 
@@ -49,6 +51,8 @@ class Scanner(ABC):
     """Its name in run files and in the scene: "pinhole"."""
     sheet: ClassVar[str] = ""
     """The one sheet of a workbook that holds it; "": those whose headings say so."""
+    word: ClassVar[str] = "Module"
+    """What its modules are called in the scene: "Module 07"."""
     columns: ClassVar[ColumnTable]
     numbers: NDArray[np.int64]
     source: SystemSource | None
@@ -108,7 +112,7 @@ class Scanner(ABC):
     @classmethod
     def of(cls, values: Mapping[str, Any]) -> Self:
         """The scanner with these attributes, of which some may be columns without a field of the class."""
-        own = {f.name for f in fields(cls)}  # type: ignore[arg-type]
+        own = signature(cls).parameters
         more = {name: value for name, value in values.items() if name not in own}
         return cls(**{name: value for name, value in values.items() if name in own}, more=more)  # type: ignore[call-arg]
 
@@ -183,6 +187,11 @@ class Scanner(ABC):
     ) -> Views:
         """The modules' images, of n_v rows and n_u columns, as the settings of a run ask for them."""
 
+    @property
+    def pixels(self) -> tuple[int, int] | None:
+        """The pixels (n_v, n_u) of its images, if it has any of its own; runs have them unless their settings say others."""
+        return None
+
     def fields(self) -> Floats:
         """What each module's camera sees, (M, 5), mm: `Views.fields` of its image."""
         return self.views((1, 1)).fields(self.poses())
@@ -193,6 +202,15 @@ class Scanner(ABC):
         A module has at most one part of each kind.
         """
         return ()
+
+    def findings(
+        self, others: Sequence[Scanner] = (), construction: Any = None, bore: float | None = None
+    ) -> Sequence[Finding]:
+        """What is wrong with its modules in one room with `others`, whose solids are built as a `construction` says.
+
+        The patient lies within `bore`, mm, of the z axis, if that is given.
+        """
+        raise InputError(f"there are no checks of a scanner of the kind {self.kind}")
 
     def rings(self) -> NDArray[np.int64]:
         """Index (M,) of each module's group, from 0; all are one by default."""

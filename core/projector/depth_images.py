@@ -132,7 +132,7 @@ def _whole_holes(
 
 def _by_cameras(model: WholeHoles, volume: Any, weights: Any, functions: Any, threads: int) -> list[Any]:
     """Derivatives by positions, rotations, lengths, effective diameters, pitches and offsets."""
-    found = list(model.gradient(volume, weights, functions, threads))
+    found = list(model.gradient(volume[None], weights[None], functions, threads))
     first, pitch = (np.array([getattr(numbers, name) for *_, numbers in found]) for name in ("first", "pitch"))
     pitch = pitch - (np.array(model.pixels) - 1) / 2 * first
     return [

@@ -1,6 +1,7 @@
 """How images move with the geometry: derivatives by the modules' places, frames, collimators, holes and pixels."""
 
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -59,7 +60,8 @@ def geometry_gradient(A: Projector, volume: Volume | Floats | Floats32, images: 
     A
         Of `Emission` by its depth-dependent response (hole "auto" or "depth"), in numpy.
     volume, images
-        (n_x, n_y, n_z), or a `Volume`; and (M, n_v, n_u).
+        (n_x, n_y, n_z), or a `Volume`; and (M, n_v, n_u). Of a batch of both, with one axis more before, the sum, which
+        takes less time than one by one.
 
     Raises
     ------
@@ -76,10 +78,14 @@ def geometry_gradient(A: Projector, volume: Volume | Floats | Floats32, images: 
             f"geometry gradient: voxels before pinhole {model.system.numbers[A._close_parts[0][0]]} are too close to it; "
             "take a smaller grid"
         )
-    array, given = A._check(volume, batch=False), checked(images, "images", A.shape_out, A._float64)
-    volume_, functions, threads = A._depth_arguments(array)
-    responded = np.asarray(A._responded(given.astype(volume_.dtype, copy=False)))
-    each = list(holes.gradient(volume_, responded, functions, threads))
+    array = A._check(volume)
+    array = array.reshape(-1, *A.shape_in)
+    given = checked(images, "images", A.shape_out, A._float64, batch=True).reshape(-1, *A.shape_out)
+    if len(given) != len(array):
+        raise InputError(f"geometry gradient: {len(array)} volumes, but images of {len(given)}")
+    volumes, functions, threads = A._depth_arguments(array)
+    responded = np.stack([np.asarray(A._responded(each.astype(volumes.dtype, copy=False))) for each in given])
+    each = list(holes.gradient(volumes, responded, functions, threads))
     numbers = [own for *_, own in each]
     first, pitch = (np.array([getattr(own, name) for own in numbers]) for name in ("first", "pitch"))
     # The image's middle is half its pixels from its first; along a real detector, steps go backwards.
@@ -91,7 +97,7 @@ def geometry_gradient(A: Projector, volume: Volume | Floats | Floats32, images: 
         np.array([frame for _, frame, _ in each]),
         np.array([own.length for own in numbers]),
         np.array([own.diameter for own in numbers]) * _effective_rise(model),
-        (pitch * signs)[:, ::-1] + _by_blur(A, volume_, given),
+        (pitch * signs)[:, ::-1] + sum(map(partial(_by_blur, A), volumes, given)),
         (first * signs)[:, ::-1],
     )
 

@@ -164,37 +164,44 @@ class WholeHoles:
         return volume
 
     def gradient(
-        self, volume: Array, images: Array, functions: ModuleType, workers: int
+        self, volumes: Array, images: Array, functions: ModuleType, workers: int
     ) -> Iterator[tuple[Array, Array, ViewNumbers]]:
-        """Of the sum of `images` times those of `volume`, of one type, the derivatives by each view.
+        """Of the sum of `images` (n, M, n_v, n_u) times those of n `volumes`, of one type, the derivatives by each view.
 
         They are those by the pinhole's place (3,), by the module's frame (3, 3), and by the rest of the view's numbers.
         """
-        (filled,), origin = cropped(volume)
-        filled, kind, affine = np.ascontiguousarray(filled), volume.dtype.type, self.grid.affine[:3]
+        filled, origin = cropped(*volumes)
+        kind = images.dtype.type
+        shape, affine = filled[0].shape, self.grid.affine[:3]
 
         def of_view(m: int) -> tuple[Array, Array, ViewNumbers]:
             pinhole, frame, *_ = self._module(m)
-            numbers, by_passing = ViewNumbers.zero(), np.zeros_like(filled)
-            center: Array
-            parts = self._of_part(m, origin, filled.shape, kind)
-            passes = self._passes(m, origin, filled, None) if parts else None
-            for (of, pixels), zone in zip(parts, self._reached(m, origin, filled.shape), strict=True):
-                image, cells = np.ascontiguousarray(images[m][pixels]), functions.voxels_to_cells(filled, of, passes)
-                taken = functions.pixels_to_cells(image, of)
-                matrix, line = functions.differentiate_places(filled, taken, of, passes)
-                matrix[:, :3] += np.outer(line, of.line)
-                after = image * functions.cells_to_pixels(cells, of)
-                taps = functions.differentiate_taps(image, cells, of)
-                sums = Sums(matrix, line, (cells * taken).sum(axis=0), after, taps)
-                numbers = numbers.plus(self.make(m, *zone).gradient(of, pixels, origin, sums))
-                if passes is not None:
-                    functions.cells_to_voxels(by_passing, taken, of, None, slice(None))
+            numbers = ViewNumbers.zero()
+            by_passing: Array = np.zeros(shape, kind)
+            parts = self._of_part(m, origin, shape, kind)
+            passes = self._passes(m, origin, filled[0], None) if parts else None
+            for (of, pixels), zone in zip(parts, self._reached(m, origin, shape), strict=True):
+                sums = None
+                for volume, own in zip(filled, images[:, m], strict=True):
+                    image, cells = np.ascontiguousarray(own[pixels]), functions.voxels_to_cells(volume, of, passes)
+                    taken = functions.pixels_to_cells(image, of)
+                    matrix, line = functions.differentiate_places(volume, taken, of, passes)
+                    matrix[:, :3] += np.outer(line, of.line)
+                    after = image * functions.cells_to_pixels(cells, of)
+                    taps = functions.differentiate_taps(image, cells, of)
+                    found = Sums(matrix, line, (cells * taken).sum(axis=0), after, taps)
+                    sums = found if sums is None else Sums(*(a + b for a, b in zip(sums, found, strict=True)))
+                    if passes is not None:
+                        by_own = np.zeros(shape, kind)
+                        functions.cells_to_voxels(by_own, taken, of, None, slice(None))
+                        by_passing += by_own * volume
+                if sums is not None:
+                    numbers = numbers.plus(self.make(m, *zone).gradient(of, pixels, origin, sums))
             by = numbers.to_camera
-            center, by_frame = -by[:, 3] @ frame, by[:, :3] @ affine[:, :3].T
-            by_frame += np.outer(by[:, 3], affine[:, 3] - pinhole)
+            center: Array = -(by[:, 3] @ frame)
+            by_frame: Array = by[:, :3] @ affine[:, :3].T + np.outer(by[:, 3], affine[:, 3] - pinhole)
             if passes is not None and self.mu is not None:
-                center = center + self._rays(m, self.mu, origin, filled).gradient(by_passing * filled)
+                center = center + self._rays(m, self.mu, origin, filled[0]).gradient(by_passing)
             return center, by_frame, numbers
 
         return in_order(of_view, range(self.n), workers)

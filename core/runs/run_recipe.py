@@ -64,6 +64,7 @@ def run_recipe(
         A file cannot be read, the recipe names no system, or see `project_run`; all but the volumes is checked first.
     """
     system = recipe_system(recipe) if system is None else chosen_modules(system, recipe["system.modules"], _MODULES)
+    recipe = with_pixels(recipe, system)
     model = recipe_model(recipe, system)
     if mu is None:
         mu = _attenuation(recipe, model, stages)
@@ -105,7 +106,14 @@ def recipe_system(recipe: Recipe, path: Callable[[str], str | Path] = Path) -> S
 
 def recipe_views(recipe: Recipe, system: Scanner) -> Views:
     """The views of a recipe's detector."""
-    return system.views(**_detector(recipe))
+    return system.views(**_detector(with_pixels(recipe, system)))
+
+
+def with_pixels(recipe: Recipe, system: Scanner) -> Recipe:
+    """The recipe with a scanner's own pixels, if it has any and the recipe asks for no others."""
+    names = "detector.rows", "detector.columns"
+    own = None if any(name in recipe.given for name in names) else system.pixels
+    return recipe if own is None else recipe.updated(dict(zip(names, own, strict=True)))
 
 
 def _detector(recipe: Recipe) -> dict[str, Any]:

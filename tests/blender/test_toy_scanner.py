@@ -237,7 +237,7 @@ def test_its_modules_are_moved_turned_edited_and_renumbered(scene, system):
     assert scanner.read_scanner(collection).numbers.tolist() == [1, 2]
     bpy.ops.mphdrr.duplicate_modules(count=1, angle=0.4)
     assert len(scanner.read_scanner(collection)) == 3
-    with pytest.raises(RuntimeError, match="no pinholes"):
+    with pytest.raises(RuntimeError, match="no checks of a scanner of the kind toy x-ray"):
         bpy.ops.mphdrr.check_geometry()
 
 

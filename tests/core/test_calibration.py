@@ -191,8 +191,21 @@ def test_a_module_with_wrong_images_is_named_and_spoils_no_other(some, fault):
     found = measured.calibrated(images)
     assert found.misfitting == (some.numbers[5],)
     others = np.arange(len(some)) != 5
+    assert found.chi_square[5] > 1.2
     assert 0.6 < measured.normalized(found)[others].mean() < 1.5
     assert found.chi_square[others].mean() == pytest.approx(1, abs=0.08)
+
+
+@pytest.mark.long
+def test_a_wrong_module_takes_no_others_with_it_where_a_distance_is_known(scanner):
+    """All 80: their scale hangs on the distance alone."""
+    measured = Measured(scanner, seed=1)
+    images = measured.images()
+    images[:, 36] = images[:, 36, ::-1]
+    distances = np.full((len(measured.points),) * 2, np.nan)
+    distances[0, 1] = np.linalg.norm(measured.points[0] - measured.points[1])
+    found = measured.calibrated(images, distances=distances)
+    assert found.misfitting == (scanner.numbers[36],) and found.used.sum() == 79 * len(images)
 
 
 def test_what_images_do_not_tell_stays_nominal(some):

@@ -90,6 +90,16 @@ def test_the_reference_and_float32_agree_with_it(rng):
             np.testing.assert_allclose(own, expected, atol=bound * np.abs(expected).max(), err_msg=name)
 
 
+def test_of_a_batch_it_is_the_sum(rng):
+    (x, weights), (other, more) = numbers(rng), numbers(rng)
+    A = projector(intrinsic_fwhm=3.0)
+    both = mph.geometry_gradient(A, np.stack([x, other]), np.stack([weights, more]))
+    each = mph.geometry_gradient(A, x, weights), mph.geometry_gradient(A, other, more)
+    for own, first, second in zip(both, *each, strict=True):
+        np.testing.assert_allclose(own, first + second, rtol=0, atol=1e-9 * np.abs(own).max())
+    refused(lambda: mph.geometry_gradient(A, np.stack([x, other]), weights), "2 volumes", "of 1")
+
+
 def test_a_part_of_the_volume_has_its_part_of_them(rng):
     x, weights = numbers(rng)
     part = np.zeros_like(x)

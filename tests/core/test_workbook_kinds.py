@@ -28,19 +28,17 @@ def xray():
     columns = ColumnTable(
         [
             *(
-                Column(f"{axis}s", "sources", i, headings=(f"{axis}s", f"{axis} of source"), place=f"X-ray!{'BCD'[i]}")
+                Column(f"{axis}s", "sources", i, headings=(f"{axis}s", f"{axis} of source"), place=f"Toy!{'BCD'[i]}")
                 for i, axis in enumerate("xyz")
             ),
-            Column("D", "distance", headings=("D", "source to panel"), place="X-ray!E", plausible=(10, 5000)),
-            Column("kV", "voltage", kind="whole", headings=("kV", "tube voltage"), place="X-ray!F", blank=80.0),
-            Column(
-                "anode", "anode", kind="choice", choices=("W", "Mo"), headings=("anode",), place="X-ray!G", blank="W"
-            ),
+            Column("D", "distance", headings=("D", "source to panel"), place="Toy!E", plausible=(10, 5000)),
+            Column("kV", "voltage", kind="whole", headings=("kV", "tube voltage"), place="Toy!F", blank=80.0),
+            Column("anode", "anode", kind="choice", choices=("W", "Mo"), headings=("anode",), place="Toy!G", blank="W"),
             Column(
                 "r",
                 derived=lambda s: np.linalg.norm(s.sources, axis=1),
                 headings=("r", "source to isocentre"),
-                place="X-ray!H",
+                place="Toy!H",
                 formula="=SQRT(SUMSQ({xs},{ys},{zs}))",
             ),
         ]
@@ -49,7 +47,7 @@ def xray():
     @dataclass(frozen=True, eq=False)
     class XRay(Scanner):
         kind: ClassVar[str] = "toy x-ray"
-        sheet: ClassVar[str] = "X-ray"
+        sheet: ClassVar[str] = "Toy"
         columns: ClassVar[ColumnTable]
 
         sources: NDArray[np.float64]
@@ -85,8 +83,8 @@ def two(xray):
 def both(workbook, two, tmp_path):
     """The users' workbook with the sheet of the second kind added."""
     written = mph.write_system(two, tmp_path / "both.xlsx", workbook)
-    assert {name.partition("!")[0] for name in written.changed} == {"X-ray"}
-    assert written.recalculated["X-ray!H3"] == pytest.approx(np.hypot(300, 5))
+    assert {name.partition("!")[0] for name in written.changed} == {"Toy"}
+    assert written.recalculated["Toy!H3"] == pytest.approx(np.hypot(300, 5))
     return written.path
 
 
@@ -99,7 +97,7 @@ def assert_same(back, system) -> None:
 def test_a_kind_has_a_new_workbook_of_its_own(two, tmp_path):
     path = mph.write_system(two, tmp_path / "new.xlsx").path
     assert kinds_in(path) == (two.kind,)
-    assert openpyxl.load_workbook(path).sheetnames == ["X-ray"]
+    assert openpyxl.load_workbook(path).sheetnames == ["Toy"]
     assert_same(read_scanner(path, two.kind), two)
     with pytest.raises(mph.InputError, match="no sheet has a column headed x1"):
         mph.read_system(path)
@@ -108,7 +106,7 @@ def test_a_kind_has_a_new_workbook_of_its_own(two, tmp_path):
 def test_a_kind_is_added_to_the_pinholes_workbook(both, workbook, two):
     assert kinds_in(both) == ("pinhole", two.kind)
     assert kinds_in(workbook) == ("pinhole",)
-    with pytest.raises(mph.InputError, match="has no sheet X-ray, which holds a scanner of the kind toy x-ray"):
+    with pytest.raises(mph.InputError, match="has no sheet Toy, which holds a scanner of the kind toy x-ray"):
         read_scanner(workbook, two.kind)
     assert_same(read_scanner(both, two.kind), two)
     np.testing.assert_array_equal(mph.read_system(both).centers, mph.read_system(workbook).centers)
@@ -116,20 +114,20 @@ def test_a_kind_is_added_to_the_pinholes_workbook(both, workbook, two):
         changed = {"xl/workbook.xml", "xl/_rels/workbook.xml.rels", "[Content_Types].xml"}
         assert all(old.read(name) == new.read(name) for name in set(old.namelist()) - changed)
     before, after = values_of(workbook), values_of(both)
-    assert before == {place: value for place, value in after.items() if place[0] != "X-ray"}
+    assert before == {place: value for place, value in after.items() if place[0] != "Toy"}
 
 
 def test_each_kind_is_edited_and_leaves_the_other_alone(both, two, tmp_path):
     other = two.replace(distance=np.array([600.0, 700.0]), anode=["W", "W"])
     written = mph.write_system(other, tmp_path / "x.xlsx", both)
-    assert written.changed == ("X-ray!E4", "X-ray!G4")
+    assert written.changed == ("Toy!E4", "Toy!G4")
     assert_same(read_scanner(written.path, two.kind), other)
     before, after = values_of(both, data_only=False), values_of(written.path, data_only=False)
-    assert {place for place in before if before[place] != after[place]} == {("X-ray", "E4"), ("X-ray", "G4")}
+    assert {place for place in before if before[place] != after[place]} == {("Toy", "E4"), ("Toy", "G4")}
     pinholes = mph.read_system(both)
     moved = pinholes[:79]
     back = mph.write_system(moved, tmp_path / "p.xlsx", both)
-    assert not any(name.startswith("X-ray") for name in (*back.changed, *back.recalculated))
+    assert not any(name.startswith("Toy") for name in (*back.changed, *back.recalculated))
     assert_same(read_scanner(back.path, two.kind), two)
     swapped = mph.write_system(two[[1, 0]], tmp_path / "s.xlsx", both)
     assert_same(read_scanner(swapped.path, two.kind), two[[1, 0]])
@@ -138,16 +136,16 @@ def test_each_kind_is_edited_and_leaves_the_other_alone(both, two, tmp_path):
 @pytest.mark.parametrize(
     ("cell", "value", "message"),
     [
-        ("F4", 80.5, "X-ray!F4 is 80.5, expected kV of module 2, a whole number"),
-        ("G3", "Rh", "X-ray!G3 holds the text 'Rh', expected anode of module 1, one of W, Mo"),
-        ("E3", -600, "X-ray!E3 has D = -600 mm, expected more than 0"),
-        ("E1", "D (old)", "X-ray!E1 holds 'D (old)' in the heading of D"),
-        ("B4", None, "X-ray!B4 is blank, expected xs of module 2, a number"),
+        ("F4", 80.5, "Toy!F4 is 80.5, expected kV of module 2, a whole number"),
+        ("G3", "Rh", "Toy!G3 holds the text 'Rh', expected anode of module 1, one of W, Mo"),
+        ("E3", -600, "Toy!E3 has D = -600 mm, expected more than 0"),
+        ("E1", "D (old)", "Toy!E1 holds 'D (old)' in the heading of D"),
+        ("B4", None, "Toy!B4 is blank, expected xs of module 2, a number"),
     ],
 )
 def test_a_kinds_cells_are_checked_as_the_pinholes_are(cell, value, message, both, two):
     with edited(both) as book:
-        book["X-ray"][cell] = value
+        book["Toy"][cell] = value
     with pytest.raises(mph.InputError) as refusal:
         read_scanner(both, two.kind)
     assert message in str(refusal.value)

@@ -4,6 +4,7 @@ import argparse
 from typing import Any
 
 from ...geometry.collimator import angle_from_degrees
+from ...geometry.scanner import Scanner
 from ...geometry.system import PinholeSystem
 from ...geometry.views import Views
 from ...physics.isotopes import ISOTOPES, isotope
@@ -26,15 +27,17 @@ def add_action(actions: Any, name: str, run: Any) -> argparse.ArgumentParser:
 def add_views(parser: argparse.ArgumentParser, pixels: str) -> None:
     """Add the images, for `views_of`; `pixels` is the help of their size."""
     add = parser.add_argument
-    add("--size", type=int, nargs=2, default=[256, 256], metavar=("ROWS", "COLUMNS"), help=pixels)
+    size = f"{pixels}; default: 256 256, or those of X-ray panels"
+    add("--size", type=int, nargs=2, metavar=("ROWS", "COLUMNS"), help=size)
     add("--detector", choices=("virtual", "real"), default="virtual", help="upright in front, or crystal")
     add("--magnification", type=float, default=10.0, help="virtual detector's distance in units of l")
     add("--pitch", type=float, metavar="MM", help="pixel size; default: the crystal's whole side")
 
 
-def views_of(system: PinholeSystem, arguments: argparse.Namespace) -> Views:
+def views_of(system: Scanner, arguments: argparse.Namespace) -> Views:
     """The views of a scanner that the options of `add_views` ask for."""
-    return system.views(tuple(arguments.size), arguments.detector, arguments.magnification, arguments.pitch)
+    shape = tuple(arguments.size) if arguments.size else system.pixels or (256, 256)
+    return system.views(shape, arguments.detector, arguments.magnification, arguments.pitch)
 
 
 def add_materials(parser: argparse.ArgumentParser) -> None:

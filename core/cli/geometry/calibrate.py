@@ -10,14 +10,13 @@ import numpy as np
 
 from ...design.calibration import Calibration
 from ...design.calibration_recipe import run_calibration
+from ...design.residuals import residual_sheet
 from ...files import write_bytes
-from ...runs.display import DIVERGING, Display
-from ...runs.mosaic import sheet, write_png
+from ...runs.mosaic import write_png
 from ...workbook import write_system
 from ..options import add_run, counted, output_path, print_answer, progress_bar
 
 _LISTED = 5
-_MOST = 5.0  # standard deviations at the ends of the picture's colours
 
 
 def add_parser(actions: Any) -> None:
@@ -40,10 +39,7 @@ def _run(arguments: argparse.Namespace) -> None:
     write_system(found.system, path, None if source is None else source.path)
     record = _record(found)
     write_bytes(path.with_suffix(".json"), json.dumps(record, indent=1).encode())
-    display = Display(colors=DIVERGING, low=-_MOST, high=_MOST)
-    residuals = found.residuals.astype(np.float32)
-    drawn = sheet(residuals, found.system.numbers, found.system.rings(), "standard deviations", display)
-    write_png(drawn.picture, path.with_suffix(".png"))
+    write_png(residual_sheet(found).picture, path.with_suffix(".png"))
     print_answer(arguments, record, _lines(found, record, path))
 
 
@@ -72,16 +68,10 @@ def _lines(found: Calibration, record: dict[str, Any], path: Path) -> Iterator[s
     yield f"{path}: {counted(len(found.system), 'module')} by {counted(len(found.points), 'point')}, {images}"
     for name, sd in zip(found.names, spread, strict=True):
         yield f"  {name:12s} known to {sd:.3f} {'degrees' if name.startswith('tilt') else 'mm'}"
-    if found.gauge:
-        yield f"  {', '.join(found.gauge)} of the scanner as a whole: nominal, images of these sources do not tell them"
-    for line in found.untold():
-        yield f"  not told, {line}"
+    for line in found.summary():
+        yield f"  {line}"
     if np.isfinite(found.chi_square).any():
         yield f"  chi-square {np.nanmin(found.chi_square):.2f} to {np.nanmax(found.chi_square):.2f} per degree of freedom"
     yield " module  chi-square  misfit  images"
     for m in np.argsort(-np.nan_to_num(found.misfit))[:_LISTED]:
         yield f"{found.system.numbers[m]:7d} {found.chi_square[m]:11.2f} {found.misfit[m]:7.2f} {found.used[:, m].sum():7d}"
-    if found.misfitting:
-        yield f"  modules that do not fit: {', '.join(map(str, found.misfitting))}"
-    else:
-        yield "  all modules fit"

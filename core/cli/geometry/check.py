@@ -7,11 +7,13 @@ import numpy as np
 
 from ...errors import InputError
 from ...geometry.checks import check_geometry
-from ...geometry.collimator import EdgePlace
+from ...geometry.collimator import Construction, EdgePlace, angle_from_degrees
+from ...geometry.scanner import Scanner
 from ...geometry.system import PinholeSystem
 from ...physics.isotopes import ISOTOPES
 from ...recording import recorded_warnings
-from ..options import counted, print_answer, read_workbook, refuse
+from ...workbook import kinds_in, read_scanner
+from ..options import counted, print_answer, read_any, refuse
 from .arguments import add_action, add_edge, optics_of
 
 
@@ -25,6 +27,7 @@ def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     add("--edge-at", choices=get_args(EdgePlace), default="middle", help=place)
     add_edge(parser)
     add("--isotope", metavar="NAME", help=f"{', '.join(ISOTOPES)}: its photons must be stopped by the plates")
+    add("--bore", type=float, metavar="MM", help="of X-ray systems: radius of the patient's bore around the z axis")
     add("--strict", action="store_true", help="exit with status 1 if there is any warning or finding")
 
 
@@ -37,23 +40,37 @@ def _run(arguments: argparse.Namespace) -> None:
     if arguments.aperture_mu is None:
         refuse(arguments, ("isotope",), "needs --aperture-mu")
     with recorded_warnings() as messages:
-        system = read_workbook(arguments)
+        system = read_any(arguments)
+        others = [] if isinstance(system, PinholeSystem) else _others(arguments, system)
     parts = {"plate_thickness": arguments.plate, "wall_thickness": arguments.wall, "edge_at": arguments.edge_at}
-    optics = optics_of(arguments, system)
-    report = check_geometry(system, **parts, aperture_mu=optics.aperture_mu, opening_angle=optics.opening_angle)
-    findings = report.messages()
-    warnings, found = counted(len(messages), "warning"), counted(len(findings), "finding")
-    total = f"{warnings} of the workbook, {found} in the geometry"
+    if isinstance(system, PinholeSystem):
+        refuse(arguments, ("bore",), "is of X-ray systems")
+        optics = optics_of(arguments, system)
+        report = check_geometry(system, **parts, aperture_mu=optics.aperture_mu, opening_angle=optics.opening_angle)
+        findings, geometry = report.messages(), report.as_dict()
+    else:
+        angle = angle_from_degrees(arguments.opening_angle, "--opening-angle")
+        found = system.findings(others, Construction(**parts, opening_angle=angle), arguments.bore)
+        findings, geometry = [str(one) for one in found], {"ok": not found}
+    total = f"{counted(len(messages), 'warning')} of the workbook, {counted(len(findings), 'finding')} in the geometry"
     summary = _summary(system)
-    answer = {"summary": summary, "warnings": messages, "findings": findings, "geometry": report.as_dict()}
+    answer = {"summary": summary, "warnings": messages, "findings": findings, "geometry": geometry}
     lines = [*(f"{name:22s} {text}" for name, text in summary.items()), *findings, total]
     print_answer(arguments, answer, lines, [f"warning: {message}" for message in messages])
     if arguments.strict and (messages or findings):
         raise InputError(f"{arguments.workbook}: {total}")
 
 
-def _summary(system: PinholeSystem) -> dict[str, str]:
+def _others(arguments: argparse.Namespace, system: Scanner) -> list[Scanner]:
+    """The scanners of other kinds in the same workbook."""
+    kinds = kinds_in(arguments.workbook)
+    return [read_scanner(arguments.workbook, kind) for kind in kinds if kind != system.kind]
+
+
+def _summary(system: Scanner) -> dict[str, str]:
     lines = {"modules": str(len(system)), "rings": " + ".join(map(str, np.bincount(system.rings())))}
+    if not isinstance(system, PinholeSystem):
+        return lines | {"kind": system.kind}
     for name, values in {
         "b, pinhole distance": system.pinhole_distance,
         "l, collimator length": system.collimator_length,

@@ -8,12 +8,13 @@ import numpy as np
 
 from ...arrays import Array, table_rows
 from ...errors import InputError
+from ...geometry.scanner import Scanner
 from ...geometry.system import PinholeSystem
 from ...geometry.views import Views
 from ...perspective.epipolar import epipolar_lines, epipolar_segments, epipole
 from ...perspective.triangulation import fit_marker
 from ...perspective.view_rays import points_at_depths
-from ..options import chosen_modules, print_answer, read_workbook
+from ..options import chosen_modules, print_answer, read_any
 from .arguments import add_action, add_views, views_of
 
 # A module is named as one that does not fit if the chance of its misfit is below this, counted for all modules.
@@ -39,7 +40,7 @@ def _run(arguments: argparse.Namespace) -> None:
     mphdrr geometry epipolar scanner.xlsx --pixel 7:120,130
     mphdrr geometry epipolar scanner.xlsx --pixel 7:120,130 --pixel 31:99.4,140.2 --pixel 52:131,88 --sigma 0.5
     """
-    system = read_workbook(arguments)
+    system = read_any(arguments)
     pixels = [_pixel(system, text) for text in arguments.pixel]
     views = views_of(system, arguments)
     if len(pixels) == 1:
@@ -53,7 +54,7 @@ def _run(arguments: argparse.Namespace) -> None:
     _print_point(arguments, system, views, pixels)
 
 
-def _print_ray(arguments: argparse.Namespace, system: PinholeSystem, views: Views, m: int, pixel: list[float]) -> None:
+def _print_ray(arguments: argparse.Namespace, system: Scanner, views: Views, m: int, pixel: list[float]) -> None:
     near, far = _depths(arguments.depth, system, m)
     segments = epipolar_segments(views, m, pixel, near, far)
     ends = points_at_depths(views, m, pixel, np.array([near, far]))
@@ -88,7 +89,7 @@ def _print_ray(arguments: argparse.Namespace, system: PinholeSystem, views: View
 
 
 def _print_point(
-    arguments: argparse.Namespace, system: PinholeSystem, views: Views, pixels: list[tuple[int, list[float]]]
+    arguments: argparse.Namespace, system: Scanner, views: Views, pixels: list[tuple[int, list[float]]]
 ) -> None:
     index = np.array([m for m, _ in pixels])
     numbers = system.numbers[index].tolist()
@@ -122,7 +123,7 @@ def _print_point(
     print_answer(arguments, record, lines)
 
 
-def _pixel(system: PinholeSystem, text: str) -> tuple[int, list[float]]:
+def _pixel(system: Scanner, text: str) -> tuple[int, list[float]]:
     """Index of the module, and its column and row, of a ``MODULE:COLUMN,ROW``."""
     module, _, place = text.partition(":")
     try:
@@ -138,9 +139,10 @@ def _pixel(system: PinholeSystem, text: str) -> tuple[int, list[float]]:
     return int(index[0]), [column, row]
 
 
-def _depths(given: list[float] | None, system: PinholeSystem, m: int) -> tuple[float, float]:
+def _depths(given: list[float] | None, system: Scanner, m: int) -> tuple[float, float]:
     if given is None:
-        distance, radius = float(system.pinhole_distance[m]), float(system.roi_radius[m])
+        distance = float(np.linalg.norm(system.poses()[m, :3, 3]))
+        radius = float(system.roi_radius[m]) if isinstance(system, PinholeSystem) else system.region_radius()
         return max(distance - radius, 0.0), distance + radius
     if len(given) > 2:
         raise InputError(f"--depth: expected one depth or two, got {len(given)}")

@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 from .... import core as mph
 from ...exchange import FORMATS, Format
-from ..options import add_run, add_workbook, chosen_modules, output_path, read_workbook
+from ..options import add_run, add_workbook, chosen_modules, output_path, read_any
 from .arguments import add_views, views_of
 
 _WORDS = {bool: "yes|no", int: "N", float: "NUMBER", str: "TEXT", tuple: "NUMBER,NUMBER,...", mph.Grid: "VOLUME-FILE"}
@@ -38,7 +38,7 @@ def _run(arguments: argparse.Namespace) -> None:
     format = FORMATS[arguments.format] if arguments.format else _format_of(arguments.output)
     options = dict(_option(format, text) for text in arguments.set)
     path = output_path(arguments.output, format.suffixes) if format.suffixes else Path(arguments.output)
-    system = chosen_modules(read_workbook(arguments), arguments.modules)
+    system = chosen_modules(read_any(arguments), arguments.modules)
     mph.write_geometry(system, path, format.name, views=views_of(system, arguments), **options)
     print(f"{path}: {format.title}, {len(system)} module{'s' * (len(system) > 1)}")
 

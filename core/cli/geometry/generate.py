@@ -43,6 +43,28 @@ def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     add("--rotation", type=float, default=0.0, metavar="DEG", help="azimuth of its first plate")
     add("--open", action="store_true", help="no plate joins the last vertex to the first")
     _add_modules(parser)
+    for name, run, arrangement in (("xray-arc", _xray_arc, mph.xray_arc), ("xray-ring", _xray_ring, mph.xray_ring)):
+        _add_xray(add_run(shapes, name, run), arrangement)
+
+
+def _add_xray(parser: argparse.ArgumentParser, arrangement: Callable[..., mph.XraySystem]) -> None:
+    """Add the options of an arrangement of X-ray sources; without them, its own defaults hold."""
+    parser.set_defaults(arrangement=arrangement)
+    add = parser.add_argument
+    add("--sources", dest="n", type=int, metavar="N", help="number of sources (default: 24)")
+    if arrangement is mph.xray_arc:
+        add("--end", type=float, metavar="DEG", help="azimuth of the last source")
+    add("--start", type=float, metavar="DEG", help="azimuth of the first source")
+    add("--z", type=float, metavar="MM", help="of the sources")
+    add("--source-radius", type=float, metavar="MM", help="from the sources to the isocentre")
+    add("--panel-radius", type=float, metavar="MM", help="from the panels' middles to the isocentre")
+    add("--panel-size", type=float, nargs=2, metavar="MM", help="width and height of a panel")
+    add("--size", dest="shape", type=int, nargs=2, metavar=("ROWS", "COLUMNS"), help="pixels of a panel")
+    add("--kvp", type=float, metavar="KV", help="tube voltage")
+    add("--mas", type=float, metavar="MAS", help="charge of an exposure")
+    add("--filters", metavar="TEXT", help='mm of each material, such as "Al 2.5 + Cu 0.1"')
+    add("--into", metavar="FILE", help="workbook in a copy of which they are a sheet, such as that of the pinholes")
+    add("-o", "--output", required=True, metavar="FILE", help=".xlsx")
 
 
 def _add_modules(parser: argparse.ArgumentParser) -> None:
@@ -93,3 +115,30 @@ def _plates(arguments: argparse.Namespace) -> None:
     counts = arguments.modules
     shape = counts[0] if len(counts) == 1 else counts, vertices
     _write(arguments, mph.plate_rings, *shape, closed=not arguments.open)
+
+
+def _xray_arc(arguments: argparse.Namespace) -> None:
+    """X-ray sources on an arc, each with its panel opposite.
+
+    mphdrr geometry generate xray-arc --sources 24 --start -98 --end 8 --into scanner.xlsx -o both.xlsx
+    """
+    _write_xray(arguments)
+
+
+def _xray_ring(arguments: argparse.Namespace) -> None:
+    """A ring of X-ray sources above the modules, each with its tilted panel below.
+
+    mphdrr geometry generate xray-ring --sources 24 --z 310 --into scanner.xlsx -o both.xlsx
+    """
+    _write_xray(arguments)
+
+
+def _write_xray(arguments: argparse.Namespace) -> None:
+    names = ("n", "start", "end", "z", "source_radius", "panel_radius", "panel_size", "shape", "kvp", "mas", "filters")
+    given = {name: value for name in names if (value := getattr(arguments, name, None)) is not None}
+    given |= {name: float(np.deg2rad(given[name])) for name in ("start", "end") if name in given}
+    path = output_path(arguments.output, (".xlsx", ".xlsm"))
+    system = arguments.arrangement(**given)
+    mph.write_system(system, path, arguments.into)
+    apart = np.linalg.norm(system.panel_centers - system.sources, axis=1)
+    print(f"{path}: {len(system)} sources, {apart.min():.2f} to {apart.max():.2f} mm from their panels")

@@ -5,13 +5,16 @@ import dataclasses
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ...errors import InputError
 from ...geometry.columns import ANGLE_UNITS, Column
+from ...geometry.frames import affine_matrix
+from ...geometry.scanner import SCANNERS, Scanner
 from ...geometry.system import PinholeSystem
 from ...recording import recorded_warnings
 from ...workbook import write_system
-from ..options import chosen_modules, output_path, print_answer, read_workbook
+from ..options import chosen_modules, output_path, print_answer, read_any
 from .arguments import add_action
 
 _SHORT = {
@@ -25,10 +28,12 @@ _METAVARS = {"length": "MM", "angle": "DEG", "text": "TEXT"}
 
 
 def _options() -> dict[str, tuple[Column, ...]]:
-    """Field -> its columns, of those that an option sets; l, and where the modules are, are another matter."""
-    columns = PinholeSystem.columns
-    others = {columns[name].field for name in ("l", *columns.position)}
-    return {name: its for name, its in columns.fields.items() if name not in others}
+    """Field -> its columns, of all kinds of scanners, that an option sets; l and the modules' places are another matter."""
+    found: dict[str, tuple[Column, ...]] = {}
+    for kind in SCANNERS.values():
+        others = {kind.columns[name].field for name in kind.columns.position} | {"collimator_length"}
+        found = {name: its for name, its in kind.columns.fields.items() if name not in others} | found
+    return found
 
 
 def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
@@ -52,7 +57,7 @@ def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
         "following it, the others stay"
     )
     add("--length", metavar="MM", help=length)
-    add("--move", type=float, nargs=3, metavar=("X", "Y", "Z"), help="shift of the pinholes, mm")
+    add("--move", type=float, nargs=3, metavar=("X", "Y", "Z"), help="shift of the modules, mm")
     add("--remove", metavar="RANGE", help="modules to take out")
     add("--order", metavar="N,N,...", help="the modules' numbers in the order they are to have")
     columns = "with --columns, also write the column map (.toml) of the new workbook"
@@ -74,7 +79,7 @@ def _run(arguments: argparse.Namespace) -> None:
         raise InputError("--write-columns: the workbook is read by its headings, expected it with --columns")
     map_path = None if arguments.write_columns is None else output_path(arguments.write_columns, (".toml",))
     with recorded_warnings() as messages:
-        system = _changed(read_workbook(arguments), arguments)
+        system = _changed(read_any(arguments), arguments)
         written = write_system(system, target, template=arguments.workbook)
     if map_path is not None and written.columns is not None:
         written.columns.write(map_path)
@@ -84,15 +89,52 @@ def _run(arguments: argparse.Namespace) -> None:
     print_answer(arguments, answer, [text], [f"warning: {message}" for message in messages])
 
 
-def _changed(system: PinholeSystem, arguments: argparse.Namespace) -> PinholeSystem:
+def _changed(system: Scanner, arguments: argparse.Namespace) -> Scanner:
     chosen = np.isin(system.numbers, chosen_modules(system, arguments.modules).numbers)
     changes: dict[str, Any] = {}
     for name, columns in _options().items():
         given = getattr(arguments, name)
         if given is not None:
+            if name not in system.columns.fields:
+                raise InputError(f"--{_option(name)}: is no column of a {system.kind} scanner")
             value = np.multiply(given, ANGLE_UNITS["deg"]) if columns[0].kind == "angle" else given
             mask = chosen if columns[0].axis is None else chosen[:, None]
             changes[name] = np.where(mask, value, getattr(system, name))
+    if isinstance(system, PinholeSystem):
+        system = _with_lengths(system, arguments, chosen, changes)
+    else:
+        system = _moved(system, arguments, chosen, changes)
+    if arguments.remove is not None:
+        removed = np.isin(system.numbers, chosen_modules(system, arguments.remove, "--remove").numbers)
+        if removed.all():
+            raise InputError(f"--remove {arguments.remove!r}: are all modules, expected at least one to be left")
+        system = system[~removed]
+    if arguments.order is None:
+        return system
+    index = {str(number): i for i, number in enumerate(system.numbers)}
+    wanted = [part.strip() for part in arguments.order.split(",")]
+    if sorted(wanted) != sorted(index):
+        raise InputError(f"--order: expected each of the modules' {len(index)} numbers once, got {len(wanted)}")
+    return system[np.array([index[number] for number in wanted])]
+
+
+def _moved(
+    system: Scanner, arguments: argparse.Namespace, chosen: NDArray[np.bool_], changes: dict[str, Any]
+) -> Scanner:
+    """Modules of any kind with these changes, the chosen ones shifted."""
+    if arguments.length is not None:
+        raise InputError("--length: only pinhole modules have a collimator")
+    if arguments.move is not None:
+        shifted = affine_matrix(np.eye(3), arguments.move) @ system.poses()
+        for name, values in system.attributes_at(shifted).items():
+            changes[name] = np.where(chosen[:, None], values, getattr(system, name))
+    return system.replace(**changes)
+
+
+def _with_lengths(
+    system: PinholeSystem, arguments: argparse.Namespace, chosen: NDArray[np.bool_], changes: dict[str, Any]
+) -> PinholeSystem:
+    """Pinhole modules with these changes, and collimator lengths that follow or are given."""
     if arguments.move is not None:
         changes["centers"] = np.where(chosen[:, None], system.centers + arguments.move, system.centers)
     length = PinholeSystem.columns["l"]
@@ -108,16 +150,4 @@ def _changed(system: PinholeSystem, arguments: argparse.Namespace) -> PinholeSys
     # Lengths that are the formula's to 1e-9 stay as they are, to the last digit.
     others = follows & ~length.is_default(system)
     lengths = np.where(others, length.default(system.columns.needed_values(system)), system.collimator_length)
-    system = system.replace(collimator_length=lengths)
-    if arguments.remove is not None:
-        removed = np.isin(system.numbers, chosen_modules(system, arguments.remove, "--remove").numbers)
-        if removed.all():
-            raise InputError(f"--remove {arguments.remove!r}: are all modules, expected at least one to be left")
-        system = system[~removed]
-    if arguments.order is None:
-        return system
-    index = {str(number): i for i, number in enumerate(system.numbers)}
-    wanted = [part.strip() for part in arguments.order.split(",")]
-    if sorted(wanted) != sorted(index):
-        raise InputError(f"--order: expected each of the modules' {len(index)} numbers once, got {len(wanted)}")
-    return system[np.array([index[number] for number in wanted])]
+    return system.replace(collimator_length=lengths)

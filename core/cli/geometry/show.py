@@ -3,11 +3,14 @@
 import argparse
 from typing import Any
 
+import numpy as np
+
 from ...arrays import table_rows
 from ...errors import InputError
+from ...geometry.scanner import Scanner
 from ...geometry.system import PinholeSystem
 from ...workbook import draft_column_map
-from ..options import chosen_modules, output_path, print_answer, read_workbook
+from ..options import chosen_modules, kind_of, output_path, print_answer, read_any
 from .arguments import add_action
 
 
@@ -28,7 +31,10 @@ def _run(arguments: argparse.Namespace) -> None:
     if arguments.write_columns is not None:
         _write_columns(arguments)
         return
-    system = read_workbook(arguments)
+    system = read_any(arguments)
+    if not isinstance(system, PinholeSystem):
+        _show_columns(arguments, system)
+        return
     chosen = set(chosen_modules(system, arguments.modules).numbers.tolist())
     rows = [row for row in _rows(system) if row["number"] in chosen]  # rings are those of the whole scanner
     heading = (
@@ -51,11 +57,25 @@ def _run(arguments: argparse.Namespace) -> None:
     print_answer(arguments, {"modules": rows, "units": "mm, radians"}, lines)
 
 
+def _show_columns(arguments: argparse.Namespace, system: Scanner) -> None:
+    """Print the columns of modules of any kind, as its table has them."""
+    chosen = chosen_modules(system, arguments.modules)
+    rings = system.rings()[np.isin(system.numbers, chosen.numbers)] + 1  # those of the whole scanner
+    own = {name: column for name, column in chosen.columns.items() if not column.is_unused(chosen)}
+    columns = {"number": chosen.numbers, "ring": rings, **{name: column.of(chosen) for name, column in own.items()}}
+    texts = {name: list(map(own[name].number_of if name in own else str, columns[name].tolist())) for name in columns}
+    width = {name: max(map(len, (name, *its))) for name, its in texts.items()}
+    rows = [tuple(texts), *zip(*texts.values(), strict=True)]
+    lines = [" ".join(f"{text:>{width[name]}}" for name, text in zip(texts, row, strict=True)) for row in rows]
+    answer = {"modules": table_rows(columns), "units": "mm, radians"}
+    print_answer(arguments, answer, [*lines, "lengths in mm"])
+
+
 def _write_columns(arguments: argparse.Namespace) -> None:
     path = output_path(arguments.write_columns, (".toml",))
     if arguments.columns is not None:
         raise InputError("--write-columns writes what the headings say, expected it without --columns")
-    draft = draft_column_map(arguments.workbook)
+    draft = draft_column_map(arguments.workbook, kind_of(arguments))
     draft.write(path)
     then = f"check it, then: geometry show {arguments.workbook} --columns {path}"
     lines = [f"{path}: {len(draft.questions)} to be settled; {then}"]

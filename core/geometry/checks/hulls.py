@@ -56,7 +56,9 @@ class Hulls:
 
 
 def _corners(vertices: Floats) -> Floats:
-    """Corners (8, 3) of the hull: both ends of a solid are squares around Z, of which the outermost count."""
+    """Corners (8, 3) of the hull: both ends of a solid but a box are squares around Z, of which the outermost count."""
+    if len(vertices) == 8:  # a box
+        return vertices
     corners = []
     for z in (vertices[:, 2].min(), vertices[:, 2].max()):
         half = np.abs(vertices[vertices[:, 2] == z, :2]).max()

@@ -2,24 +2,11 @@
 
 import math
 from dataclasses import asdict, dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 from ..collimator import EdgePlace
+from ..finding import Finding
 from ..part_colors import PartKind
-
-
-class Finding:
-    """Something wrong with one module or with a pair of modules; ``str`` gives it in one line."""
-
-    message: ClassVar[str]
-
-    def __str__(self) -> str:
-        return self.message.format(self)
-
-    @property
-    def modules(self) -> tuple[int, ...]:
-        """Numbers of the modules concerned."""
-        return tuple(getattr(self, name) for name in ("first", "second", "module", "by") if hasattr(self, name))
 
 
 @dataclass(frozen=True)

@@ -156,6 +156,7 @@ class ScannerProperties(bpy.types.PropertyGroup):
     )
     untidy: StringProperty(name="Untidy", description="Copied cameras and parts without a camera, in words")
     findings: StringProperty(name="Findings", description="What the last check of the geometry found, JSON")
+    design: StringProperty(name="Design", description="What the last design found, lines as JSON")
     calibration: StringProperty(name="Calibration", description="What the last calibration found, lines as JSON")
 
 

@@ -45,6 +45,11 @@ class MPHDRR_PT_design(ScannerPanel, bpy.types.Panel):
             row = layout.row(align=True)
             row.prop(properties, "keep_aimed", toggle=True, icon="CON_TRACKTO")
             row.operator("mphdrr.aim_modules")
+        column = layouts.invoking(layout.column(align=True))
+        column.operator("mphdrr.optimise", text="Optimise", icon="OPTIONS")
+        jobs.draw_job(column)
+        for text in json.loads(properties.design or "[]"):
+            draw_text(column, text, icon="DOT")
 
 
 class MPHDRR_PT_scanner_design(ScannerPanel, bpy.types.Panel):

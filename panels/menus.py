@@ -67,6 +67,7 @@ class MPHDRR_MT_modules(bpy.types.Menu):
         layout.operator_menu_enum("mphdrr.renumber_modules", "order", icon="LINENUMBERS_ON")
         layout.separator()
         layout.operator("mphdrr.check_geometry", icon="CHECKMARK")
+        layout.operator("mphdrr.optimise", icon="OPTIONS")
         layout.operator("mphdrr.calibrate", icon="TRACKER")
         layout.operator_menu_enum("mphdrr.add_map", "quantity", icon="OUTLINER_DATA_LIGHTPROBE")
         layout.separator()

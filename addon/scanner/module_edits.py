@@ -265,6 +265,33 @@ def renumber(collection: bpy.types.Collection, order: Literal["RINGS", "LIST"] =
     return int(np.count_nonzero(system.numbers[places] != ordered.numbers))
 
 
+def can_become(collection: bpy.types.Collection, system: Scanner) -> bool:
+    """Whether a scanner has the modules of another one, by their numbers, and only the user moves them."""
+    found = scanner.modules(collection)
+    numbers = sorted(camera.mphdrr_module.number for camera in found)
+    is_kind = module_values.kind_of(collection) is type(system)
+    return is_kind and numbers == sorted(system.numbers.tolist()) and all(map(following.is_free, found))
+
+
+def become(collection: bpy.types.Collection, system: Scanner) -> None:
+    """Give modules the places, directions and values that `system` has by their numbers, in float64.
+
+    They are those of no workbook then. Raises InputError, and leaves the scanner as it was, unless it `can_become` this.
+    """
+    if not can_become(collection, system):
+        raise InputError(f"scanner '{collection.name}' has other modules than the one that it is to become")
+    cameras_ = {camera.mphdrr_module.number: camera for camera in scanner.modules(collection)}
+    found = [cameras_[number] for number in system.numbers.tolist()]
+    with following.writing():
+        module_values.write_modules(found, system)
+        for camera, matrix in zip(found, cameras.matrices_of(system.poses()), strict=True):
+            objects.set_world_matrix(camera, matrix)
+        if module_values.off_aim(collection, found):
+            collection.mphdrr_scanner.keep_aimed = False
+    scanner.remember_source(collection, system)
+    following.refresh(collection, aim=False)
+
+
 def move_to(collection: bpy.types.Collection, system: PinholeSystem) -> None:
     """Move and turn modules, with their lengths, to where `system` has those of their numbers.
 

@@ -66,7 +66,7 @@ def build_scanner(
         set_visible(new.cameras[number], False)
 
     properties = collection.mphdrr_scanner
-    properties.scanner_name, properties.kind = name, system.kind
+    properties.scanner_name, properties.kind, properties.design = name, system.kind, ""
     for setting, value in asdict(construction).items():
         setattr(properties, setting, value.upper() if isinstance(value, str) else value)
     properties.is_scanner = properties.parts_free = True

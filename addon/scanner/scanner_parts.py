@@ -110,6 +110,8 @@ def losses(collection: bpy.types.Collection) -> list[str]:
     gone = collection.mphdrr_scanner.n_modules - sum(not o.mphdrr_module.added for o in found)
     if gone > 0:
         lost.append(f"{gone} module{'s' * (gone > 1)} deleted or moved out")
+    if collection.mphdrr_scanner.design and not collection.mphdrr_scanner.workbook:
+        lost.append("a design that no workbook has")
     names = [o.name for o in others] + [c.name for c in _own_collections(collection)]
     if names:
         lost.append(f"yours, which will move to the scene's collection: {several(names, 6)}")

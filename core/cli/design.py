@@ -4,7 +4,7 @@ import argparse
 
 from ..design.evaluating import evaluate
 from ..design.fronts import pareto
-from ..design.optimising import Design, optimize
+from ..design.optimising import optimize
 from ..design.recipe import TEMPLATE, read_design_recipe
 from ..files import read_text, write_bytes
 from ..workbook import write_system
@@ -57,14 +57,13 @@ def _optimize(arguments: argparse.Namespace) -> None:
         raise
     write_system(found.system, path)
     record = {"parameters": found.parameters, "objectives": found.values, "faults": found.faults}
-    lines = [f"{name} {value:.6g}" for name, value in found.parameters.items()]
-    lines += [f"{name}: {first:.5g} at the start, now {last:.5g}" for name, (first, last) in found.values.items()]
+    *lines, verdict = found.summary()
     if arguments.evaluate:
         gain = evaluate(recipe, found.start, found.system, None if arguments.quiet else progress_bar("evaluating"))
         record["evaluation"] = gain._asdict()
         lines.append(f"{gain.score}: {gain.start:.4g} at the start, now {gain.found:.4g}; better by {gain.gain:.1%}, "
                      f"95 % interval {gain.low:.1%} to {gain.high:.1%}")  # fmt: skip
-    print_answer(arguments, record, [*lines, f"{path}: {_words(found)}"], found.faults)
+    print_answer(arguments, record, [*lines, f"{path}: {verdict}"], found.faults)
 
 
 def _pareto(arguments: argparse.Namespace) -> None:
@@ -78,9 +77,3 @@ def _pareto(arguments: argparse.Namespace) -> None:
         found.write(path)
     lines = ["  ".join(f"{name} {value:.5g}" for name, value in row.items()) for row in found.rows]
     print_answer(arguments, list(found.rows), lines)
-
-
-def _words(found: Design) -> str:
-    if found.ok:
-        return f"{len(found.system)} modules that pass every check"
-    return f"it fails {len(found.faults)} checks: not a good scanner"

@@ -23,7 +23,7 @@ from .recipe import DesignRecipe, read_design_recipe
 from .solvers import scipy_module
 
 Shown = Callable[[PinholeSystem, float], None]
-"""Called as ``callback(system, objective)`` after each step."""
+"""Called as ``callback(system, objective)`` after each step: the best until then, and what the step has reached."""
 
 _STRENGTHS = (1.0, 10.0, 100.0)
 """What a missing mm costs in the rounds, beside an objective of 1 at the start."""
@@ -50,6 +50,14 @@ class Design:
     def ok(self) -> bool:
         """Whether the scanner passes every check."""
         return not self.faults
+
+    def summary(self) -> list[str]:
+        """The free numbers, each objective before and after, and whether it passes every check: a line each."""
+        lines = [f"{name} {value:.6g}" for name, value in self.parameters.items()]
+        lines += [f"{name}: {first:.5g} at the start, now {last:.5g}" for name, (first, last) in self.values.items()]
+        if self.ok:
+            return [*lines, f"{len(self.system)} modules that pass every check"]
+        return [*lines, f"it fails {len(self.faults)} checks: not a good scanner"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +104,7 @@ def optimize(
     state
         A file (.json) that is written after each step, with which the same call goes on where it was stopped.
     callback
-        Called as ``callback(system, objective)`` after each step.
+        Called as ``callback(system, objective)`` after each step, with the best scanner until then.
 
     Raises
     ------
@@ -147,7 +155,7 @@ class _Search:
 
     def result(self) -> Design:
         """The best until now."""
-        values = Loss(self._free, ()).values_at(self._best())
+        values = self._values()
         system = self._free.build(values)
         wanted = zip(self._recipe.goals, self._recipe.wanted(), strict=True)
         worth = {name: (objective(self._system)[0], objective(system)[0]) for name, objective in wanted}
@@ -160,6 +168,7 @@ class _Search:
 
         def at(x: Floats) -> tuple[float, Floats]:
             nonlocal good
+            self._tell(number)
             try:
                 found = loss(x)
                 good = x.copy()
@@ -174,7 +183,7 @@ class _Search:
             self._merits.append(-value)
             self._write()
             if self._callback is not None:
-                self._callback(self._free.build(loss.values_at(point)), -value)
+                self._callback(self._free.build(self._values()), -value)
             self._tell(number)
 
         options = {"maxiter": steps, "ftol": 1e-10, "gtol": 1e-7}
@@ -195,6 +204,10 @@ class _Search:
         """The point of the last search, or of the first ones the best."""
         those = self._found if len(self._found) <= self._starts else self._found[-1:]
         return np.array(min(those)[1]) if those else self._drawn(0)
+
+    def _values(self) -> Floats:
+        """The free numbers of the best point, in their own units."""
+        return Loss(self._free, ()).values_at(self._best())
 
     def _loss(self, coarse: int, strength: float) -> Loss:
         """What a search makes small: each objective is 1 for the start."""

@@ -13,6 +13,7 @@ from typing import Any
 from ..arrays import Array
 from ..errors import InputError, naming
 from ..events.entries import by_key, check_entries, flat, like, required, table
+from ..files import read_bytes
 from ..geometry.grid import Grid
 from ..geometry.system import PinholeSystem, chosen_modules
 from ..phantoms.language import parse_phantom, read_phantom
@@ -196,13 +197,18 @@ class DesignRecipe(Values):
             raise InputError(f"pareto.entry: expected one of the recipe, such as generator.modules, got {entry!r}")
         return replace(self, objectives=[{**goal, name: number} if name in goal else goal for goal in self.objectives])
 
-    @property
+    @cached_property
     def fingerprint(self) -> str:
-        """SHA-256 of all that decides over the design."""
+        """SHA-256 of all that decides over the design, with the contents of the files that it names."""
         own = sorted(
             (key, value) for key, value in self.given.items() if not key.startswith(("pareto.", "evaluation."))
         )
-        return hashlib.sha256(repr((own, self.generator, self.free, self.objectives)).encode()).hexdigest()
+        bodies = [
+            text for goal in self.goals.values() if "parts" in goal.rows for text in (*goal["body"], goal["parts"])
+        ]
+        files = [text for text in (self.generator.get("file"), *bodies) if text and "\n" not in text]
+        contents = [read_bytes(self.folder / name) for name in files]
+        return hashlib.sha256(repr((own, self.generator, self.free, self.objectives, contents)).encode()).hexdigest()
 
 
 def design_recipe(values: Mapping[str, Any], folder: Path = Path()) -> DesignRecipe:

@@ -172,6 +172,18 @@ def test_a_search_that_is_stopped_keeps_the_best_and_goes_on(tmp_path):
     assert again.parameters == found.parameters, "what is done is not done again"
 
 
+def test_other_contents_of_a_named_file_make_another_recipe(system, tmp_path):
+    def fingerprint(radius: float, hole: float) -> str:
+        (tmp_path / "body.toml").write_text(BODY.replace("20", str(radius)))
+        mph.write_system(replace(system, pinhole_diameter=np.full(len(system), hole)), tmp_path / "own.xlsx")
+        wanted = [{"kind": "lesion", "body": ["body.toml"], "parts": PARTS}]
+        generator, free = {"kind": "workbook", "file": "own.xlsx"}, {"diameter": [0.5, 2.0]}
+        return small_design(tmp_path, generator=generator, free=free, objectives=wanted).fingerprint
+
+    assert len({fingerprint(20, 3.0), fingerprint(21, 3.0), fingerprint(21, 3.1)}) == 3
+    assert fingerprint(21, 3.1) == fingerprint(21, 3.1)
+
+
 def test_constraints_that_cannot_hold_are_said():
     recipe = small_design(constraints={"bore": 195.0}, search={"starts": 1, "coarse_steps": 2, "steps": 1})
     found = mph.design.optimize(recipe)

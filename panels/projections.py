@@ -9,7 +9,7 @@ from ..addon.runs.projection_properties import drawn, makes_counts
 from ..addon.scanner import scanner
 from ..addon.volumes import volumes
 from .runs import draw_changes
-from .sidebar import Folded, Sidebar, draw_hint, draw_text
+from .sidebar import Folded, Sidebar, draw_facts, draw_hint, draw_text
 
 _MAIN = ("time", "photons", "hole", "aperture_points", "pixel_points")
 """Settings of models that the panel itself shows; the others stand under Physics."""
@@ -26,7 +26,12 @@ class MPHDRR_PT_projections(Sidebar, bpy.types.Panel):
         column.prop(settings, "volume", placeholder="Active volume")
         column.prop(settings, "model")
         layouts.draw_settings(column, settings, (each for each in drawn(settings, "model") if each[0] in _MAIN))
-        layouts.draw_settings(column, settings, drawn(settings, "detector"))
+        collection = scanner.active_scanner(context.scene)
+        own = collection and scanner.own_pixels(collection)
+        if own:  # as its views are, whatever the settings for other scanners
+            draw_facts(column.split(factor=0.4), ("Pixels", f"{own[1]} × {own[0]}, its own"))
+        else:
+            layouts.draw_settings(column, settings, drawn(settings, "detector"))
         modules = column.column(align=True)
         modules.prop(settings, "all_modules")
         if not settings.all_modules:
@@ -34,7 +39,7 @@ class MPHDRR_PT_projections(Sidebar, bpy.types.Panel):
         layouts.draw_settings(column, settings, drawn(settings, "compute"))
         row = layouts.invoking(layout.row())
         row.scale_y = 1.4
-        has_scanner = scanner.active_scanner(context.scene) is not None
+        has_scanner = collection is not None
         has_volume = bool(volumes.volume_objects(context.scene))
         row.enabled = has_scanner and has_volume
         row.operator("mphdrr.render_projections", icon="RENDER_STILL")

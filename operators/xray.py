@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import math
+from typing import Any
 
 import bpy
 from bpy.props import EnumProperty, FloatProperty, IntProperty, StringProperty
@@ -15,8 +17,8 @@ from ..addon.scanner import scanner
 from ..core import xray_arc, xray_ring
 
 _USUAL = {
-    "ARC": {"source_radius": 300.0, "panel_size": 350.0, "z": 200.0},
-    "RING": {"source_radius": 400.0, "panel_size": 300.0, "z": 310.0},
+    "ARC": {"start": math.radians(-98.0), "source_radius": 300.0, "panel_size": 350.0, "z": 200.0},
+    "RING": {"start": 0.0, "source_radius": 400.0, "panel_size": 300.0, "z": 310.0},
 }
 """The defaults of `xray_arc` and `xray_ring`, where they differ."""
 
@@ -36,11 +38,11 @@ def _angle(name: str, description: str, default: float) -> object:
 
 
 class MPHDRR_OT_add_xray_system(Reported, bpy.types.Operator):
-    """Add X-ray sources, each with its panel opposite, as a scanner beside the pinhole modules; the panels then work on it"""
+    """Add X-ray sources, each with its panel opposite, as a scanner beside the pinhole modules, and work on it"""
 
     bl_label = "Add X-ray System"
 
-    name: StringProperty(name="Name", description="Of the scanner, which replaces one of this name", default="X-ray")
+    name: StringProperty(name="Name", description="Of the scanner; with a number, if it is taken", default="X-ray")
     arrangement: EnumProperty(
         name="Arrangement",
         description="Where the sources are; its usual numbers come with it",
@@ -73,11 +75,15 @@ class MPHDRR_OT_add_xray_system(Reported, bpy.types.Operator):
         for name, value in _USUAL[self.arrangement].items():
             if not self.properties.is_property_set(name):  # by a script, which has only chosen the arrangement
                 setattr(self, name, value)
-        lengths = {name: typed(getattr(self, name)) for name in ("source_radius", "panel_radius", "panel_size", "z", "kvp")}
-        settings = {**lengths, "shape": (self.pixels, self.pixels), "start": self.start}
+        numbers = ("source_radius", "panel_radius", "panel_size", "z", "kvp")
+        settings: dict[str, Any] = {name: typed(getattr(self, name)) for name in numbers}
+        start, end = (math.radians(round(math.degrees(angle), 4)) for angle in (self.start, self.end))  # as typed
+        settings |= {"shape": (self.pixels, self.pixels), "start": start}
         is_arc = self.arrangement == "ARC"
-        system = xray_arc(self.sources, end=self.end, **settings) if is_arc else xray_ring(self.sources, **settings)
-        collection = scanner.build_scanner(context.scene, system, self.name)
+        system = xray_arc(self.sources, end=end, **settings) if is_arc else xray_ring(self.sources, **settings)
+        names = itertools.chain([self.name], (f"{self.name} {number}" for number in itertools.count(2)))
+        name = next(each for each in names if scanner.find_scanner(context.scene, each) is None)
+        collection = scanner.build_scanner(context.scene, system, name)
         studio.light(context.scene)
         context.view_layer.update()  # so that scripts find the children's matrix_world in place
         panel, reconstruction = context.scene.mphdrr_projections, context.scene.mphdrr_reconstruction

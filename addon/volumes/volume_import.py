@@ -104,7 +104,11 @@ def dosing(item: bpy.types.Object, isotope: str) -> jobs.Job:
 
 
 def _made_of(
-    item: bpy.types.Object, what: str, how: str, provenance: dict[str, Any], make_one: Callable[[Volume, Progress | None], Volume]
+    item: bpy.types.Object,
+    what: str,
+    how: str,
+    provenance: dict[str, Any],
+    make_one: Callable[[Volume, Progress | None], Volume],
 ) -> jobs.Job:
     """The job that adds `what` is made of a volume, state by state, in its place."""
     volumes.require_volume(item)

@@ -58,7 +58,7 @@ class MPHDRR_OT_add_dose_map(jobs.JobOperator, bpy.types.Operator):
     isotope: EnumProperty(
         name="Isotope",
         description="What decays",
-        items=choices.items(choices.ISOTOPES, ((name, name, "") for name in decays())),
+        items=choices.items({}, ((name, name, "") for name in decays())),
         default="Tc-99m",
     )
 

@@ -9,7 +9,7 @@ from ..addon.runs.projection_properties import drawn, makes_counts
 from ..addon.scanner import scanner
 from ..addon.volumes import volumes
 from .runs import draw_changes
-from .sidebar import Folded, Sidebar, draw_facts, draw_hint, draw_text
+from .sidebar import Folded, Sidebar, draw_hint, draw_text
 
 _MAIN = ("time", "photons", "hole", "aperture_points", "pixel_points")
 """Settings of models that the panel itself shows; the others stand under Physics."""
@@ -29,7 +29,11 @@ class MPHDRR_PT_projections(Sidebar, bpy.types.Panel):
         collection = scanner.active_scanner(context.scene)
         own = collection and scanner.own_pixels(collection)
         if own:  # as its views are, whatever the settings for other scanners
-            draw_facts(column.split(factor=0.4), ("Pixels", f"{own[1]} × {own[0]}, its own"))
+            split = column.split(factor=0.4)
+            name = split.row()
+            name.alignment = "RIGHT"  # as the settings' names
+            name.label(text="Pixels")
+            split.label(text=f"{own[1]} × {own[0]}, its own", translate=False)
         else:
             layouts.draw_settings(column, settings, drawn(settings, "detector"))
         modules = column.column(align=True)

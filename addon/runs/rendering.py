@@ -26,7 +26,7 @@ from ...core.volumes.volume import require_quantity
 from ..blender import ids, jobs, storage, timers
 from ..phantoms import phantoms
 from ..pictures import images, planes, recoloring
-from ..scanner import following, module_values, scanner
+from ..scanner import following, scanner
 from ..volumes import volumes
 from . import projection_properties, runs
 
@@ -87,7 +87,7 @@ def sources(
     context: bpy.types.Context, recipe: Recipe, model: Model, volume: str = "", mu: str = ""
 ) -> tuple[bpy.types.Object, bpy.types.Object | None]:
     """The objects of what is projected and of what attenuates it, if anything; arguments and errors as of `render_job`."""
-    taken = module_values.kind_of(scanner.required_scanner(context.scene)).takes
+    taken = scanner.kind_of(scanner.required_scanner(context.scene)).takes
     taken = tuple(each for each in taken if each in (("mu",) if recipe["model.photons"] else model.takes))
     item = _chosen_volume(context, volume, taken, model.name)
     mu_item = _given(context, "mu", mu) if recipe["model.kind"] == "emission" else None
@@ -100,7 +100,7 @@ def integrates_activity(context: bpy.types.Context) -> bool:
     """Whether the panel's settings ask for a radiograph of activity, whatever volume is meant: few want one."""
     settings, known = context.scene.mphdrr_projections, volumes.volume_objects(context.scene)
     collection = scanner.active_scanner(context.scene)
-    if collection is not None and "activity" not in module_values.kind_of(collection).takes:
+    if collection is not None and "activity" not in scanner.kind_of(collection).takes:
         return False
     meant = [settings.volume] if settings.volume else [context.object] if context.object in known else known
     is_radiograph = settings.model == "TRANSMISSION" and not settings.photons

@@ -33,7 +33,7 @@ class MPHDRR_PT_projections(Sidebar, bpy.types.Panel):
             name = split.row()
             name.alignment = "RIGHT"  # as the settings' names
             name.label(text="Pixels")
-            split.label(text=f"{own[1]} × {own[0]}, its own", translate=False)
+            split.label(text=iface("{columns} × {rows}, its own").format(rows=own[0], columns=own[1]), translate=False)
         else:
             layouts.draw_settings(column, settings, drawn(settings, "detector"))
         modules = column.column(align=True)

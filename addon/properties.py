@@ -134,6 +134,10 @@ class ScannerProperties(bpy.types.PropertyGroup):
         name="Intrinsic FWHM", description="Resolution of the detectors in mm on the crystal, for the readouts. 0: ideal",
         min=0.0, soft_max=10.0, step=10, update=on_edit("scanner"),
     )  # fmt: skip
+    bore: FloatProperty(
+        name="Bore", description="Radius in mm about the z axis that the patient needs, for Check Geometry. 0: not checked",
+        min=0.0, soft_max=500.0,
+    )  # fmt: skip
     keep_aimed: BoolProperty(
         name="Keep Aimed",
         description="Turn a module that is moved so that it keeps looking at the isocentre. One that is only turned "

@@ -8,6 +8,7 @@ from bpy.props import BoolProperty, FloatProperty, FloatVectorProperty, StringPr
 from ..addon.blender import file_properties, jobs, layouts, storage
 from ..addon.phantoms import phantoms
 from ..addon.phantoms.phantom_properties import FILE, PhantomSettings, identifier, sampling, settings_class
+from ..addon.scanner import scanner
 from ..core import Phantom, euler_pose, read_phantom
 from ..core.phantoms.kinds import KINDS
 
@@ -23,6 +24,12 @@ class AddPhantom(jobs.JobOperator):
     phi: FloatProperty(name="Phi", description="Turn about world z, done last", subtype="ANGLE")
     theta: FloatProperty(name="Theta", description="Turn about world y, after psi", subtype="ANGLE")
     psi: FloatProperty(name="Psi", description="Turn about the phantom's own axis, done first", subtype="ANGLE")
+
+    def ask(self: Any, context: bpy.types.Context) -> set[str] | None:
+        """Where the chosen scanner sees attenuation alone, offer to add it."""
+        collection = scanner.active_scanner(context.scene)
+        self.attenuation |= collection is not None and "activity" not in scanner.kind_of(collection).takes
+        return super().ask(context)
 
     def draw(self: Any, context: bpy.types.Context) -> None:
         layout = layouts.labelled(self.layout)

@@ -1,12 +1,13 @@
 """The active volume: slices through it, a CT's attenuation, its files cleaned up or found again."""
 
 import bpy
-from bpy.props import FloatProperty, StringProperty
+from bpy.props import EnumProperty, FloatProperty, StringProperty
 
 from ..addon import recovery
-from ..addon.blender import decimals, jobs, storage
+from ..addon.blender import choices, decimals, jobs, storage
 from ..addon.blender.reports import Reported, ask_to_remove, needs
 from ..addon.volumes import slices, volume_import, volumes
+from ..core.xray.dose import decays
 
 
 class MPHDRR_OT_add_slices(Reported, bpy.types.Operator):
@@ -27,6 +28,10 @@ class MPHDRR_OT_remove_slices(Reported, bpy.types.Operator):
         slices.remove_slices(context.object)
 
 
+def _is_activity(context: bpy.types.Context) -> bool:
+    return volumes.is_volume(context.object) and volumes.quantity_of(context.object) == "activity"
+
+
 def _is_ct(context: bpy.types.Context) -> bool:
     return volumes.is_volume(context.object) and volumes.quantity_of(context.object) == "hu"
 
@@ -45,6 +50,22 @@ class MPHDRR_OT_ct_to_attenuation(jobs.JobOperator, bpy.types.Operator):
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
         return volume_import.converting(context.object, decimals.typed(self.energy))
+
+
+class MPHDRR_OT_add_dose_map(jobs.JobOperator, bpy.types.Operator):
+    """Make a volume of the absorbed dose rate (mGy/h) from the active volume of activity, as in water of density 1"""
+
+    isotope: EnumProperty(
+        name="Isotope",
+        description="What decays",
+        items=choices.items({}, ((name, name, "") for name in decays())),
+        default="Tc-99m",
+    )
+
+    poll = needs((_is_activity, "No activity is active: select a volume of activity"))
+
+    def job(self, context: bpy.types.Context) -> jobs.Job:
+        return volume_import.dosing(context.object, self.isotope)
 
 
 class MPHDRR_OT_clean_volume_files(Reported, bpy.types.Operator):

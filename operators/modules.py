@@ -37,6 +37,7 @@ class MPHDRR_OT_look_through_module(selection.OnScanner, bpy.types.Operator):
 
     def change(self, context: bpy.types.Context, collection: bpy.types.Collection) -> str:
         context.scene.camera = scanner.module(collection, self.number)
+        scanner.fit_pixels(context.scene.render, context.scene.camera)
         if context.area is not None and context.area.type == "VIEW_3D":
             context.area.spaces.active.region_3d.view_perspective = "CAMERA"
         return f"Looking through {context.scene.camera.name}"

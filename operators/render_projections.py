@@ -39,6 +39,7 @@ class MPHDRR_OT_render_projections(projection_properties.ProjectionSettings, job
             lambda name: self._setting(context.scene, name),
             self.properties.is_property_set,
             {projection_properties.OPENING_ANGLE: math.degrees(decimals.typed(angle))},
+            collection,
         )
         return rendering.render_job(context, recipe, self.volume, self.mu)
 

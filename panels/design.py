@@ -65,8 +65,9 @@ class MPHDRR_PT_scanner_design(ScannerPanel, bpy.types.Panel):
         if pinholes.has_pinholes(kind):
             _draw_pinholes(layout, column, properties)
         layout.operator_menu_enum("mphdrr.renumber_modules", "order", text="Renumber", icon="LINENUMBERS_ON")
-        if pinholes.has_pinholes(kind):
-            layout.operator("mphdrr.check_geometry", icon="CHECKMARK")
+        if not pinholes.has_pinholes(kind):
+            layout.prop(properties, "bore", text="Bore (mm)")
+        layout.operator("mphdrr.check_geometry", icon="CHECKMARK")
         if properties.findings:
             findings = json.loads(properties.findings)
             if not findings:

@@ -58,6 +58,7 @@ class MPHDRR_PT_geometry(Sidebar, bpy.types.Panel):
             row.scale_y = 1.4
             row.operator("mphdrr.load_example", icon="PLAY")
         layout.operator("mphdrr.import_geometry", text="Import Workbook", icon="IMPORT")
+        layout.operator("mphdrr.add_xray_system", icon="LIGHT_SPOT")
         if collection is None:
             draw_hint(layout, "Or drop one on the viewport.")
             jobs.draw_job(layout)

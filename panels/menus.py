@@ -47,6 +47,7 @@ class MPHDRR_MT_modules(bpy.types.Menu):
     def draw(self, context: bpy.types.Context) -> None:
         layout = invoking(self.layout)
         layout.operator("mphdrr.import_geometry", icon="IMPORT")
+        layout.operator("mphdrr.add_xray_system", icon="LIGHT_SPOT")
         layout.operator("mphdrr.export_geometry", icon="EXPORT")
         layout.operator("mphdrr.export_for_program")
         layout.separator()
@@ -88,6 +89,7 @@ class MPHDRR_MT_volumes(bpy.types.Menu):
         layout.operator("mphdrr.show_phantom_outline", text="Show or Hide Outline", icon="SHADING_WIRE")
         layout.separator()
         layout.operator("mphdrr.ct_to_attenuation", icon="MOD_FLUIDSIM")
+        layout.operator_menu_enum("mphdrr.add_dose_map", "isotope", icon="OUTLINER_DATA_VOLUME")
         layout.operator("mphdrr.add_slices", icon="MESH_PLANE")
         layout.operator("mphdrr.remove_slices", icon="X")
         layout.operator("mphdrr.show_in_perspective", icon="VIEW_PERSPECTIVE")

@@ -71,6 +71,8 @@ def _draw_display(layout: bpy.types.UILayout, item: bpy.types.Object) -> None:
     settings = item.mphdrr_volume
     if settings.quantity == "hu":
         layout.operator("mphdrr.ct_to_attenuation", icon="MOD_FLUIDSIM")
+    if settings.quantity == "activity":
+        layout.operator_menu_enum("mphdrr.add_dose_map", "isotope", text="Dose Map", icon="OUTLINER_DATA_VOLUME")
     column = layout.column(align=True)
     column.prop(settings, "display_low", text=iface("Low, {unit}").format(unit=settings.unit))
     column.prop(settings, "display_high", text=iface("High, {unit}").format(unit=settings.unit))

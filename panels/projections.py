@@ -26,7 +26,16 @@ class MPHDRR_PT_projections(Sidebar, bpy.types.Panel):
         column.prop(settings, "volume", placeholder="Active volume")
         column.prop(settings, "model")
         layouts.draw_settings(column, settings, (each for each in drawn(settings, "model") if each[0] in _MAIN))
-        layouts.draw_settings(column, settings, drawn(settings, "detector"))
+        collection = scanner.active_scanner(context.scene)
+        own = collection and scanner.own_pixels(collection)
+        if own:  # as its views are, whatever the settings for other scanners
+            split = column.split(factor=0.4)
+            name = split.row()
+            name.alignment = "RIGHT"  # as the settings' names
+            name.label(text="Pixels")
+            split.label(text=iface("{columns} × {rows}, its own").format(rows=own[0], columns=own[1]), translate=False)
+        else:
+            layouts.draw_settings(column, settings, drawn(settings, "detector"))
         modules = column.column(align=True)
         modules.prop(settings, "all_modules")
         if not settings.all_modules:
@@ -34,7 +43,7 @@ class MPHDRR_PT_projections(Sidebar, bpy.types.Panel):
         layouts.draw_settings(column, settings, drawn(settings, "compute"))
         row = layouts.invoking(layout.row())
         row.scale_y = 1.4
-        has_scanner = scanner.active_scanner(context.scene) is not None
+        has_scanner = collection is not None
         has_volume = bool(volumes.volume_objects(context.scene))
         row.enabled = has_scanner and has_volume
         row.operator("mphdrr.render_projections", icon="RENDER_STILL")

@@ -54,14 +54,24 @@ def recipe_values(get: Callable[[str], Any]) -> dict[str, Any]:
     return values
 
 
-def settings_recipe(get: Callable[[str], Any], is_given: Callable[[str], bool], more: Mapping[str, Any]) -> Recipe:
+def settings_recipe(
+    get: Callable[[str], Any],
+    is_given: Callable[[str], bool],
+    more: Mapping[str, Any],
+    collection: bpy.types.Collection | None = None,
+) -> Recipe:
     """The recipe of model, detector, noise and backend, with `more` values by their keys.
 
     `get` gives a property's value, `is_given` whether a script has set it: InputError then says if it has no effect.
+    Images of the scanner `collection` that have pixels of their own have these, unless a script has set others.
     """
     first, last = get("first"), get("last")
     modules = f"{first or ''}-{last or ''}" if first or last else None
     values = {**recipe_values(get), **more, "system.modules": modules}
+    if own := collection and scanner.own_pixels(collection):
+        pixels = {"height": own[0], "width": own[1]}
+        of_images = [name for name, setting in PROPERTIES.items() if setting.key.startswith("detector.")]
+        values |= {PROPERTIES[name].key: pixels.get(name) for name in of_images if not is_given(name)}
     given = [
         setting.key
         for name, setting in PROPERTIES.items()

@@ -87,8 +87,9 @@ def sources(
     context: bpy.types.Context, recipe: Recipe, model: Model, volume: str = "", mu: str = ""
 ) -> tuple[bpy.types.Object, bpy.types.Object | None]:
     """The objects of what is projected and of what attenuates it, if anything; arguments and errors as of `render_job`."""
-    photons = recipe["model.photons"]
-    item = _chosen_volume(context, volume, ("mu",) if photons else model.takes, model.name)
+    taken = scanner.kind_of(scanner.required_scanner(context.scene)).takes
+    taken = tuple(each for each in taken if each in (("mu",) if recipe["model.photons"] else model.takes))
+    item = _chosen_volume(context, volume, taken, model.name)
     mu_item = _given(context, "mu", mu) if recipe["model.kind"] == "emission" else None
     if mu_item is not None:
         require_quantity(volumes.quantity_of(mu_item), ("mu",), f"{mu_item.name!r} for attenuation")
@@ -98,6 +99,9 @@ def sources(
 def integrates_activity(context: bpy.types.Context) -> bool:
     """Whether the panel's settings ask for a radiograph of activity, whatever volume is meant: few want one."""
     settings, known = context.scene.mphdrr_projections, volumes.volume_objects(context.scene)
+    collection = scanner.active_scanner(context.scene)
+    if collection is not None and "activity" not in scanner.kind_of(collection).takes:
+        return False
     meant = [settings.volume] if settings.volume else [context.object] if context.object in known else known
     is_radiograph = settings.model == "TRANSMISSION" and not settings.photons
     return is_radiograph and bool(meant) and all(volumes.quantity_of(item) == "activity" for item in meant)

@@ -203,12 +203,12 @@ def _volume_state(item: bpy.types.Object) -> dict[str, Any]:
     return {"name": item.name, "content": volumes.content_of(item), "state": state, "pose": pose}
 
 
-def panel_recipe(scene: bpy.types.Scene) -> Recipe:
-    """What the panel asks for now."""
-    collection = scanner.active_scanner(scene)
+def panel_recipe(scene: bpy.types.Scene, collection: bpy.types.Collection | None = None) -> Recipe:
+    """What the panel asks for now, of a scanner, by default the active one."""
+    collection = collection or scanner.active_scanner(scene)
     angle = math.pi / 2 if collection is None else collection.mphdrr_scanner.opening_angle
     more = {OPENING_ANGLE: math.degrees(decimals.typed(angle))}
-    return settings_recipe(lambda name: getattr(scene.mphdrr_projections, name), lambda name: False, more)
+    return settings_recipe(lambda name: getattr(scene.mphdrr_projections, name), lambda name: False, more, collection)
 
 
 def _settings(recipe: Recipe) -> dict[str, Any]:
@@ -223,7 +223,7 @@ def _differences(scene: bpy.types.Scene, old: Mapping[str, Any], own: bpy.types.
     yield from _of_modules(collection, old)
     if old["volume"] is None:
         return
-    settings = _settings(panel_recipe(scene))
+    settings = _settings(panel_recipe(scene, collection))
     panel = scene.mphdrr_projections
     chosen = panel.volume or _found(scene, old["volume"])
     yield from _of_volume(scene, "", old["volume"], chosen)

@@ -19,6 +19,7 @@ from ...core.geometry.finding import Finding
 from ...core.geometry.scanner import SCANNERS, Scanner
 from ...core.workbook import ColumnMap, QuantityCells, SystemSource
 from ..blender import ids, objects
+from ..blender.decimals import typed
 from . import cameras, collimators, following, framing, pinholes
 from .following import modules
 from .module_values import aim_of, changes, kind_of, off_aim, read_modules, remember
@@ -75,18 +76,23 @@ def build_scanner(
     _write_source(properties, system)
     following.refresh(collection)
 
-    (n_v, n_u), (width, height) = shape, np.abs(system.fields()[0, 3:]).tolist()
+    first = next(iter(new.cameras.values()))
     render = scene.render
-    render.resolution_x, render.resolution_y, render.resolution_percentage = n_u, n_v, 100
-    longer = (width / n_u) / (height / n_v)  # how many times as wide as high a pixel is
-    render.pixel_aspect_x, render.pixel_aspect_y = max(1.0, longer), max(1.0, 1 / longer)
+    render.resolution_y, render.resolution_x, render.resolution_percentage = *shape, 100
+    fit_pixels(render, first)
     if old is None or not is_set_up(scene):
         set_up_scene(scene, collection)
-    first = next(iter(new.cameras.values()))
     if scene.camera is None:
         scene.camera = first
     scene.mphdrr_geometry.scanner = collection  # and its first module becomes active
     return collection
+
+
+def fit_pixels(render: bpy.types.RenderSettings, camera: bpy.types.Object) -> None:
+    """Make a picture's pixels such that it shows a module's whole field, unstretched."""
+    *_, width, height = map(abs, cameras.field_of(camera.data))
+    longer = (width / render.resolution_x) / (height / render.resolution_y)  # how many times as wide as high a pixel is
+    render.pixel_aspect_x, render.pixel_aspect_y = max(1.0, longer), max(1.0, 1 / longer)
 
 
 def remember_source(collection: bpy.types.Collection, system: Scanner) -> None:
@@ -225,6 +231,13 @@ def read_scanner(collection: bpy.types.Collection) -> Scanner:
     return read_modules(kind_of(collection), found, objects.world_matrices(found), known)
 
 
+def own_pixels(collection: bpy.types.Collection) -> tuple[int, int] | None:
+    """The pixels (n_v, n_u) of a scanner's images, of a kind that says them: those of its first module."""
+    properties = collection.mphdrr_scanner
+    says = "pixel_rows" in kind_of(collection).columns.fields
+    return (properties.pixel_rows, properties.pixel_columns) if says else None
+
+
 def read_pinholes(collection: bpy.types.Collection) -> PinholeSystem:
     """`read_scanner` of one that must have pinholes, or `InputError`."""
     system = read_scanner(collection)
@@ -249,7 +262,8 @@ def check_geometry(collection: bpy.types.Collection) -> tuple[list[str], list[bp
     else:
         others = [c for c in scanners(bpy.context.scene) if c.mphdrr_scanner.kind != system.kind]
         built = [pinholes.construction(c.mphdrr_scanner) for c in others if pinholes.has_pinholes(kind_of(c))]
-        findings = system.findings([read_scanner(c) for c in others], next(iter(built), None))
+        bore = typed(collection.mphdrr_scanner.bore) or None
+        findings = system.findings([read_scanner(c) for c in others], next(iter(built), None), bore)
     with following.writing():
         collection.mphdrr_scanner.findings = json.dumps([str(finding) for finding in findings])
         for camera in found:

@@ -1,12 +1,12 @@
-"""Volumes from files, and CTs that become attenuation: jobs that add a volume to the scene."""
+"""Volumes from files, the attenuation of CTs and the dose of activity: jobs that add a volume to the scene."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import bpy
 
-from ...core import Volume, centered, hu_to_mu, memory
+from ...core import Volume, absorbed_dose_rate, centered, hu_to_mu, memory
 from ...core.progress import Progress, part_of
 from ...core.volumes.volume_files import READ_FORMATS, read_volume
 from ..blender import jobs, storage
@@ -90,24 +90,44 @@ def name_of(path: Path) -> str:
 
 def converting(item: bpy.types.Object, energy: float) -> jobs.Job:
     """The job that adds the attenuation of a CT, for photons of an energy in keV; the CT stays."""
+    provenance = {"ct": item.name, "energy_keV": energy}
+    return _made_of(item, "mu", f" at {energy:g} keV", provenance, lambda ct, _: hu_to_mu(ct, energy))
+
+
+def dosing(item: bpy.types.Object, isotope: str) -> jobs.Job:
+    """The job that adds the absorbed dose rate of an isotope's activity in water, mGy/h; the activity stays."""
+    provenance = {"activity": item.name, "isotope": isotope}
+    return _made_of(
+        item, "dose rate", f" of {isotope}", provenance,
+        lambda activity, progress: absorbed_dose_rate(activity, isotope, progress=progress),
+    )  # fmt: skip
+
+
+def _made_of(
+    item: bpy.types.Object,
+    what: str,
+    how: str,
+    provenance: dict[str, Any],
+    make_one: Callable[[Volume, Progress | None], Volume],
+) -> jobs.Job:
+    """The job that adds `what` is made of a volume, state by state, in its place."""
     volumes.require_volume(item)
     readers = [volumes.reader(item, path) for path in storage.files_of_states(item.data)]
     count = len(readers)
     n_x, n_y, n_z = item.mphdrr_volume.shape
-    memory.require(8.0 * count * n_x * n_y * n_z, f"the attenuation of {count * n_x * n_y * n_z} voxels")
-    provenance: dict[str, Any] = {"ct": item.name, "energy_keV": energy}
+    memory.require(8.0 * count * n_x * n_y * n_z, f"the {what} of {count * n_x * n_y * n_z} voxels")
     frame_start, sequence_mode = item.data.frame_start, item.data.sequence_mode
 
     def make(progress: Progress) -> list[Volume]:
         states: list[Volume] = []
-        for read in readers:
-            progress(len(states), count)
-            states.append(hu_to_mu(read(), energy))
+        for number, read in enumerate(readers):
+            progress(number, count)
+            states.append(make_one(read(), part_of(progress, number, count)))
         return states
 
     def finish(made: bpy.types.Object, stored: stored_volumes.StoredVolume) -> str:
         made.data.frame_start, made.data.sequence_mode = frame_start, sequence_mode
-        return f"Added {made.name!r}: {volumes.values_text(stored)} at {energy:g} keV"
+        return f"Added {made.name!r}: {volumes.values_text(stored)}{how}"
 
     pose, home = volumes.pose_of_object(item), item.users_collection[0]
-    return volumes.adding("CT to attenuation", make, f"{item.name} mu", finish, pose, provenance, home)
+    return volumes.adding(f"Making {what}", make, f"{item.name} {what}", finish, pose, provenance, home)

@@ -53,6 +53,8 @@ class Scanner(ABC):
     """The one sheet of a workbook that holds it; "": those whose headings say so."""
     word: ClassVar[str] = "Module"
     """What its modules are called in the scene: "Module 07"."""
+    takes: ClassVar[tuple[str, ...]] = ("activity", "mu")
+    """What of a body its images can be of: quantities of volumes."""
     columns: ClassVar[ColumnTable]
     numbers: NDArray[np.int64]
     source: SystemSource | None

@@ -15,6 +15,7 @@ from ..errors import InputError
 from ..geometry.grid import Grid
 from ..memory import require
 from ..physics.isotopes import isotope as isotope_of
+from ..progress import Progress, tell
 from ..validation import freeze, instance, one_of, positive, real_array
 from ..volumes.volume import Volume, require_quantity
 from .coefficients import between, energy_absorption, photon_data, table_lines
@@ -52,7 +53,11 @@ def decays() -> dict[str, Decay]:
 
 
 def absorbed_dose_rate(
-    activity: Volume, isotope: str, density: ArrayLike | None = None, photons: str = "build-up"
+    activity: Volume,
+    isotope: str,
+    density: ArrayLike | None = None,
+    photons: str = "build-up",
+    progress: Progress | None = None,
 ) -> Volume:
     """Absorbed dose rate, mGy/h, of an activity.
 
@@ -73,6 +78,8 @@ def absorbed_dose_rate(
         "build-up": ``E mu_en / rho B(mu r) exp(-mu r) / (4 pi r^2)`` with the build-up factors of ANSI/ANS-6.4.3 for a
         point source in water. "straight": ``B = 1`` and mu_en for mu, so that photons lose energy along straight lines;
         for comparison with closed forms. "none": electrons alone.
+    progress
+        Called while the kernel is made, which takes most of the time.
 
     Returns
     -------
@@ -97,7 +104,7 @@ def absorbed_dose_rate(
     rate = decays_per_s * local / mass
     if photons != "none":
         rho = float((mass**2).sum() / mass.sum())
-        kernel = voxel_kernel(grid, lambda r: sum_of_lines(decay.lines, rho, r, photons == "build-up"))
+        kernel = voxel_kernel(grid, lambda r: sum_of_lines(decay.lines, rho, r, photons == "build-up"), progress)
         rate += convolved(decays_per_s * grid.voxel_volume, kernel)
     return Volume(rate * _MGY_PER_HOUR, grid, "dose_rate")
 
@@ -152,7 +159,7 @@ def build_up_factor(energy: float, depths: Floats) -> Floats:
     return 1 + (b - 1) * growth
 
 
-def voxel_kernel(grid: Grid, radial: Radial) -> Floats:
+def voxel_kernel(grid: Grid, radial: Radial, progress: Progress | None = None) -> Floats:
     """The mean in one voxel of what a point somewhere in another gives: for offsets around 0 along each axis, wrapped.
 
     `radial` is ``4 pi r^2`` times the point kernel at r, mm. The array is (2 n_x, 2 n_y, 2 n_z); index -1 is offset -1.
@@ -171,6 +178,7 @@ def voxel_kernel(grid: Grid, radial: Radial) -> Floats:
     kernel = np.empty([2 * n for n in grid.shape])
     with np.errstate(divide="ignore"):
         for i, x in enumerate(axes[0]):
+            tell(progress, i, len(axes[0]))
             kernel[i] = at(np.stack(np.broadcast_arrays(x, axes[1][:, None], axes[2]), axis=-1))
     inside, weights = _differences()
     reach = [range(-min(_NEAR, n - 1), min(_NEAR, n - 1) + 1) for n in grid.shape]

@@ -122,6 +122,7 @@ class XraySystem(Scanner):
     kind: ClassVar[str] = "x-ray"
     sheet: ClassVar[str] = "X-ray"
     word: ClassVar[str] = "X-ray"
+    takes: ClassVar[tuple[str, ...]] = ("mu",)
     columns: ClassVar[ColumnTable] = XRAY_COLUMNS
 
     sources: Floats

@@ -56,7 +56,8 @@ class Spots:
         dim, of_dim = ((~bright * counts).sum((2, 3)) for counts in (self.windows, expected))
         together = of_dim >= 1
         rest = together * (dim - of_dim) ** 2 / np.maximum(of_dim, 1)
-        return each + rest, bright.sum((2, 3)) + together - 4.0  # of middle, radius and counts
+        freedom = np.asarray(bright.sum((2, 3)) + together - 4, np.float64)  # less middle, radius and counts
+        return each + rest, freedom
 
 
 def find_spots(

@@ -155,7 +155,7 @@ class Zone:
         along = depth / self.counts / np.linalg.norm(depth)
         pieces = (np.indices(tuple(self.counts)).reshape(3, -1).T + 0.5) / self.counts - 0.5
         apart = (len(self.inverses) - 1) / (self.inverses[-1] - self.inverses[0])
-        padded = np.pad(kernel.astype(kind), ((0, 0), (self.steps[0],) * 2, (0, 0)))
+        padded: Array = np.pad(kernel.astype(kind), ((0, 0), (self.steps[0],) * 2, (0, 0)))
         zone = self.near, self.far, float(self.inverses[0]), float(apart)
         return DepthResponse(matrix, pieces, along, *self.limits, *zone, before.astype(kind), padded, self.steps, after)
 

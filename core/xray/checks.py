@@ -173,7 +173,7 @@ def _overlaps(
         others.sort(key=lambda p: -depths[p])
         yield PanelOverlap(number, tuple(names[p] for p in others), depths[others[0]])
     inside = (hulls.offsets - hulls.normals @ _sources(system)[m]).min(axis=1)
-    for p in np.flatnonzero(inside > TOUCH):
+    for p in np.flatnonzero(inside > TOUCH).tolist():
         yield SwallowedSource(number, names[p], float(inside[p]))
 
 

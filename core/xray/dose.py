@@ -106,7 +106,7 @@ def absorbed_dose_rate(
         rho = float((mass**2).sum() / mass.sum())
         kernel = voxel_kernel(grid, lambda r: sum_of_lines(decay.lines, rho, r, photons == "build-up"), progress)
         rate += convolved(decays_per_s * grid.voxel_volume, kernel)
-    return Volume(rate * _MGY_PER_HOUR, grid, "dose_rate")
+    return Volume(np.asarray(rate * _MGY_PER_HOUR, np.float32), grid, "dose_rate")
 
 
 def absorbed_dose(

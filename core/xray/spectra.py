@@ -129,11 +129,12 @@ def tube_spectrum(kvp: float, filters: Mapping[str, float] = _FILTERS, angle: fl
     if angle >= 90:
         raise InputError(f"angle: expected less than 90 degrees, got {angle:g}")
     if angle == _ANGLE:
-        energies = _LOWEST + _STEP * (np.arange(photons.shape[1]) + 0.5)
+        energies = np.asarray(_LOWEST + _STEP * (np.arange(photons.shape[1]) + 0.5), np.float64)
         row = min(int((kvp - voltages[0]) / 2), len(voltages) - 2)
         share = (kvp - voltages[row]) / 2
         there = energies < kvp
-        bare = Spectrum(energies[there], ((1 - share) * photons[row] + share * photons[row + 1])[there])
+        between: Floats = (1 - share) * photons[row] + share * photons[row + 1]
+        bare = Spectrum(energies[there], between[there])
     else:
         bare = _by_spekpy(kvp, angle)
     return bare.filtered(filters)

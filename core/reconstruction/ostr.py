@@ -31,8 +31,9 @@ def ostr(
     """The attenuation for which the photons that pass are most likely, less the penalty of a prior (OSTR).
 
     Counts are Poisson-distributed, so a ray counts as much as photons pass on it, which `sirt` and `tv` do not know. Each
-    update is a step for a subset of the views, ``x <- x + (n A.T(photons (exp(-A x) - exp(-images))) - prior') / c``, with n
-    the number of subsets and c a curvature that no step exceeds near the data.
+    update is a step for a subset of the views, ``x <- x + (A.T(passed - counts) - prior' / n) / (A.T(A(1) c) + 2 prior'' / n)``,
+    with the photons that would pass x, the number n of subsets, and the larger of both counts for the curvature c: that of a
+    ray is nowhere larger on the way from x to what was measured.
 
     Parameters
     ----------
@@ -62,7 +63,7 @@ def ostr(
     References
     ----------
     H. Erdogan, J. A. Fessler, "Ordered subsets algorithms for transmission tomography", Physics in Medicine and Biology 44
-    (1999) 2835-2851: separable paraboloidal surrogates with precomputed curvatures.
+    (1999) 2835-2851: separable paraboloidal surrogates; their precomputed curvature is `c` once the data are met.
     """
     loop = LeastSquaresLoop("OSTR", A, images, iterations, nonnegative, *options, **named)
     if A.model.takes == ("activity",):
@@ -74,20 +75,21 @@ def ostr(
     parts = A.subsets(max(1, len(A.views) // 5) if subsets is None else subsets)
     n = len(parts)
     counts = blank * np.exp(-loop.images)
-    curvature = loop.adjoint(loop.forward(loop.weights, loop.preparing()) * counts, loop.preparing())
-    per_voxel = inverse(curvature)
-    penalty = penalty_of(prior, A.grid, per_voxel > 0)
+    lengths = [np.asarray(part(loop.weights, loop.preparing())) for part in parts]
+    is_seen = loop.adjoint(np.ones(A.shape_out, np.float32), loop.preparing()) > 0
+    penalty = penalty_of(prior, A.grid, is_seen)
 
     def step(number: int, x: Array, progress: Progress | None) -> tuple[Array, float]:
         for k, s in enumerate(access_order(n)):
-            which = parts[s].which
-            passed = blank[which] * np.exp(-parts[s](x, waiting(progress, k, n + 1)))
-            upwards = n * loop.weights * parts[s].T(passed - counts[which], waiting(progress, k, n + 1))
-            scale = per_voxel
+            part, asked = parts[s], waiting(progress, k, n + 1)
+            measured = counts[part.which]
+            passed = blank[part.which] * np.exp(-np.asarray(part(x, asked)))
+            upwards = np.asarray(part.T(passed - measured, asked)) * loop.weights
+            scale = np.asarray(part.T(lengths[s] * np.maximum(passed, measured), asked)) * loop.weights
             if penalty is not None:
-                upwards = upwards - penalty.gradient(x)
-                scale = np.divide(1, curvature + 2 * penalty.curvature(x), out=np.zeros_like(x), where=per_voxel > 0)
-            x = loop.bounded(x + scale * upwards)
+                upwards -= penalty.gradient(x) / n
+                scale += 2 / n * penalty.curvature(x)
+            x = loop.bounded(x + upwards * inverse(scale))
         seen = loop.forward(x, waiting(progress, n, n + 1)).astype(np.float64)
         tell(progress, n + 1, n + 1)
         likely = -float(np.sum(blank * np.exp(-seen) + counts * seen))

@@ -18,10 +18,17 @@ from ..reconstruction.least_squares import sirt
 from ..validation import freeze, instance, real_array, whole_number
 from ..volumes.volume import LINE_INTEGRALS, Volume, require_quantity
 
-_LEVELS = (4, 2, 1)
-"""Pixels are joined to squares of these sides: coarse ones find motion that is larger than details."""
-_SETTLED, _FINE = 0.1, 0.005
+_LEVELS = ((4, 4), (2, 2), (2, 1))
+"""Squares of so many pixels are compared, and each of their pixels that many pixels wide projected: coarse ones first, to find
+motion that is larger than details; the last with the derivatives of those before, which are many projections."""
+_FAR = 1.0
+"""Steps of half a voxel from where derivatives were taken, beyond which they are taken anew."""
+_SETTLED, _FINE = 0.1, 0.02
 """A step is small where it is less than these shares of the standard deviations, or of half a voxel."""
+_EXACT = 1e-12
+"""Variance of line integrals, below which they are as exact as they can be computed."""
+_BLIND = 1e12
+"""Condition number of what images say of six numbers, from which on they do not say all."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,64 +68,69 @@ class Motion:
 class MotionFinder:
     """Finds the motions of a body since a reference, one set of images after the other: for motion as it happens.
 
-    What takes long is done when it is made: 12 projections, for the images' derivatives by the six numbers. A motion then
-    takes about four. Parameters are those of `find_motion`.
+    Images are linear in a motion of less than half a voxel: the derivatives of the one before are kept as long as they are
+    right. Then a motion takes two or three projections, else about ten. Parameters are those of `find_motion`.
     """
 
     def __init__(
-        self,
-        reference: Volume,
-        views: Views,
-        photons: ArrayLike | None = None,
-        around: Motion | None = None,
-        backend: str = "auto",
+        self, reference: Volume, views: Views, photons: ArrayLike | None = None, backend: str = "auto"
     ) -> None:
         instance(reference, Volume, "reference")
         require_quantity(reference.quantity, LINE_INTEGRALS, "find_motion")
         instance(views, Views, "views")
         self.reference, self.views, self._backend = reference, views, backend
         self._center = reference.grid.center
-        self._start = np.zeros(6) if around is None else np.concatenate([around.shift, around.rotation])
         self._photons = None if photons is None else real_array(photons, "photons", None)
-        step = reference.grid.spacing.min() / 2
+        step = reference.grid.spacing.min()
         radius = np.linalg.norm(reference.grid.corners()[0] - self._center) / 2
         self._steps = np.array([step] * 3 + [step / radius] * 3)
-        ends = [[self._project(self._start + s * e, 1) for s in (1, -1)] for e in np.diag(self._steps)]
-        fine = np.stack([(a - b) / (2 * h) for (a, b), h in zip(ends, self._steps, strict=True)])
-        self._slopes = {k: _joined(fine, k) for k in _LEVELS if all(n % k == 0 for n in views.shape)}
+        self._known: dict[int, tuple[Floats, Floats]] = {}  # by level: where derivatives were taken, and they
 
     def __call__(self, images: ArrayLike, start: Motion | None = None, iterations: int = 10) -> Motion:
         """The motion in `images`, see `find_motion`; `start` is a first guess, such as the motion before."""
         seen = real_array(images, "images", (len(self.views), *self.views.shape))
-        weights = self._weights(seen)
-        motion = self._start if start is None else np.concatenate([start.shift, start.rotation])
-        for level, slopes in self._slopes.items():
-            own, of_each = _joined(seen, level), _joined(weights, level)
-            a = slopes.reshape(6, -1)
-            information = (a * of_each.ravel()) @ a.T
-            if np.linalg.cond(information * np.outer(self._steps, self._steps)) > 1e12:
-                raise InputError("find_motion: these images do not show all of a motion: expected more or other views")
+        noise = self._noise(seen)
+        motion = np.zeros(6) if start is None else np.concatenate([start.shift, start.rotation])
+        levels = [pair for pair in _LEVELS if all(n % pair[0] == 0 for n in self.views.shape)] or [(1, 1)]
+        for level, width in levels if start is None else levels[-1:]:
+            own, variances = _joined(seen, level), _joined(noise, level).ravel() / level**2
             for _ in range(whole_number(iterations, "iterations")):
-                left = (own - self._project(motion, level)).ravel()
-                step = np.linalg.solve(information, a @ (of_each.ravel() * left))
-                motion = motion + step
-                variance = float(of_each.ravel() @ left**2) / max(1, left.size - 6)
-                deviations = np.sqrt(variance * np.diag(np.linalg.inv(information)))
-                settled = bool(np.all(np.abs(step) <= np.maximum(_SETTLED * deviations, _FINE * self._steps) * level))
+                slopes = self._slopes(motion, level)
+                left = (own - _joined(self._project(motion, width), level // width)).ravel()
+                unexplained = max(0.0, float(np.mean(left**2 - variances)))
+                of_each = 1 / np.maximum(variances + unexplained, _EXACT)
+                information = (slopes * of_each) @ slopes.T
+                if not np.linalg.cond(information) < _BLIND:
+                    raise InputError("find_motion: these images do not show all of a motion: expected more or other views")
+                inverse = np.linalg.inv(information)
+                step = inverse @ (slopes @ (of_each * left))
+                motion = motion + self._steps * step
+                variance = float(of_each @ left**2) / max(1, left.size - 6)
+                enough = np.maximum(_SETTLED * np.sqrt(variance * np.diag(inverse)), _FINE * level)
+                settled = bool(np.all(np.abs(step) <= enough))
                 if settled:
                     break
         if not settled:
             warn("find_motion: it has not settled: the motion may be too large, or the body changed", 2)
-        covariance = variance * np.linalg.inv(information)
+        covariance = variance * inverse * np.outer(self._steps, self._steps)
         return Motion(freeze(motion[:3]), freeze(motion[3:]), self._center, freeze(covariance), settled)
 
-    def _weights(self, images: Floats) -> Floats:
-        """Inverse variances of the images, up to a factor."""
+    def _slopes(self, motion: Floats, level: int) -> Floats:
+        """Derivatives (6, pixels) of the images by the six numbers in units of their steps, near a motion."""
+        place, slopes = self._known.get(level, (np.full(6, np.inf), np.zeros((6, 0))))
+        if np.abs((motion - place) / self._steps).max() > _FAR:
+            ends = [[self._project(motion + sign * by, level) for sign in (1, -1)] for by in np.diag(self._steps)]
+            slopes = np.stack([(after - before).ravel() / 2 for after, before in ends])
+            self._known[level] = motion, slopes
+        return slopes
+
+    def _noise(self, images: Floats) -> Floats:
+        """Variances of the images by the photons that pass, 0 where their number is not known."""
         if self._photons is None:
-            return np.ones(images.shape)
+            return np.zeros(images.shape)
         if self._photons.shape not in ((), images.shape) or self._photons.min() <= 0:
             raise InputError(f"photons: expected more than 0, one number or images of {images.shape}")
-        return self._photons * np.exp(-images)
+        return np.exp(images) / self._photons
 
     def _project(self, motion: Floats, level: int) -> Floats:
         """Images (M, n_v, n_u) of the moved reference, of pixels `level` times as large."""
@@ -137,9 +149,8 @@ def find_motion(
 ) -> Motion:
     """How a body has moved since a reference volume was made of it, from its images now.
 
-    By Gauss-Newton on the difference of the images and those of the moved reference, from coarse pixels to fine ones. The
-    derivatives are differences of projections of the reference where it was; for many sets of images make them once, with
-    a `MotionFinder`.
+    By Gauss-Newton on the difference of the images and those of the moved reference, from coarse pixels to fine ones, with
+    derivatives that are differences of projections. For many sets of images, such as those of a film, make a `MotionFinder`.
 
     Parameters
     ----------
@@ -153,7 +164,7 @@ def find_motion(
         Photons of a pixel where nothing is between, one number or images: pixels then count by the photons that pass.
         Without it all count alike.
     start
-        A first guess.
+        A first guess, within a voxel or so; without it the reference is taken to be where it was, within a few.
     iterations
         At most so many on each of the levels of pixels.
 
@@ -171,7 +182,7 @@ def find_motion(
     InputWarning
         The steps have not become small.
     """
-    return MotionFinder(reference, views, photons, start, backend)(images, start, iterations)
+    return MotionFinder(reference, views, photons, backend)(images, start, iterations)
 
 
 def find_change(

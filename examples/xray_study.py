@@ -39,7 +39,7 @@ def main() -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--bodies", type=int, default=4, help="bodies of the table")
-    parser.add_argument("--picture", help="write slices of the first body (.png, .webp)")
+    parser.add_argument("--picture", help="write slices of the first body (.webp)")
     arguments = parser.parse_args()
     warnings.simplefilter("ignore", mph.InputWarning)  # FDK says that the arc is too short, which is what is studied
     arrangements = {"arc": mph.xray_arc(shape=(64, 64)), "ring": mph.xray_ring(shape=(64, 64))}

@@ -1,6 +1,6 @@
 """CT by few stationary sources: motion and change against a reference, likelihood of photons, mu for SPECT, kerma."""
 
-import warnings
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,10 +9,10 @@ import mphdrr.core as mph
 from mphdrr.core.geometry.frames import affine_matrix, rotations
 
 PHOTONS = 1e5
-GRID = mph.Grid.centered(40, 3.5)
+GRID = mph.Grid.centered(48, 3.0)
 BODY = mph.ShapePhantom(
     [
-        mph.Ellipsoid(radii=(62, 54, 58), mu=0.020),
+        mph.Ellipsoid(radii=(66, 42, 56), mu=0.020),
         mph.Ellipsoid(radii=(20, 14, 30), position=(-22, 8, 4), mu=0.006),
         mph.Ellipsoid(radii=(16, 22, 12), position=(24, -12, -14), mu=0.035),
         mph.Ellipsoid(radii=(10, 8, 16), position=(6, 26, 18), euler=(0.4, 0.7, 0.1), mu=0.028),
@@ -23,7 +23,7 @@ VIEWS = mph.xray_arc(shape=(64, 64)).views()
 
 def line_integrals(phantom, views, pose=None, photons=PHOTONS, seed=0):
     """Of voxels half as large, with noise."""
-    fine = phantom.voxelize(mph.Grid.centered(80, 1.75), pose, quantity="mu")
+    fine = phantom.voxelize(mph.Grid.centered(96, 1.5), pose, quantity="mu")
     passed = photons * np.exp(-np.asarray(mph.Projector(fine.grid, views)(fine)))
     return np.log(photons / np.maximum(mph.sample_counts(passed, seed), 0.5))
 
@@ -57,19 +57,19 @@ def test_a_motion_of_5_mm_and_3_degrees_is_found(finder, seed):
 def test_the_covariance_is_that_of_the_noise(finder, reference):
     exact = np.asarray(mph.Projector(GRID, VIEWS)(reference), float)
     found = []
-    for seed in range(40):
+    for seed in range(16):
         counts = mph.sample_counts(1e3 * np.exp(-exact), seed)
         found.append(finder(np.log(1e3 / np.maximum(counts, 0.5))))
     moves = np.array([[*m.shift, *m.rotation] for m in found])
     said = np.mean([np.diag(m.covariance) for m in found], axis=0)
     ratio = moves.var(axis=0) / said
-    assert ratio.mean() == pytest.approx(1, abs=0.35)  # 40 draws of six numbers: standard deviation 0.09 and more
+    assert ratio.mean() == pytest.approx(1, abs=0.4)  # of 16 draws, the mean of six: standard deviation about 0.15
 
 
 def test_of_exact_images_of_itself_there_is_no_motion(reference):
     images = mph.Projector(GRID, VIEWS)(reference)
     found = mph.find_motion(reference, images, VIEWS)
-    np.testing.assert_allclose([*found.shift, *found.rotation], 0, atol=1e-4)
+    np.testing.assert_allclose([*found.shift, *found.rotation], 0, atol=2e-3)  # coarse pixels settle first
 
 
 def test_what_has_changed_is_found_beside_the_motion(reference):
@@ -139,10 +139,26 @@ def test_kerma_at_the_isocentre():
 
 
 def test_spect_with_the_mu_of_the_ct():
+    grid = mph.Grid.centered((44, 32, 54), 8.0, (35, -30, -30))
+    fine = mph.Grid.centered((88, 64, 108), 4.0, (35, -30, -30))
     torso = mph.CardiacTorso()
-    coarse, fine = mph.Grid.centered((36, 26, 46), 10.0, (35, -30, -30)), None
-    fine = mph.Grid.centered((72, 52, 92), 5.0, (35, -30, -30))
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        activity, mu = torso.voxelize(fine), torso.voxelize(fine, quantity="mu")
-    assert mu.array.max() > 0
+    activity, mu = torso.voxelize(fine), torso.voxelize(fine, quantity="mu")
+    ct = mph.hu_to_mu(mph.mu_to_hu(mu, 140.5), 70.0)
+    xray = mph.xray_ring(source_radius=600, panel_size=(800, 600), shape=(36, 48)).views()  # they see all of the torso
+    passed = 1e6 * np.exp(-np.asarray(mph.Projector(fine, xray)(ct)))
+    images = np.log(1e6 / np.maximum(mph.sample_counts(passed, 1), 0.5))
+    body = torso.voxelize(grid, quantity="mu").array > 0.002
+    found = mph.tv(mph.Projector(grid, xray), images, 2.0, 30, start=0.019 * body, mask=body).volume
+    known = {"true": mu, "found": mph.hu_to_mu(mph.mu_to_hu(found, 70.0), 140.5), "none": None}
+
+    pinholes = mph.read_system(Path(__file__).parents[2] / "examples" / "dc-spect-80.xlsx")[::4]
+    views = pinholes.views((16, 16), magnification=1.0)
+
+    def projector(grid, mu):
+        return mph.Projector(grid, views, mph.Emission(pinholes, mu=mu, hole="point", pixel_points=1, tolerance=1e9))
+
+    counts = np.asarray(projector(fine, mu)(activity))
+    heart = mph.resample(activity, grid, "mean").array > 30
+    means = {name: mph.osem(projector(grid, at), counts, 4, 4).volume.array[heart].mean() for name, at in known.items()}
+    assert means["found"] == pytest.approx(means["true"], rel=0.03)
+    assert means["none"] < 0.6 * means["true"]

@@ -88,7 +88,9 @@ def main(folder: Path | None) -> None:
         print(f"motion, {words}: {time.monotonic() - start:.2f} s")
     apart = motion.pose @ [*motion.center, 1] - pose @ [*motion.center, 1]
     turned = np.degrees(np.linalg.norm(motion.rotation - rotation))
-    print(f"motion of {np.linalg.norm(shift):.1f} mm: {np.linalg.norm(apart[:3]):.2f} mm and {turned:.2f} degrees beside")
+    print(
+        f"motion of {np.linalg.norm(shift):.1f} mm: {np.linalg.norm(apart[:3]):.2f} mm and {turned:.2f} degrees beside"
+    )
     print(f"{time.monotonic() - begun:.0f} s in all")
     if folder is not None:
         folder.mkdir(parents=True, exist_ok=True)

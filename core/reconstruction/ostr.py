@@ -31,9 +31,9 @@ def ostr(
     """The attenuation for which the photons that pass are most likely, less the penalty of a prior (OSTR).
 
     Counts are Poisson-distributed, so a ray counts as much as photons pass on it, which `sirt` and `tv` do not know. Each
-    update is a step for a subset of the views, ``x <- x + (A.T(passed - counts) - prior' / n) / (A.T(A(1) c) + 2 prior'' / n)``,
-    with the photons that would pass x, the number n of subsets, and the larger of both counts for the curvature c: that of a
-    ray is nowhere larger on the way from x to what was measured.
+    update is a step for a subset of the views, ``x <- x + (A.T(passed - counts) - p' / n) / (A.T(A(1) c) + 2 p'' / n)``, with
+    the photons that would pass x, the prior's derivatives, the number n of subsets, and the larger of both counts for the
+    curvature c: that of a ray is nowhere larger on the way from x to what was measured.
 
     Parameters
     ----------
@@ -84,11 +84,11 @@ def ostr(
             part, asked = parts[s], waiting(progress, k, n + 1)
             measured = counts[part.which]
             passed = blank[part.which] * np.exp(-np.asarray(part(x, asked)))
-            upwards = np.asarray(part.T(passed - measured, asked)) * loop.weights
-            scale = np.asarray(part.T(lengths[s] * np.maximum(passed, measured), asked)) * loop.weights
+            upwards: Array = np.asarray(part.T(passed - measured, asked)) * loop.weights
+            scale: Array = np.asarray(part.T(lengths[s] * np.maximum(passed, measured), asked)) * loop.weights
             if penalty is not None:
-                upwards -= penalty.gradient(x) / n
-                scale += 2 / n * penalty.curvature(x)
+                upwards = upwards - penalty.gradient(x) / n
+                scale = scale + 2 * penalty.curvature(x) / n
             x = loop.bounded(x + upwards * inverse(scale))
         seen = loop.forward(x, waiting(progress, n, n + 1)).astype(np.float64)
         tell(progress, n + 1, n + 1)

@@ -1,4 +1,4 @@
-"""Absorbed dose of activity in the body: electrons where they are set free, photons by a point kernel of water; kerma of CT."""
+"""Absorbed dose of activity in the body: electrons where they are set free, photons by a point kernel of water."""
 
 from __future__ import annotations
 

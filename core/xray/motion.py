@@ -19,12 +19,12 @@ from ..validation import freeze, instance, real_array, whole_number
 from ..volumes.volume import LINE_INTEGRALS, Volume, require_quantity
 
 _LEVELS = ((4, 4), (2, 2), (2, 1))
-"""Squares of so many pixels are compared, and each of their pixels that many pixels wide projected: coarse ones first, to find
-motion that is larger than details; the last with the derivatives of those before, which are many projections."""
+"""Pixels are joined to squares of the first number to be compared, of the second to be projected: coarse ones first, to find
+motion that is larger than details. The last take their derivatives from those before, as they are many projections."""
 _FAR = 1.0
-"""Steps of half a voxel from where derivatives were taken, beyond which they are taken anew."""
+"""Voxels from where derivatives were taken, beyond which they are taken anew."""
 _SETTLED, _FINE = 0.1, 0.02
-"""A step is small where it is less than these shares of the standard deviations, or of half a voxel."""
+"""A step is small where it is less than these shares of the standard deviations, or of a voxel."""
 _EXACT = 1e-12
 """Variance of line integrals, below which they are as exact as they can be computed."""
 _BLIND = 1e12
@@ -68,7 +68,7 @@ class Motion:
 class MotionFinder:
     """Finds the motions of a body since a reference, one set of images after the other: for motion as it happens.
 
-    Images are linear in a motion of less than half a voxel: the derivatives of the one before are kept as long as they are
+    Images are nearly linear in a motion of less than a voxel: the derivatives of the one before are kept as long as they are
     right. Then a motion takes two or three projections, else about ten. Parameters are those of `find_motion`.
     """
 
@@ -101,7 +101,9 @@ class MotionFinder:
                 of_each = 1 / np.maximum(variances + unexplained, _EXACT)
                 information = (slopes * of_each) @ slopes.T
                 if not np.linalg.cond(information) < _BLIND:
-                    raise InputError("find_motion: these images do not show all of a motion: expected more or other views")
+                    raise InputError(
+                        "find_motion: these images do not show all of a motion: expected more or other views"
+                    )
                 inverse = np.linalg.inv(information)
                 step = inverse @ (slopes @ (of_each * left))
                 motion = motion + self._steps * step
@@ -135,7 +137,9 @@ class MotionFinder:
     def _project(self, motion: Floats, level: int) -> Floats:
         """Images (M, n_v, n_u) of the moved reference, of pixels `level` times as large."""
         grid = _moved(self.reference.grid, _pose(motion, self._center))
-        return np.asarray(Projector(grid, _coarser(self.views, level), backend=self._backend)(self.reference.array), float)
+        return np.asarray(
+            Projector(grid, _coarser(self.views, level), backend=self._backend)(self.reference.array), float
+        )
 
 
 def find_motion(
@@ -186,7 +190,12 @@ def find_motion(
 
 
 def find_change(
-    reference: Volume, images: ArrayLike, views: Views, motion: Motion | None = None, iterations: int = 20, **options: Any
+    reference: Volume,
+    images: ArrayLike,
+    views: Views,
+    motion: Motion | None = None,
+    iterations: int = 20,
+    **options: Any,
 ) -> Volume:
     """What has changed since a reference, besides its motion: `sirt` of what the moved reference does not explain.
 
@@ -213,7 +222,9 @@ def _moved(grid: Grid, pose: Floats) -> Grid:
 def _coarser(views: Views, level: int) -> Views:
     n_v, n_u = views.shape
     size = n_v // level, n_u // level
-    return Views(views.sources, views.detector_centers, level * views.u_steps, level * views.v_steps, size, views.parallel)
+    return Views(
+        views.sources, views.detector_centers, level * views.u_steps, level * views.v_steps, size, views.parallel
+    )
 
 
 def _joined(images: Floats, level: int) -> Floats:

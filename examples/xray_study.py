@@ -3,8 +3,8 @@
     python examples/xray_study.py [--bodies 4] [--picture study.png]
 
 It makes the tables of docs/xray.md, in about five minutes on two free cores. Images are made from voxels half as large as
-those that are reconstructed, with Poisson noise. Strengths and numbers of iterations are chosen on two bodies that are not in the
-table. All errors are root mean squares within a ball of 60 mm, relative to the rms of the truth.
+those that are reconstructed, with Poisson noise. Strengths and numbers of iterations are chosen on two bodies that are not
+in the table. All errors are root mean squares within a ball of 60 mm, relative to the rms of the truth.
 """
 
 from __future__ import annotations

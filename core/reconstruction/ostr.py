@@ -31,9 +31,9 @@ def ostr(
     """The attenuation for which the photons that pass are most likely, less the penalty of a prior (OSTR).
 
     Counts are Poisson-distributed, so a ray counts as much as photons pass on it, which `sirt` and `tv` do not know. Each
-    update is a step for a subset of the views, ``x <- x + (A.T(passed - counts) - p' / n) / (A.T(A(1) c) + 2 p'' / n)``, with
-    the photons that would pass x, the prior's derivatives, the number n of subsets, and the larger of both counts for the
-    curvature c: that of a ray is nowhere larger on the way from x to what was measured.
+    update is a step for a subset of the views, ``x <- x + (A.T(passed - counts) - p' / n) / (A.T(A(1) c) + 2 p'' / n)``,
+    with the photons that would pass x, the prior's derivatives, the number n of subsets, and the larger of both counts for
+    the curvature c: that of a ray is nowhere larger on the way from x to what was measured.
 
     Parameters
     ----------

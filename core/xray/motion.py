@@ -44,7 +44,8 @@ class Motion:
     center : array (3,)
         The reference's middle before, world mm.
     covariance : array (6, 6)
-        Of shift and rotation, mm and rad: that of noise, made larger where what is left over is more than noise.
+        Of shift and rotation, mm and rad: that of noise, made larger where what is left over is more than noise. The
+        standard deviations of the rotation are up to a third too small.
     settled : bool
         Whether the last step was small.
     """

@@ -283,7 +283,7 @@ def test_a_file_is_a_method_without_iterations_or_an_objective(toy, radiograph, 
     toy.write_text("much", encoding="utf-8")
     assert refused(capsys, *small, "--method", toy, "-o", tmp_path / "no.npz").endswith("model.toy: expected a number")
     said = refused(capsys, *small, "--method", "model.onnx", "-o", tmp_path / "no.npz")
-    assert "expected one of osem, mlem, bsrem, sirt, cgls, tv or a file (.pt, .toy), got 'model.onnx'" in said
+    assert "expected one of osem, mlem, bsrem, sirt, cgls, tv, ostr or a file (.pt, .toy), got 'model.onnx'" in said
 
 
 def test_a_state_of_other_settings_is_refused_in_a_line(file, tmp_path, capsys):

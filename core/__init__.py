@@ -47,7 +47,7 @@ from .phantoms.random import random_pose
 from .phantoms.shapes import Box, Capsule, Cone, Cylinder, Ellipsoid, Shape, Sphere
 from .phantoms.shepp_logan import SheppLogan
 from .phantoms.torso import CardiacTorso
-from .physics.ct_numbers import diffdrr_density, hu_to_mu
+from .physics.ct_numbers import diffdrr_density, hu_to_mu, mu_to_hu
 from .physics.isotopes import ISOTOPES, Isotope, isotope
 from .physics.maps import completeness_map, modules_map, resolution_map, sensitivity_map
 from .physics.materials import MATERIALS, Material, attenuation
@@ -74,6 +74,7 @@ from .reconstruction.fdk import fdk
 from .reconstruction.files import read_reconstruction, write_reconstruction
 from .reconstruction.least_squares import cgls, sirt
 from .reconstruction.loop import IterativeOptions
+from .reconstruction.ostr import ostr
 from .reconstruction.priors import Prior, Quadratic, RelativeDifference, TotalVariation
 from .reconstruction.result import Reconstruction
 from .reconstruction.scores.derenzo import DerenzoScore, DerenzoSector, RodProfile, derenzo_score
@@ -109,7 +110,8 @@ from .xray.arrangements import xray_arc, xray_ring
 from .xray.checks import find_in_room
 from .xray.decomposition import correct_beam_hardening, decompose, decompose_images, virtual_monoenergetic
 from .xray.detectors import EnergyIntegrator, PhotonCounter
-from .xray.dose import absorbed_dose, absorbed_dose_rate
+from .xray.dose import absorbed_dose, absorbed_dose_rate, isocentre_kerma
+from .xray.motion import Motion, MotionFinder, find_change, find_motion
 from .xray.spectra import Spectrum, tube_spectrum
 from .xray.spectral import SpectralTransmission, water_and_bone
 from .xray.system import XraySystem

@@ -40,7 +40,20 @@ class _Parser(argparse.ArgumentParser):
 
 def build_parser(more_commands: Sequence[AddParser] = ()) -> argparse.ArgumentParser:
     """The parser of ``mphdrr``, with this package's commands and `more_commands`."""
-    from . import backproject, design, events, export, geometry, learn, phantom, project, reconstruct, score, volume
+    from . import (
+        backproject,
+        design,
+        events,
+        export,
+        geometry,
+        learn,
+        phantom,
+        project,
+        reconstruct,
+        score,
+        volume,
+        xray,
+    )
 
     parser = _Parser(
         prog="mphdrr",
@@ -49,7 +62,8 @@ def build_parser(more_commands: Sequence[AddParser] = ()) -> argparse.ArgumentPa
     )
     parser.add_argument("--version", action="version", version=f"mphDRR {VERSION}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True, parser_class=_Parser)
-    for command in (geometry, phantom, volume, project, reconstruct, backproject, score, events, learn, design, export):
+    scans = (project, reconstruct, backproject, score, xray)
+    for command in (geometry, phantom, volume, *scans, events, learn, design, export):
         command.add_parser(commands)
     for add_parser in more_commands:
         add_parser(commands)

@@ -41,6 +41,8 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     add("--spacing", type=float, nargs="+", metavar="MM", help="resample to this voxel size, one or three")
     method = "of resampling; default: mean for coarser voxels, else linear; labels need nearest"
     add("--method", choices=("linear", "nearest", "mean"), help=method)
+    text = "attenuation at KEV (or an isotope's line), such as that of a reconstructed CT, to CT numbers"
+    add("--from-mu", metavar="KEV", help=text)
     add("--to-mu", action="store_true", help="CT numbers to attenuation, 1/mm, at --energy")
     energy = "of the photons, or an isotope's name: its strongest line (default: 140.5)"
     convert.add_argument("--energy", metavar="KEV", help=energy)
@@ -116,6 +118,7 @@ def _convert(arguments: argparse.Namespace) -> None:
     """Convert a volume to another format, and crop, move, resample it or convert it to attenuation.
 
     mphdrr volume convert dicom_folder --center --spacing 2 --to-mu --energy Tc-99m -o mu.nii.gz
+    mphdrr volume convert mu70.nii.gz --from-mu 70 --to-mu --energy Tc-99m -o mu.nii.gz
     """
     path = output_path(arguments.output, VOLUME_FORMATS)
     if arguments.energy is not None and not arguments.to_mu:
@@ -134,6 +137,8 @@ def _convert(arguments: argparse.Namespace) -> None:
         volume = mph.centered(volume)
     if arguments.spacing:
         volume = _respaced(volume, arguments.spacing, arguments.method)
+    if arguments.from_mu is not None:
+        volume = mph.mu_to_hu(volume, photon_energy(arguments.from_mu))
     if arguments.to_mu:
         volume = mph.hu_to_mu(volume, energy)
     mph.write_volume(volume, path)

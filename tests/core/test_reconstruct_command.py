@@ -199,7 +199,7 @@ def test_each_method_has_its_own_defaults_wherever_it_is_chosen(name, run, radio
 def test_every_argument_of_a_method_or_prior_is_a_setting():
     """One word, one meaning: methods that take the same argument have it from the same row."""
     assert {name: method.own["iterations"] for name, method in METHODS.items()} == {
-        "osem": 10, "mlem": 50, "bsrem": 30, "sirt": 100, "cgls": 10, "tv": 200
+        "osem": 10, "mlem": 50, "bsrem": 30, "sirt": 100, "cgls": 10, "tv": 200, "ostr": 30
     }  # fmt: skip
     by_hand = {"neighbors", "similar"}  # Python alone has them
     for choice in (*METHODS.values(), *PRIORS.values()):
@@ -283,7 +283,7 @@ def test_a_file_is_a_method_without_iterations_or_an_objective(toy, radiograph, 
     toy.write_text("much", encoding="utf-8")
     assert refused(capsys, *small, "--method", toy, "-o", tmp_path / "no.npz").endswith("model.toy: expected a number")
     said = refused(capsys, *small, "--method", "model.onnx", "-o", tmp_path / "no.npz")
-    assert "expected one of osem, mlem, bsrem, sirt, cgls, tv or a file (.pt, .toy), got 'model.onnx'" in said
+    assert "expected one of osem, mlem, bsrem, sirt, cgls, tv, ostr or a file (.pt, .toy), got 'model.onnx'" in said
 
 
 def test_a_state_of_other_settings_is_refused_in_a_line(file, tmp_path, capsys):

@@ -80,7 +80,7 @@ def mu_to_hu(volume: Volume, energy: float = CT_ENERGY) -> Volume:
     instance(volume, Volume, "mu_to_hu")
     require_quantity(volume.quantity, ("mu",), "mu_to_hu")
     water, air = (attenuation(name, energy) for name in ("water", "air"))
-    hu = 1000 * (volume.array.astype(np.float64) - water) / (water - air)
+    hu = np.asarray(1000 * (volume.array.astype(np.float64) - water) / (water - air), np.float32)
     return Volume(hu, volume.grid, "hu", volume.note)
 
 

@@ -283,7 +283,7 @@ def test_bad_files_are_refused_in_one_line(tmp_path, kind, message):
 def test_arguments_are_checked(tmp_path):
     vdb.write(str(tmp_path / "a.vdb"), grids=[_foreign(vdb.FloatGrid, np.ones((2, 2, 2), np.float32))])
     for arguments, message in (
-        ({"quantity": "dose"}, "activity, mu"),
+        ({"quantity": "warmth"}, "activity, mu"),
         ({"unit": 0.0}, "mm"),
         ({"grid": "x"}, "density"),
     ):

@@ -213,7 +213,7 @@ def test_volumes_are_float32_copies_that_nobody_can_change(rng):
     [
         (np.zeros((3, 4, 6)), "mu", "expected shape 3 x 4 x 5, got 3 x 4 x 6"),
         (np.full((3, 4, 5), np.inf), "mu", r"inf is not a finite number at index \(0, 0, 0\)"),
-        (np.zeros((3, 4, 5)), "dose", "expected one of activity, mu, hu"),
+        (np.zeros((3, 4, 5)), "warmth", "expected one of activity, mu, hu"),
         (np.zeros((3, 4, 5), complex), "mu", "expected real numbers"),
         (np.full((3, 4, 5), 1e300), "mu", "not a finite number"),
     ],

@@ -234,5 +234,5 @@ def test_a_recipe_says_which_kind_of_scanner_a_workbook_is_read_as(tubes, workbo
     np.testing.assert_array_equal(run.projections, project_run(tubes, volume, (9, 11)).projections)
     (pinholes,) = mph.run_recipe(mph.Recipe(given), volume=volume)
     assert len(pinholes.system) == 80
-    with pytest.raises(InputError, match="kind of scanner 'sextant': expected one of pinhole, tubes"):
+    with pytest.raises(InputError, match="kind of scanner 'sextant': expected one of pinhole, x-ray, tubes"):
         next(mph.run_recipe(mph.Recipe({**given, "system.kind": "sextant"}), volume=volume))

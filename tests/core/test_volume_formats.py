@@ -600,7 +600,7 @@ BAD = {
         "space 'scanner-xyz': expected right-anterior-superior",
     ),
     "wrong unit": (_npz(unit="1/cm"), "its values are in 1/cm; expected 1/mm for mu"),
-    "unknown quantity": (_npz(quantity="dose", unit="Gy"), "it holds 'dose': say which quantity that is"),
+    "unknown quantity": (_npz(quantity="warmth", unit="Gy"), "it holds 'warmth': say which quantity that is"),
     "a singular affine": (_npz(affine=np.diag([1, 1, 0, 1])), "its three axes are not independent"),
     "an affine of 3 rows": (_npz(affine=np.eye(4)[:3]), "expected shape 4 x 4, got 3 x 4"),
     "no affine": (_npy, "it has no affine: give one"),

@@ -578,7 +578,7 @@ def test_impossible_places_are_refused(template, path, message):
 def test_only_systems_are_written(tmp_path):
     with pytest.raises(mph.InputError, match="expected a Scanner, got str"):
         mph.write_system("scanner.xlsx", tmp_path / "o.xlsx")  # type: ignore[arg-type]
-    with pytest.raises(mph.InputError, match="expected a PinholeSystem, got str"):
+    with pytest.raises(mph.InputError, match="expected a Scanner, got str"):
         mph.write_geometry("scanner.xlsx", tmp_path / "o.json", "mphdrr")  # type: ignore[arg-type]
 
 

@@ -246,6 +246,7 @@ def test_a_front_is_a_table_and_a_plot(tmp_path):
     assert (tmp_path / "front.csv").read_text().count("\n") == 3
 
 
+@pytest.mark.long
 def test_the_gain_is_judged_by_draws_of_noise():
     """Where hardly anything is counted, wider holes are better, and no scanner gains on itself."""
     evaluation = {"body": BODY, "draws": 5, "iterations": 1, "subsets": 2}

@@ -54,6 +54,7 @@ def test_a_motion_of_5_mm_and_3_degrees_is_found(finder, seed):
     np.testing.assert_allclose(found.pose, pose_of(found.shift, found.rotation), atol=1e-12)  # about the origin
 
 
+@pytest.mark.long
 def test_the_covariance_is_that_of_the_noise(finder, reference):
     exact = np.asarray(mph.Projector(GRID, VIEWS)(reference), float)
     found = []

@@ -102,7 +102,7 @@ def test_pt_without_torch_says_so(tmp_path, run):
     try:
         import torch  # noqa: F401
     except ImportError:
-        with pytest.raises(mph.InputError, match="need torch"):
+        with pytest.raises(mph.InputError, match="torch is missing"):
             mph.write_run(run, tmp_path / "run.pt")
         assert not list(tmp_path.iterdir())
     else:

@@ -123,7 +123,7 @@ class SpectralTransmission:
     def volume_gradient(
         self, volumes: Sequence[Volume | Array] | Array, values: ArrayLike, A: Projector, mAs: ArrayLike
     ) -> Array:
-        """The adjoint of the derivative of `project` by the volumes, of `values` (bins, M, n_v, n_u): (materials, *grid)."""
+        """The adjoint of the derivative of `project` by the volumes, of `values` (bins, M, n_v, n_u): one per material."""
         paths = self.gradient(self._paths(volumes, A), values, mAs)
         return np.stack([A.T(path) for path in paths])
 

@@ -6,9 +6,9 @@ from ..design.evaluating import evaluate
 from ..design.fronts import pareto
 from ..design.optimising import optimize
 from ..design.recipe import TEMPLATE, read_design_recipe
-from ..files import read_text, write_bytes
+from ..files import read_text
 from ..workbook import write_system
-from .options import add_command, add_run, new_recipe_path, output_path, print_answer, progress_bar, say
+from .options import add_command, add_run, give_recipe, output_path, print_answer, progress_bar, say
 
 
 def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
@@ -34,13 +34,7 @@ def _new(arguments: argparse.Namespace) -> None:
 
     mphdrr design new -o design.toml
     """
-    text = read_text(TEMPLATE)
-    if arguments.output is None:
-        print(text, end="")
-        return
-    path = new_recipe_path(arguments.output)
-    write_bytes(path, text.encode())
-    print(f"{path}: edit it, then: mphdrr design optimize {path} -o scanner.xlsx")
+    give_recipe(read_text(TEMPLATE), arguments.output, "mphdrr design optimize {path} -o scanner.xlsx")
 
 
 def _optimize(arguments: argparse.Namespace) -> None:

@@ -4,13 +4,12 @@ import argparse
 
 from .. import learning
 from ..errors import InputError
-from ..files import write_bytes
 from ..learning.judging.judge import judge
 from ..learning.judging.recipe import read_judge_recipe
 from ..learning.networks import NETWORKS
 from ..learning.recipe import template_text
 from ..progress import Progress
-from .options import add_command, add_run, new_recipe_path, output_path, progress_bar, say
+from .options import add_command, add_run, give_recipe, output_path, progress_bar, say
 
 
 def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
@@ -42,13 +41,7 @@ def _new(arguments: argparse.Namespace) -> None:
 
     mphdrr learn new --like unrolled -o training.toml
     """
-    text = template_text(arguments.like)
-    if arguments.output is None:
-        print(text, end="")
-        return
-    path = new_recipe_path(arguments.output)
-    write_bytes(path, text.encode())
-    print(f"{path}: edit it, then: mphdrr learn train {path} -o model.pt")
+    give_recipe(template_text(arguments.like), arguments.output, "mphdrr learn train {path} -o model.pt")
 
 
 def _train(arguments: argparse.Namespace) -> None:

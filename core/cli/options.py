@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import InputError
-from ..files import ensure_folder, refuse_folder, require_ending
+from ..files import ensure_folder, refuse_folder, require_ending, write_bytes
 from ..geometry.scanner import SCANNERS, Scanner
 from ..geometry.system import PinholeSystem
 from ..geometry.system import chosen_modules as chosen_modules
@@ -152,6 +152,16 @@ def new_recipe_path(text: str) -> Path:
     if path.exists():
         raise InputError(f"{path}: it exists; choose another name, or remove it first")
     return path
+
+
+def give_recipe(text: str, output: str | None, then: str) -> None:
+    """Print a recipe to begin with, or write it to a new file and say what comes `then`, a command with {path}."""
+    if output is None:
+        print(text, end="")
+        return
+    path = new_recipe_path(output)
+    write_bytes(path, text.encode())
+    print(f"{path}: edit it, then: {then.format(path=path)}")
 
 
 def numbered_path(path: Path, number: int, count: int) -> Path:

@@ -98,7 +98,11 @@ class Calibration:
         for name, told in zip(self.names, self.told.T, strict=True):
             numbers = self.system.numbers[told < _TOLD].tolist()
             if numbers:
-                which = "all modules" if len(numbers) == len(told) else f"modules {several(numbers, 12)}"
+                which = (
+                    "all modules"
+                    if len(numbers) == len(told)
+                    else f"module{'s' * (len(numbers) > 1)} {several(numbers, 12)}"
+                )
                 weak.setdefault(which, []).append(name)
         return [f"{which}: {', '.join(names)}" for which, names in weak.items()]
 

@@ -217,7 +217,7 @@ def test_what_images_do_not_tell_stays_nominal(some):
     assert np.allclose(found.system.centers[5], some.centers[5]) and np.allclose(found.system.tilt[5], some.tilt[5])
     assert np.allclose(found.told[5], 0) and (np.delete(found.told, 5, axis=0) > 0.9).all()
     names = "position u, position v, position k, tilt u, tilt v, tilt k"
-    assert found.untold() == [f"modules {some.numbers[5]}: {names}"]
+    assert found.untold() == [f"module {some.numbers[5]}: {names}"]
     assert np.allclose(found.spread[5], [5.0] * 3 + [np.radians(2)] * 3, rtol=1e-3)
 
 

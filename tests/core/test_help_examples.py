@@ -94,6 +94,14 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
         images = np.random.default_rng(k).poisson(mph.point_images(model, views, [place], activity=1e5)[0])
         counts = mph.counts_run(images[:, ::-1, ::-1], system, "1-80", "back-v", 60.0)
         mph.write_run(counts, folder / f"point{k}.h5")
+    xray = mph.xray_ring(12, shape=(16, 24))
+    mph.write_system(xray, folder / "both.xlsx", WORKBOOK)
+    tissue = mph.read_volume(folder / "ct-mu.nii.gz", "mu")
+    mph.write_volume(tissue, folder / "mu70.nii.gz")
+    seen = {"system.file": str(folder / "both.xlsx"), "system.kind": "x-ray", "model.kind": "transmission"}
+    (radiographs,) = mph.run_recipe(mph.Recipe(seen), volume=tissue)
+    mph.write_run(radiographs, folder / "radiographs.h5")
+    mph.write_volume(mph.Volume(np.where(body > 0, 10.0, 0.0).astype(np.float32), grid, "activity"), folder / "spect.nii.gz")
     (folder / "points.toml").write_text('[runs]\nfiles = ["point0.h5", "point1.h5", "point2.h5"]\n')
     return folder
 

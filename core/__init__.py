@@ -9,113 +9,138 @@ Everything imported here is the public interface. Arguments that cannot be used 
 >>> images = mph.Projector(grid, views)(mph.DerenzoPhantom(40, (8, 6, 5, 4, 3, 2), 40).voxelize(grid))
 """
 
-import types
+import ast
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from . import design, events, learning
-from .design.calibration import Calibration, calibrate
-from .design.point_images import point_images
-from .errors import InputError, InputWarning
-from .exchange import read_geometry, write_geometry
-from .geometry.checks import GeometryReport, check_geometry
-from .geometry.design_formulas import collimator_length, roi_radius_seen
-from .geometry.frames import euler_pose
-from .geometry.generators import ellipse_rings, plate_rings, regular_polygon
-from .geometry.grid import Grid
-from .geometry.parallel_views import parallel_views
-from .geometry.presets import c_arm_views, pinhole_views
-from .geometry.ring_fits import RingFit, fit_rings, ring_order
-from .geometry.system import PinholeSystem
-from .geometry.views import Views
-from .perspective.backprojection import backproject, views_that_see
-from .perspective.coordinates import line_through, transform_lines, transform_points
-from .perspective.correspondence import Correspondences, find_correspondences, samples_along_rays
-from .perspective.epipolar import epipolar_lines, epipolar_segments, epipole, essential_matrix, fundamental_matrix
-from .perspective.perspective_grid import PerspectiveGrid, depth_ranges, perspective_grids
-from .perspective.predictions import predict_views, prediction_errors, spread_along_rays
-from .perspective.resampling import camera_to_camera, from_perspective, to_perspective
-from .perspective.triangulation import MarkerFit, fit_marker, triangulate
-from .perspective.view_rays import intrinsic_matrices, points_at_depths, project_points, view_frames
-from .phantoms.defrise import DefrisePhantom
-from .phantoms.derenzo import DerenzoPhantom, DerenzoRods
-from .phantoms.jaszczak import JaszczakPhantom
-from .phantoms.language import read_phantom, write_phantom
-from .phantoms.mixture import MixturePhantom
-from .phantoms.nema import NemaBody
-from .phantoms.phantom import Phantom, PhantomMesh, ShapePhantom
-from .phantoms.points import PointGrid
-from .phantoms.random import random_pose
-from .phantoms.shapes import Box, Capsule, Cone, Cylinder, Ellipsoid, Shape, Sphere
-from .phantoms.shepp_logan import SheppLogan
-from .phantoms.torso import CardiacTorso
-from .physics.ct_numbers import diffdrr_density, hu_to_mu, mu_to_hu
-from .physics.isotopes import ISOTOPES, Isotope, isotope
-from .physics.maps import completeness_map, modules_map, resolution_map, sensitivity_map
-from .physics.materials import MATERIALS, Material, attenuation
-from .physics.noise import sample_counts
-from .physics.optics import Optics
-from .physics.performance import ModulePerformance, isocentre_performance, magnification, resolution, seen, sensitivity
-from .physics.sampling import sampling_gaps
-from .progress import Cancelled, Progress
-from .projector import (
-    Emission,
-    GeometryGradient,
-    InverseSquareSum,
-    Projector,
-    Transmission,
-    geometry_gradient,
-    intensity,
-    trace_rays,
-)
-from .reconstruction.adapters import deepinv_physics, parallelproj_operator, pytomography_matrix, scipy_operator
-from .reconstruction.bsrem import bsrem
-from .reconstruction.expectation import mlem, osem
-from .reconstruction.fbp import fbp
-from .reconstruction.fdk import fdk
-from .reconstruction.files import read_reconstruction, write_reconstruction
-from .reconstruction.least_squares import cgls, sirt
-from .reconstruction.loop import IterativeOptions
-from .reconstruction.ostr import ostr
-from .reconstruction.priors import Prior, Quadratic, RelativeDifference, TotalVariation
-from .reconstruction.result import Reconstruction
-from .reconstruction.scores.derenzo import DerenzoScore, DerenzoSector, RodProfile, derenzo_score
-from .reconstruction.scores.images import BiasAndDeviation, bias_and_deviation, contrast_to_noise, nrmse, psnr, ssim
-from .reconstruction.scores.nema import NemaScore, NemaSphere, nema_score
-from .reconstruction.scores.summary import VolumeScore, score_volume
-from .reconstruction.stopping import StoppingRule, StopWhen
-from .reconstruction.tv import tv
-from .runs.backprojecting import backproject_run, run_line_integrals
-from .runs.files import read_run, write_run
-from .runs.frame_files import read_counts
-from .runs.measured import counts_run
-from .runs.mosaic import as_seen, mosaic
-from .runs.orientations import ORIENTATIONS
-from .runs.projecting import project_run
-from .runs.recipe import Recipe, read_recipe, write_recipe
-from .runs.reconstructing import reconstruct_run
-from .runs.run import ProjectionRun
-from .runs.run_recipe import projector_of_run, run_recipe
-from .system_source import SystemSource
-from .volumes.meshes.mesh import Mesh, read_mesh, write_mesh
-from .volumes.meshes.surface import volume_to_mesh
-from .volumes.meshes.voxelization import voxelize_mesh
-from .volumes.rearranging import canonical, centered, crop, crop_to_box, pad, split_labels
-from .volumes.resampling import resample
-from .volumes.volume import Volume
-from .volumes.volume_files import read_volume, write_volume
-from .workbook.column_map import ColumnMap, MappedColumn, MappedTable
-from .workbook.draft import ColumnMapDraft, draft_column_map, preview_workbook
-from .workbook.reader import kinds_in, read_scanner, read_system
-from .workbook.writer import WrittenWorkbook, write_system
-from .xray.arrangements import xray_arc, xray_ring
-from .xray.checks import find_in_room
-from .xray.decomposition import correct_beam_hardening, decompose, decompose_images, virtual_monoenergetic
-from .xray.detectors import EnergyIntegrator, PhotonCounter
-from .xray.dose import absorbed_dose, absorbed_dose_rate, isocentre_kerma
-from .xray.motion import Motion, MotionFinder, find_change, find_motion
-from .xray.spectra import Spectrum, tube_spectrum
-from .xray.spectral import SpectralTransmission, water_and_bone
-from .xray.system import XraySystem
+if TYPE_CHECKING:
+    from . import design, events, learning
+    from .design.calibration import Calibration, calibrate
+    from .design.point_images import point_images
+    from .errors import InputError, InputWarning
+    from .exchange import read_geometry, write_geometry
+    from .geometry.checks import GeometryReport, check_geometry
+    from .geometry.design_formulas import collimator_length, roi_radius_seen
+    from .geometry.frames import euler_pose
+    from .geometry.generators import ellipse_rings, plate_rings, regular_polygon
+    from .geometry.grid import Grid
+    from .geometry.parallel_views import parallel_views
+    from .geometry.presets import c_arm_views, pinhole_views
+    from .geometry.ring_fits import RingFit, fit_rings, ring_order
+    from .geometry.system import PinholeSystem
+    from .geometry.views import Views
+    from .perspective.backprojection import backproject, views_that_see
+    from .perspective.coordinates import line_through, transform_lines, transform_points
+    from .perspective.correspondence import Correspondences, find_correspondences, samples_along_rays
+    from .perspective.epipolar import epipolar_lines, epipolar_segments, epipole, essential_matrix, fundamental_matrix
+    from .perspective.perspective_grid import PerspectiveGrid, depth_ranges, perspective_grids
+    from .perspective.predictions import predict_views, prediction_errors, spread_along_rays
+    from .perspective.resampling import camera_to_camera, from_perspective, to_perspective
+    from .perspective.triangulation import MarkerFit, fit_marker, triangulate
+    from .perspective.view_rays import intrinsic_matrices, points_at_depths, project_points, view_frames
+    from .phantoms.defrise import DefrisePhantom
+    from .phantoms.derenzo import DerenzoPhantom, DerenzoRods
+    from .phantoms.jaszczak import JaszczakPhantom
+    from .phantoms.language import read_phantom, write_phantom
+    from .phantoms.mixture import MixturePhantom
+    from .phantoms.nema import NemaBody
+    from .phantoms.phantom import Phantom, PhantomMesh, ShapePhantom
+    from .phantoms.points import PointGrid
+    from .phantoms.random import random_pose
+    from .phantoms.shapes import Box, Capsule, Cone, Cylinder, Ellipsoid, Shape, Sphere
+    from .phantoms.shepp_logan import SheppLogan
+    from .phantoms.torso import CardiacTorso
+    from .physics.ct_numbers import diffdrr_density, hu_to_mu, mu_to_hu
+    from .physics.isotopes import ISOTOPES, Isotope, isotope
+    from .physics.maps import completeness_map, modules_map, resolution_map, sensitivity_map
+    from .physics.materials import MATERIALS, Material, attenuation
+    from .physics.noise import sample_counts
+    from .physics.optics import Optics
+    from .physics.performance import (
+        ModulePerformance,
+        isocentre_performance,
+        magnification,
+        resolution,
+        seen,
+        sensitivity,
+    )
+    from .physics.sampling import sampling_gaps
+    from .progress import Cancelled, Progress
+    from .projector import (
+        Emission,
+        GeometryGradient,
+        InverseSquareSum,
+        Projector,
+        Transmission,
+        geometry_gradient,
+        intensity,
+        trace_rays,
+    )
+    from .reconstruction.adapters import deepinv_physics, parallelproj_operator, pytomography_matrix, scipy_operator
+    from .reconstruction.bsrem import bsrem
+    from .reconstruction.expectation import mlem, osem
+    from .reconstruction.fbp import fbp
+    from .reconstruction.fdk import fdk
+    from .reconstruction.files import read_reconstruction, write_reconstruction
+    from .reconstruction.least_squares import cgls, sirt
+    from .reconstruction.loop import IterativeOptions
+    from .reconstruction.ostr import ostr
+    from .reconstruction.priors import Prior, Quadratic, RelativeDifference, TotalVariation
+    from .reconstruction.result import Reconstruction
+    from .reconstruction.scores.derenzo import DerenzoScore, DerenzoSector, RodProfile, derenzo_score
+    from .reconstruction.scores.images import BiasAndDeviation, bias_and_deviation, contrast_to_noise, nrmse, psnr, ssim
+    from .reconstruction.scores.nema import NemaScore, NemaSphere, nema_score
+    from .reconstruction.scores.summary import VolumeScore, score_volume
+    from .reconstruction.stopping import StoppingRule, StopWhen
+    from .reconstruction.tv import tv
+    from .runs.backprojecting import backproject_run, run_line_integrals
+    from .runs.files import read_run, write_run
+    from .runs.frame_files import read_counts
+    from .runs.measured import counts_run
+    from .runs.mosaic import as_seen, mosaic
+    from .runs.orientations import ORIENTATIONS
+    from .runs.projecting import project_run
+    from .runs.recipe import Recipe, read_recipe, write_recipe
+    from .runs.reconstructing import reconstruct_run
+    from .runs.run import ProjectionRun
+    from .runs.run_recipe import projector_of_run, run_recipe
+    from .system_source import SystemSource
+    from .volumes.meshes.mesh import Mesh, read_mesh, write_mesh
+    from .volumes.meshes.surface import volume_to_mesh
+    from .volumes.meshes.voxelization import voxelize_mesh
+    from .volumes.rearranging import canonical, centered, crop, crop_to_box, pad, split_labels
+    from .volumes.resampling import resample
+    from .volumes.volume import Volume
+    from .volumes.volume_files import read_volume, write_volume
+    from .workbook.column_map import ColumnMap, MappedColumn, MappedTable
+    from .workbook.draft import ColumnMapDraft, draft_column_map, preview_workbook
+    from .workbook.reader import kinds_in, read_scanner, read_system
+    from .workbook.writer import WrittenWorkbook, write_system
+    from .xray.arrangements import xray_arc, xray_ring
+    from .xray.checks import find_in_room
+    from .xray.decomposition import correct_beam_hardening, decompose, decompose_images, virtual_monoenergetic
+    from .xray.detectors import EnergyIntegrator, PhotonCounter
+    from .xray.dose import absorbed_dose, absorbed_dose_rate, isocentre_kerma
+    from .xray.motion import Motion, MotionFinder, find_change, find_motion
+    from .xray.spectra import Spectrum, tube_spectrum
+    from .xray.spectral import SpectralTransmission, water_and_bone
+    from .xray.system import XraySystem
 
-__all__ = [
-    name for name, value in globals().items() if not (name.startswith("_") or isinstance(value, types.ModuleType))
-]
+(_BLOCK,) = (each for each in ast.parse(Path(__file__).read_text("utf-8")).body if isinstance(each, ast.If))
+_MODULES = {name.name: line.module for line in _BLOCK.body if isinstance(line, ast.ImportFrom) for name in line.names}
+"""Public name -> module, of the imports above: each is imported when it is first asked for."""
+
+__all__ = [name for name, module in _MODULES.items() if module]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    module = import_module(f".{_MODULES[name] or name}", __name__)
+    found = globals()[name] = getattr(module, name) if _MODULES[name] else module
+    return found
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_MODULES})

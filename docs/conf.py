@@ -53,7 +53,9 @@ def public_names() -> dict[str, list[str]]:
     Those of a room with names of its own, ``mph.events``, begin with its name.
     """
     rooms: dict[str, list[str]] = {}
-    for line in ast.parse(_PUBLIC.read_text(encoding="utf-8")).body:
+    body = ast.parse(_PUBLIC.read_text(encoding="utf-8")).body
+    (block,) = (each for each in body if isinstance(each, ast.If))
+    for line in block.body:
         if isinstance(line, ast.ImportFrom) and line.module:
             names = [alias.name for alias in line.names if alias.name in mph.__all__]
             rooms.setdefault(line.module.split(".")[0], []).extend(names)

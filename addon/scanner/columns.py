@@ -8,7 +8,7 @@ import numpy as np
 from bpy.props import EnumProperty, FloatProperty, IntProperty, StringProperty
 
 from ...core.geometry.columns import Column
-from ...core.geometry.scanner import SCANNERS
+from ...core.scanner_kinds import SCANNERS
 from ..blender import choices, decimals
 
 _BLANK = "BLANK"  # how a choice that may be blank is called in an enumeration

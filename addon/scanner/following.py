@@ -12,7 +12,8 @@ import numpy as np
 
 from ...core.errors import InputError
 from ...core.geometry.module_parts import ModulePart
-from ...core.geometry.scanner import SCANNERS, Scanner
+from ...core.geometry.scanner import Scanner
+from ...core.scanner_kinds import SCANNERS
 from ..blender import objects
 from . import cameras, collimators, pinholes
 from .module_values import TYPED, Kind, aim_of, designed, kind_of, readings, together

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from ...core import InputError, PinholeSystem, ring_order
 from ...core.geometry.frames import affine_matrix, rotations
 from ...core.geometry.module_parts import ModulePart
-from ...core.geometry.scanner import SCANNERS, Scanner
+from ...core.geometry.scanner import Scanner
+from ...core.scanner_kinds import SCANNERS
 from ..blender import ids, objects, updates
 from . import cameras, collimators, following, module_values, pinholes, scanner
 from .scanner_parts import clear, new_part, parts_and_others

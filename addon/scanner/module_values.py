@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from ...core import InputError, SystemSource
 from ...core.geometry.columns import Column
 from ...core.geometry.frames import module_poses
-from ...core.geometry.scanner import Scanner, scanner_kind
+from ...core.geometry.scanner import Scanner
+from ...core.scanner_kinds import scanner_kind
 from ..blender import decimals, objects
 from . import cameras, columns
 

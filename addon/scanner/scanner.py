@@ -16,7 +16,8 @@ from mathutils import Quaternion
 from ...core import InputError, PinholeSystem
 from ...core.geometry.collimator import Construction
 from ...core.geometry.finding import Finding
-from ...core.geometry.scanner import SCANNERS, Scanner
+from ...core.geometry.scanner import Scanner
+from ...core.scanner_kinds import SCANNERS
 from ...core.workbook import ColumnMap, QuantityCells, SystemSource
 from ..blender import ids, objects
 from ..blender.decimals import typed

@@ -13,10 +13,11 @@ from typing import Any
 
 from ..errors import InputError
 from ..files import ensure_folder, refuse_folder, require_ending, write_bytes
-from ..geometry.scanner import SCANNERS, Scanner
+from ..geometry.scanner import Scanner
 from ..geometry.system import PinholeSystem
 from ..geometry.system import chosen_modules as chosen_modules
 from ..progress import Progress
+from ..scanner_kinds import SCANNERS
 from ..validation import shape_text
 from ..volumes.volume import Volume
 from ..workbook import kinds_in, read_scanner

@@ -7,9 +7,10 @@ from typing import Any
 from ..arrays import table_rows
 from ..errors import InputError
 from ..files import AnyPath, read_bytes
-from ..geometry.scanner import Scanner, scanner_kind
+from ..geometry.scanner import Scanner
 from ..geometry.system import PinholeSystem
 from ..geometry.views import Views
+from ..scanner_kinds import scanner_kind
 from .format import Format
 
 _KIND = "mphDRR geometry"

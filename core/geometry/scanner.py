@@ -1,7 +1,7 @@
 """What any scanner offers: a table of typed columns with a row for each module, its views, its solids, its source file.
 
-`PinholeSystem` is the first kind. A new kind is a class derived from `Scanner` with its columns, which enters itself in
-`SCANNERS`.
+`PinholeSystem` is the first kind. A new kind is a class derived from `Scanner` with its columns, and a line in
+`core/scanner_kinds.py`.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..arrays import Array, Floats
 from ..errors import InputError
 from ..system_source import SystemSource
-from ..validation import freeze, one_of, real_array
+from ..validation import freeze, real_array
 from .columns import ColumnTable, Values
 from .finding import Finding
 from .module_parts import ModulePart
@@ -31,12 +31,6 @@ Fault = tuple[str, int, str]
 
 SCANNERS: dict[str, type[Scanner]] = {}
 """Name -> class, of the kinds of scanners; each enters itself when it is defined."""
-
-
-def scanner_kind(name: str) -> type[Scanner]:
-    """The class of a kind of scanner, or `InputError`."""
-    one_of(name, SCANNERS, "kind of scanner")
-    return SCANNERS[name]
 
 
 class Scanner(ABC):

@@ -8,7 +8,6 @@ from importlib import import_module
 from typing import Any
 
 from ..errors import needing
-from ..reconstruction.methods import METHOD_FILES
 
 _PUBLIC = {
     "read_model": "model_file",
@@ -30,6 +29,3 @@ def __getattr__(name: str) -> Any:
 
 def __dir__() -> list[str]:
     return sorted(_PUBLIC)
-
-
-METHOD_FILES[".pt"] = lambda path: __getattr__("read_model")(path).method

@@ -8,6 +8,7 @@ import inspect
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from importlib import import_module
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -78,7 +79,12 @@ METHODS: Mapping[str, Method] = {
 }  # fmt: skip
 """The methods by their names in recipes and on the command line."""
 
-METHOD_FILES: dict[str, Callable[[Path], Method]] = {}
+
+def _network(path: Path) -> Method:
+    return import_module("..learning", __package__).read_model(path).method  # type: ignore[no-any-return]  # needs torch
+
+
+METHOD_FILES: dict[str, Callable[[Path], Method]] = {".pt": _network}
 """What reads a file as a method, by the file's ending in lower case, such as ".pt"; it raises `InputError`."""
 
 PRIORS: Mapping[str, Choice] = {

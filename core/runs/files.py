@@ -16,10 +16,11 @@ from ..arrays import Array
 from ..errors import InputError, needing, reading
 from ..files import AnyPath, require_ending, require_file, write_bytes
 from ..geometry.grid import Grid
-from ..geometry.scanner import Scanner, scanner_kind
+from ..geometry.scanner import Scanner
 from ..geometry.system import PinholeSystem
 from ..geometry.views import Views
 from ..hdf5 import attributes, datasets, numbers, opened, pack
+from ..scanner_kinds import scanner_kind
 from ..volumes.formats import numpy_files
 from ..volumes.volume import Volume
 from .run import ProjectionRun

@@ -11,7 +11,8 @@ from typing import Any, Literal, get_args
 from ..errors import InputError
 from ..files import AnyPath, write_bytes
 from ..geometry.columns import ColumnTable
-from ..geometry.scanner import Scanner, scanner_kind
+from ..geometry.scanner import Scanner
+from ..scanner_kinds import scanner_kind
 from ..toml import parse_toml, read_toml, toml_value
 from .headings import unit_of
 from .sheet_xml import MAX_COLUMN, MAX_ROW

@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 from ..errors import InputError
 from ..files import AnyPath
 from ..geometry.columns import ColumnTable
-from ..geometry.scanner import scanner_kind
 from ..recording import recorded_warnings
+from ..scanner_kinds import scanner_kind
 from .book import HEADING_ROWS, Book, Outdated, Sheet, shortened
 from .calculation import Uncomputed
 from .column_map import ColumnMap, Joined, MappedColumn, MappedTable

@@ -4,7 +4,8 @@ import re
 from collections import defaultdict
 from functools import cached_property
 
-from ..geometry.scanner import SCANNERS, Scanner
+from ..geometry.scanner import Scanner
+from ..scanner_kinds import SCANNERS
 from .book import HEADING_ROWS, Book, Sheet, module_number
 from .formulas import areas_in
 from .headings import Heading, Vocabulary, is_label_heading, is_number_heading, plain, unit_of, vocabulary

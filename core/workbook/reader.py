@@ -11,8 +11,9 @@ from ..arrays import Array, Floats
 from ..errors import InputError, naming, warn
 from ..files import AnyPath
 from ..geometry.columns import Values
-from ..geometry.scanner import SCANNERS, Scanner, first, scanner_kind
+from ..geometry.scanner import Scanner, first
 from ..geometry.system import AnyScanner, PinholeSystem
+from ..scanner_kinds import SCANNERS, scanner_kind
 from ..system_source import QuantityCells, SystemSource
 from .agreement import tolerance
 from .book import Book

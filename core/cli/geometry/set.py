@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 from ...errors import InputError
 from ...geometry.columns import ANGLE_UNITS, Column
 from ...geometry.frames import affine_matrix
-from ...geometry.scanner import SCANNERS, Scanner
+from ...geometry.scanner import Scanner
 from ...geometry.system import PinholeSystem
 from ...recording import recorded_warnings
+from ...scanner_kinds import SCANNERS
 from ...workbook import write_system
 from ..options import chosen_modules, output_path, print_answer, read_any
 from .arguments import add_action

@@ -15,7 +15,7 @@ from sphinx.util import logging
 from sphinx.util.docutils import SphinxDirective
 
 import mphdrr.core as mph
-from mphdrr.addon.cli import demo, figure, scene
+from mphdrr.addon.cli import COMMANDS
 from mphdrr.core.cli import build_parser
 from mphdrr.core.version import VERSION
 
@@ -95,7 +95,7 @@ class Commands(SphinxDirective):
     def run(self) -> list[nodes.Node]:
         """Ask the parsers."""
         os.environ["COLUMNS"] = "88"
-        return _sections(build_parser((figure.add_parser, scene.add_parser, demo.add_parser)))
+        return _sections(build_parser(COMMANDS))
 
 
 def _sections(parser: Any) -> list[nodes.Node]:

@@ -6,9 +6,15 @@ The commands without Blender are in `core.cli`; those here import bpy only when 
 from collections.abc import Sequence
 
 from ...core import cli
-from . import demo, figure, scene
+
+COMMANDS = {
+    f"{__name__}.figure": "draw a figure as papers show them, of a scanner, a phantom or projections",
+    f"{__name__}.scene": "make a Blender scene of the scanner, with a volume and projections",
+    f"{__name__}.demo": "run the main job: workbook, phantom, 80 projections, scene, pictures and dataset",
+}
+"""Those that need Blender."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command line (by default the program's own) and return its exit status."""
-    return cli.main(argv, more_commands=(figure.add_parser, scene.add_parser, demo.add_parser))
+    return cli.main(argv, COMMANDS)

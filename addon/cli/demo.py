@@ -9,10 +9,12 @@ from pathlib import Path
 from typing import Any
 
 from ...core import ProjectionRun, Recipe, files, run_recipe, write_run
-from ...core.cli.options import add_command, add_workbook, progress_bar, read_workbook
+from ...core.cli.options import add_command, progress_bar
+from ...core.cli.scanners import add_workbook, read_workbook
 from ...core.errors import warn
 from ...core.example import EULER_DEGREES, EXAMPLE
 from ...core.runs.mosaic import write_sheet
+from . import COMMANDS
 from .scene import INSTALL_BLENDER, new_scene, quiet, save_scene
 
 _FIGURES = {"phantom": "inside", "cut-away": "cut-away", "sums": "sums"}
@@ -26,7 +28,7 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     parser = add_command(
         subparsers,
         "demo",
-        "run the main job: workbook, phantom, 80 projections, scene, pictures and dataset",
+        COMMANDS[__name__],
         "mphdrr demo --output out",
     )
     parser.add_argument("--output", default="out", metavar="FOLDER", help="where the results go")

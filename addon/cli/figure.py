@@ -26,6 +26,7 @@ from ...core.phantoms.kinds import KINDS as PHANTOMS
 from ...core.runs.files import FORMATS, read_run
 from ...core.runs.run_recipe import phantom_pose, run_recipe
 from ...core.toml import read_toml
+from . import COMMANDS
 from .scene import new_scene, quiet
 
 _WORKBOOKS = (".xlsx", ".xlsm")
@@ -42,7 +43,7 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     parser = add_command(
         subparsers,
         "figure",
-        "draw a figure as papers show them, of a scanner, a phantom or projections",
+        COMMANDS[__name__],
         "mphdrr figure cut-away scanner.xlsx derenzo -o figure.png --size 1600x900\n"
         "example: mphdrr figure scanner scanner.xlsx --modules 1-40 -o modules.svg\n"
         "example: mphdrr figure mosaic run.h5 -o mosaic.png -o mosaic.svg",

@@ -11,8 +11,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ...core import InputError, read_run
-from ...core.cli.options import add_command, add_workbook, chosen_modules, output_path, read_any
+from ...core.cli.options import add_command, output_path
+from ...core.cli.scanners import add_workbook, chosen_modules, read_any
 from ...core.volumes.volume_files import read_volume, read_volume_of
+from . import COMMANDS
 
 if TYPE_CHECKING:
     import bpy
@@ -26,7 +28,7 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     parser = add_command(
         subparsers,
         "scene",
-        "make a Blender scene of the scanner, with a volume and projections",
+        COMMANDS[__name__],
         "mphdrr scene scanner.xlsx --run run.h5 -o scanner.blend",
     )
     add_workbook(parser)

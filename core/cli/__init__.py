@@ -9,7 +9,9 @@ import contextlib
 import io
 import sys
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
+from importlib import import_module
+from types import MappingProxyType
 from typing import Any, NoReturn
 
 from ..errors import InputError, InputWarning
@@ -17,7 +19,21 @@ from ..progress import Cancelled
 from ..version import VERSION
 from .options import NotingStore, say
 
-AddParser = Callable[[Any], None]
+COMMANDS = {
+    "geometry": "work on a geometry workbook",
+    "phantom": "make a phantom volume",
+    "volume": "look at volumes and convert them",
+    "project": "project a volume, or a phantom, into every module; or take measured counts for the projections",
+    "reconstruct": "reconstruct the volume that a run's images are of",
+    "backproject": "put together what a run's views say of each voxel: sum, geometric mean or minimum",
+    "score": "score a reconstructed volume beside the truth: what a run was simulated of, a phantom, or a volume",
+    "xray": "motion seen by X rays, kerma of a CT, absorbed dose",
+    "events": "make sets of training events from a recipe",
+    "learn": "train networks that reconstruct",
+    "design": "design a scanner by gradients",
+    "export": "write a projection run in another format",
+}
+"""What they do, by their modules here; those modules are imported when their options are wanted."""
 
 OK, INPUT_ERROR, USAGE, INTERRUPTED = 0, 1, 2, 130
 
@@ -38,23 +54,8 @@ class _Parser(argparse.ArgumentParser):
         raise SystemExit(USAGE)
 
 
-def build_parser(more_commands: Sequence[AddParser] = ()) -> argparse.ArgumentParser:
-    """The parser of ``mphdrr``, with this package's commands and `more_commands`."""
-    from . import (
-        backproject,
-        design,
-        events,
-        export,
-        geometry,
-        learn,
-        phantom,
-        project,
-        reconstruct,
-        score,
-        volume,
-        xray,
-    )
-
+def build_parser(more_commands: Mapping[str, str] = MappingProxyType({}), only: str | None = None) -> _Parser:
+    """The parser of ``mphdrr``: this package's commands and more, by their modules; all their options or those of `only` one."""
     parser = _Parser(
         prog="mphdrr",
         description="Multi-pinhole SPECT: from the geometry workbook to projections to train on.",
@@ -62,15 +63,16 @@ def build_parser(more_commands: Sequence[AddParser] = ()) -> argparse.ArgumentPa
     )
     parser.add_argument("--version", action="version", version=f"mphDRR {VERSION}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True, parser_class=_Parser)
-    scans = (project, reconstruct, backproject, score, xray)
-    for command in (geometry, phantom, volume, *scans, events, learn, design, export):
-        command.add_parser(commands)
-    for add_parser in more_commands:
-        add_parser(commands)
+    for module, summary in {**{f"{__name__}.{name}": text for name, text in COMMANDS.items()}, **more_commands}.items():
+        name = module.rpartition(".")[2]
+        if only in (None, name):
+            import_module(module).add_parser(commands)
+        else:
+            commands.add_parser(name, help=summary)
     return parser
 
 
-def main(argv: Sequence[str] | None = None, more_commands: Sequence[AddParser] = ()) -> int:
+def main(argv: Sequence[str] | None = None, more_commands: Mapping[str, str] = MappingProxyType({})) -> int:
     """Run one command line and return its exit status: 0, 1 (the user's input), 2 (usage) or 130 (interrupted)."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
@@ -90,9 +92,10 @@ def main(argv: Sequence[str] | None = None, more_commands: Sequence[AddParser] =
         return _fail(f"{error.filename or 'output'}: {error.strerror or error}", INPUT_ERROR)
 
 
-def _status(argv: Sequence[str] | None, more_commands: Sequence[AddParser]) -> int:
+def _status(argv: Sequence[str] | None, more_commands: Mapping[str, str]) -> int:
     try:
-        arguments = build_parser(more_commands).parse_args(argv)
+        words = sys.argv[1:] if argv is None else argv
+        arguments = build_parser(more_commands, next(iter(words), "")).parse_args(words)
     except SystemExit as stop:  # --help, --version and usage errors
         return stop.code if isinstance(stop.code, int) else USAGE
     with warnings.catch_warnings():

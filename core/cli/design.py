@@ -8,13 +8,14 @@ from ..design.optimising import optimize
 from ..design.recipe import TEMPLATE, read_design_recipe
 from ..files import read_text
 from ..workbook import write_system
+from . import COMMANDS
 from .options import add_command, add_run, give_recipe, output_path, print_answer, progress_bar, say
 
 
 def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     """Add the command."""
     example = "mphdrr design new -o design.toml\nexample: mphdrr design optimize design.toml -o new.xlsx"
-    parser = add_command(subparsers, "design", "design a scanner by gradients", example)
+    parser = add_command(subparsers, "design", COMMANDS["design"], example)
     actions = parser.add_subparsers(metavar="ACTION", required=True)
     new = add_run(actions, "new", _new)
     new.add_argument("-o", "--output", metavar="FILE", help="a new file (.toml); default: standard output")

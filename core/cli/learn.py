@@ -9,13 +9,14 @@ from ..learning.judging.recipe import read_judge_recipe
 from ..learning.networks import NETWORKS
 from ..learning.recipe import template_text
 from ..progress import Progress
+from . import COMMANDS
 from .options import add_command, add_run, give_recipe, output_path, progress_bar, say
 
 
 def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     """Add the command."""
     example = "mphdrr learn new -o training.toml\nexample: mphdrr learn train training.toml -o model.pt"
-    parser = add_command(subparsers, "learn", "train networks that reconstruct", example)
+    parser = add_command(subparsers, "learn", COMMANDS["learn"], example)
     actions = parser.add_subparsers(metavar="ACTION", required=True)
     new = add_run(actions, "new", _new)
     names = "\n".join(f"  {name:<13}{kind.label}: {kind.text}" for name, kind in NETWORKS.items())

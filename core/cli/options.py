@@ -9,18 +9,14 @@ import textwrap
 import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ..errors import InputError
 from ..files import ensure_folder, refuse_folder, require_ending, write_bytes
-from ..geometry.scanner import Scanner
-from ..geometry.system import PinholeSystem
-from ..geometry.system import chosen_modules as chosen_modules
 from ..progress import Progress
-from ..scanner_kinds import SCANNERS
-from ..validation import shape_text
-from ..volumes.volume import Volume
-from ..workbook import kinds_in, read_scanner
+
+if TYPE_CHECKING:  # the parser of all commands reads this file, and numpy takes a while
+    from ..volumes.volume import Volume
 
 _HANGING = 15 * " "  # under the second column of lists in descriptions
 
@@ -81,42 +77,10 @@ def add_command(subparsers, name: str, summary: str, example: str, run: Any = No
     return parser
 
 
-def add_workbook(parser: argparse.ArgumentParser, name: str = "workbook", default: str | None = None) -> None:
-    """The geometry workbook, for `read_workbook`; `name` may be that of an option, with a default."""
-    option = {} if name == "workbook" else {"default": default, "dest": "workbook"}
-    parser.add_argument(name, metavar="FILE", help="geometry workbook (.xlsx, .xlsm)", **option)  # type: ignore[arg-type]
-    parser.add_argument(
-        "--columns",
-        metavar="MAP",
-        help="column map (.toml): which cells hold what, where the headings do not say it; geometry show --write-columns "
-        "makes a draft",
-    )
-    kinds = "kind of the scanner, of a workbook that holds several; default: the first that it holds"
-    parser.add_argument("--scanner-kind", choices=SCANNERS, metavar="KIND", help=f"{kinds}, of {', '.join(SCANNERS)}")
-
-
-def kind_of(arguments: argparse.Namespace) -> str:
-    """The kind of scanner that the options of `add_workbook` ask for."""
-    found = () if arguments.scanner_kind or arguments.columns else kinds_in(arguments.workbook)
-    return arguments.scanner_kind or next(iter(found), PinholeSystem.kind)
-
-
-def read_any(arguments: argparse.Namespace) -> Scanner:
-    """The scanner of the workbook of `add_workbook`, of any kind."""
-    return read_scanner(arguments.workbook, kind_of(arguments), arguments.columns)
-
-
-def read_workbook(arguments: argparse.Namespace) -> PinholeSystem:
-    """The pinholes of the workbook of `add_workbook`; `InputError` of another kind of scanner."""
-    system = read_any(arguments)
-    if not isinstance(system, PinholeSystem):
-        raise InputError(f"{arguments.workbook}: its scanner is of the kind {system.kind}, expected one with pinholes")
-    return system
-
-
-def described(volume: Volume) -> str:
+def described(volume: "Volume") -> str:
     """A volume's voxels and the range of its values, for people: ``64 x 64 x 64 voxels, 0 to 4.2``."""
-    return f"{shape_text(volume.grid.shape)} voxels, {float(volume.array.min()):.4g} to {float(volume.array.max()):.4g}"
+    voxels, values = " x ".join(map(str, volume.grid.shape)), volume.array
+    return f"{voxels} voxels, {float(values.min()):.4g} to {float(values.max()):.4g}"
 
 
 def print_answer(arguments: argparse.Namespace, record: Any, lines: Iterable[str], notes: Iterable[str] = ()) -> None:

@@ -8,7 +8,9 @@ from ... import core as mph
 from ..runs.reconstructing import line_integrals
 from ..volumes.volume_files import VOLUME_FORMATS
 from ..xray.dose import decays
-from .options import add_command, add_run, add_workbook, described, output_path, print_answer
+from . import COMMANDS
+from .options import add_command, add_run, described, output_path, print_answer
+from .scanners import add_workbook
 
 _LEAST_DENSITY = 0.05
 """g/cm^3, of air and thin lung: the dose of electrons in less would be that of noise."""
@@ -16,8 +18,7 @@ _LEAST_DENSITY = 0.05
 
 def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     """Add the command."""
-    text = "motion seen by X rays, kerma of a CT, absorbed dose"
-    xray = add_command(subparsers, "xray", text, "mphdrr xray kerma both.xlsx")
+    xray = add_command(subparsers, "xray", COMMANDS["xray"], "mphdrr xray kerma both.xlsx")
     actions = xray.add_subparsers(metavar="ACTION", required=True)
 
     motion = add_run(actions, "motion", _motion)

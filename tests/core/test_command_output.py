@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 import mphdrr.core as mph
-from mphdrr.addon.cli import demo, figure, main, scene
+from mphdrr.addon.cli import COMMANDS, main
 from mphdrr.core.cli import build_parser
 
 from .conftest import WORKBOOK, refused, run_python
@@ -29,11 +29,16 @@ def parsers(
                 yield from parsers(below, (*words, name))
 
 
-ALL = dict(parsers(build_parser((figure.add_parser, scene.add_parser, demo.add_parser))))
+ALL = dict(parsers(build_parser(COMMANDS)))
 SHORT = [
     ("--version",), ("geometry", "show", str(WORKBOOK)), ("geometry", "show", str(WORKBOOK), "--json"),
     ("geometry", "check", str(WORKBOOK)), ("geometry", "performance", str(WORKBOOK)), ("events", "new"),
 ]  # fmt: skip
+
+
+def test_commands_are_listed_with_what_they_say_of_themselves():
+    full, quick = (build_parser(COMMANDS, only).format_help() for only in (None, ""))
+    assert full == quick
 
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no /dev/full")

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 import mphdrr.core as mph
-from mphdrr.addon.cli import demo, figure, main, scene
+from mphdrr.addon.cli import COMMANDS, main
 from mphdrr.core.cli import build_parser
 from mphdrr.core.design.recipe import TEMPLATE
 
@@ -38,7 +38,7 @@ def examples(parser: argparse.ArgumentParser) -> Iterator[str]:
                 yield from examples(action.choices[name])
 
 
-ALL = list(dict.fromkeys(examples(build_parser((figure.add_parser, scene.add_parser, demo.add_parser)))))
+ALL = list(dict.fromkeys(examples(build_parser(COMMANDS))))
 
 
 def run(folder: Path, command: str) -> None:

@@ -10,7 +10,8 @@ from ...geometry.views import Views
 from ...physics.isotopes import ISOTOPES, isotope
 from ...physics.materials import APERTURES, CRYSTALS
 from ...physics.optics import Optics
-from ..options import add_run, add_workbook, number_or_name
+from ..options import add_run, number_or_name
+from ..scanners import add_workbook
 
 MATERIAL_OPTIONS = ("aperture_mu", "opening_angle", "crystal_mu", "intrinsic_fwhm", "isotope")
 """Destinations of the options of `add_materials`."""

@@ -13,7 +13,8 @@ from ...geometry.system import PinholeSystem
 from ...physics.isotopes import ISOTOPES
 from ...recording import recorded_warnings
 from ...workbook import kinds_in, read_scanner
-from ..options import counted, print_answer, read_any, refuse
+from ..options import counted, print_answer, refuse
+from ..scanners import read_any
 from .arguments import add_action, add_edge, optics_of
 
 

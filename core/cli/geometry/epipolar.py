@@ -14,7 +14,8 @@ from ...geometry.views import Views
 from ...perspective.epipolar import epipolar_lines, epipolar_segments, epipole
 from ...perspective.triangulation import fit_marker
 from ...perspective.view_rays import points_at_depths
-from ..options import chosen_modules, print_answer, read_any
+from ..options import print_answer
+from ..scanners import chosen_modules, read_any
 from .arguments import add_action, add_views, views_of
 
 # A module is named as one that does not fit if the chance of its misfit is below this, counted for all modules.

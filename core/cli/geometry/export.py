@@ -8,7 +8,8 @@ from typing import Any, Literal
 
 from .... import core as mph
 from ...exchange import FORMATS, Format
-from ..options import add_run, add_workbook, chosen_modules, output_path, read_any
+from ..options import add_run, output_path
+from ..scanners import add_workbook, chosen_modules, read_any
 from .arguments import add_views, views_of
 
 _WORDS = {bool: "yes|no", int: "N", float: "NUMBER", str: "TEXT", tuple: "NUMBER,NUMBER,...", mph.Grid: "VOLUME-FILE"}

@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 
 from ...geometry.ring_fits import RingFit, fit_rings
-from ..options import print_answer, read_workbook
+from ..options import print_answer
+from ..scanners import read_workbook
 from .arguments import add_action
 
 _FOLLOWS = 0.1  # mm off the ellipse that rounding in a workbook explains

@@ -9,7 +9,8 @@ from .... import core as mph
 from ...physics.maps import MAPS
 from ...validation import shape_text, whole_shape
 from ...volumes.volume_files import VOLUME_FORMATS
-from ..options import chosen_modules, one_or_three, output_path, print_answer, progress_bar, read_workbook, refuse
+from ..options import one_or_three, output_path, print_answer, progress_bar, refuse
+from ..scanners import chosen_modules, read_workbook
 from .arguments import MATERIAL_OPTIONS, add_action, add_materials, optics_of
 
 _OF_MATERIALS = ("sensitivity", "resolution")

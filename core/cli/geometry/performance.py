@@ -8,7 +8,8 @@ import numpy as np
 from ...arrays import table_rows
 from ...physics.performance import magnification, resolution, sensitivity
 from ...physics.sampling import sampling_gaps
-from ..options import print_answer, read_workbook
+from ..options import print_answer
+from ..scanners import read_workbook
 from .arguments import add_action, add_materials, optics_of
 
 

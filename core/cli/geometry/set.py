@@ -15,7 +15,8 @@ from ...geometry.system import PinholeSystem
 from ...recording import recorded_warnings
 from ...scanner_kinds import SCANNERS
 from ...workbook import write_system
-from ..options import chosen_modules, output_path, print_answer, read_any
+from ..options import output_path, print_answer
+from ..scanners import chosen_modules, read_any
 from .arguments import add_action
 
 _SHORT = {

@@ -10,7 +10,8 @@ from ...errors import InputError
 from ...geometry.scanner import Scanner
 from ...geometry.system import PinholeSystem
 from ...workbook import draft_column_map
-from ..options import chosen_modules, kind_of, output_path, print_answer, read_any
+from ..options import output_path, print_answer
+from ..scanners import chosen_modules, kind_of, read_any
 from .arguments import add_action
 
 

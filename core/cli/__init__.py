@@ -55,7 +55,7 @@ class _Parser(argparse.ArgumentParser):
 
 
 def build_parser(more_commands: Mapping[str, str] = MappingProxyType({}), only: str | None = None) -> _Parser:
-    """The parser of ``mphdrr``: commands of this package and more, by their modules; all or `only` one have their options."""
+    """The parser of ``mphdrr``: commands by their modules, these and others; options of all, or of `only` one."""
     parser = _Parser(
         prog="mphdrr",
         description="Multi-pinhole SPECT: from the geometry workbook to projections to train on.",

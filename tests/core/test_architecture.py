@@ -130,7 +130,7 @@ def test_import_loads_nothing_heavy(module: str, unwanted: set[str]):
 @pytest.mark.parametrize("path", [path for path in SOURCES if "bpy" in path.read_text(encoding="utf-8")], ids=str)
 def test_labels_can_be_translated(path):
     """A label is a text that a catalogue can have: what is put into it comes after `pgettext_iface`."""
-    for call in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for call in ast.walk(tree_of(path)):
         for keyword in call.keywords if isinstance(call, ast.Call) else ():
             if keyword.arg in ("text", "heading", "placeholder") and isinstance(keyword.value, ast.JoinedStr):
                 words = [part.value for part in keyword.value.values if isinstance(part, ast.Constant)]
@@ -179,7 +179,7 @@ def test_only_one_file_writes_files():
     But for the two files of event sets that only grow at their ends, whose readers leave out what is not whole there.
     """
     for path in set(SOURCES) - {ROOT / "core" / name for name in ("files.py", "events/index.py", "events/store.py")}:
-        calls = [node for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))) if isinstance(node, ast.Call)]
+        calls = [node for node in ast.walk(tree_of(path)) if isinstance(node, ast.Call)]
         assert [call.lineno for call in calls if writes(call)] == [], path
 
 

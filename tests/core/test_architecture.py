@@ -67,17 +67,19 @@ def module_of(path: Path) -> str:
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
 
+MODULES = {module_of(path) for path in SOURCES}
+
+
 def imported_modules(path: Path) -> set[str]:
     """Modules whose names a file imports; a package counts only where names of its own are taken."""
     package = path.relative_to(ROOT).parent.parts
-    modules = {module_of(source) for source in SOURCES}
     found = set()
     for node in ast.walk(tree_of(path)):
         if isinstance(node, ast.ImportFrom) and node.level:
             base = package[: len(package) - node.level + 1]
             module = ".".join((*base, node.module) if node.module else base)
             for alias in node.names:
-                found.add(f"{module}.{alias.name}" if f"{module}.{alias.name}" in modules else module)
+                found.add(f"{module}.{alias.name}" if f"{module}.{alias.name}" in MODULES else module)
     return found - {module_of(path)}
 
 
@@ -187,10 +189,11 @@ def test_the_tests_that_the_pages_name_are_there():
     files: dict[str, str] = {}
     for path in sorted((ROOT / "tests").rglob("test_*.py")):
         files[path.name] = files.get(path.name, "") + path.read_text(encoding="utf-8")
+    everything = "".join(files.values())
     for page in sorted((ROOT / "docs").glob("*.md")):
         for line in page.read_text(encoding="utf-8").splitlines():
             named = {Path(name).name for name in re.findall(r"`([\w/]*test_\w+\.py)`", line)}
             assert named <= files.keys(), page.name
-            text = "".join(files[name] for name in (named if line.startswith("|") and named else files))
+            text = "".join(map(files.get, named)) if line.startswith("|") and named else everything
             missing = [name for name in re.findall(r"`(test_\w+)`", line) if f"def {name}(" not in text]
             assert not missing, page.name

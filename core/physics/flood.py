@@ -1,0 +1,126 @@
+"""Efficiencies of pixels from the image of an even source: what is left of a flood without its smooth trend."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..arrays import Array, Floats
+from ..errors import InputError, warn
+from ..validation import freeze, real_array
+
+_SURE = 5.5
+"""Standard deviations: chance gives them to one pixel in 5e7, to either side."""
+_MILD = 2.0
+"""Standard deviations from which on a pixel counts less for the trend (Cauchy)."""
+_ROUNDS = 30
+_LEAST_SHARE = 0.01
+"""A module that counts less than this share of what others do is dead."""
+_NORMAL = 1.4826  # standard deviations of a normal distribution in a median of absolute deviations
+
+
+@dataclass(frozen=True, eq=False)
+class FloodEfficiency:
+    """What a flood says of the pixels of M modules; its text is one line of it."""
+
+    efficiency: Floats
+    """(M, n_v, n_u), of `Emission`: mean 1 over the living pixels of each module, 0 of dead and hot ones."""
+    dead: NDArray[np.int64]
+    """(n, 3): module, row and column, from 0, of pixels that count too little in modules that live."""
+    hot: NDArray[np.int64]
+    """(n, 3): of pixels that count too much, and are not to be trusted."""
+    dead_modules: NDArray[np.int64]
+    """(n,): modules, from 0, that count nothing, or next to nothing."""
+    spread: float
+    """Relative standard deviation of the living pixels' efficiencies, without that of the counts."""
+
+    def __str__(self) -> str:
+        modules, rows, columns = self.efficiency.shape
+        what = f"{len(self.dead)} dead and {len(self.hot)} hot pixels, {len(self.dead_modules)} dead modules"
+        return f"{modules} modules of {columns} x {rows} pixels: {what}; others vary by {self.spread:.2%}"
+
+
+def flood_efficiency(flood: ArrayLike, smooth_order: int = 2, spread: float = 0.05) -> FloodEfficiency:
+    """The efficiencies of pixels, and which are dead or hot, from the image of an even source.
+
+    In each module a polynomial of rows and columns, the trend of the source's distance and angle, is fitted to the counts,
+    weighted as Poisson's noise asks and so that single pixels cannot pull at it. Efficiencies are counts by trend. A pixel is
+    dead or hot where it is 5.5 standard deviations off the trend: of the counts' noise (root of the deviance) and of the
+    pixels' own differences, by the median of the absolute deviations.
+
+    Parameters
+    ----------
+    flood
+        Counts (M, n_v, n_u), as the images of the runs whose efficiency they are to give: the same pixels, modules and
+        detector plane. 16 counts a pixel or more, or dead pixels cannot be told from chance; the efficiencies are as good as
+        their counts, 10,000 for 1 %.
+    smooth_order
+        Largest power in the polynomial, 0 for none but the mean.
+    spread
+        Relative standard deviation that pixels may have of their own at least: less than 5.5 of it is neither dead nor hot.
+    """
+    counts = real_array(flood, "flood", (None, None, None))
+    if not counts.size or counts.min() < 0:
+        raise InputError(f"flood: expected counts, 0 or more, got {counts.min(initial=0.0):g}")
+    if not isinstance(smooth_order, int | np.integer) or not 0 <= smooth_order <= 8:
+        raise InputError(f"flood: smooth_order: expected a whole number from 0 to 8, got {smooth_order!r}")
+    least = float(real_array(spread, "flood: spread", ()))
+    if least < 0:
+        raise InputError(f"flood: spread: expected 0 or more, got {least:g}")
+    middles = np.array([np.median(image) for image in counts])
+    totals = counts.sum(axis=(1, 2))
+    usual = float(np.median(totals[totals > 0])) if totals.any() else 0.0
+    is_dead = (totals <= _LEAST_SHARE * usual) | (totals == 0)
+    if (few := middles[~is_dead]).size and few.min() < _SURE**2 / 2 + 1:
+        warn(f"flood: {few.min():g} counts in half the pixels of a module: too few to tell dead pixels from chance", 2)
+    basis = _basis(counts.shape[1:], smooth_order)
+    found, low, high = (np.zeros(counts.shape, kind) for kind in (float, bool, bool))
+    own: list[float] = []
+    for m in np.flatnonzero(~is_dead):
+        trend = _trend(counts[m], basis, least)
+        off, differing = _deviations(counts[m], trend, least)
+        low[m], high[m] = (off < -_SURE) | (counts[m] == 0), off > _SURE
+        lives = ~(low[m] | high[m])
+        if lives.any():
+            ratio = np.where(lives, counts[m] / trend, 0.0)
+            found[m] = ratio / ratio[lives].mean()
+        own.append(differing)
+    places = (np.argwhere(which).astype(np.int64) for which in (low, high))
+    return FloodEfficiency(
+        freeze(found), *map(freeze, places), freeze(np.flatnonzero(is_dead)), float(np.mean(own)) if own else 0.0
+    )
+
+
+def _basis(shape: tuple[int, ...], order: int) -> Floats:
+    """Products of Legendre polynomials over an image, up to a total order: (terms, pixels)."""
+    v, u = (np.polynomial.legendre.legvander(np.linspace(-1, 1, n) if n > 1 else np.zeros(1), order) for n in shape)
+    terms = [np.outer(v[:, i], u[:, j]).ravel() for i in range(order + 1) for j in range(order + 1 - i)]
+    return np.array(terms)
+
+
+def _trend(counts: Array, basis: Floats, least: float) -> Floats:
+    """The smooth mean of an image of counts, by iterated weights."""
+    values = counts.ravel()
+    middle = max(float(np.median(values[values > 0])), 1e-3)
+    trend = np.full(values.shape, middle)
+    values = np.minimum(values, 3 * middle)  # to begin with
+    weights = (values > 0).astype(float)
+    for number in range(_ROUNDS):
+        scaled = basis * weights
+        terms: Any = np.linalg.lstsq(scaled @ basis.T, scaled @ values, rcond=None)[0]
+        trend = np.maximum(terms @ basis, 0.05 * middle)
+        if number == 0:
+            values = counts.ravel()
+        off, _ = _deviations(values, trend, least)
+        weights = 1 / (trend * (1 + (off / _MILD) ** 2))
+    return trend.reshape(counts.shape)
+
+
+def _deviations(counts: Array, trend: Floats, least: float) -> tuple[Floats, float]:
+    """How many standard deviations counts are off a trend, and how much pixels differ beside the noise, relatively."""
+    logs = np.log(np.divide(counts, trend), out=np.zeros_like(trend), where=counts > 0)
+    off = np.sign(counts - trend) * np.sqrt(np.maximum(2 * (counts * logs - counts + trend), 0))
+    ratio = counts / trend - 1
+    own = max((_NORMAL * float(np.median(np.abs(ratio)))) ** 2 - float(np.median(1 / trend)), 0.0) ** 0.5
+    return off / np.sqrt(1 + trend * max(own, least) ** 2), own

@@ -45,9 +45,9 @@ def flood_efficiency(flood: ArrayLike, smooth_order: int = 2, spread: float = 0.
     """The efficiencies of pixels, and which are dead or hot, from the image of an even source.
 
     In each module a polynomial of rows and columns, the trend of the source's distance and angle, is fitted to the counts,
-    weighted as Poisson's noise asks and so that single pixels cannot pull at it. Efficiencies are counts by trend. A pixel is
-    dead or hot where it is 5.5 standard deviations off the trend: of the counts' noise (root of the deviance) and of the
-    pixels' own differences, by the median of the absolute deviations.
+    weighted as Poisson's noise asks and so that single pixels cannot pull at it. Efficiencies are counts by trend. Dead or
+    hot is a pixel 5.5 standard deviations off the trend: of the counts' noise (root of the deviance) and of the pixels' own
+    differences, by the median of the absolute deviations.
 
     Parameters
     ----------

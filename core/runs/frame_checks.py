@@ -34,7 +34,7 @@ def warn_of_frames(
     pairs = [(known.setdefault(counts[k].tobytes(), k), k) for k in used if np.count_nonzero(counts[k]) > _FEW]
     if equal := [f"{called[one]} and {called[k]}" for one, k in pairs if one != k]:
         warn(f"{name}: equal in every pixel: {_some(equal)}")
-    dead = [(k, *place) for k in used for place in _empty_pixels(counts[k], declared[k])]
+    dead = [(k, *place) for k in sorted(used) for place in _empty_pixels(counts[k], declared[k])]
     if dead:
         places = _some([f"{called[k]}, row {row + 1}, column {column + 1}" for k, row, column in dead])
         warn(f"{name}: no counts in {places}, {_WELL} and more around; if they are dead, say so (--efficiency)")

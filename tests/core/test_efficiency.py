@@ -40,15 +40,15 @@ def test_the_projector_and_its_adjoint_are_weighted(system, forms, rng, backend,
     )
     options = {"hole": hole, "mu": mu, "intrinsic_fwhm": 4.0, "pixel_points": 1 if hole == "point" else None}
     x, y = rng.uniform(0, 1, grid.shape), rng.uniform(0, 1, (len(system), 4, 6))
-    bare = mph.Projector(grid, views, mph.Emission(system, **options), backend)
+    bare = mph.Projector(grid, views, mph.Emission(system, **options), backend, double=True)
     for efficiency in forms:
-        A = mph.Projector(grid, views, mph.Emission(system, efficiency=efficiency, **options), backend)
-        np.testing.assert_allclose(A(x), each(efficiency) * bare(x), rtol=2e-6, atol=1e-12)
-        np.testing.assert_allclose(A.T(y), bare.T(each(efficiency) * y), rtol=2e-6, atol=1e-12)
+        A = mph.Projector(grid, views, mph.Emission(system, efficiency=efficiency, **options), backend, double=True)
+        np.testing.assert_allclose(A(x), each(efficiency) * bare(x), rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(A.T(y), bare.T(each(efficiency) * y), rtol=1e-9, atol=1e-12)
         assert np.vdot(A(x), y) == pytest.approx(np.vdot(x, A.T(y)), rel=1e-6)
         np.testing.assert_array_equal(A.living, np.broadcast_to(each(efficiency) > 0, y.shape))
         which = np.array([7, 4, 3])
-        part = mph.Projector(grid, views[which], A.model.of_views(which), backend)
+        part = mph.Projector(grid, views[which], A.model.of_views(which), backend, double=True)
         np.testing.assert_allclose(part(x), A(x)[which], rtol=1e-6)
         for subset in A.subsets(3):
             np.testing.assert_allclose(subset(x), A(x)[subset.which], rtol=1e-5, atol=1e-9)
@@ -61,9 +61,9 @@ def test_gradients_are_weighted(system, forms, rng, hole):
     mu = mph.Volume(np.full(grid.shape, 0.002), grid, "mu")
     options = {"hole": hole, "mu": mu, "intrinsic_fwhm": 4.0, "pixel_points": 1 if hole == "point" else None}
     x, y = (torch.tensor(rng.uniform(0, 1, shape)) for shape in (grid.shape, (len(system), 4, 6)))
-    bare = mph.Projector(grid, views, mph.Emission(system, **options), "cpu")
+    bare = mph.Projector(grid, views, mph.Emission(system, **options), "cpu", double=True)
     efficiency = forms[2]
-    A = mph.Projector(grid, views, mph.Emission(system, efficiency=efficiency, **options), "cpu")
+    A = mph.Projector(grid, views, mph.Emission(system, efficiency=efficiency, **options), "cpu", double=True)
 
     def gradients(projector, weights):
         own = [x.clone().requires_grad_(), torch.tensor(mu.array, dtype=torch.float64).requires_grad_()]

@@ -1,7 +1,7 @@
 """Dead time: what a counter records that is busy for a while after each photon, and how many photons there were.
 
-A counter that photons do not disturb while it is busy (non-paralysable) records ``m = n / (1 + n tau)`` of a rate n. One that
-each photon makes busy anew (paralysable) records ``m = n exp(-n tau)``, at most ``1 / (e tau)``, at ``n = 1 / tau``.
+A counter that photons do not disturb while it is busy (non-paralysable) records ``m = n / (1 + n tau)`` of a rate n. One
+that each photon makes busy anew (paralysable) records ``m = n exp(-n tau)``, at most ``1 / (e tau)``, at ``n = 1 / tau``.
 
 Reference: G. F. Knoll, "Radiation Detection and Measurement", 4th edition (2010), section 4.VII.
 """

@@ -86,15 +86,14 @@ def flood_efficiency(flood: ArrayLike, smooth_order: int = 2, spread: float = 0.
             ratio = np.where(lives, counts[m] / trend, 0.0)
             found[m] = ratio / ratio[lives].mean()
         own.append(differing)
-    places = (np.argwhere(which).astype(np.int64) for which in (low, high))
-    return FloodEfficiency(
-        freeze(found), *map(freeze, places), freeze(np.flatnonzero(is_dead)), float(np.mean(own)) if own else 0.0
-    )
+    dead, hot, modules = (freeze(np.argwhere(which).astype(np.int64)) for which in (low, high, is_dead))
+    return FloodEfficiency(freeze(found), dead, hot, modules[:, 0], float(np.mean(own)) if own else 0.0)
 
 
 def _basis(shape: tuple[int, ...], order: int) -> Floats:
     """Products of Legendre polynomials over an image, up to a total order: (terms, pixels)."""
-    v, u = (np.polynomial.legendre.legvander(np.linspace(-1, 1, n) if n > 1 else np.zeros(1), order) for n in shape)
+    powers: Any = np.polynomial.legendre.legvander
+    v, u = (powers(np.linspace(-1, 1, n) if n > 1 else np.zeros(1), order) for n in shape)
     terms = [np.outer(v[:, i], u[:, j]).ravel() for i in range(order + 1) for j in range(order + 1 - i)]
     return np.array(terms)
 

@@ -54,7 +54,7 @@ def live_shares_of(recipe: Recipe, counts: Array) -> Floats:
     return live_shares(counts, recipe["model.time"], seconds, kind) if seconds else np.ones((1, 1, 1))  # type: ignore[arg-type]
 
 
-def scaled(values: float | Floats, shares: Floats) -> float | Floats:
+def scaled(values: float | Floats, shares: Array) -> float | Floats:
     """Efficiencies or a background, of any of their forms, times shares (M, 1, 1) of modules."""
     if np.all(shares == 1):
         return values

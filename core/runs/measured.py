@@ -128,8 +128,8 @@ def counts_run(
     efficiency = recipe_efficiency(recipe) if efficiency is None else efficiency
     efficiency = checked_background(efficiency, "efficiency (--efficiency)", len(system), (n_v, n_u))
     background = scaled(living_background(made["model.background"], efficiency), live_shares_of(made, images))
-    whole = {"unit": "counts", "settings": record, "background": background, "efficiency": efficiency}
-    run = ProjectionRun(images, system, views, **whole)
+    known: Any = {"settings": record, "background": background, "efficiency": efficiency}
+    run = ProjectionRun(images, system, views, unit="counts", **known)
     _warn_of_others(found, used, words, run)
     warn_of_frames(array, used, called, found.name, time, _declared(run, words, used, array.shape))
     return run

@@ -33,7 +33,7 @@ from .recipe import Recipe, recorded_recipe
 from .run import ProjectionRun
 
 _MODELS: dict[str, Any] = {"transmission": Transmission, "emission": Emission, "inverse-square": InverseSquareSum}
-_MODULES = "system.modules"
+_MODULES, _EFFICIENCY = "system.modules", "model.efficiency"
 _MOST_MU = 500.0
 """1/mm: more than any material of the tables attenuates photons of 10 keV or more."""
 
@@ -138,9 +138,10 @@ def recipe_model(recipe: Recipe, system: Scanner, mu: Volume | None = None, run:
         if "model.opening_angle_degrees" in recipe.given:
             given["opening_angle"] = math.radians(recipe["model.opening_angle_degrees"])
         given["mu"] = mu
-        is_own = run is not None and "recipe" in run.settings
-        is_own = is_own and run.recipe["model.efficiency"] == recipe["model.efficiency"]
-        given["efficiency"] = run.efficiency if is_own else recipe_efficiency(recipe)
+        if run is not None and "recipe" in run.settings and run.recipe[_EFFICIENCY] == recipe[_EFFICIENCY]:
+            given["efficiency"] = run.efficiency
+        else:
+            given["efficiency"] = recipe_efficiency(recipe)
         if run is not None and recipe["model.dead_time"]:
             shares = live_shares_of(recipe, run.projections)
             given |= {name: scaled(given.get(name, 0.0), shares) for name in ("background", "efficiency")}

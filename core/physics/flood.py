@@ -79,9 +79,11 @@ def flood_efficiency(flood: ArrayLike, smooth_order: int = 2, spread: float = 0.
     own: list[float] = []
     for m in np.flatnonzero(~is_dead):
         trend = _trend(counts[m], basis, least)
-        off, differing = _deviations(counts[m], trend, least)
-        low[m], high[m] = (off < -_SURE) | (counts[m] == 0), off > _SURE
-        lives = ~(low[m] | high[m])
+        lives = counts[m] > 0
+        for _ in range(3):  # how pixels differ is that of those that live
+            off, differing = _deviations(counts[m], trend, least, lives)
+            low[m], high[m] = (off < -_SURE) | (counts[m] == 0), off > _SURE
+            lives = ~(low[m] | high[m])
         if lives.any():
             ratio = np.where(lives, counts[m] / trend, 0.0)
             found[m] = ratio / ratio[lives].mean()
@@ -111,15 +113,16 @@ def _trend(counts: Array, basis: Floats, least: float) -> Floats:
         trend = np.maximum(terms @ basis, 0.05 * middle)
         if number == 0:
             values = counts.ravel()
-        off, _ = _deviations(values, trend, least)
-        weights = 1 / (trend * (1 + (off / _MILD) ** 2))
+        off, _ = _deviations(values, trend, least, values > 0)
+        weights = (values > 0) / (trend * (1 + (off / _MILD) ** 2))
     return trend.reshape(counts.shape)
 
 
-def _deviations(counts: Array, trend: Floats, least: float) -> tuple[Floats, float]:
-    """How many standard deviations counts are off a trend, and how much pixels differ beside the noise, relatively."""
+def _deviations(counts: Array, trend: Floats, least: float, lives: Array) -> tuple[Floats, float]:
+    """How many standard deviations counts are off a trend, and how much pixels that live differ beside noise, relatively."""
     logs = np.log(np.divide(counts, trend), out=np.zeros_like(trend), where=counts > 0)
     off = np.sign(counts - trend) * np.sqrt(np.maximum(2 * (counts * logs - counts + trend), 0))
-    ratio = counts / trend - 1
-    own = max((_NORMAL * float(np.median(np.abs(ratio)))) ** 2 - float(np.median(1 / trend)), 0.0) ** 0.5
+    ratio, noise = (counts / trend - 1)[lives], (1 / trend)[lives]
+    middles = (float(np.median(values)) if values.size else 0.0 for values in (np.abs(ratio), noise))
+    own = max((_NORMAL * next(middles)) ** 2 - next(middles), 0.0) ** 0.5
     return off / np.sqrt(1 + trend * max(own, least) ** 2), own

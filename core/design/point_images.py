@@ -87,7 +87,8 @@ def point_images(model: Emission, views: Views, points: ArrayLike, activity: Arr
     totals = 1000 * model.effective_time * activities[:, None] * sensitivity(system, points, optics=model.optics)
     pitch, blurs = np.abs(lattice.step), lattice.blurs(views.shape)
     shares = [disc_shares(at, radius, pitch, views.shape, blurs)[0] for at, radius in zip(pixels, radii, strict=True)]
-    return totals[..., None, None] * shares * each_pixel(model.efficiency) + each_pixel(model.background)
+    efficiency = each_pixel(model.efficiency)
+    return totals[..., None, None] * shares * efficiency + np.where(efficiency > 0, each_pixel(model.background), 0.0)
 
 
 def disc_shares(

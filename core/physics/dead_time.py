@@ -61,14 +61,12 @@ def live_shares(
     _, rates, busy = _checked(counts, time, dead_time, kind)
     recorded = rates * busy
     most = 1.0 if kind == "non-paralysable" else math.exp(-1)
-    worst = np.argmax(recorded) if recorded.size else 0
-    is_beyond = recorded >= most if kind == "non-paralysable" else recorded > most * (1 + 1e-12)
-    if is_beyond.any():
-        rate, tau = (float(np.broadcast_to(values, recorded.shape).flat[worst]) for values in (rates, busy))
-        raise InputError(
-            f"dead time: {rate:.6g} counts per s at index {worst}, but a {kind} counter that is busy for {tau:g} s records "
-            f"at most {most / tau:.6g}"
-        )
+    worst, beyond = int(np.argmax(recorded)), most * (1 - 1e-12 if kind == "non-paralysable" else 1 + 1e-12)
+    if recorded.flat[worst] > beyond:
+        tau = float(np.broadcast_to(busy, recorded.shape).flat[worst])
+        found = f"{recorded.flat[worst] / tau:.6g} counts per s at index {worst}"
+        can = f"a {kind} counter that is busy for {tau:g} s records at most {most / tau:.6g}"
+        raise InputError(f"dead time: {found}, but {can}")
     if kind == "non-paralysable":
         return 1 - recorded
     p = np.sqrt(np.maximum(2 * (1 - math.e * recorded), 0))
@@ -86,10 +84,8 @@ def _checked(counts: ArrayLike, time: ArrayLike, dead_time: ArrayLike, kind: str
     one_of(kind, KINDS, "kind")
     numbers = real_array(counts, "counts", None)
     seconds, busy = real_array(time, "time", None), real_array(dead_time, "dead_time", None)
-    if numbers.min(initial=0.0) < 0 or busy.min(initial=0.0) < 0:
-        raise InputError("counts and dead_time: expected 0 or more")
-    if seconds.min(initial=np.inf) <= 0:
-        raise InputError(f"time: expected more than 0 s, got {seconds.min():g}")
+    if not numbers.size or numbers.min() < 0 or busy.min(initial=0.0) < 0 or seconds.min(initial=1.0) <= 0:
+        raise InputError("dead time: expected counts and dead_time of 0 or more, and time of more than 0 s")
     totals = numbers
     if numbers.ndim == 3:
         totals = numbers.sum(axis=(1, 2), keepdims=True)

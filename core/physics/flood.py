@@ -8,13 +8,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..arrays import Array, Floats
 from ..errors import InputError, warn
-from ..validation import freeze, real_array
+from ..validation import at_least_0, freeze, one_of, real_array
 
 _SURE = 5.5
 """Standard deviations: chance gives them to one pixel in 5e7, to either side."""
 _MILD = 2.0
 """Standard deviations from which on a pixel counts less for the trend (Cauchy)."""
 _ROUNDS = 30
+_FEWEST = 16  # counts: chance leaves a pixel of fewer empty too often
 _LEAST_SHARE = 0.01
 """A module that counts less than this share of what others do is dead."""
 _NORMAL = 1.4826  # standard deviations of a normal distribution in a median of absolute deviations
@@ -60,21 +61,17 @@ def flood_efficiency(flood: ArrayLike, smooth_order: int = 2, spread: float = 0.
     spread
         Relative standard deviation that pixels may have of their own at least: less than 5.5 of it is neither dead nor hot.
     """
-    counts = real_array(flood, "flood", (None, None, None))
-    if not counts.size or counts.min() < 0:
-        raise InputError(f"flood: expected counts, 0 or more, got {counts.min(initial=0.0):g}")
-    if not isinstance(smooth_order, int | np.integer) or not 0 <= smooth_order <= 8:
-        raise InputError(f"flood: smooth_order: expected a whole number from 0 to 8, got {smooth_order!r}")
-    least = float(real_array(spread, "flood: spread", ()))
-    if least < 0:
-        raise InputError(f"flood: spread: expected 0 or more, got {least:g}")
-    middles = np.array([np.median(image) for image in counts])
-    totals = counts.sum(axis=(1, 2))
-    usual = float(np.median(totals[totals > 0])) if totals.any() else 0.0
-    is_dead = (totals <= _LEAST_SHARE * usual) | (totals == 0)
-    if (few := middles[~is_dead]).size and few.min() < _SURE**2 / 2 + 1:
-        warn(f"flood: {few.min():g} counts in half the pixels of a module: too few to tell dead pixels from chance", 2)
-    basis = _basis(counts.shape[1:], smooth_order)
+    counts, least = real_array(flood, "flood", (None, None, None)), at_least_0(spread, "flood: spread")
+    if counts.min(initial=0.0) < 0:
+        raise InputError(f"flood: expected counts, 0 or more, got {counts.min():g}")
+    one_of(smooth_order, range(9), "flood: smooth_order")
+    totals, middles = counts.sum(axis=(1, 2)), np.median(counts, axis=(1, 2))
+    is_dead = totals <= _LEAST_SHARE * (np.median(totals[totals > 0]) if totals.any() else 0.0)
+    if middles.min(initial=np.inf, where=~is_dead) < _FEWEST:
+        warn("flood: a module with few counts in half its pixels: too few to tell dead pixels from chance", 2)
+    v, u = (np.linspace(-1, 1, n)[:, None] ** np.arange(smooth_order + 1) for n in counts.shape[1:])
+    powers = [(i, j) for i in range(smooth_order + 1) for j in range(smooth_order + 1 - i)]
+    basis = np.array([np.outer(v[:, i], u[:, j]).ravel() for i, j in powers])
     found, low, high = (np.zeros(counts.shape, kind) for kind in (float, bool, bool))
     own: list[float] = []
     for m in np.flatnonzero(~is_dead):
@@ -92,16 +89,8 @@ def flood_efficiency(flood: ArrayLike, smooth_order: int = 2, spread: float = 0.
     return FloodEfficiency(freeze(found), dead, hot, modules[:, 0], float(np.mean(own)) if own else 0.0)
 
 
-def _basis(shape: tuple[int, ...], order: int) -> Floats:
-    """Products of Legendre polynomials over an image, up to a total order: (terms, pixels)."""
-    powers: Any = np.polynomial.legendre.legvander
-    v, u = (powers(np.linspace(-1, 1, n) if n > 1 else np.zeros(1), order) for n in shape)
-    terms = [np.outer(v[:, i], u[:, j]).ravel() for i in range(order + 1) for j in range(order + 1 - i)]
-    return np.array(terms)
-
-
 def _trend(counts: Array, basis: Floats, least: float) -> Floats:
-    """The smooth mean of an image of counts, by iterated weights."""
+    """The smooth mean of an image of counts, a sum of the terms (n, pixels) of a `basis`, by iterated weights."""
     values = counts.ravel()
     middle = max(float(np.median(values[values > 0])), 1e-3)
     trend = np.full(values.shape, middle)

@@ -25,7 +25,7 @@ from ..validation import instance, positive, real_array, strict_whole
 from ..volumes.volume import Volume, require_quantity
 from .bundles import Beam
 from .hole_response import WholeHoles
-from .models import Model, checked_background, checked_times, living_background
+from .models import Model, checked_background, checked_times
 from .pixel_points import TOLERANCE, expected_error, lattices, offsets, points_needed, require_points, shadow_edges
 from .rays import Fan, view_rays
 
@@ -193,8 +193,6 @@ class Emission(Model):
         self._set("pixel_points", require_points(self.pixel_points, "emission: pixel_points"))
         for name in ("background", "efficiency"):
             self._set(name, checked_background(getattr(self, name), f"emission: {name}", len(self.system)))
-        with naming("emission"):
-            self._set("background", living_background(self.background, self.efficiency))
         if self.hole not in ("auto", "depth", "rays", "point"):
             raise InputError(f"emission: hole: expected 'auto', 'depth', 'rays' or 'point', got {self.hole!r}")
         has_points = (self.aperture_points, self.aperture_tolerance) != (None, None)

@@ -187,14 +187,3 @@ def each_pixel(values: float | Floats) -> Floats:
     """One number, those of views (M,), or images (M, n_v, n_u), with all three axes."""
     array = np.asarray(values, np.float64)
     return array.reshape(array.shape + (1,) * (3 - array.ndim))
-
-
-def living_background(background: float | Floats, efficiency: float | Floats) -> float | Floats:
-    """A model's background, of its own form or that of the efficiency, where dead pixels have none."""
-    if np.all(efficiency) or not np.any(background):
-        return background
-    shapes = [np.shape(values)[1:] for values in (background, efficiency) if np.ndim(values) == 3]
-    if len(set(shapes)) > 1:
-        raise InputError("background and efficiency: images of {} and {} pixels".format(*map(shape_text, shapes)))
-    found = np.where(each_pixel(efficiency) > 0, each_pixel(background), 0.0)
-    return freeze(found if shapes else found[:, 0, 0]) if found.size > 1 else float(found[0, 0, 0])

@@ -182,9 +182,12 @@ class Projector(LinearOperator):
 
     @property
     def background(self) -> Array:
-        """What the model expects besides the volume's images, (M, n_v, n_u), read-only: ``A(x) + A.background``."""
-        values = np.asarray(self.model.background)
-        return np.broadcast_to(values[:, None, None] if values.ndim == 1 else values, self.shape_out)
+        """What the model expects besides the volume's images, (M, n_v, n_u), read-only: ``A(x) + A.background``.
+
+        Dead pixels have none.
+        """
+        values = each_pixel(self.model.background)
+        return freeze(np.where(self.living, values, 0.0)) if values.any() else np.broadcast_to(values, self.shape_out)
 
     @property
     def living(self) -> NDArray[np.bool_]:

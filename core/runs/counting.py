@@ -11,7 +11,6 @@ from ..files import AnyPath, require_file
 from ..hdf5 import datasets, numbers, opened
 from ..physics.dead_time import live_shares
 from ..projector.models import each_pixel
-from ..validation import shape_text
 from ..volumes.formats import numpy_files
 from .recipe import Recipe
 
@@ -21,20 +20,15 @@ EFFICIENCY = "efficiency"
 
 def read_efficiency(path: AnyPath) -> Array:
     """The efficiencies (M,) or (M, n_v, n_u) in a file: the array of .npy; of .npz and .h5 the only one, or "efficiency"."""
-    path = Path(path)
-    require_file(path)
-    with reading(path, "efficiencies"):
-        if path.suffix.lower() in (".h5", ".hdf5"):
-            with opened(path, whole=True) as file:
-                arrays: dict[str, Any] = {name: numbers(item) for name, item in datasets(file).items()}
+    with reading(require_file(path), "efficiencies"):
+        if Path(path).suffix.lower() in (".npy", ".npz"):
+            arrays = numpy_files.load(Path(path))
         else:
-            arrays = dict(numpy_files.load(path))
-        name = EFFICIENCY if EFFICIENCY in arrays else next(iter(arrays), "")
-        if len(arrays) != 1 and name != EFFICIENCY:
+            with opened(path, whole=True) as file:
+                arrays = {name: numbers(item) for name, item in datasets(file).items()}
+        if len(arrays) != 1 and EFFICIENCY not in arrays:
             raise InputError(f"expected one array, or one called {EFFICIENCY}, found {', '.join(arrays) or 'none'}")
-        if arrays[name].ndim not in (1, 3):
-            raise InputError(f"expected a number or an image for each module, got {shape_text(arrays[name].shape)}")
-        return np.asarray(arrays[name])
+        return arrays.get(EFFICIENCY, next(iter(arrays.values())))
 
 
 def recipe_efficiency(recipe: Recipe) -> Any:

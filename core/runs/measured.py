@@ -20,7 +20,7 @@ from ..files import read_text
 from ..geometry.scanner import Detector, Scanner
 from ..memory import require
 from ..progress import Stages
-from ..projector.models import checked_background, checked_times, each_pixel, living_background
+from ..projector.models import checked_background, checked_times, each_pixel
 from ..validation import instance, one_of, real_numbers, require_finite, shape_text
 from .counting import live_shares_of, recipe_efficiency, scaled
 from .frame_checks import warn_of_frames
@@ -127,7 +127,7 @@ def counts_run(
     }  # fmt: skip
     efficiency = recipe_efficiency(recipe) if efficiency is None else efficiency
     efficiency = checked_background(efficiency, "efficiency (--efficiency)", len(system), (n_v, n_u))
-    background = scaled(living_background(made["model.background"], efficiency), live_shares_of(made, images))
+    background = scaled(made["model.background"], live_shares_of(made, images))
     known: Any = {"settings": record, "background": background, "efficiency": efficiency}
     run = ProjectionRun(images, system, views, unit="counts", **known)
     _warn_of_others(found, used, words, run)

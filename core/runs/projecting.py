@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..arrays import Floats32
+from ..arrays import Array, Floats32
 from ..errors import InputError, warn
 from ..geometry.scanner import Detector, Scanner
 from ..geometry.system import PinholeSystem
@@ -51,13 +51,12 @@ class Imaging:
         (tau, kind), model = self.dead_time, self.model
         if not tau or not isinstance(model, Emission):
             return np.ones((1, 1, 1), np.float32)
-        totals = images.sum(axis=(1, 2), dtype=float)
+        totals = np.maximum(images.sum(axis=(1, 2), dtype=float), 1e-30)
         if kind == "paralysable" and (beyond := totals / model.time > 1 / tau).any():
             numbers = ", ".join(map(str, model.system.numbers[beyond][:5]))
             warn(f"dead time: so many photons that more of them would be fewer counts, in module {numbers}")
-        recorded = dead_time_counts(totals, model.time, tau, kind)  # type: ignore[arg-type]
-        shares = np.divide(recorded, totals, out=np.ones_like(totals), where=totals > 0)
-        return shares.astype(np.float32)[:, None, None]
+        recorded: Array = dead_time_counts(totals, model.time, tau, kind) / totals  # type: ignore[arg-type]
+        return recorded.astype(np.float32)[:, None, None]
 
     def expected(self, volume: Volume, mu: Floats32 | None = None, progress: Progress | None = None) -> Floats32:
         """The expected images (M, n_v, n_u) of a volume, the background included, without dead time.

@@ -30,28 +30,25 @@ def each(values):
 @pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("hole", ["auto", "point"])
 def test_the_projector_and_its_adjoint_are_weighted(system, forms, rng, backend, hole):
-    if backend == "numpy" and hole == "auto":
-        pytest.skip("slow")
-    near = mph.Grid.centered(7, 52.0)  # reaches so close to pinholes that rays project some voxels
-    grid, views, mu = (
-        near,
-        system.views((4, 6), pitch=90.0),
-        mph.Volume(np.full((3, 3, 3), 0.01), near.box([2, 2, 2], (3, 3, 3)), "mu"),
-    )
+    if backend != "cpu" and hole == "auto":
+        pytest.skip("numpy is slow, and torch takes the same kernels")
+    grid, views = mph.Grid.centered(6, 60.0), system.views((4, 6), pitch=90.0)
+    mu = mph.Volume(np.full((3, 3, 3), 0.01), grid.box([2, 2, 2], (3, 3, 3)), "mu")
     options = {"hole": hole, "mu": mu, "intrinsic_fwhm": 4.0, "pixel_points": 1 if hole == "point" else None}
     x, y = rng.uniform(0, 1, grid.shape), rng.uniform(0, 1, (len(system), 4, 6))
     bare = mph.Projector(grid, views, mph.Emission(system, **options), backend, double=True)
+    assert bool(bare._close_parts) == (hole == "auto"), "rays project voxels close to pinholes, by the whole hole"
     for efficiency in forms:
         A = mph.Projector(grid, views, mph.Emission(system, efficiency=efficiency, **options), backend, double=True)
         np.testing.assert_allclose(A(x), each(efficiency) * bare(x), rtol=1e-9, atol=1e-12)
         np.testing.assert_allclose(A.T(y), bare.T(each(efficiency) * y), rtol=1e-9, atol=1e-12)
         assert np.vdot(A(x), y) == pytest.approx(np.vdot(x, A.T(y)), rel=1e-6)
         np.testing.assert_array_equal(A.living, np.broadcast_to(each(efficiency) > 0, y.shape))
-        which = np.array([7, 4, 3])
-        part = mph.Projector(grid, views[which], A.model.of_views(which), backend, double=True)
-        np.testing.assert_allclose(part(x), A(x)[which], rtol=1e-6)
-        for subset in A.subsets(3):
-            np.testing.assert_allclose(subset(x), A(x)[subset.which], rtol=1e-5, atol=1e-9)
+    which = np.array([7, 4, 3])
+    part = mph.Projector(grid, views[which], A.model.of_views(which), backend, double=True)
+    np.testing.assert_allclose(part(x), A(x)[which], rtol=1e-6)
+    for subset in A.subsets(3):
+        np.testing.assert_allclose(subset(x), A(x)[subset.which], rtol=1e-5, atol=1e-9)
 
 
 @pytest.mark.parametrize("hole", ["auto", "point"])
@@ -62,6 +59,7 @@ def test_gradients_are_weighted(system, forms, rng, hole):
     options = {"hole": hole, "mu": mu, "intrinsic_fwhm": 4.0, "pixel_points": 1 if hole == "point" else None}
     x, y = (torch.tensor(rng.uniform(0, 1, shape)) for shape in (grid.shape, (len(system), 4, 6)))
     bare = mph.Projector(grid, views, mph.Emission(system, **options), "cpu", double=True)
+    assert bool(bare._close_parts) == (hole == "auto")
     efficiency = forms[2]
     A = mph.Projector(grid, views, mph.Emission(system, efficiency=efficiency, **options), "cpu", double=True)
 
@@ -113,8 +111,8 @@ def test_dead_pixels_have_no_background(system, scan):
             A = mph.Projector(grid, views, emission(system, time=600, background=background, efficiency=value))
             expected = np.where(np.broadcast_to(each(value), A.shape_out) > 0, each(background), 0)
             np.testing.assert_array_equal(A.background, expected)
-    with pytest.raises(mph.InputError, match="background and efficiency: images of 4 x 4 and 8 x 8 pixels"):
-        mph.Emission(system, background=np.ones((12, 4, 4)), efficiency=efficiency)
+            points = mph.point_images(A.model, views, [[0.0, 0.0, 0.0]], 0.0)
+            np.testing.assert_allclose(points[0], expected)
 
 
 def test_noise_free_mlem_returns_the_same_volume_with_any_efficiency(system, scan, rng):
@@ -291,7 +289,7 @@ def test_what_is_no_flood_is_refused_and_too_few_counts_are_said(rng):
         mph.flood_efficiency(np.ones((4, 4)))
     with pytest.raises(mph.InputError, match="smooth_order"):
         mph.flood_efficiency(np.ones((1, 4, 4)), -1)
-    with pytest.warns(mph.InputWarning, match="3 counts in half the pixels of a module: too few"):
+    with pytest.warns(mph.InputWarning, match="too few to tell dead pixels"):
         mph.flood_efficiency(np.full((1, 8, 8), 3))
     assert mph.flood_efficiency(np.zeros((2, 4, 4))).dead_modules.tolist() == [0, 1]
 
@@ -305,13 +303,11 @@ def test_the_command_writes_what_recipes_read(workbook, rng, tmp_path, capsys):
     assert main(["project", str(workbook), "--counts", str(tmp_path / "flood.npy"), *said, "-o", run]) == 0
     assert main(["counts", "flood", run, "-o", str(tmp_path / "e.npy")]) == 0
     printed = capsys.readouterr().out
-    assert "dead: module 3, row 4, column 5\n" in printed and "hot: module 2, row 6, column 7\n" in printed
-    assert main(["counts", "flood", run, "-o", str(tmp_path / "e.npz"), "--json"]) == 0
+    assert "dead: 3/4/5\n" in printed and "hot: 2/6/7\n" in printed
+    assert main(["counts", "flood", run, "-o", str(tmp_path / "again.npy"), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["dead"] == [[3, 4, 5]]
     options = ["--modules", "2-4", "--emission", "--size", "16", "16", "--voxels", "8", "--detector", "real"]
-    for name in ("e.npy", "e.npz"):
-        output = tmp_path / "run.h5"
-        command = ["project", str(workbook), *options, "--efficiency", str(tmp_path / name), "-o", str(output)]
-        assert main(command) == 0
-        found = mph.read_run(output)
-        assert found.efficiency[1, 3, 4] == found.efficiency[0, 5, 6] == 0 and found.projections[1, 3, 4] == 0
+    output = tmp_path / "run.h5"
+    assert main(["project", str(workbook), *options, "--efficiency", str(tmp_path / "e.npy"), "-o", str(output)]) == 0
+    found = mph.read_run(output)
+    assert found.efficiency[1, 3, 4] == found.efficiency[0, 5, 6] == 0 and found.projections[1, 3, 4] == 0

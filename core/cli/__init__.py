@@ -24,6 +24,7 @@ COMMANDS = {
     "phantom": "make a phantom volume",
     "volume": "look at volumes and convert them",
     "project": "project a volume, or a phantom, into every module; or take measured counts for the projections",
+    "counts": "find dead and hot pixels in measured counts",
     "reconstruct": "reconstruct the volume that a run's images are of",
     "backproject": "put together what a run's views say of each voxel: sum, geometric mean or minimum",
     "score": "score a reconstructed volume beside the truth: what a run was simulated of, a phantom, or a volume",

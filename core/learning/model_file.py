@@ -43,6 +43,8 @@ ALLOWED = ("scanner", "grid", "physics")
 """What may be allowed to differ from what a network was trained for."""
 _NO_PHYSICS = ("time", "background")
 """Entries of a model's record that may differ: a network is given counts and background of each scan."""
+_LATER = {"start": 0.0, "efficiency": 1.0}
+"""Entries that records of earlier versions lack, and what they stand for."""
 _KEPT = 4
 _SETUPS: dict[Any, Setup] = {}
 """Setups that all networks share, the last used last, and how many are kept."""
@@ -84,7 +86,9 @@ class Contents:
 
 
 def _physics(text: str) -> dict[str, Any]:
-    return {name: value for name, value in json.loads(text).items() if name not in _NO_PHYSICS}
+    known = _LATER | json.loads(text)
+    times = known["time"] if isinstance(known.get("time"), list) else []  # one stands for all: then it is a scale
+    return {name: value for name, value in known.items() if name not in _NO_PHYSICS} | {"times": times}
 
 
 def write_model(contents: Contents, path: AnyPath) -> None:

@@ -26,13 +26,14 @@ from ..volumes.rearranging import centered
 from ..volumes.volume import Volume
 from ..volumes.volume_files import read_volume, read_volume_of
 from ..workbook import read_scanner
+from .counting import dead_time_of, live_shares_of, recipe_efficiency, scaled
 from .measured import recipe_counts
 from .projecting import Imaging, project_run, warn_of_energy
 from .recipe import Recipe, recorded_recipe
 from .run import ProjectionRun
 
 _MODELS: dict[str, Any] = {"transmission": Transmission, "emission": Emission, "inverse-square": InverseSquareSum}
-_MODULES = "system.modules"
+_MODULES, _EFFICIENCY = "system.modules", "model.efficiency"
 _MOST_MU = 500.0
 """1/mm: more than any material of the tables attenuates photons of 10 keV or more."""
 
@@ -91,7 +92,7 @@ def run_recipe(
             system, source, **_detector(recipe), backend=recipe["compute.backend"], threads=recipe["compute.threads"],
             settings={"volume": _volume_name(record), **converted, "recipe": record.tables()},
             model=recipe_model(recipe, system, mu_of_it), photons=recipe["model.photons"],
-            noise_seed=record["noise.seed"], progress=stages("projecting"),
+            noise_seed=record["noise.seed"], progress=stages("projecting"), dead_time=dead_time_of(recipe),
         )  # fmt: skip
 
 
@@ -123,8 +124,12 @@ def _detector(recipe: Recipe) -> dict[str, Any]:
     return {"shape": shape, "detector": recipe["detector.plane"], **given}
 
 
-def recipe_model(recipe: Recipe, system: Scanner, mu: Volume | None = None) -> Model:
-    """The model that a recipe asks for; `mu` is what attenuates. `InputError` where the settings do not go together."""
+def recipe_model(recipe: Recipe, system: Scanner, mu: Volume | None = None, run: ProjectionRun | None = None) -> Model:
+    """The model that a recipe asks for; `mu` is what attenuates. `InputError` where the settings do not go together.
+
+    Of a `run` it has the efficiencies, if they are the recipe's, and what dead time has left of its photons is, as a part
+    of them, in its efficiency and background: so counts have Poisson's noise.
+    """
     cls = _MODELS[recipe["model.kind"]]
     given = recipe.fields("model", cls)
     if given.get("pixel_points") == "auto":
@@ -133,6 +138,13 @@ def recipe_model(recipe: Recipe, system: Scanner, mu: Volume | None = None) -> M
         if "model.opening_angle_degrees" in recipe.given:
             given["opening_angle"] = math.radians(recipe["model.opening_angle_degrees"])
         given["mu"] = mu
+        if run is not None and "recipe" in run.settings and run.recipe[_EFFICIENCY] == recipe[_EFFICIENCY]:
+            given["efficiency"] = run.efficiency
+        else:
+            given["efficiency"] = recipe_efficiency(recipe)
+        if run is not None and recipe["model.dead_time"]:
+            shares = live_shares_of(recipe, run.projections)
+            given |= {name: scaled(given.get(name, 0.0), shares) for name in ("background", "efficiency")}
     return cls(**given) if cls is Transmission else cls(system, **given)
 
 
@@ -170,7 +182,7 @@ def projector_of_run(
     """
     recipe = run.recipe if recipe is None else recipe
     if mu is None and recipe["model.kind"] == "emission":
-        model = recipe_model(recipe, run.system)
+        model = recipe_model(recipe, run.system, run=run)
         if recipe["attenuation.of_phantom"]:
             mu = _mu_of_phantom(recipe_phantom(recipe), phantom_pose(recipe), grid, model, stages)
         elif recipe["volume.center"] and recipe["attenuation.file"] is not None:
@@ -179,7 +191,7 @@ def projector_of_run(
             )
         else:
             mu = _attenuation(recipe, model, stages)
-    return recipe_imaging(recipe, run.system, run.views, grid, mu, backend, threads).projector
+    return Projector(grid, run.views, recipe_model(recipe, run.system, mu, run), backend, threads)
 
 
 def recipe_imaging(
@@ -188,7 +200,7 @@ def recipe_imaging(
 ) -> Imaging:  # fmt: skip
     """What makes a recipe's images of volumes on a grid; `mu` is what attenuates."""
     projector = Projector(grid, views, recipe_model(recipe, system, mu), backend, threads)
-    return Imaging(projector, recipe["model.photons"])
+    return Imaging(projector, recipe["model.photons"], dead_time_of(recipe))
 
 
 def _volume_name(record: Recipe) -> str:

@@ -60,6 +60,7 @@ from .physics.sampling import sampling_gaps
 from .progress import Cancelled, Progress
 from .projector import (
     Emission,
+    FrameProjector,
     GeometryGradient,
     InverseSquareSum,
     Projector,

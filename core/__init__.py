@@ -71,6 +71,7 @@ if TYPE_CHECKING:
     from .progress import Cancelled, Progress
     from .projector import (
         Emission,
+        FrameProjector,
         GeometryGradient,
         InverseSquareSum,
         Projector,

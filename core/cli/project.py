@@ -12,6 +12,7 @@ from ..phantoms.kinds import KINDS
 from ..runs.files import FORMATS
 from ..runs.mosaic import write_sheet
 from ..runs.presets import PRESETS
+from ..runs.run_recipe import frames_of
 from ..runs.settings import SETTINGS
 from .options import add_run, numbered_path, output_path, progress_bar
 from .recipe_options import add_entries, add_option, add_setting, typed_entries
@@ -137,8 +138,7 @@ def _run(arguments: argparse.Namespace) -> None:
     path = output_path(arguments.output, FORMATS)
     picture = output_path(arguments.mosaic) if arguments.mosaic else None
     recipe, kept = _chosen(arguments)
-    states = recipe["volume.states"] or ()
-    count = max(1, len(states))
+    states, count = recipe["volume.states"] or (), len(frames_of(recipe))
     outputs = {numbered_path(path, number, count).resolve() for number in range(1, count + 1)}
     counts = recipe["counts.files"] or ()
     for file in (*states, *counts, recipe["volume.file"], recipe["attenuation.file"]):

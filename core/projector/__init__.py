@@ -7,6 +7,7 @@ before it is needed.
 """
 
 from .emission import Emission
+from .frames import FrameProjector
 from .geometry_gradient import GeometryGradient, geometry_gradient
 from .inverse_square import InverseSquareSum
 from .linear_operator import Adjoint

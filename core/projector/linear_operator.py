@@ -67,12 +67,12 @@ class LinearOperator(ABC):
 
     @property
     @abstractmethod
-    def shape_in(self) -> tuple[int, int, int]:
+    def shape_in(self) -> tuple[int, ...]:
         """Shape of what it takes."""
 
     @property
     @abstractmethod
-    def shape_out(self) -> tuple[int, int, int]:
+    def shape_out(self) -> tuple[int, ...]:
         """Shape of what it gives."""
 
     def _check(self, x: Any) -> ArrayOrTensor:
@@ -82,7 +82,7 @@ class LinearOperator(ABC):
         self, x: ArrayOrTensor, progress: Progress | None = None, mu: ArrayOrTensor | None = None
     ) -> ArrayOrTensor:
         """Apply to a checked array or tensor, one by one to those of a batch; nothing is recorded in a graph."""
-        batch = tuple(x.shape[:-3])
+        batch = tuple(x.shape[: x.ndim - len(self.shape_in)])
         if not batch:
             return self._run_one(x, progress, mu)
         n = math.prod(batch)
@@ -121,12 +121,12 @@ class Adjoint(LinearOperator):
         return self._operator
 
     @property
-    def shape_in(self) -> tuple[int, int, int]:
+    def shape_in(self) -> tuple[int, ...]:
         """Shape of what the operator gives."""
         return self._operator.shape_out
 
     @property
-    def shape_out(self) -> tuple[int, int, int]:
+    def shape_out(self) -> tuple[int, ...]:
         """Shape of what the operator takes."""
         return self._operator.shape_in
 

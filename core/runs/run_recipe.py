@@ -48,7 +48,7 @@ def run_recipe(
     mu: Volume | None = None,
     stages: Stages = lambda stage: None,
 ) -> Iterator[ProjectionRun]:
-    """Make what a recipe asks for: one run, or one for each of ``volume.states``; of measured counts, the run of these.
+    """Make what a recipe asks for: one run, or one for each of ``volume.states`` and frames; of counts, the run of these.
 
     Parameters
     ----------
@@ -82,18 +82,43 @@ def run_recipe(
         sources = _from_files(recipe, recorded, mu, stages)
     else:
         sources = _from_phantom(recipe, recorded, model, mu, stages)
+    frames = frames_of(recipe)
     energy = recipe["volume.energy"] or recipe["attenuation.energy"]
     converted = {} if energy is None else {"ct_converted_at_kev": photon_energy(energy)}
-    for number, (source, mu_of_it, record) in enumerate(sources):
-        seed = recipe["noise.seed"]
-        if seed is not None:  # noise of its own for each state
+    for number, ((source, mu_of_it, record), times) in enumerate(_in_frames(sources, frames)):
+        record, seed = record.updated(times), recipe["noise.seed"]
+        if seed is not None:  # noise of its own for each
             record = record.updated({"noise.seed": seed + number})
         yield project_run(
             system, source, **_detector(recipe), backend=recipe["compute.backend"], threads=recipe["compute.threads"],
             settings={"volume": _volume_name(record), **converted, "recipe": record.tables()},
-            model=recipe_model(recipe, system, mu_of_it), photons=recipe["model.photons"],
+            model=recipe_model(recipe.updated(times), system, mu_of_it), photons=recipe["model.photons"],
             noise_seed=record["noise.seed"], progress=stages("projecting"), dead_time=dead_time_of(recipe),
         )  # fmt: skip
+
+
+def frames_of(recipe: Recipe) -> list[dict[str, Any]]:
+    """What each run of a recipe changes in it: its frame's times, if it has frames; `InputError` if their numbers differ."""
+    times, starts, states = recipe["frames.times"], recipe["frames.starts"], recipe["volume.states"] or ()
+    if times is None:
+        return [{}] * max(1, len(states))
+    if starts is None:
+        if np.ndim(recipe["model.start"]):
+            raise InputError("frames.starts: needed where model.start has a number for each module")
+        starts = recipe["model.start"] + np.cumsum([0, *times[:-1]])
+    for name, others in (("frames.starts", starts), ("volume.states", states)):
+        if len(others) not in (len(times), *([0, 1] if name == "volume.states" else [])):
+            raise InputError(f"{name}: expected {len(times)}, as many as frames.times, got {len(others)}")
+    whole = {"frames.times": None, "frames.starts": None}
+    return [{"model.time": t, "model.start": float(s), **whole} for t, s in zip(times, starts, strict=True)]
+
+
+def _in_frames(sources: Iterator[_Source], frames: list[dict[str, Any]]) -> Iterator[tuple[_Source, dict[str, Any]]]:
+    """The volumes in their frames; a single one is in all of them."""
+    source = next(sources)
+    for frame in frames:
+        yield source, frame
+        source = next(sources, source)
 
 
 def recipe_system(recipe: Recipe, path: Callable[[str], str | Path] = Path) -> Scanner:

@@ -348,7 +348,12 @@ _DECLARED = (
             label="Distance (× l)"),
     Setting("detector.pitch", float, None, "Pixel size", "the image covers the crystal's whole side", unit="mm", above=0,
             slider=10, label="Pixel Size (mm)"),
-    Setting("noise.seed", int, None, "Draw Poisson counts with this seed; of several states with SEED, SEED + 1 …",
+    Setting("frames.times", float, None, "Durations of a scan's frames, or of a heart's gates: a run of each, as OUTPUT-1, "
+            "OUTPUT-2 …, of the volume, or of each its state", "there is one frame", unit="s", above=0, sizes=(),
+            needs=(_COUNTS, _MADE), option="--frame-times"),
+    Setting("frames.starts", float, None, "When they start after the reference time of the activity; of gates, all with the "
+            "scan", "each as the one before ends", unit="s", sizes=(), needs=("frames.times",), option="--frame-starts"),
+    Setting("noise.seed", int, None, "Draw Poisson counts with this seed; of several states or frames with SEED, SEED + 1 …",
             "their expected means", least=0, most=2**64 - 1,
             needs=("model.kind=emission or model.photons", _MADE), option="--noise"),
     Setting("reconstruction.method", str, "osem", "How the volume is found", endings=METHOD_FILES,

@@ -48,6 +48,7 @@ from .phantoms.shapes import Box, Capsule, Cone, Cylinder, Ellipsoid, Shape, Sph
 from .phantoms.shepp_logan import SheppLogan
 from .phantoms.torso import CardiacTorso
 from .physics.ct_numbers import diffdrr_density, hu_to_mu, mu_to_hu
+from .physics.energy_window import energy_window_scatter
 from .physics.isotopes import ISOTOPES, Isotope, isotope
 from .physics.maps import completeness_map, modules_map, resolution_map, sensitivity_map
 from .physics.materials import MATERIALS, Material, attenuation
@@ -94,6 +95,7 @@ from .runs.recipe import Recipe, read_recipe, write_recipe
 from .runs.reconstructing import reconstruct_run
 from .runs.run import ProjectionRun
 from .runs.run_recipe import projector_of_run, run_recipe
+from .runs.scatter_windows import ScatterWindows
 from .system_source import SystemSource
 from .volumes.meshes.mesh import Mesh, read_mesh, write_mesh
 from .volumes.meshes.surface import volume_to_mesh

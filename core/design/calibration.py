@@ -220,7 +220,8 @@ def _check_model(model: Emission, system: PinholeSystem, views: Views) -> None:
     if len(model.system) != len(system) or not np.allclose(model.system.poses(), system.poses()):
         raise InputError("calibrate: model: expected that of the system, Emission(system, ...)")
     model.check(views)
-    for name, is_other in (("edge 'path'", model.edge == "path"), ("depth_layers", model.depth_layers > 1)):
+    others = {"edge 'path'": model.edge == "path", "depth_layers": model.depth_layers > 1}
+    for name, is_other in (others | {"lines apart": len(model.parts()) > 1}).items():
         if is_other:
             raise InputError(f"calibrate: model: takes no {name}: a spot is a hole's shadow on the crystal's front")
 

@@ -41,6 +41,8 @@ _DIGEST = 64  # characters
 _END = b"PK\x05\x06"  # of a zip's last record, which without a comment has 22 bytes
 ALLOWED = ("scanner", "grid", "physics")
 """What may be allowed to differ from what a network was trained for."""
+_LATER = {"energy_fwhm": None, "lines": "together"}
+"""Entries that records of earlier versions do not have, and what these meant."""
 _NO_PHYSICS = ("time", "background")
 """Entries of a model's record that may differ: a network is given counts and background of each scan."""
 _KEPT = 4
@@ -84,7 +86,7 @@ class Contents:
 
 
 def _physics(text: str) -> dict[str, Any]:
-    return {name: value for name, value in json.loads(text).items() if name not in _NO_PHYSICS}
+    return {name: value for name, value in (_LATER | json.loads(text)).items() if name not in _NO_PHYSICS}
 
 
 def write_model(contents: Contents, path: AnyPath) -> None:

@@ -41,9 +41,9 @@ class Counts(np.ndarray[Any, Any]):
 
     Attributes
     ----------
-    about : array (frames, 4)
-        Of each frame its exposure, s, the size of its pixels along a row and down the columns, mm, and the number of its
-        energy window; NaN where the file does not say it.
+    about : array (frames, 6)
+        Of each frame its exposure, s, the size of its pixels along a row and down the columns, mm, and of its energy window
+        the number, and the lowest and highest energy, keV; NaN where the file does not say it.
     kind : str
         What the frames are of, such as "2 energy windows".
     name : str
@@ -55,7 +55,7 @@ class Counts(np.ndarray[Any, Any]):
     def __array_finalize__(self, source: Any) -> None:
         self.kind, self.name = getattr(source, "kind", ""), getattr(source, "name", "counts")
         is_same = isinstance(source, Counts) and source.shape == self.shape
-        self.about = source.about if is_same else np.full((*self.shape[:1], 4), math.nan)
+        self.about = source.about if is_same else np.full((*self.shape[:1], 6), math.nan)
 
     def __getitem__(self, key: Any) -> Any:
         found = super().__getitem__(key)
@@ -169,8 +169,8 @@ def _reader(path: Path, ending: str) -> Callable[[Path, Layout], Counts]:
 def _counts(array: Array, kind: str = "", **known: Sequence[float]) -> Counts:
     """Checked frames, with an axis of frames also where there is only one, and what is `known` about them from the file.
 
-    That is their `time` (s), `pixel` (along a row and down the columns, mm) and energy `window` (number). Of these, fewer
-    than frames are those of blocks of frames, which follow each other.
+    That is their `time` (s), `pixel` (along a row and down the columns, mm), energy `window` (number) and its `low` and
+    `high` energy (keV). Of these, fewer than frames are those of blocks of frames, which follow each other.
     """
     array = array[None] if array.ndim == 2 else array
     if array.ndim != 3 or not array.size:
@@ -179,7 +179,7 @@ def _counts(array: Array, kind: str = "", **known: Sequence[float]) -> Counts:
         raise InputError(f"expected whole or real numbers, found {array.dtype}")
     counts = array.view(Counts)
     counts.kind, counts.about[:, 1:3] = kind, known.get("pixel", math.nan)
-    for column, name in ((0, "time"), (3, "window")):
+    for column, name in ((0, "time"), (3, "window"), (4, "low"), (5, "high")):
         each = np.array(known.get(name) or [math.nan])
         counts.about[:, column] = each[np.arange(len(array)) * len(each) // len(array)]
     return counts
@@ -292,7 +292,11 @@ def _interfile(path: Path, layout: Layout) -> Counts:
     pixel = [float(text(f"scaling factor (mm/pixel) [{i}]", "nan")) for i in (1, 2)]
     kind = f"{windows} energy windows" if windows > 1 else ""
     frames = _numbers(data, type_, (count, rows, columns), skip)
-    return _counts(frames, kind, time=times, pixel=pixel, window=range(1, windows + 1))
+    low, high = (
+        [float(text(f"energy window {word} level [{i}]", "nan")) for i in range(1, windows + 1)]
+        for word in ("lower", "upper")
+    )
+    return _counts(frames, kind, time=times, pixel=pixel, window=range(1, windows + 1), low=low, high=high)
 
 
 def _interfile_header(path: Path) -> dict[str, list[str]]:
@@ -304,7 +308,8 @@ def _interfile_header(path: Path) -> dict[str, list[str]]:
     for line in lines:
         key, assigned, value = line.partition(":=")
         if assigned and not line.lstrip().startswith(";"):
-            header.setdefault(" ".join(key.strip().lstrip("!").lower().split()), []).append(value.strip())
+            key = " ".join(key.strip().lstrip("!").lower().replace("[", " [").split())
+            header.setdefault(key, []).append(value.strip())
     return header
 
 
@@ -336,7 +341,8 @@ def _dicom(path: Path, layout: Layout) -> Counts:
     kind = ", ".join(f"{n} {name.lower()}s" for name, n in several.items() if n > 1)
     pixel = [float(size) for size in data.get("PixelSpacing") or (math.nan, math.nan)][::-1]
     windows = _which(data, "Energy Window", several["Energy Window"])
-    return _counts(array, kind, time=_dicom_times(data), pixel=pixel, window=windows)
+    low, high = zip(*(_dicom_energies(data, number) for number in windows), strict=True)
+    return _counts(array, kind, time=_dicom_times(data), pixel=pixel, window=windows, low=low, high=high)
 
 
 _VECTORS = ("Energy Window", "Detector", "Phase", "Rotation", "RR Interval", "Time Slot")
@@ -350,6 +356,16 @@ def _dicom_times(data: Any) -> list[float]:
         if any(map(math.isfinite, parts)):
             return [parts[number - 1] for number in _which(data, name, len(parts))]
     return [_dicom_time(data)]
+
+
+def _dicom_energies(data: Any, number: int) -> tuple[float, float]:
+    """The lowest and the highest energy, keV, of the energy window of a number; NaN of one that is not a single range."""
+    windows = data.get("EnergyWindowInformationSequence") or ()
+    ranges = windows[number - 1].get("EnergyWindowRangeSequence") or () if 0 < number <= len(windows) else ()
+    if len(ranges) != 1:
+        return math.nan, math.nan
+    low, high = (ranges[0].get(f"EnergyWindow{word}Limit") for word in ("Lower", "Upper"))
+    return (math.nan if low is None else float(low)), (math.nan if high is None else float(high))
 
 
 def _which(data: Any, name: str, count: int) -> list[int]:

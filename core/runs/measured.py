@@ -23,6 +23,7 @@ from .frame_files import Counts, Layout, differs, read_frames
 from .orientations import ORIENTATIONS, on_crystal
 from .recipe import Recipe, recorded_recipe
 from .run import ProjectionRun
+from .scatter_windows import ScatterWindows
 
 _MOST_NUMBERS = 1 << 20  # in a list of frames
 _FEW = 10
@@ -46,6 +47,7 @@ def counts_run(
     pitch: ArrayLike | None = None,
     recipe: Recipe | None = None,
     settings: Mapping[str, Any] | None = None,
+    scatter: ScatterWindows | None = None,
 ) -> ProjectionRun:
     """The run of a scanner that has measured `counts`.
 
@@ -73,6 +75,8 @@ def counts_run(
         Says the rest of the model, for reconstruction: isotope, aperture, crystal, attenuation.
     settings
         More to record in the run.
+    scatter
+        Frames of other energy windows, from which the scatter in `frames` is estimated: it is added to the run's background.
 
     Returns
     -------
@@ -94,10 +98,14 @@ def counts_run(
     turned = [on_crystal(frame, word) for frame, word in zip(array, words, strict=True)]
     if len({image.shape for image in turned}) > 1:
         raise InputError("orientation (--orientation): frames that are not square cannot lie both upright and turned")
-    place = {number: k for k, number in enumerate(numbers) if number is not None}
-    images = np.stack([turned[place[int(number)]] for number in system.numbers]).astype(np.float32)
+    used = {"peak": _in_order(numbers, system)}
+    for word, own in {} if scatter is None else scatter.frames.items():
+        with naming(f"{word}_frames (--{word}-frames)"):
+            used[word] = _in_order(frame_numbers(own, len(array), system), system)
+    of_windows = {word: np.stack([turned[k] for k in own]).astype(np.float32) for word, own in used.items()}
     if detector == "virtual":  # upright, the crystal's image point-inverted
-        images = images[:, ::-1, ::-1]
+        of_windows = {word: images[:, ::-1, ::-1] for word, images in of_windows.items()}
+    images = of_windows["peak"]
     n_v, n_u = images.shape[1:]
     views = system.views((n_v, n_u), detector, magnification, pitch)
     given = {key: value for key, value in (recipe or Recipe()).given.items() if key.startswith(_KEPT)}
@@ -109,11 +117,13 @@ def counts_run(
         "pitch_mm": None if pitch is None else np.broadcast_to(pitch, 2).tolist(), "model": "emission",
         **(settings or {}), "recipe": recorded_recipe(Recipe(given)).tables(),
     }  # fmt: skip
-    used = [place[int(number)] for number in system.numbers]
     background = given.get("model.background", 0.0)
+    if scatter is not None:
+        estimate, record["scatter"] = scatter.estimate(of_windows, used, found)
+        background = background + estimate
     run = ProjectionRun(images, system, views, unit="counts", settings=record, background=background)
-    _warn_of_others(found, used, words, run)
-    _warn_of_frames(array, used, numbers, found.name)
+    _warn_of_others(found, used["peak"], words, run)
+    _warn_of_frames(array, used["peak"], numbers, found.name)
     return run
 
 
@@ -129,10 +139,17 @@ def recipe_counts(recipe: Recipe, system: Scanner, stages: Stages = lambda stage
             found, system, frames, orientation[0] if orientation and len(orientation) == 1 else orientation,
             recipe.given.get("model.time"), expected=recipe["counts.expected"],
             detector=recipe.given.get("detector.plane", "real"), magnification=recipe["detector.magnification"],
-            pitch=recipe["detector.pitch"], recipe=recipe, settings={"counts": found.name},
+            pitch=recipe["detector.pitch"], recipe=recipe, settings={"counts": found.name}, scatter=_scatter(recipe),
         )  # fmt: skip
     _require_size(recipe, run, found.name)
     return run
+
+
+def _scatter(recipe: Recipe) -> ScatterWindows | None:
+    """The windows of a recipe from which scatter is estimated."""
+    names = "lower_frames", "upper_frames", "window_widths", "scatter_fwhm"
+    given = [recipe[f"counts.{name}"] for name in names]
+    return None if given[:2] == [None, None] else ScatterWindows(*given)
 
 
 def require_given(frames: Any, orientation: Any, time: Any, found: Counts) -> None:
@@ -167,6 +184,11 @@ def frame_numbers(frames: Any, count: int, system: Scanner) -> list[int | None]:
     if without := sorted(own - set(numbers)):
         raise InputError(f"{name}: module {_listed(without)} has no frame; leave such modules out with --modules")
     return found
+
+
+def _in_order(numbers: list[int | None], system: Scanner) -> list[int]:
+    """The frames of the system's modules."""
+    return [numbers.index(int(number)) for number in system.numbers]
 
 
 def _parsed(text: str) -> list[int | None]:

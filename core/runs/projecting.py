@@ -23,6 +23,10 @@ from ..volumes.volume import Volume
 from .run import ProjectionRun
 
 
+LINES = "lines"
+"""In place of the energy at which CT numbers become mu: they attenuate each line of the isotope at its own."""
+
+
 @dataclass(frozen=True, eq=False)
 class Imaging:
     """Makes images of volumes: the one route of runs, reconstructions and events, with the same warnings for all."""
@@ -132,7 +136,7 @@ def warn_of_energy(model: Model, energy: float | str | None, source: str) -> Non
     `source` names what the mu is of.
     """
     window = model.window if isinstance(model, Emission) else None
-    if window is None or energy is None:
+    if window is None or energy in (None, LINES):
         return
     energy = photon_energy(energy)
     if not window[0] <= energy <= window[1]:

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +28,7 @@ from ..volumes.volume import Volume
 from ..volumes.volume_files import read_volume, read_volume_of
 from ..workbook import read_scanner
 from .measured import recipe_counts
-from .projecting import Imaging, project_run, warn_of_energy
+from .projecting import LINES, Imaging, project_run, warn_of_energy
 from .recipe import Recipe, recorded_recipe
 from .run import ProjectionRun
 
@@ -82,7 +83,7 @@ def run_recipe(
     else:
         sources = _from_phantom(recipe, recorded, model, mu, stages)
     energy = recipe["volume.energy"] or recipe["attenuation.energy"]
-    converted = {} if energy is None else {"ct_converted_at_kev": photon_energy(energy)}
+    converted = {} if energy in (None, LINES) else {"ct_converted_at_kev": photon_energy(energy)}
     for number, (source, mu_of_it, record) in enumerate(sources):
         seed = recipe["noise.seed"]
         if seed is not None:  # noise of its own for each state
@@ -179,7 +180,11 @@ def projector_of_run(
             )
         else:
             mu = _attenuation(recipe, model, stages)
-    return recipe_imaging(recipe, run.system, run.views, grid, mu, backend, threads).projector
+    model = recipe_model(recipe, run.system, mu)
+    if isinstance(model, Emission) and np.ndim(run.background):  # not all pixels alike, such as scatter: the recipe says only what is added to each
+        own = run.recipe["model.background"] if "recipe" in run.settings else 0.0
+        model = replace(model, background=np.maximum(run.background + (recipe["model.background"] - own), 0))
+    return Projector(grid, run.views, model, backend, threads)
 
 
 def recipe_imaging(
@@ -250,12 +255,12 @@ def _read(path: str, recipe: Recipe, progress: Progress | None) -> Volume:
 def read_mu(
     path: str | Path, energy: float | str | None, series: str | None = None, progress: Progress | None = None
 ) -> Volume:
-    """The volume of mu in a file: as it is, or from CT numbers at `energy` (keV, or an isotope's)."""
+    """The volume of mu in a file: as it is, or from CT numbers at `energy` (keV, or an isotope's); of `LINES` the CT numbers."""
     if energy is not None:
         volume = read_volume(path, series=series, progress=progress)
         if volume.quantity != "hu":
             raise InputError(f"{path}: it holds {volume.quantity}; an energy (--energy) is for CT numbers (hu)")
-        return hu_to_mu(volume, photon_energy(energy))
+        return volume if energy == LINES else hu_to_mu(volume, photon_energy(energy))
     advice = "; of CT numbers, give the energy (--energy) to convert them"
     volume = read_volume_of(path, "mu", advice, series=series, progress=progress)
     lowest, highest = float(volume.array.min()), float(volume.array.max())

@@ -2,8 +2,8 @@
 
 References
 ----------
-K. Ogawa, Y. Harata, T. Ichihara, A. Kubo, S. Hashimoto, "A practical method for position-dependent Compton-scatter correction
-in single photon emission CT", IEEE Transactions on Medical Imaging 10 (1991) 408-412: triple energy windows.
+K. Ogawa, Y. Harata, T. Ichihara, A. Kubo, S. Hashimoto, "A practical method for position-dependent Compton-scatter
+correction in single photon emission CT", IEEE Transactions on Medical Imaging 10 (1991) 408-412: triple energy windows.
 R. J. Jaszczak, K. L. Greer, C. E. Floyd, C. C. Harris, R. E. Coleman, "Improved SPECT quantification using compensation for
 scattered photons", Journal of Nuclear Medicine 25 (1984) 893-900: double energy windows.
 """
@@ -27,7 +27,7 @@ _LEAST_SHARE = 1e-4
 
 
 def acceptance(energy: float, window: tuple[float, float], fwhm: float) -> float:
-    """Share of the photons of an `energy` that are measured within a `window`, where energies blur with this FWHM, all keV."""
+    """Share of the photons of an `energy` that are measured within a `window`; energies blur with this FWHM. All in keV."""
     scale = math.sqrt(2) * fwhm / FWHM_PER_SIGMA
     low, high = ((edge - energy) / scale for edge in window)
     if low > 0:  # the difference of two numbers close to 1
@@ -82,8 +82,8 @@ def energy_window_scatter(
     widths : sequence of 3 numbers
         Widths of the three windows, keV; that of a missing window may be None.
     fwhm : float, optional
-        FWHM, in pixels, of a Gaussian that smooths the estimate: scatter is smoother than noise. Its weights within the image
-        sum to 1 for each pixel, so an even estimate stays as it is.
+        FWHM, in pixels, of a Gaussian that smooths the estimate: scatter is smoother than noise. Its weights within the
+        image sum to 1 for each pixel, so an even estimate stays as it is.
 
     Returns
     -------
@@ -100,7 +100,9 @@ def energy_window_scatter(
     if len(shape) != 3:
         raise InputError(f"{name}: peak: expected counts (M, n_v, n_u), got shape {shape_text(shape)}")
     if len(widths) != 3:
-        raise InputError(f"{name}: widths: expected those of the lower, the peak and the upper window, got {len(widths)}")
+        raise InputError(
+            f"{name}: widths: expected those of the lower, the peak and the upper window, got {len(widths)}"
+        )
     if lower is None and upper is None:
         raise InputError(f"{name}: expected counts of the lower or the upper window, or both")
     w_peak = positive(widths[1], f"{name}: width of the peak window", "keV")

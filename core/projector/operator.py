@@ -155,7 +155,9 @@ class Projector(LinearOperator):
         if self.model.mu is None:
             raise InputError("mu: the projector's model has none; give it one to say on which grid mu is")
         if any(part.model.mu is not self.model.mu for part in self._parts):
-            raise InputError("mu: each of the model's lines has its own; give the model one volume of mu for all of them")
+            raise InputError(
+                "mu: each of the model's lines has its own; give the model one volume of mu for all of them"
+            )
         x, mu = promote(x, require_no_negative(checked(mu, "mu", self.model.mu.grid.shape, self._float64)))
         if not getattr(mu, "requires_grad", False):
             return self._apply(x, progress, mu)

@@ -5,7 +5,7 @@ from dataclasses import replace
 from typing import Any
 
 from ..arrays import is_tensor
-from ..errors import InputError
+from ..errors import InputError, warn
 from ..physics.ct_numbers import hu_to_mu
 from ..physics.energy_window import counted_lines
 from ..physics.isotopes import Isotope, isotope
@@ -66,25 +66,17 @@ def checked_mu(mu: Any, lines: Lines) -> Volume | tuple[Volume, ...] | None:
 
 def models_of_lines(model: Any, lines: Lines) -> tuple[Any, ...]:
     """The model of each line's photons: with its energy alone, what attenuates it, and its share of the photons."""
-    total, known, parts = sum(photons for _, photons in lines), model.isotope, []
-    for k, (energy, photons) in enumerate(lines):
-        mu = model.mu
-        if isinstance(mu, tuple):
-            mu = mu[k]
-        elif mu is not None and mu.quantity == "hu":
-            mu = hu_to_mu(mu, energy) if k == 0 else _in_silence(mu, energy)
-        own = Isotope(known.name, known.half_life, ((energy, photons),))
-        counted = model.photons_per_decay * (photons / total)
-        parts.append(
-            replace(
-                model, isotope=own, window=(energy, energy), energy_fwhm=None, lines="together", mu=mu,
-                photons_per_decay=counted, background=0.0,
-            )
-        )  # fmt: skip
-    return tuple(parts)
-
-
-def _in_silence(hu: Volume, energy: float) -> Volume:
-    """The mu of CT numbers whose warnings have been given."""
-    with recorded_warnings():
-        return hu_to_mu(hu, energy)
+    total, mu = sum(photons for _, photons in lines), model.mu
+    volumes = mu if isinstance(mu, tuple) else [mu] * len(lines)
+    if isinstance(mu, Volume) and mu.quantity == "hu":
+        with recorded_warnings() as texts:
+            volumes = [hu_to_mu(mu, energy) for energy, _ in lines]
+        for text in dict.fromkeys(texts):  # each once, not for each line
+            warn(text)
+    return tuple(
+        replace(
+            model, isotope=replace(model.isotope, lines=((energy, photons),)), window=(energy, energy), energy_fwhm=None,
+            lines="together", mu=own, photons_per_decay=model.photons_per_decay * (photons / total), background=0.0,
+        )
+        for (energy, photons), own in zip(lines, volumes, strict=True)
+    )  # fmt: skip

@@ -22,7 +22,6 @@ from ..validation import positive, seed_number
 from ..volumes.volume import Volume
 from .run import ProjectionRun
 
-
 LINES = "lines"
 """In place of the energy at which CT numbers become mu: they attenuate each line of the isotope at its own."""
 

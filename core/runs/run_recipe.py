@@ -181,7 +181,7 @@ def projector_of_run(
         else:
             mu = _attenuation(recipe, model, stages)
     model = recipe_model(recipe, run.system, mu)
-    if isinstance(model, Emission) and np.ndim(run.background):  # not all pixels alike, such as scatter: the recipe says only what is added to each
+    if isinstance(model, Emission) and np.ndim(run.background):  # such as scatter; the recipe has what is in all pixels
         own = run.recipe["model.background"] if "recipe" in run.settings else 0.0
         model = replace(model, background=np.maximum(run.background + (recipe["model.background"] - own), 0))
     return Projector(grid, run.views, model, backend, threads)
@@ -255,7 +255,7 @@ def _read(path: str, recipe: Recipe, progress: Progress | None) -> Volume:
 def read_mu(
     path: str | Path, energy: float | str | None, series: str | None = None, progress: Progress | None = None
 ) -> Volume:
-    """The volume of mu in a file: as it is, or from CT numbers at `energy` (keV, or an isotope's); of `LINES` the CT numbers."""
+    """The volume of mu in a file: as it is, or from CT numbers at `energy` (keV, an isotope's); for `LINES` CT numbers."""
     if energy is not None:
         volume = read_volume(path, series=series, progress=progress)
         if volume.quantity != "hu":

@@ -36,7 +36,9 @@ class ScatterWindows:
 
     def __post_init__(self) -> None:
         if self.lower_frames is None and self.upper_frames is None:
-            raise InputError("scatter: expected lower_frames (--lower-frames) or upper_frames (--upper-frames), or both")
+            raise InputError(
+                "scatter: expected lower_frames (--lower-frames) or upper_frames (--upper-frames), or both"
+            )
         if self.widths is not None and len(self.widths) != 3:
             raise InputError(f"scatter: expected widths of three windows, got {len(self.widths)}")
 
@@ -65,11 +67,14 @@ class ScatterWindows:
         """The width of a window, keV: what is given, unless a file contradicts it, or what the files say."""
         given = None if self.widths is None else float(self.widths[_WORDS.index(word)])
         said = {round(high - low, 3) for low, high in found.about[used, 4:6] if np.isfinite(low + high)}
-        text = f"{found.name}: the file says a {word} window of {' and '.join(f'{width:g}' for width in sorted(said))} keV"
+        text = (
+            f"{found.name}: the file says a {word} window of {' and '.join(f'{width:g}' for width in sorted(said))} keV"
+        )
         if len(said) > 1:
             raise InputError(f"{text}; expected frames of one width")
         if given is None and not said:
-            raise InputError(f"{found.name}: it does not say how wide windows are; say it (--window-widths LOWER PEAK UPPER)")
+            advice = "say it (--window-widths LOWER PEAK UPPER)"
+            raise InputError(f"{found.name}: it does not say how wide the energy windows are; {advice}")
         if given is None:
             return said.pop()
         if any(differs(width, given) for width in said):

@@ -51,7 +51,9 @@ def test_the_variance_is_that_of_draws(rng, fwhm):
     found, stated = mph.energy_window_scatter(*draws, WIDTHS, fwhm)
     spread = np.var(found, axis=0, ddof=1)
     assert stated.mean() == pytest.approx(spread.mean(), rel=0.05)
-    rows = [stated.mean(axis=0)[where].mean() / spread[where].mean() for where in (np.s_[:2], np.s_[:, -2:], np.s_[3:6])]
+    rows = [
+        stated.mean(axis=0)[where].mean() / spread[where].mean() for where in (np.s_[:2], np.s_[:, -2:], np.s_[3:6])
+    ]
     np.testing.assert_allclose(rows, 1, rtol=0.05)  # at the edges, too
     expected, _ = mph.energy_window_scatter(*means, WIDTHS, fwhm)
     np.testing.assert_allclose(found.mean(axis=0), expected[0], atol=6 * np.sqrt(stated.mean() / 1000))
@@ -61,7 +63,7 @@ def test_smoothing_leaves_what_is_even(rng):
     even = np.full((2, 7, 9), 5.0)
     found, variance = mph.energy_window_scatter(even, even, even, WIDTHS, 4.0)
     np.testing.assert_allclose(found, 5 * 28 / 6, rtol=1e-12)
-    plain, noisier = mph.energy_window_scatter(even, even, even, WIDTHS)
+    _, noisier = mph.energy_window_scatter(even, even, even, WIDTHS)
     assert (variance < noisier / 4).all()
 
 

@@ -46,7 +46,8 @@ def gaussian_share(energy, window, fwhm):
 
 
 @pytest.mark.parametrize(
-    ("name", "window"), [("Tc-99m", None), ("I-131", None), ("In-111", (150, 190)), ("Ga-67", (80, 330)), ("Lu-177", None)]
+    ("name", "window"),
+    [("Tc-99m", None), ("I-131", None), ("In-111", (150, 190)), ("Ga-67", (80, 330)), ("Lu-177", None)],
 )
 def test_a_window_counts_each_lines_part_of_the_gaussian(module, name, window):
     model = mph.Emission(module, isotope=name, window=window, energy_fwhm=0.095)
@@ -136,7 +137,9 @@ def test_lines_apart_without_attenuation_have_their_own_holes_and_crystals(syste
     )
     np.testing.assert_allclose(apart(x), plain(x), rtol=1e-5)
     model = several(system, lines="apart", photons_per_decay=2.0, intrinsic_fwhm=3.0)
-    assert [part.aperture_mu for part in model.parts()] == [mph.attenuation("tungsten", e) for e in (284.3, 364.5, 637.0)]
+    assert [part.aperture_mu for part in model.parts()] == [
+        mph.attenuation("tungsten", e) for e in (284.3, 364.5, 637.0)
+    ]
     assert sum(part.photons_per_decay for part in model.parts()) == pytest.approx(2.0)
     again = dataclasses.replace(model, time=20.0)
     assert [part.crystal_mu for part in again.parts()] == [part.crystal_mu for part in model.parts()]
@@ -190,9 +193,15 @@ def test_what_does_not_go_together_is_refused(module, ct):
         ({"energy_fwhm": 9.5, "isotope": "I-131"}, ("share of the energy", "9.5")),
         ({"mu": ct}, ("CT numbers", "isotope")),
         ({"mu": [water("mu", 0.01)]}, ("without an isotope",)),
-        ({"mu": [water("mu", 0.01)] * 3, "isotope": "In-111", "window": (150, 270)}, ("2 volumes", "171.3, 245.4", "3")),
+        (
+            {"mu": [water("mu", 0.01)] * 3, "isotope": "In-111", "window": (150, 270)},
+            ("2 volumes", "171.3, 245.4", "3"),
+        ),
         ({"mu": [ct, ct], "isotope": "In-111", "window": (150, 270)}, ("mu", "hu")),
-        ({"isotope": "In-111", "window": (190, 230), "energy_fwhm": 0.1, "photons_per_decay": 1.0}, ("In-111", "171.3")),
+        (
+            {"isotope": "In-111", "window": (190, 230), "energy_fwhm": 0.1, "photons_per_decay": 1.0},
+            ("In-111", "171.3"),
+        ),
     ):
         refused(lambda given=given: mph.Emission(module, **given), *words)
 

@@ -66,7 +66,7 @@ class Projector(LinearOperator):
     The results are float32; float64 with `double` or ``backend="numpy"``, and for tensors of float64 with all backends but
     cuda.
     On a GPU the adjoint of the torch and cuda backends adds in no fixed order: it differs by float32 rounding from
-    call to call. Up to 128 MiB of rays and their weights are kept from call to call.
+    call to call. Up to 128 MiB of rays and their weights are kept from call to call, of lines apart for each line.
 
     Examples
     --------

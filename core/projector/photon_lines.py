@@ -38,7 +38,7 @@ def checked_photons(model: Any) -> dict[str, Any]:
 
 
 def checked_mu(mu: Any, lines: Lines) -> Volume | tuple[Volume, ...] | None:
-    """What attenuates photons of these lines: of mu one volume, or one for each line; or one volume of CT numbers.
+    """What attenuates photons of these lines: of mu one volume, or one for each line; or of CT numbers one.
 
     Of a single line it is its volume of mu.
     """
@@ -50,15 +50,13 @@ def checked_mu(mu: Any, lines: Lines) -> Volume | tuple[Volume, ...] | None:
         if not isinstance(volume, Volume):
             hint = "; tensors of it go to the projector, A(x, mu=...)" if is_tensor(volume) else ""
             raise InputError(f"emission: expected mu to be a Volume, got {type(volume).__name__}{hint}")
-        require_quantity(volume.quantity, ("mu", "hu") if is_one else ("mu",), "emission: mu")
+        require_quantity(volume.quantity, ("mu", "hu") if is_one and lines else ("mu",), "emission: mu")
         if volume.quantity == "mu" and volume.array.min() < 0:
             raise InputError(f"emission: mu must not be negative, got {volume.array.min():g} 1/mm")
     if not is_one and len(volumes) != len(lines):
         energies = ", ".join(f"{energy:g}" for energy, _ in lines)
         expected = f"{len(lines)} volumes, of the lines at {energies} keV" if lines else "one volume without an isotope"
         raise InputError(f"emission: mu: expected {expected}, got {len(volumes)}")
-    if volumes[0].quantity == "hu" and not lines:
-        raise InputError("emission: mu: CT numbers (hu) need an isotope, whose photons they attenuate")
     if len(lines) > 1:
         return mu if is_one else tuple(volumes)
     return hu_to_mu(volumes[0], lines[0][0]) if volumes[0].quantity == "hu" else volumes[0]

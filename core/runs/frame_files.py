@@ -179,7 +179,7 @@ def _counts(array: Array, kind: str = "", **known: Sequence[float]) -> Counts:
         raise InputError(f"expected whole or real numbers, found {array.dtype}")
     counts = array.view(Counts)
     counts.kind, counts.about[:, 1:3] = kind, known.get("pixel", math.nan)
-    for column, name in ((0, "time"), (3, "window"), (4, "low"), (5, "high")):
+    for column, name in ((0, "time"), (3, "window"), (-2, "low"), (-1, "high")):
         each = np.array(known.get(name) or [math.nan])
         counts.about[:, column] = each[np.arange(len(array)) * len(each) // len(array)]
     return counts

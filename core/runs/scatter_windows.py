@@ -66,7 +66,7 @@ class ScatterWindows:
     def _width(self, word: str, used: Sequence[int], found: Counts) -> float:
         """The width of a window, keV: what is given, unless a file contradicts it, or what the files say."""
         given = None if self.widths is None else float(self.widths[_WORDS.index(word)])
-        said = {round(high - low, 3) for low, high in found.about[used, 4:6] if np.isfinite(low + high)}
+        said = {round(high - low, 3) for low, high in found.about[used, -2:] if np.isfinite(low + high)}
         text = (
             f"{found.name}: the file says a {word} window of {' and '.join(f'{width:g}' for width in sorted(said))} keV"
         )
@@ -89,7 +89,7 @@ def _require_own_frames(used: Mapping[str, Sequence[int]], found: Counts) -> Non
             where = f"{word}_frames (--{word}-frames): frame {other + 1}"
             if other in used["peak"] or (word == "upper" and other in used.get("lower", ())):
                 raise InputError(f"{where} is of another window, too")
-            mine, its = found.about[k, 4:6].mean(), found.about[other, 4:6].mean()
+            mine, its = found.about[k, -2:].mean(), found.about[other, -2:].mean()
             if side * (its - mine) < 0:
                 raise InputError(f"{where} is of energies around {its:g} keV, the peak's around {mine:g} keV")
             if differs(found.about[other, 0], found.about[k, 0]):

@@ -191,7 +191,7 @@ def test_what_does_not_go_together_is_refused(module, ct):
         ({"lines": "apart"}, ("lines needs an isotope",)),
         ({"lines": "each", "isotope": "In-111"}, ("lines", "together")),
         ({"energy_fwhm": 9.5, "isotope": "I-131"}, ("share of the energy", "9.5")),
-        ({"mu": ct}, ("CT numbers", "isotope")),
+        ({"mu": ct}, ("expected a volume of mu, got hu",)),
         ({"mu": [water("mu", 0.01)]}, ("without an isotope",)),
         (
             {"mu": [water("mu", 0.01)] * 3, "isotope": "In-111", "window": (150, 270)},

@@ -255,7 +255,7 @@ class Emission(Model):
         for name, value in settings.items():
             if isinstance(value, np.ndarray):
                 settings[name] = value.tolist() if value.ndim == 1 else "images"
-        volumes = self.mu if isinstance(self.mu, tuple) else [self.mu]
+        volumes: Any = self.mu if isinstance(self.mu, tuple) else [self.mu]
         grids = [{"shape": list(mu.grid.shape), "affine": mu.grid.affine.tolist()} for mu in volumes if mu is not None]
         if grids:
             settings["mu"] = grids if isinstance(self.mu, tuple) else grids[0]
@@ -410,7 +410,8 @@ class Emission(Model):
             return everywhere.pixel_weights(m, u, v, (1.0, 1.0), float(self.system.collimator_length[m]), opening)
 
         of_modules = self._frames, self.system.collimator_length, self.effective_diameter, sides, weigh
-        return WholeHoles(views, grid, *of_modules, self.mu, self.hole == "depth")
+        mu: Any = self.mu  # of models that are computed as a whole one volume
+        return WholeHoles(views, grid, *of_modules, mu, self.hole == "depth")
 
     def caution(self, views: Views, grid: Grid) -> str | None:
         """A warning where there are too few rays for the tolerance."""

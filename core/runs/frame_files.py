@@ -341,7 +341,7 @@ def _dicom(path: Path, layout: Layout) -> Counts:
     kind = ", ".join(f"{n} {name.lower()}s" for name, n in several.items() if n > 1)
     pixel = [float(size) for size in data.get("PixelSpacing") or (math.nan, math.nan)][::-1]
     windows = _which(data, "Energy Window", several["Energy Window"])
-    low, high = zip(*(_dicom_energies(data, number) for number in windows), strict=True)
+    low, high = ([_dicom_energy(data, number, word) for number in windows] for word in ("Lower", "Upper"))
     return _counts(array, kind, time=_dicom_times(data), pixel=pixel, window=windows, low=low, high=high)
 
 
@@ -358,14 +358,12 @@ def _dicom_times(data: Any) -> list[float]:
     return [_dicom_time(data)]
 
 
-def _dicom_energies(data: Any, number: int) -> tuple[float, float]:
-    """The lowest and the highest energy, keV, of the energy window of a number; NaN of one that is not a single range."""
+def _dicom_energy(data: Any, number: int, word: str) -> float:
+    """The lower or the upper limit of the energy window of a number, keV; NaN of one that is not a single range."""
     windows = data.get("EnergyWindowInformationSequence") or ()
     ranges = windows[number - 1].get("EnergyWindowRangeSequence") or () if 0 < number <= len(windows) else ()
-    if len(ranges) != 1:
-        return math.nan, math.nan
-    low, high = (ranges[0].get(f"EnergyWindow{word}Limit") for word in ("Lower", "Upper"))
-    return (math.nan if low is None else float(low)), (math.nan if high is None else float(high))
+    limit = ranges[0].get(f"EnergyWindow{word}Limit") if len(ranges) == 1 else None
+    return math.nan if limit is None else float(limit)
 
 
 def _which(data: Any, name: str, count: int) -> list[int]:

@@ -15,13 +15,14 @@ from .conftest import BACKENDS, refused
 from .small_events import WORKBOOK as FEWER_MODULES
 
 DEPTH = 50.0  # mm of water before the source
+RAYS = {"hole": "rays", "aperture_points": 1, "pixel_points": 1, "tolerance": 1e9}
 TUMOR = ("I-131", (250.0, 700.0))  # three lines
 
 
 @pytest.fixture
 def module():
     """A pinhole at x = 200 mm that looks along -x; it is small, as the sources of these laws are."""
-    return mph.PinholeSystem([[200.0, 0.0, 0.0]], 0.2, 60.0, 50.0, 10.0, roi_radius=60.0)
+    return mph.PinholeSystem([[200.0, 0.0, 0.0]], 0.2, 60.0, 0.8, 10.0, roi_radius=60.0)
 
 
 @pytest.fixture
@@ -70,7 +71,7 @@ def test_a_window_counts_each_lines_part_of_the_gaussian(module, name, window):
 @pytest.mark.parametrize("energy_fwhm", [None, 0.1])
 @pytest.mark.parametrize("options", [{"hole": "point"}, {"hole": "rays"}, {"hole": "depth"}, {"aperture_points": 7}])
 def test_water_before_a_point_lets_each_line_pass_by_its_own_law(module, options, energy_fwhm):
-    grid, views = mph.Grid.centered(1, 0.3), module.views((9, 9), "real", pitch=4.0)
+    grid, views = mph.Grid.centered(1, 0.3), module.views((16, 16), "real")
     given = {"isotope": "Ga-67", "window": (170, 330), "energy_fwhm": energy_fwhm, "time": 1e-3, **options}
     bare = mph.Emission(module, **given)
     energies, photons = np.transpose(bare.photon_lines)
@@ -98,28 +99,28 @@ def each_line(system, ct, **changes):
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-@pytest.mark.parametrize("options", [{}, {"hole": "rays", "aperture_points": 3, "pixel_points": 1, "edge": "path"}])
+@pytest.mark.parametrize("options", [{}, RAYS | {"edge": "path"}])
 def test_images_and_adjoint_are_the_sums_of_the_lines(system, ct, rng, backend, options):
     system = system[:3]
     grid, views = mph.Grid.centered((7, 6, 5), 12.0), system.views((8, 9))
     x, y = rng.random(grid.shape), rng.random((3, 8, 9))
     A = mph.Projector(grid, views, several(system, ct, **options), backend, double=True)
     each = [mph.Projector(grid, views, model, backend, double=True) for model in each_line(system, ct, **options)]
-    images = A(x)
-    assert len(each) == 3
-    np.testing.assert_allclose(images, sum(line(x) for line in each), rtol=1e-12)
-    np.testing.assert_allclose(A.T(y), sum(line.T(y) for line in each), rtol=1e-12)
+    images, close = A(x), {"rtol": 1e-12, "atol": 1e-14}
+    assert len(each) == 3 and images.max() > 1e-4
+    np.testing.assert_allclose(images, sum(line(x) for line in each), **close)
+    np.testing.assert_allclose(A.T(y), sum(line.T(y) for line in each), **close)
     assert abs(np.vdot(images, y) - np.vdot(x, A.T(y))) < 1e-6 * np.linalg.norm(images) * np.linalg.norm(y)
     np.testing.assert_array_equal(np.stack(list(A.iter_views(x))), images)
     for part in A.subsets(2):
-        np.testing.assert_allclose(part(x), images[part.which], rtol=1e-12)
-    np.testing.assert_allclose(A(np.stack([x, 2 * x]))[1], 2 * images, rtol=1e-12)
+        np.testing.assert_allclose(part(x), images[part.which], **close)
+    np.testing.assert_allclose(A(np.stack([x, 2 * x]))[1], 2 * images, **close)
 
 
 def test_one_line_is_computed_as_ever_bit_for_bit(system, ct, rng):
     grid, views = mph.Grid.centered((7, 6, 5), 12.0), system.views((8, 9))
     x = rng.random(grid.shape)
-    for given in ({}, {"window": (120, 150)}, {"hole": "rays", "pixel_points": 1}):
+    for given in ({}, {"window": (120, 150)}, RAYS):
         common = {"isotope": "Tc-99m", "aperture_mu": "lead", "crystal_mu": "NaI", **given}
         plain = mph.Projector(grid, views, mph.Emission(system, mph.hu_to_mu(ct, 140.5), **common))
         for mu in (ct, [mph.hu_to_mu(ct, 140.5)]):

@@ -361,7 +361,7 @@ def _dicom_times(data: Any) -> list[float]:
 def _dicom_energy(data: Any, number: int, word: str) -> float:
     """The lower or the upper limit of the energy window of a number, keV; NaN of one that is not a single range."""
     windows = data.get("EnergyWindowInformationSequence") or ()
-    ranges = windows[number - 1].get("EnergyWindowRangeSequence") or () if 0 < number <= len(windows) else ()
+    ranges: Any = windows[number - 1].get("EnergyWindowRangeSequence") or () if 0 < number <= len(windows) else ()
     limit = ranges[0].get(f"EnergyWindow{word}Limit") if len(ranges) == 1 else None
     return math.nan if limit is None else float(limit)
 

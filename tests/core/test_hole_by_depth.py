@@ -222,7 +222,7 @@ def centres(grid):
 
 @pytest.mark.parametrize("wide", [4.0, 80.0, 500.0])
 def test_every_voxel_loses_photons_however_wide_those_of_mu_are(wide):
-    """Behind a slab of mu, of voxels as wide as this, exp(-mu d / cos(psi)) are left; where no ray met a voxel, none were."""
+    """Behind a slab of mu, of voxels as wide as this, exp(-mu d / cos(psi)) are left."""
     system = mph.PinholeSystem([[200.0, 0.0, 0.0]], 2.0, 60.0, 50.0, 10.0, roi_radius=60.0)
     n = max(1, round(120 / wide))
     slab = mph.Volume(

@@ -274,7 +274,7 @@ _DECLARED = (
             label="Window (keV)"),
     Setting("model.energy_fwhm", float, None, "FWHM of the detector's energy resolution at the window's line, as a share of "
             "its energy: of each line, also beside the window, a part is counted", "all photons within the window",
-            above=0, most=0.99, slider=0.3, needs=(_COUNTS, "model.isotope"), label="Energy Resolution"),
+            above=0, most=0.99, slider=0.3, needs=(_COUNTS, "model.isotope"), label="Energy FWHM"),
     Setting("model.lines", str, "together", "How several lines of the isotope are computed", label="Lines", words={
         "together": ("Together", "As photons of one kind, with effective coefficients"),
         "apart": ("Apart", "Each with its own attenuation, penetration and absorption: takes their number times as long"),

@@ -48,7 +48,9 @@ from .phantoms.shapes import Box, Capsule, Cone, Cylinder, Ellipsoid, Shape, Sph
 from .phantoms.shepp_logan import SheppLogan
 from .phantoms.torso import CardiacTorso
 from .physics.ct_numbers import diffdrr_density, hu_to_mu, mu_to_hu
+from .physics.dead_time import dead_time_corrected, dead_time_counts
 from .physics.energy_window import energy_window_scatter
+from .physics.flood import FloodEfficiency, flood_efficiency
 from .physics.isotopes import ISOTOPES, Isotope, isotope
 from .physics.maps import completeness_map, modules_map, resolution_map, sensitivity_map
 from .physics.materials import MATERIALS, Material, attenuation

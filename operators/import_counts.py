@@ -19,8 +19,8 @@ def _items(words: Any, text: str) -> choices.Items:
 
 
 class MPHDRR_OT_import_counts(jobs.JobOperator, bpy.types.Operator):
-    """Read measured counts, a frame for each module of the scanner, as projections. Which frame is which module, how frames
-    lie on the crystals and the exposure time are never guessed: say them, and check the mosaic
+    """Read measured counts, a frame for each module of the scanner, as projections. Which frame is which module, and how
+    frames lie on the crystals, is never guessed: say it, and check the mosaic
     """
 
     bl_label = "Import Measured Counts"
@@ -42,7 +42,7 @@ class MPHDRR_OT_import_counts(jobs.JobOperator, bpy.types.Operator):
         default=_NONE,
     )
     time: FloatProperty(
-        name="Time (s)", description="Exposure of the frames in seconds; 0: not said", default=0.0, min=0.0,
+        name="Time (s)", description="Exposure of the frames in seconds; 0: that of the files", default=0.0, min=0.0,
         options={"SKIP_SAVE"},
     )  # fmt: skip
     pixel: FloatProperty(

@@ -3,12 +3,12 @@
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
-from bpy.props import BoolProperty, EnumProperty, FloatProperty, FloatVectorProperty, IntProperty
+from bpy.props import BoolProperty, EnumProperty, FloatProperty, FloatVectorProperty, IntProperty, StringProperty
 
 from ...core.errors import InputError
 from ...core.runs.recipe import is_met
 from ...core.runs.settings import Setting
-from . import choices, decimals
+from . import choices, decimals, storage
 
 Settings = Mapping[str, Setting]
 """Settings by the names of their properties. A coefficient has a second property, of its material."""
@@ -27,6 +27,11 @@ _NUMBERS = {
 def material_of(name: str, setting: Setting) -> str | None:
     """The property of a coefficient's material; None for other settings."""
     return name.replace("_mu", "_material") if setting.kind is float and setting.words else None
+
+
+def of_modules(name: str, setting: Setting) -> str | None:
+    """The property of numbers of modules, a text; None for settings that have one number."""
+    return f"{name}_of_modules" if setting.of_modules else None
 
 
 def identifier(name: str, word: str) -> str:
@@ -61,6 +66,12 @@ def properties_of(settings: Settings) -> dict[str, Any]:
             make: Callable[..., Any] = IntProperty if setting.kind is int else FloatProperty
             default = setting.default[0] if isinstance(setting.default, tuple) else setting.default or 0
             made[name] = make(default=default, **common)
+        if each := of_modules(name, setting):
+            or_file = f", or a file with an image for each ({', '.join(setting.endings)})" if setting.endings else ""
+            made[each] = StringProperty(
+                name=f"{setting.label.partition(' (')[0]} by Module",
+                description=f"A number for each module that is projected, such as 10, 20, 30{or_file}. Empty: one for all",
+            )
     return made
 
 
@@ -70,6 +81,9 @@ def values_of(settings: Settings, get: Callable[[str], Any]) -> dict[str, Any]:
     for name, setting in settings.items():
         material = material_of(name, setting)
         value = get(name)
+        if (each := of_modules(name, setting)) and (text := get(each).strip()):
+            values[setting.key] = str(storage.absolute(text)) if setting.names_file(text) else text
+            continue
         if material is not None and get(material) != "NUMBER":
             name, value = material, get(material)
         if isinstance(value, str):
@@ -108,15 +122,19 @@ def drawn_of(
             yield material, not unmet
         if material is None or getattr(owner, material) == "NUMBER":
             yield name, not unmet
+        if each := of_modules(name, setting):
+            yield each, not unmet
 
 
 def set_property(owner: Any, settings: Settings, name: str, value: Any) -> None:
     """Set a property to a value of a recipe; None and "auto" are its default."""
     setting = settings[name]
-    material = material_of(name, setting)
-    for own in filter(None, (name, material)):
+    material, each = material_of(name, setting), of_modules(name, setting)
+    for own in filter(None, (name, material, each)):
         owner.property_unset(own)
-    if isinstance(value, str) and value != "auto":
+    if each and isinstance(value, str | list | tuple):
+        setattr(owner, each, value if isinstance(value, str) else ", ".join(map(str, value)))
+    elif isinstance(value, str) and value != "auto":
         own = material or name
         setattr(owner, own, identifier(own, value))
     elif value not in (None, "auto"):

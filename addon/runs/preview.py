@@ -146,6 +146,8 @@ def quick_recipe(recipe: Recipe) -> Recipe:
     if "model.background" in recipe.given:  # of larger pixels
         shares = (recipe[name] / fewer[name] for name in ("detector.rows", "detector.columns"))
         fewer["model.background"] = recipe["model.background"] * math.prod(shares)
+    if isinstance(recipe["model.efficiency"], str):  # images of other pixels
+        fewer["model.efficiency"] = None
     return recipe.updated(fewer)
 
 

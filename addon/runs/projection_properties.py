@@ -13,7 +13,15 @@ from ...core.physics.maps import MAPS
 from ...core.runs.presets import PRESETS
 from ...core.runs.recipe import Recipe, fitting_recipe
 from ...core.runs.settings import SETTINGS
-from ..blender.setting_properties import drawn_of, identifier, material_of, properties_of, set_property, values_of
+from ..blender.setting_properties import (
+    drawn_of,
+    identifier,
+    material_of,
+    of_modules,
+    properties_of,
+    set_property,
+    values_of,
+)
 from ..blender.updates import on_edit
 from ..scanner import scanner
 from ..volumes import volumes
@@ -75,7 +83,8 @@ def settings_recipe(
     given = [
         setting.key
         for name, setting in PROPERTIES.items()
-        if (is_given(name) or is_given(material_of(name, setting) or name)) and values[setting.key] != setting.default
+        if any(map(is_given, filter(None, (name, material_of(name, setting), of_modules(name, setting)))))
+        and values[setting.key] != setting.default
     ]
     return fitting_recipe(values, given)
 

@@ -42,6 +42,7 @@ def build_parser(more_commands: Sequence[AddParser] = ()) -> argparse.ArgumentPa
     """The parser of ``mphdrr``, with this package's commands and `more_commands`."""
     from . import (
         backproject,
+        counts,
         design,
         events,
         export,
@@ -62,7 +63,7 @@ def build_parser(more_commands: Sequence[AddParser] = ()) -> argparse.ArgumentPa
     )
     parser.add_argument("--version", action="version", version=f"mphDRR {VERSION}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True, parser_class=_Parser)
-    scans = (project, reconstruct, backproject, score, xray)
+    scans = (project, counts, reconstruct, backproject, score, xray)
     for command in (geometry, phantom, volume, *scans, events, learn, design, export):
         command.add_parser(commands)
     for add_parser in more_commands:

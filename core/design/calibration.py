@@ -15,9 +15,10 @@ from ..geometry.system import PinholeSystem
 from ..geometry.views import Views
 from ..progress import Progress, stages_of
 from ..projector.emission import Emission
+from ..projector.models import each_pixel
 from ..validation import instance, one_of, positive, real_array, shape_text
 from .bundle import LENGTH, OFFSET, Bundle, Moved
-from .point_images import Lattice, each_pixel
+from .point_images import Lattice
 from .solvers import scipy_module
 from .spots import Spots, find_spots
 
@@ -198,7 +199,7 @@ def calibrate(
     lattice = Lattice.of(model, views)
     radii = model.effective_diameter / 2 * (1 + system.collimator_length / system.pinhole_distance)
     stages = stages_of(progress)
-    spots = find_spots(images, each_pixel(model), lattice, radii, stages("finding spots"))
+    spots = find_spots(images, each_pixel(model.background), lattice, radii, stages("finding spots"))
     stages("finding modules")
     _require_spots(spots.seen, 2 if points is None else 1)
     places = lattice.first + lattice.step * spots.pixels
@@ -220,8 +221,10 @@ def _check_model(model: Emission, system: PinholeSystem, views: Views) -> None:
     if len(model.system) != len(system) or not np.allclose(model.system.poses(), system.poses()):
         raise InputError("calibrate: model: expected that of the system, Emission(system, ...)")
     model.check(views)
+    uneven = np.ndim(model.efficiency) == 3 or not np.all(model.efficiency)
     others = {"edge 'path'": model.edge == "path", "depth_layers": model.depth_layers > 1}
-    for name, is_other in (others | {"lines apart": len(model.parts()) > 1}).items():
+    others |= {"lines apart": len(model.parts()) > 1, "efficiency of single pixels, or of 0": uneven}
+    for name, is_other in others.items():
         if is_other:
             raise InputError(f"calibrate: model: takes no {name}: a spot is a hole's shadow on the crystal's front")
 

@@ -60,7 +60,7 @@ def run_calibration(path: AnyPath, progress: Progress | None = None) -> Calibrat
         runs = [read_run(folder / name) for name in files]
         workbook = recipe["system.file"]
         system = runs[0].system if workbook is None else read_system(folder / workbook)
-        model = recipe_model(runs[0].recipe, system)
+        model = recipe_model(runs[0].recipe, system, run=runs[0])
         if not isinstance(system, PinholeSystem) or not isinstance(model, Emission):
             raise InputError("runs.files: expected runs of counts of pinholes")
         for name, run in zip(files, runs, strict=True):

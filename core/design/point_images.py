@@ -20,6 +20,7 @@ from ..geometry.views import Views
 from ..physics.crystal import gaussian_blur
 from ..physics.performance import sensitivity
 from ..projector.emission import Emission
+from ..projector.models import each_pixel
 from ..validation import instance, one_for_all, real_array
 
 _FWHM_PER_SIGMA = 2 * math.sqrt(2 * math.log(2))
@@ -86,13 +87,8 @@ def point_images(model: Emission, views: Views, points: ArrayLike, activity: Arr
     totals = 1000 * model.effective_time * activities[:, None] * sensitivity(system, points, optics=model.optics)
     pitch, blurs = np.abs(lattice.step), lattice.blurs(views.shape)
     shares = [disc_shares(at, radius, pitch, views.shape, blurs)[0] for at, radius in zip(pixels, radii, strict=True)]
-    return totals[..., None, None] * shares + each_pixel(model)
-
-
-def each_pixel(model: Emission) -> Floats:
-    """The model's background with all three axes."""
-    values = np.asarray(model.background, np.float64)
-    return values.reshape(values.shape + (1,) * (3 - values.ndim))
+    efficiency = each_pixel(model.efficiency)
+    return totals[..., None, None] * shares * efficiency + np.where(efficiency > 0, each_pixel(model.background), 0.0)
 
 
 def disc_shares(

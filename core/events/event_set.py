@@ -19,6 +19,7 @@ from ..geometry.scanner import Scanner
 from ..geometry.views import Views
 from ..physics.isotopes import isotope
 from ..physics.noise import draw_counts
+from ..runs.counting import live_shares_of, scaled
 from ..runs.projecting import LINES
 from ..runs.recipe import Recipe, recorded_recipe
 from ..runs.run import ProjectionRun
@@ -241,10 +242,12 @@ class Event:
         record = self._record(recipe)
         if record is not None:
             settings["recipe"] = record.tables()
-        background, unit = recipe_model(recipe, self.system).background, self.unit(model)
+        made: Any = recipe_model(self._folder.recipe.placed(recipe), self.system)
+        images = self.images(model, noise_seed, level)
+        background = scaled(made.background, live_shares_of(recipe, images))
         return ProjectionRun(
-            self.images(model, noise_seed, level), self.system, self.views, self.truth, unit=unit, settings=settings,
-            seed=noise_seed, background=background,
+            images, self.system, self.views, self.truth, unit=self.unit(model), settings=settings, seed=noise_seed,
+            background=background, efficiency=made.efficiency,
         )  # fmt: skip
 
     def _record(self, model: Recipe) -> Recipe | None:
@@ -254,7 +257,7 @@ class Event:
         changes: dict[str, Any] = {key: str(recipe.input(name).path) for key, name in files.items() if name is not None}
         if "attenuation.file" in changes and model["attenuation.energy"] != LINES:
             changes |= {"attenuation.energy": None}  # the set's copy holds mu
-        record = recorded_recipe(model.updated(changes))
+        record = recorded_recipe(recipe.placed(model.updated(changes)))
         if planned.phantom is not None and planned.entry["gates"] == 1 and planned.activity_factor == 1:
             own: dict[str, Any] = {"phantom.voxels": recipe.grid.shape, "phantom.spacing": recipe.grid.spacing.tolist()}
             if planned.file is not None:
@@ -282,10 +285,12 @@ class Event:
 
 def _at_level(recipe: Recipe, level: float) -> Recipe:
     """The recipe of a model whose images are a share of the counts of another's."""
-    changes = {key: level * recipe[key] for key in ("model.photons", "model.background") if recipe[key]}
+    changes: dict[str, Any] = {key: level * recipe[key] for key in ("model.photons", "model.background") if recipe[key]}
     if recipe["model.kind"] == "emission":
-        time, name = recipe["model.time"], recipe["model.isotope"]
-        changes["model.time"] = level * time if name is None else isotope(name).duration(level, time)
+        times, name = np.atleast_1d(recipe["model.time"]).tolist(), recipe["model.isotope"]
+        changes["model.time"] = [
+            level * time if name is None else isotope(name).duration(level, time) for time in times
+        ]
     return recipe.updated(changes)
 
 

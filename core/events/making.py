@@ -172,7 +172,8 @@ class EventMaker:
         mu = None if file is None else self.recipe.input(file).volume()
         if recipe["attenuation.of_phantom"]:  # each event has its own: here, to say on which grid
             mu = Volume(freeze(np.zeros(grid.shape, np.float32)), grid, "mu")
-        imaging = recipe_imaging(recipe, self.system, self.views, grid, mu, threads=self.threads)
+        placed = self.recipe.placed(recipe)
+        imaging = recipe_imaging(placed, self.system, self.views, grid, mu, threads=self.threads)
         warn_of_energy(imaging.model, recipe["attenuation.energy"], Path(file or "").name)
         return imaging
 

@@ -234,6 +234,11 @@ class EventRecipe:
                 known[name] = self.inputs.get(name) or original_input(name, self.folder, self.files[name])
         return known[name]
 
+    def placed(self, model: Recipe) -> Recipe:
+        """A model's recipe with its file of efficiencies where it is."""
+        file = model["model.efficiency"]
+        return model.updated({"model.efficiency": str(self.input(file).path)}) if isinstance(file, str) else model
+
     @cached_property
     def fingerprint(self) -> str:
         """SHA-256 of what the recipe says and of the contents of all files that it names; comments do not count."""
@@ -282,6 +287,8 @@ class EventRecipe:
         for name, model in self.models.items():
             if (file := model["attenuation.file"]) is not None:
                 values["models"][name]["attenuation"] = change(file, _what("mu", model["attenuation.energy"]))
+            if isinstance(file := model["model.efficiency"], str):
+                values["models"][name]["efficiency"] = change(file, "copy")
         return values
 
 

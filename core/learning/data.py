@@ -72,6 +72,10 @@ class Source:
             raise InputError(f"data.model: expected one of the set's models of counts, {', '.join(counts) or 'none'}")
         if self.events.recipe.models[name]["attenuation.of_phantom"]:
             raise InputError(f"data.model: {name}: each event attenuates otherwise; choose a model without attenuation")
+        if self.events.recipe.models[name]["model.dead_time"]:
+            raise InputError(
+                f"data.model: {name}: dead time takes another share of each event; choose a model without it"
+            )
         return str(name)
 
     @cached_property

@@ -41,10 +41,10 @@ _DIGEST = 64  # characters
 _END = b"PK\x05\x06"  # of a zip's last record, which without a comment has 22 bytes
 ALLOWED = ("scanner", "grid", "physics")
 """What may be allowed to differ from what a network was trained for."""
-_LATER = {"energy_fwhm": None, "lines": "together"}
-"""Entries that records of earlier versions do not have, and what these meant."""
 _NO_PHYSICS = ("time", "background")
 """Entries of a model's record that may differ: a network is given counts and background of each scan."""
+_LATER = {"start": 0.0, "efficiency": 1.0, "energy_fwhm": None, "lines": "together"}
+"""Entries that records of earlier versions lack, and what they stand for."""
 _KEPT = 4
 _SETUPS: dict[Any, Setup] = {}
 """Setups that all networks share, the last used last, and how many are kept."""
@@ -86,7 +86,9 @@ class Contents:
 
 
 def _physics(text: str) -> dict[str, Any]:
-    return {name: value for name, value in (_LATER | json.loads(text)).items() if name not in _NO_PHYSICS}
+    known = _LATER | json.loads(text)
+    times = known["time"] if isinstance(known.get("time"), list) else []  # one stands for all: then it is a scale
+    return {name: value for name, value in known.items() if name not in _NO_PHYSICS} | {"times": times}
 
 
 def write_model(contents: Contents, path: AnyPath) -> None:

@@ -3,8 +3,12 @@
 import math
 from dataclasses import dataclass
 
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..arrays import Floats
 from ..errors import InputError
-from ..validation import one_of, positive
+from ..validation import one_of, positive, real_array
 from .mass_attenuation import table_lines
 
 _SECONDS = {"min": 60.0, "h": 3600.0, "d": 24 * 3600.0}
@@ -32,10 +36,15 @@ class Isotope:
         """The `lines` in the energy window from `low` to `high`, keV."""
         return tuple((energy, photons) for energy, photons in self.lines if low <= energy <= high)
 
-    def mean_decay_time(self, duration: float) -> float:
-        """``(1 - exp(-lambda t)) / lambda``, s: in this time the initial activity decays as often as within `duration`."""
-        rate = math.log(2) / self.half_life
-        return -math.expm1(-rate * positive(duration, "duration", "s")) / rate
+    def mean_decay_time(self, duration: ArrayLike, start: ArrayLike = 0.0) -> float | Floats:
+        """``exp(-lambda start) (1 - exp(-lambda t)) / lambda``, s: in this time the activity at 0 decays as often as from
+        `start` on within the `duration` t, both s, numbers or arrays.
+        """
+        rate, times = math.log(2) / self.half_life, real_array(duration, "duration", None)
+        if times.size and times.min() <= 0:
+            raise InputError(f"duration: expected more than 0 s, got {times.min():g}")
+        found = np.exp(-rate * real_array(start, "start", None)) * -np.expm1(-rate * times) / rate
+        return found if found.ndim else float(found)
 
     def duration(self, share: float, whole: float) -> float:
         """The time, s, from the start, in which a `share` of the decays of a `whole` duration, s, happens."""

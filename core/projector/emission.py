@@ -26,7 +26,7 @@ from ..validation import instance, positive, real_array, strict_whole
 from ..volumes.volume import Volume
 from .bundles import Beam
 from .hole_response import WholeHoles
-from .models import Model, checked_background
+from .models import Model, checked_background, checked_times
 from .photon_lines import checked_mu, checked_photons, models_of_lines
 from .pixel_points import TOLERANCE, expected_error, lattices, offsets, points_needed, require_points, shadow_edges
 from .rays import Fan, view_rays
@@ -69,11 +69,13 @@ class Emission(Model):
         ``exp(-integral of mu)`` is integrated in closed form inside a voxel. CT numbers ("hu") attenuate each of
         `photon_lines` as `hu_to_mu` says for its energy; several volumes are of these lines, in their order. None: no
         attenuation.
-    time : float
-        The acquisition's, s.
+    time : float or array (M,)
+        The acquisition's, s; or those of the modules' frames.
+    start : float or array (M,)
+        When it starts, or the frames do: s after the reference time of the activity.
     isotope : Isotope or str, optional
-        Its photons are counted, and the volume is its activity at the start, which decays during `time`. None: one photon
-        per decay, and constant activity.
+        Its photons are counted, and the volume is its activity at the reference time, which decays until `start` and
+        during `time`. None: one photon per decay, and constant activity.
     window : tuple of (float, float), optional
         Energies, keV, between which the isotope's photons are counted. None: 10 % around its strongest line.
     energy_fwhm : float, optional
@@ -138,7 +140,10 @@ class Emission(Model):
         Whether rays steeper than the knife edge's cone, psi > alpha / 2, count nothing, with either edge.
     background : float or array (M,) or (M, n_v, n_u)
         Counts of each pixel in the whole acquisition besides those of the volume, such as scatter and dark counts. ``A(x)``
-        leaves them out; runs add them before noise is drawn, and reconstructions expect them.
+        leaves them out; runs add them before noise is drawn, and reconstructions expect them. Dead pixels have none.
+    efficiency : float or array (M,) or (M, n_v, n_u)
+        Factors of the counts of the volume, of each module or pixel, as `flood_efficiency` gives them. Where it is 0 the
+        pixel is dead: nothing is expected there, and reconstructions leave it out.
 
     References
     ----------
@@ -149,7 +154,7 @@ class Emission(Model):
 
     system: PinholeSystem
     mu: Volume | Sequence[Volume] | None = None  # type: ignore[assignment]  # several only of several lines
-    time: float = 1.0
+    time: float | Floats = 1.0
     photons_per_decay: float = None  # type: ignore[assignment]  # always a number once made
     aperture_points: int | None = None
     aperture_mu: float | str | None = None  # a number once made
@@ -168,6 +173,8 @@ class Emission(Model):
     tolerance: float = TOLERANCE
     background: float | Floats = 0.0  # type: ignore[assignment]  # no class of mutable values: checked, and frozen
     hole: Hole = "auto"
+    start: float | Floats = 0.0
+    efficiency: float | Floats = 1.0  # type: ignore[assignment]  # likewise
     energy_fwhm: float | None = None
     lines: Literal["together", "apart"] = "together"
 
@@ -180,8 +187,9 @@ class Emission(Model):
     def __post_init__(self) -> None:
         instance(self.system, PinholeSystem, "emission")
         self._set_optics()
-        for name in ("time", "tolerance"):
-            self._set(name, positive(getattr(self, name), f"emission: {name}"))
+        self._set("tolerance", positive(self.tolerance, "emission: tolerance"))
+        self._set("time", checked_times(self.time, "emission: time", len(self.system)))
+        self._set("start", checked_times(self.start, "emission: start", len(self.system), is_positive=False))
         if self.aperture_tolerance is not None:
             self._set("aperture_tolerance", positive(self.aperture_tolerance, "emission: aperture_tolerance"))
         if self.aperture_points is not None:
@@ -192,7 +200,8 @@ class Emission(Model):
             if self.aperture_tolerance is not None:
                 raise InputError("emission: give aperture_points or aperture_tolerance, not both")
         self._set("pixel_points", require_points(self.pixel_points, "emission: pixel_points"))
-        self._set("background", checked_background(self.background, "emission: background", len(self.system)))
+        for name in ("background", "efficiency"):
+            self._set(name, checked_background(getattr(self, name), f"emission: {name}", len(self.system)))
         if self.hole not in ("auto", "depth", "rays", "point"):
             raise InputError(f"emission: hole: expected 'auto', 'depth', 'rays' or 'point', got {self.hole!r}")
         has_points = (self.aperture_points, self.aperture_tolerance) != (None, None)
@@ -262,9 +271,10 @@ class Emission(Model):
         return settings
 
     @property
-    def effective_time(self) -> float:
-        """The time, s, in which the activity at the start would make as many decays as it makes while it falls."""
-        return self.time if self.isotope is None else self.isotope.mean_decay_time(self.time)  # type: ignore[union-attr]
+    def effective_time(self) -> float | Floats:
+        """The time, s, or (M,), in which the activity at the reference time would make as many decays as it makes."""
+        known: Any = self.isotope
+        return self.time if known is None else known.mean_decay_time(self.time, self.start)
 
     def unit(self, volume: Volume) -> str:
         """Unit of the images of `volume`."""
@@ -299,7 +309,8 @@ class Emission(Model):
         ):
             if bad.any():
                 raise InputError(f"emission: view {int(np.argmax(bad))}: {why}")
-        checked_background(self.background, "emission: background", len(views), views.shape)
+        for name in ("background", "efficiency"):
+            checked_background(getattr(self, name), f"emission: {name}", len(views), views.shape)
 
     @functools.cached_property
     def optics(self) -> Optics:
@@ -386,7 +397,8 @@ class Emission(Model):
         """
         side, thickness = self.system.detector_side[m], self.system.detector_thickness[m]
         optics, *along, length = self._optics_of(m).promoted(along_u, along_v, length)
-        return self.effective_time * optics.pixel_weights(along, pitch, length, side, thickness, opening, layer, cells)
+        seconds = float(np.broadcast_to(self.effective_time, len(self.system))[m])
+        return seconds * optics.pixel_weights(along, pitch, length, side, thickness, opening, layer, cells)
 
     def response(self, views: Views, m: int) -> tuple[Floats, Floats] | None:
         """The intrinsic blur of view m: matrices (n_v, n_v) along v and (n_u, n_u) along u."""

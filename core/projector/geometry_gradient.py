@@ -12,6 +12,7 @@ from ..geometry.frames import module_frames, tilted
 from ..geometry.system import PinholeSystem
 from ..volumes.volume import Volume
 from .emission import Emission
+from .models import each_pixel
 from .operator import Projector
 
 # Steps of central differences of what is smooth and quickly made: relative, or rad.
@@ -116,6 +117,7 @@ def _effective_rise(model: Emission) -> Floats:
 def _by_blur(A: Projector, volume: Array, images: Array) -> Array:
     """Derivatives through the detector's blur by the pixels' sizes along u and v, (M, 2)."""
     by, holes, views, model = np.zeros((len(images), 2)), A._depths, A.views, A.model
+    images = images * each_pixel(model.efficiency)
     if holes is None or not isinstance(model, Emission) or model.response(views, 0) is None:
         return by
     wide, narrow = (

@@ -40,6 +40,9 @@ class Model(ABC):
     background: float | Floats = 0.0
     """What each pixel measures besides the volume: a number, one for each view (M,), or images (M, n_v, n_u)."""
 
+    efficiency: float | Floats = 1.0
+    """The share of what each pixel would count that it does count, formed like `background`; 0 of dead ones."""
+
     weights_voxels: bool = False
     """Whether each view has its own voxel weights (`voxel_weights`)."""
 
@@ -148,7 +151,7 @@ def intensity(line_integrals: ArrayOrTensor, photons: float) -> ArrayOrTensor:
 
 
 def checked_background(value: ArrayLike, name: str, n: int, pixels: tuple[int, int] | None = None) -> float | Floats:
-    """Counts besides a volume's: a number, or read-only those of `n` views (M,), or their images (M, n_v, n_u).
+    """Counts besides a volume's, or efficiencies: a number, or read-only those of `n` views (M,), or images (M, n_v, n_u).
 
     Parameters
     ----------
@@ -170,3 +173,21 @@ def checked_background(value: ArrayLike, name: str, n: int, pixels: tuple[int, i
     if array.min(initial=0.0) < 0:
         raise InputError(f"{name}: expected 0 or more, got {array.min():g}")
     return freeze(array) if array.ndim else float(array)
+
+
+def checked_times(value: ArrayLike, name: str, n: int, is_positive: bool = True) -> float | Floats:
+    """Times, s: a number, or read-only those of `n` views (M,)."""
+    array = real_array(value, name, None)
+    if array.shape not in ((), (n,)):
+        raise InputError(
+            f"{name}: expected one number, or {n} numbers (one for each view), got {shape_text(array.shape)}"
+        )
+    if is_positive and array.min(initial=np.inf) <= 0:
+        raise InputError(f"{name}: expected more than 0 s, got {array.min():g}")
+    return freeze(array) if array.ndim else float(array)
+
+
+def each_pixel(values: float | Floats) -> Floats:
+    """One number, those of views (M,), or images (M, n_v, n_u), with all three axes."""
+    array = np.asarray(values, np.float64)
+    return array.reshape(array.shape + (1,) * (3 - array.ndim))

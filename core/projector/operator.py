@@ -26,7 +26,7 @@ from .doubts import doubts
 from .execution import Execution
 from .lattices import require_no_negative, same_lattice
 from .linear_operator import LinearOperator
-from .models import Model, Transmission
+from .models import Model, Transmission, each_pixel
 from .parallel import thread_count
 from .subsets import balanced_subsets
 from .transmittance import Field
@@ -189,9 +189,17 @@ class Projector(LinearOperator):
 
     @property
     def background(self) -> Array:
-        """What the model expects besides the volume's images, (M, n_v, n_u), read-only: ``A(x) + A.background``."""
-        values = np.asarray(self.model.background)
-        return np.broadcast_to(values[:, None, None] if values.ndim == 1 else values, self.shape_out)
+        """What the model expects besides the volume's images, (M, n_v, n_u), read-only: ``A(x) + A.background``.
+
+        Dead pixels have none.
+        """
+        values = each_pixel(self.model.background)
+        return freeze(np.where(self.living, values, 0.0)) if values.any() else np.broadcast_to(values, self.shape_out)
+
+    @property
+    def living(self) -> NDArray[np.bool_]:
+        """Which pixels are not dead, (M, n_v, n_u), read-only: those whose efficiency in the model is not 0."""
+        return np.broadcast_to(each_pixel(self.model.efficiency) > 0, self.shape_out)
 
     def iter_views(self, volume: Volume | ArrayOrTensor) -> Iterator[ArrayOrTensor]:
         """The images one by one, each (n_v, n_u): work between which a job can stop. Gradients are not recorded.
@@ -288,6 +296,8 @@ class Projector(LinearOperator):
             if response is not None:
                 along_v, along_u = (cast_like(matrix, image) for matrix in response)
                 image = along_v @ image @ along_u.T
+            if self._efficiency is not None:  # close parts have theirs
+                image = image * cast_like(self._efficiency[m], image)
             for view, box, close, A in self._close_parts:
                 if view == m and (part := np.where(close, to_numpy(x[box], None), 0)).any():
                     image = image + cast_like(A(part, mu=mu)[0], image)
@@ -317,12 +327,14 @@ class Projector(LinearOperator):
             if self._depths is None:
                 gradient = execution.mu_gradient(responded, self._bundles, *own)
             else:
-                gradient = self._depth_mu_gradient(responded, *own)
+                gradient = self._depth_mu_gradient(images[index], responded, *own)
             total += to_caller(self._finished(gradient, images), images)
         return total
 
     def _responded(self, images: ArrayOrTensor) -> ArrayOrTensor:
-        """`images` with the adjoint of the detector's response."""
+        """`images` with the adjoint of the detector's response and efficiency."""
+        if self._efficiency is not None:
+            images = images * cast_like(self._efficiency, images)
         for m in range(len(self.views)):
             response = self.model.response(self.views, m)
             if response is None:
@@ -352,15 +364,23 @@ class Projector(LinearOperator):
         functions = backends.load("cpu" if has_kernels else "reference_depth")
         return np.ascontiguousarray(to_numpy(x, np.float64 if double else np.float32)), functions, self.threads
 
-    def _depth_mu_gradient(self, images: ArrayOrTensor, x: ArrayOrTensor, mu: ArrayOrTensor) -> Array:
+    def _depth_mu_gradient(
+        self, images: ArrayOrTensor, responded: ArrayOrTensor, x: ArrayOrTensor, mu: ArrayOrTensor
+    ) -> Array:
         """The gradient by mu of the depth-dependent response, and of the voxels that are too close to a pinhole for it."""
         volume, *how = self._depth_arguments(x)
-        arguments = volume, to_numpy(images, None), *how, self._mu_field(mu)
+        arguments = volume, to_numpy(responded, None), *how, self._mu_field(mu)
         gradient: Array = self._depths.mu_gradient(*arguments)  # type: ignore[union-attr]
         for m, box, close, of_part in self._close_parts:
             part, image = cast_like(np.where(close, to_numpy(x[box], None), 0), x), cast_like(images[m : m + 1], x)
             gradient += to_numpy(of_part._mu_gradient(image, part, mu), None)
         return gradient
+
+    @functools.cached_property
+    def _efficiency(self) -> Array | None:
+        """That of the model, (M, n_v, n_u) or (M, 1, 1); None where it is 1."""
+        values = each_pixel(self.model.efficiency)
+        return None if np.all(values == 1) else np.broadcast_to(values, (len(self.views), *values.shape[1:]))
 
     @functools.cached_property
     def _close_parts(self) -> list[tuple[int, Any, NDArray[np.bool_], Projector]]:

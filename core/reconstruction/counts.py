@@ -37,7 +37,7 @@ class CountData:
         """Checked: `A` is of emission; counts and background are at least 0, of the projector's shape.
 
         The background is one number, one for each module (M,), or images; that of the projector's model is added to it.
-        Raises InputError.
+        Raises InputError. Pixels that are dead in the model are left out.
         """
         instance(A, Projector, method)
         if A.model.takes != ("activity",):
@@ -55,10 +55,14 @@ class CountData:
         if extra.any() and known.any():
             both = f"{extra.mean():.3g} counts a pixel, besides the {known.mean():.3g} of the projector's model"
             warn(f"background: {both}: both are expected; leave one out if they are the same", 4)
-        data = cls(measured, np.broadcast_to(extra + known, A.shape_out))
+        data = cls(measured, extra + known).living(A)
         if isinstance(A.model, Emission) and len(A.views) > 3:  # two or three say too little
             _warn_if_reversed(A, A.model.system, data)
         return data
+
+    def living(self, A: Projector) -> "CountData":
+        """The same data, with nothing in pixels that are dead in a projector's model: they then say nothing."""
+        return CountData(*(np.where(A.living, data, np.float32(0)) for data in (self.counts, self.background)))
 
     def __getitem__(self, which: NDArray[np.int64]) -> "CountData":
         return CountData(self.counts[which], self.background[which])
@@ -152,13 +156,19 @@ class CountLoop(Loop):
         return {"subsets": len(self.parts), **known} | ({"prior": None} if self.prior is None else self.prior.record())
 
 
+def _coarse(model: Any) -> Emission:
+    """An ideal pinhole of few rays, with the model's times and efficiencies."""
+    own = {"time": model.effective_time, "efficiency": model.efficiency}
+    return Emission(model.system, pixel_points=1, tolerance=1e9, **own)
+
+
 def _warn_if_reversed(A: Projector, system: PinholeSystem, data: CountData) -> None:
     """Warn where the counts are far likelier of the modules in reversed order: by a step of MLEM on few, large voxels."""
     chosen = np.unique(np.rint(np.linspace(0, len(system) - 1, min(len(system), 16))).astype(int))  # symmetric
     shape = np.minimum(A.grid.shape, 20)
     step = A.grid.shape / shape
     grid = Grid(tuple(shape), A.grid.affine @ affine_matrix(np.diag(step), (step - 1) / 2))
-    B = Projector(grid, A.views[chosen], Emission(system[chosen], pixel_points=1, tolerance=1e9), A.backend, A.threads)
+    B = Projector(grid, A.views[chosen], _coarse(A.model.of_views(chosen)), A.backend, A.threads)
     part, seen = data[chosen], np.maximum(B.T(np.ones(B.shape_out, np.float32)), LEAST)
     total, likelihoods = float(part.counts.sum(dtype=float)), []
     even = np.full(shape, total / seen.sum(dtype=float), np.float32)

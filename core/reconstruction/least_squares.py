@@ -168,7 +168,7 @@ class LeastSquaresLoop(Loop):
     Attributes
     ----------
     images : array (M, n_v, n_u)
-        What was measured, without the model's background.
+        What was measured, without the model's background; 0 in pixels that are dead in the model, which so are left out.
     weights : array (n_x, n_y, n_z)
         1 inside the mask, else 0.
     """
@@ -191,7 +191,8 @@ class LeastSquaresLoop(Loop):
         )
         self._nonnegative = nonnegative
         background = A.background.astype(np.float32)
-        self.images: Array = real_array(plain(images), "images", A.shape_out, np.float32) - background
+        measured = real_array(plain(images), "images", A.shape_out, np.float32) - background
+        self.images: Array = np.where(A.living, measured, np.float32(0))
         self.weights: Array = self.mask.astype(np.float32)
 
     def record(self) -> dict[str, Any]:

@@ -25,7 +25,7 @@ class Snapshots:
     """
 
     def __init__(self, A: Projector, subsets: int) -> None:
-        self._parts = in_access_order(A.subsets(subsets))
+        self._A, self._parts = A, in_access_order(A.subsets(subsets))
         self._seen = [np.asarray(part.T(np.ones(part.shape_out, np.float32))) for part in self._parts]
         total = np.sum(self._seen, axis=0)
         self._even = (total > LEAST) / total.sum(dtype=float)  # of one count
@@ -37,9 +37,9 @@ class Snapshots:
 
         Counts (M, n_v, n_u) and background, all that is expected besides the volume, are of the projector's shape, float32.
         """
-        data = CountData(counts, np.broadcast_to(np.float32(background), counts.shape))
+        data = CountData(counts, np.broadcast_to(np.float32(background), counts.shape)).living(self._A)
         own = [data[part.which] for part in self._parts]
-        x, found = (counts.sum(dtype=float) * self._even).astype(np.float32), []
+        x, found = (data.counts.sum(dtype=float) * self._even).astype(np.float32), []
         for number in range(1, max(after) + 1):
             for part, measured, seen in zip(self._parts, own, self._seen, strict=True):
                 factor = part.T(measured.ratio(np.asarray(part(x))))

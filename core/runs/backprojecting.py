@@ -11,6 +11,7 @@ from ..geometry.grid import Grid
 from ..perspective.backprojection import HOW, backproject
 from ..progress import Stages
 from ..projector import Emission
+from ..projector.models import each_pixel
 from ..validation import instance, one_of
 from ..volumes.volume import Volume
 from .recipe import Recipe
@@ -101,12 +102,12 @@ def run_line_integrals(run: ProjectionRun) -> Floats32:
 
 def _pixel_weights(run: ProjectionRun) -> Floats:
     """What pixels (M, n_v, n_u) count of a line integral of 1 along their rays through the middle of the hole."""
-    model: Any = recipe_model(run.recipe, run.system)
+    model: Any = recipe_model(run.recipe, run.system, run=run)
     assert isinstance(model, Emission)
     middle = replace(model, hole="point", aperture_points=None, aperture_tolerance=None, pixel_points=1, depth_layers=1)
     anywhere = Grid.centered((1, 1, 1), 1.0)  # weights do not depend on it
     every = slice(None)
-    return np.array([
+    return each_pixel(model.efficiency) * np.array([
         sum(beam.weigh(every, every, every).sum(axis=0) for beam in middle.beams(run.views, m, anywhere))  # type: ignore[misc]
         for m in range(len(run.views))
     ])  # fmt: skip
@@ -116,6 +117,6 @@ def _require_all_count(run: ProjectionRun) -> None:
     """Refuse images with pixels that count nothing: they would make products and minima 0."""
     if run.recipe["model.kind"] == "emission" and not _pixel_weights(run).all():
         raise InputError(
-            "the images reach beyond the crystals, where pixels count nothing, and products and minima would be 0: take the "
-            "sum, or project onto pixels that lie on the crystals"
+            "the images reach beyond the crystals or have dead pixels, which count nothing, and products and minima would "
+            "be 0: take the sum, or project onto pixels that lie on the crystals"
         )

@@ -82,6 +82,7 @@ def _scanner(arrays: dict[str, Array], attributes: dict[str, Any]) -> Scanner:
 _VOLUME = ("volume/array", "volume/affine")
 """Which a measured run does not have."""
 _BACKGROUND = "background"  # in the unit of the projections; where there is none, nothing but the volume was projected
+_EFFICIENCY = "efficiency"  # where there is none, 1
 _ATTRIBUTES, _SHA256 = "attributes", "sha256"
 _COMPRESS_FROM = 1 << 16  # bytes: below, compressing costs more than it saves
 
@@ -124,6 +125,8 @@ def _arrays(run: ProjectionRun) -> _Arrays:
         found |= {_VOLUME[0]: (run.volume.unit, run.volume.array), _VOLUME[1]: ("mm", run.volume.grid.affine)}
     if np.any(run.background):
         found[_BACKGROUND] = (run.unit, np.asarray(run.background))
+    if np.any(np.asarray(run.efficiency) != 1):
+        found[_EFFICIENCY] = ("", np.asarray(run.efficiency))
     return found
 
 
@@ -166,6 +169,7 @@ def _run_of(arrays: dict[str, Array], attributes: dict[str, Any]) -> ProjectionR
         workbook_sha256=str(attributes["workbook_sha256"]),
         versions=json.loads(attributes["versions"]),
         background=arrays.get(_BACKGROUND, 0.0),  # type: ignore[arg-type]  # checked there
+        efficiency=arrays.get(_EFFICIENCY, 1.0),  # type: ignore[arg-type]
     )
 
 

@@ -7,6 +7,7 @@ import math
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from datetime import date
 from pathlib import Path
 from typing import Any
 
@@ -41,9 +42,10 @@ class Counts(np.ndarray[Any, Any]):
 
     Attributes
     ----------
-    about : array (frames, 6)
-        Of each frame its exposure, s, the size of its pixels along a row and down the columns, mm, and of its energy window
-        the number, and the lowest and highest energy, keV; NaN where the file does not say it.
+    about : array (frames, 7)
+        Of each frame its exposure, s, the size of its pixels along a row and down the columns, mm, the number of its energy
+        window, its start, s after that of the first frame of all, and the lowest and highest energy of its window, keV; NaN
+        where the file does not say it.
     kind : str
         What the frames are of, such as "2 energy windows".
     name : str
@@ -55,7 +57,7 @@ class Counts(np.ndarray[Any, Any]):
     def __array_finalize__(self, source: Any) -> None:
         self.kind, self.name = getattr(source, "kind", ""), getattr(source, "name", "counts")
         is_same = isinstance(source, Counts) and source.shape == self.shape
-        self.about = source.about if is_same else np.full((*self.shape[:1], 6), math.nan)
+        self.about = source.about if is_same else np.full((*self.shape[:1], 7), math.nan)
 
     def __getitem__(self, key: Any) -> Any:
         found = super().__getitem__(key)
@@ -135,6 +137,8 @@ def read_frames(
         tell(progress, number, len(paths))
     counts = found[0] if len(found) == 1 else np.concatenate(found).view(Counts)
     counts.about = np.concatenate([one.about for one in found])
+    starts = counts.about[:, 4]  # until here after the day's beginning or that of an era
+    starts -= np.min(starts, initial=np.inf, where=np.isfinite(starts))
     counts.kind = ", ".join(sorted({one.kind for one in found} - {""}))
     counts.name = ", ".join([*(one.name for one in paths[:3]), *(["…"] if len(paths) > 3 else [])])
     return counts
@@ -169,8 +173,9 @@ def _reader(path: Path, ending: str) -> Callable[[Path, Layout], Counts]:
 def _counts(array: Array, kind: str = "", **known: Sequence[float]) -> Counts:
     """Checked frames, with an axis of frames also where there is only one, and what is `known` about them from the file.
 
-    That is their `time` (s), `pixel` (along a row and down the columns, mm), energy `window` (number) and its `low` and
-    `high` energy (keV). Of these, fewer than frames are those of blocks of frames, which follow each other.
+    That is their `time` (s), `pixel` (along a row and down the columns, mm), energy `window` (number) with its `low` and
+    `high` energy (keV), and `start` (s after any moment). Of these, fewer than frames are those of blocks of frames, which
+    follow each other.
     """
     array = array[None] if array.ndim == 2 else array
     if array.ndim != 3 or not array.size:
@@ -179,7 +184,7 @@ def _counts(array: Array, kind: str = "", **known: Sequence[float]) -> Counts:
         raise InputError(f"expected whole or real numbers, found {array.dtype}")
     counts = array.view(Counts)
     counts.kind, counts.about[:, 1:3] = kind, known.get("pixel", math.nan)
-    for column, name in ((0, "time"), (3, "window"), (-2, "low"), (-1, "high")):
+    for column, name in ((0, "time"), (3, "window"), (4, "start"), (5, "low"), (6, "high")):
         each = np.array(known.get(name) or [math.nan])
         counts.about[:, column] = each[np.arange(len(array)) * len(each) // len(array)]
     return counts
@@ -288,6 +293,8 @@ def _interfile(path: Path, layout: Layout) -> Counts:
     count = int(number("total number of images", (data.stat().st_size - skip) // frame if frame else 0))
     keys = (f"{name} (sec)" for name in ("time per projection", "image duration", "study duration"))
     times = next((list(map(float, header[key])) for key in keys if any(header.get(key, ()))), [])
+    starts = [float(each) for each in header.get("image relative start time (sec)", ()) if each]
+    starts = starts or [_seconds_of_day(each) for each in header.get("image start time", ()) if each]
     windows = int(number("number of energy windows", 1))
     pixel = [float(text(f"scaling factor (mm/pixel) [{i}]", "nan")) for i in (1, 2)]
     kind = f"{windows} energy windows" if windows > 1 else ""
@@ -296,7 +303,15 @@ def _interfile(path: Path, layout: Layout) -> Counts:
         [float(text(f"energy window {word} level [{i}]", "nan")) for i in range(1, windows + 1)]
         for word in ("lower", "upper")
     )
-    return _counts(frames, kind, time=times, pixel=pixel, window=range(1, windows + 1), low=low, high=high)
+    return _counts(
+        frames, kind, time=times, pixel=pixel, window=range(1, windows + 1), start=starts, low=low, high=high
+    )
+
+
+def _seconds_of_day(text: str) -> float:
+    """Of a time such as 14:05:30, or DICOM's 140530.25."""
+    digits = text.replace(":", "")
+    return 3600.0 * int(digits[:2]) + 60.0 * int(digits[2:4] or 0) + float(digits[4:] or 0)
 
 
 def _interfile_header(path: Path) -> dict[str, list[str]]:
@@ -342,7 +357,8 @@ def _dicom(path: Path, layout: Layout) -> Counts:
     pixel = [float(size) for size in data.get("PixelSpacing") or (math.nan, math.nan)][::-1]
     windows = _which(data, "Energy Window", several["Energy Window"])
     low, high = ([_dicom_energy(data, number, word) for number in windows] for word in ("Lower", "Upper"))
-    return _counts(array, kind, time=_dicom_times(data), pixel=pixel, window=windows, low=low, high=high)
+    times, starts = _dicom_times(data), _dicom_starts(data, len(array))
+    return _counts(array, kind, time=times, pixel=pixel, window=windows, start=starts, low=low, high=high)
 
 
 _VECTORS = ("Energy Window", "Detector", "Phase", "Rotation", "RR Interval", "Time Slot")
@@ -364,6 +380,30 @@ def _dicom_energy(data: Any, number: int, word: str) -> float:
     ranges: Any = windows[number - 1].get("EnergyWindowRangeSequence") or () if 0 < number <= len(windows) else ()
     limit = ranges[0].get(f"EnergyWindow{word}Limit") if len(ranges) == 1 else None
     return math.nan if limit is None else float(limit)
+
+
+def _dicom_starts(data: Any, count: int) -> list[float]:
+    """When frames started, s of an era: the acquisition, and in it each phase and its frames (C.8.4.8, C.8.4.14).
+
+    Nothing where the file says neither a time nor phases, and of rotations, whose views follow each other unsaid.
+    """
+    day, clock = str(data.get("AcquisitionDate") or ""), str(data.get("AcquisitionTime") or "")
+    phases = data.get("PhaseInformationSequence") or ()
+    if not (clock or phases) or data.get("RotationInformationSequence"):
+        return []
+    begun = 86400.0 * date.fromisoformat(day).toordinal() if day else 0.0
+    begun += _seconds_of_day(clock) if clock else 0.0
+    if not phases:
+        return [begun]
+    ends, firsts, apart = begun, [], []
+    for phase in phases:
+        duration, pause = _dicom_time(phase), float(phase.get("PauseBetweenFrames") or 0) / 1000
+        firsts.append(ends + float(phase.get("PhaseDelay") or 0) / 1000)
+        apart.append(duration + pause)
+        ends = firsts[-1] + int(phase.get("NumberOfFramesInPhase") or 1) * apart[-1] - pause
+    slices = data.get("TimeSliceVector")
+    of_frames = zip(_which(data, "Phase", len(phases)), [1] * count if slices is None else list(slices), strict=False)
+    return [firsts[phase - 1] + (number - 1) * apart[phase - 1] for phase, number in of_frames]
 
 
 def _which(data: Any, name: str, count: int) -> list[int]:

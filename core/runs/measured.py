@@ -1,8 +1,10 @@
 """Measured counts become a run of a scanner: which frame is which module, how it lies on the crystal, and how long it took.
 
-None of these is guessed, not even where the number of frames is that of the modules: whoever imports the counts says it.
+The first two are never guessed, not even where the number of frames is that of the modules: whoever imports the counts says
+them. Times are the files', where they have them.
 """
 
+import math
 import operator
 import re
 from collections.abc import Mapping, Sequence
@@ -18,7 +20,10 @@ from ..files import read_text
 from ..geometry.scanner import Detector, Scanner
 from ..memory import require
 from ..progress import Stages
-from ..validation import instance, one_of, positive, real_numbers, require_finite, shape_text
+from ..projector.models import checked_background, checked_times, each_pixel
+from ..validation import instance, one_of, real_numbers, require_finite, shape_text
+from .counting import live_shares_of, recipe_efficiency, scaled
+from .frame_checks import warn_of_frames
 from .frame_files import Counts, Layout, differs, read_frames
 from .orientations import ORIENTATIONS, on_crystal
 from .recipe import Recipe, recorded_recipe
@@ -26,10 +31,6 @@ from .run import ProjectionRun
 from .scatter_windows import ScatterWindows
 
 _MOST_NUMBERS = 1 << 20  # in a list of frames
-_FEW = 10
-"""Counts of a frame, and pixels: with more, chance leaves hardly a frame empty, or two frames equal."""
-_BRIGHT = 100
-"""Times as many counts as its neighbours has no pixel by hole and crystal, whose blur reaches them."""
 _MOST_EXACT = 1 << 24  # whole numbers above are rounded in float32
 _KEPT = ("system.", "attenuation.", "counts.", "model.", "detector.", "compute.")
 
@@ -39,8 +40,10 @@ def counts_run(
     system: Scanner,
     frames: str | Sequence[int | None] | None = None,
     orientation: str | Sequence[str] | None = None,
-    time: float | None = None,
+    time: ArrayLike | None = None,
     *,
+    start: ArrayLike | None = None,
+    efficiency: ArrayLike | None = None,
     expected: bool = False,
     detector: Detector = "real",
     magnification: float = 10.0,
@@ -65,7 +68,13 @@ def counts_run(
         How the frames lie on the crystals, one of `ORIENTATIONS`, or one for each frame: ``"front+v"`` where a frame, drawn
         with row 0 at the top and column 0 at the left, is the crystal as seen from the pinhole with +v at the top.
     time
-        Exposure, s.
+        Exposure, s: one number, or those of the modules (M,). None: the files' own. What contradicts them is refused.
+    start
+        When the first of the frames that are used began, s after the reference time of the activity, by default the
+        recipe's, or 0; frames that the files say began later are so much later by themselves. Or the starts of the modules
+        (M,); what contradicts the files' differences is refused.
+    efficiency
+        As in `Emission`, of the run's images; by default the recipe's. Dead pixels, 0, are left out of reconstructions.
     expected
         Whether the numbers are expected means, which may be fractions.
     detector, magnification, pitch
@@ -81,7 +90,8 @@ def counts_run(
     Returns
     -------
     ProjectionRun
-        A run of counts without a volume, its modules in the order of `system`.
+        A run of counts without a volume, its modules in the order of `system`. Warnings name, by frame and module, what is
+        hardly measured: dead modules and pixels that `efficiency` does not declare, bright pixels, equal frames.
     """
     instance(system, Scanner, "counts: system")
     array = real_numbers(counts, "counts")
@@ -92,43 +102,52 @@ def counts_run(
     require_given(frames, orientation, time, found)
     numbers = frame_numbers(frames, len(array), system)
     words = _words(orientation, len(array))
-    time = positive(time, "time (--time)", "s")
+    recipe = recipe or Recipe()
+    used = _in_order(numbers, system)
+    called = [f"frame {k + 1} (module {number})" for k, number in enumerate(numbers)]
+    time = _times(time, found, used, called)
+    start = _starts(recipe["model.start"] if start is None else start, found, used, called)
     _require_counts(array, expected)
     require(4.0 * array.size, f"counts of {shape_text(array.shape)}")
     turned = [on_crystal(frame, word) for frame, word in zip(array, words, strict=True)]
     if len({image.shape for image in turned}) > 1:
         raise InputError("orientation (--orientation): frames that are not square cannot lie both upright and turned")
-    used = {"peak": _in_order(numbers, system)}
+    frames_of = {"peak": used}
     for word, own in {} if scatter is None else scatter.frames.items():
         with naming(f"{word}_frames (--{word}-frames)"):
-            used[word] = _in_order(frame_numbers(own, len(array), system), system)
-    of_windows = {word: np.stack([turned[k] for k in own]).astype(np.float32) for word, own in used.items()}
+            frames_of[word] = _in_order(frame_numbers(own, len(array), system), system)
+    of_windows = {word: np.stack([turned[k] for k in own]).astype(np.float32) for word, own in frames_of.items()}
     if detector == "virtual":  # upright, the crystal's image point-inverted
         of_windows = {word: images[:, ::-1, ::-1] for word, images in of_windows.items()}
     images = of_windows["peak"]
     n_v, n_u = images.shape[1:]
     views = system.views((n_v, n_u), detector, magnification, pitch)
-    given = {key: value for key, value in (recipe or Recipe()).given.items() if key.startswith(_KEPT)}
-    given |= {"model.kind": "emission", "model.time": time, "detector.plane": detector}
+    given = {key: value for key, value in recipe.given.items() if key.startswith(_KEPT)}
+    given |= {"model.kind": "emission", "model.time": time, "model.start": start, "detector.plane": detector}
+    if efficiency is not None and np.ndim(efficiency) < 2:
+        given["model.efficiency"] = np.asarray(efficiency).tolist()
     given |= {"detector.rows": n_v, "detector.columns": n_u, "detector.magnification": float(magnification)}
     record = {
         "counts": "measured", "frames": numbers, "orientation": words[0] if len(set(words)) == 1 else words,
         "detector": detector, "magnification": float(magnification),
         "pitch_mm": None if pitch is None else np.broadcast_to(pitch, 2).tolist(), "model": "emission",
-        **(settings or {}), "recipe": recorded_recipe(Recipe(given)).tables(),
+        **(settings or {}), "recipe": (made := recorded_recipe(Recipe(given))).tables(),
     }  # fmt: skip
-    background = given.get("model.background", 0.0)
+    efficiency = recipe_efficiency(recipe) if efficiency is None else efficiency
+    efficiency = checked_background(efficiency, "efficiency (--efficiency)", len(system), (n_v, n_u))
+    background = scaled(made["model.background"], live_shares_of(made, images))
     if scatter is not None:
-        estimate, record["scatter"] = scatter.estimate(of_windows, used, found)
-        background = background + estimate
-    run = ProjectionRun(images, system, views, unit="counts", settings=record, background=background)
-    _warn_of_others(found, used["peak"], words, run)
-    _warn_of_frames(array, used["peak"], numbers, found.name)
+        estimate, record["scatter"] = scatter.estimate(of_windows, frames_of, found)
+        background = each_pixel(background) + estimate
+    known: Any = {"settings": record, "background": background, "efficiency": efficiency}
+    run = ProjectionRun(images, system, views, unit="counts", **known)
+    _warn_of_others(found, used, words, run)
+    warn_of_frames(array, used, called, found.name, time, _declared(run, words, used, array.shape))
     return run
 
 
 def recipe_counts(recipe: Recipe, system: Scanner, stages: Stages = lambda stage: None) -> ProjectionRun:
-    """The run of the measured counts that a recipe names; warns where a file has another exposure time or pixel size."""
+    """The run of the measured counts that a recipe names; warns where a file has another pixel size."""
     layout = Layout(*(recipe[f"counts.{name}"] for name in ("dataset", "raw_shape", "raw_type", "raw_big_endian")))
     found = read_frames(recipe["counts.files"], layout, stages("reading"))
     frames, orientation = recipe["counts.frames"], recipe["counts.orientation"]
@@ -155,12 +174,10 @@ def _scatter(recipe: Recipe) -> ScatterWindows | None:
 def require_given(frames: Any, orientation: Any, time: Any, found: Counts) -> None:
     """Refuse missing arguments; the message names them all, and what is known of the counts."""
     count, rows, columns = found.shape
-    times = found.exposures()
-    confirm = f"; the file says {_and(times)} s: confirm it" if times else ""
     texts = {
         "which module each frame is of (--frames, such as 1-80 or 3,1,2)": frames,
         f"how frames lie on the crystal (--orientation, one of {', '.join(ORIENTATIONS)})": orientation,
-        f"the exposure time in seconds (--time{confirm})": time,
+        "the exposure time in seconds (--time)": found.exposures() or time,
     }
     if missing := [text for text, value in texts.items() if value is None]:
         kind = f" ({found.kind})" if found.kind else ""
@@ -213,6 +230,63 @@ def _whole(values: Any) -> list[int | None]:
         raise InputError(f"frames (--frames): expected the modules' numbers, got {values!r:.40}") from None
 
 
+def _times(time: Any, found: Counts, used: list[int], called: list[str]) -> float | list[float]:
+    """The exposures, s, of the modules whose frames are `used`: one number where they are the same."""
+    own = found.about[used, 0]
+    if time is None:
+        for k, seconds in zip(used, own, strict=True):
+            if math.isnan(seconds):
+                raise InputError(
+                    f"{found.name}: {called[k]}: the file says no time, of others it does; say it (--time)"
+                )
+        return _one_or_all(own)
+    given = np.broadcast_to(checked_times(time, "time (--time)", len(used)), len(used))
+    wrong = [(k, said, taken) for k, said, taken in zip(used, own, given, strict=True) if differs(said, taken)]
+    for k, said, taken in wrong[:1]:
+        more = f", and others of {len(wrong) - 1} frames more" if len(wrong) > 1 else ""
+        hint = "leave it out to take the file's"
+        pair = f"the file says {said:g} s, the time (--time) is {taken:g} s"
+        raise InputError(f"{found.name}: {called[k]}: {pair}{more}; {hint}")
+    return _one_or_all(given)
+
+
+def _starts(start: Any, found: Counts, used: list[int], called: list[str]) -> float | list[float]:
+    """When the frames `used` started, s after the reference time: one number where they are the same."""
+    given = checked_times(start, "start (--start-time)", len(used), is_positive=False)
+    first = int(np.argmin(found.about[used, 4]))  # of any that is not known
+    said = found.about[used, 4] - found.about[used[first], 4]
+    if np.isnan(said).any():
+        return _one_or_all(np.broadcast_to(given, len(used)))
+    if not isinstance(given, np.ndarray):
+        return _one_or_all(given + said)
+    taken = given - given[first]
+    off = np.abs(said - taken)
+    if (off > 1e-3 * (1 + said)).any():
+        worst = int(np.argmax(off))
+        pair = f"{said[worst]:g} s after {called[used[first]]}, the starts (--start-time) {taken[worst]:g} s"
+        hint = "give that of the first frame alone to take the file's"
+        raise InputError(f"{found.name}: {called[used[worst]]}: the file says {pair}; {hint}")
+    return _one_or_all(given)
+
+
+def _one_or_all(values: Array) -> float | list[float]:
+    return float(values[0]) if np.all(values == values[0]) else values.tolist()
+
+
+def _declared(run: ProjectionRun, words: list[str], used: list[int], shape: tuple[int, ...]) -> Array:
+    """Which numbers of frames (frames, rows, columns) are of pixels that a run's efficiency declares dead."""
+    found = np.zeros(shape, bool)
+    if np.all(run.efficiency):
+        return found
+    living = np.broadcast_to(each_pixel(run.efficiency) > 0, run.projections.shape)
+    if run.settings["detector"] == "virtual":
+        living = living[:, ::-1, ::-1]
+    for k, lives in zip(used, living, strict=True):
+        places = on_crystal(np.arange(found[k].size).reshape(shape[1:]), words[k])
+        found[k].flat[places[~lives]] = True
+    return found
+
+
 def _words(orientation: Any, count: int) -> list[str]:
     words = [orientation] * count if isinstance(orientation, str) else list(orientation)
     if len(words) != count:
@@ -247,11 +321,7 @@ def _require_size(recipe: Recipe, run: ProjectionRun, names: str) -> None:
 
 
 def _warn_of_others(found: Counts, used: list[int], words: list[str], run: ProjectionRun) -> None:
-    """Warn where the files say another time or pixel size of the frames `used`, or that they are of several windows."""
-    time, times = run.recipe["model.time"], found.exposures(used)
-    if any(differs(one, time) for one in times):
-        what = "exposures" if len(times) > 1 else "an exposure"
-        warn(f"{found.name}: the file says {what} of {_and(times)} s; taken as {time:g} s, as given")
+    """Warn where the files say another pixel size of the frames `used`, or that they are of several windows."""
     if len(windows := np.unique(found.about[used, 3])) > 1 and np.isfinite(windows).all():
         what = f"frames of the energy windows {_and(windows.tolist())} are used"
         warn(f"{found.name}: {what}; say none (--frames) for those that are not meant")
@@ -267,33 +337,8 @@ def _warn_of_others(found: Counts, used: list[int], words: list[str], run: Proje
             return
 
 
-def _warn_of_frames(array: Array, used: list[int], numbers: list[int | None], name: str) -> None:
-    """Warn of frames that hardly are what modules have counted: empty ones, equal ones, single bright pixels."""
-    called = [f"frame {k + 1} (module {number})" for k, number in enumerate(numbers)]
-    sums = {k: float(array[k].sum(dtype=float)) for k in used}
-    usual = float(np.median([total for total in sums.values() if total] or [0.0]))
-    if usual > _FEW and (empty := [called[k] for k in used if not sums[k]]):
-        warn(f"{name}: no counts in {_some(empty)}, {usual:g} in others")
-    known: dict[bytes, int] = {}
-    pairs = [(known.setdefault(array[k].tobytes(), k), k) for k in used if np.count_nonzero(array[k]) > _FEW]
-    if equal := [f"{called[one]} and {called[k]}" for one, k in pairs if one != k]:
-        warn(f"{name}: equal in every pixel: {_some(equal)}")
-    usual = sorted([0.0, *(float(array[k].max()) for k in used)])[len(used) // 2]
-    for k in used:
-        row, column = divmod(int(array[k].argmax()), array.shape[2])
-        near = array[k, max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2]
-        *others, peak = np.sort(near, axis=None).tolist()
-        if peak > _BRIGHT * max(1, usual, *others):
-            text = f"{called[k]}, row {row + 1}, column {column + 1}: {peak:g} counts"
-            warn(f"{name}: {text}, at most {max(others, default=0):g} in the pixels around it and {usual:g} in others")
-
-
 def _and(numbers: Sequence[float]) -> str:
     return " and ".join(f"{number:g}" for number in numbers)
-
-
-def _some(texts: list[str]) -> str:
-    return "; ".join([*texts[:3], *([f"and {len(texts) - 3} more"] if len(texts) > 3 else [])])
 
 
 def _listed(numbers: Sequence[int]) -> str:

@@ -144,7 +144,9 @@ def caption(run: ProjectionRun) -> str:
     words = run.settings["orientation"]
     lay = words if isinstance(words, str) else "each its own way"
     side = "crystals seen from behind" if run.settings["detector"] == "real" else "what the pinholes see"
-    counts = f"{run.settings['counts']}, {run.recipe['model.time']:g} s, frames {lay}"
+    times = np.unique(run.recipe["model.time"])
+    seconds = " to ".join(f"{time:g}" for time in dict.fromkeys(times[[0, -1]]))
+    counts = f"{run.settings['counts']}, {seconds} s, frames {lay}"
     return f"{counts}. Module (frame): {side}, +v at the top, +u at the left"
 
 

@@ -7,12 +7,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..arrays import Floats32
+from ..arrays import Array, Floats32
 from ..errors import InputError, warn
 from ..geometry.scanner import Detector, Scanner
 from ..geometry.system import PinholeSystem
 from ..geometry.views import Views
 from ..memory import require
+from ..physics.dead_time import dead_time_counts
 from ..physics.isotopes import photon_energy
 from ..physics.noise import sample_counts
 from ..progress import Progress
@@ -20,6 +21,7 @@ from ..projector import Emission, Model, Projector, Transmission, intensity
 from ..projector.doubts import doubts_of_mu
 from ..validation import positive, seed_number
 from ..volumes.volume import Volume
+from .counting import scaled
 from .run import ProjectionRun
 
 LINES = "lines"
@@ -32,6 +34,7 @@ class Imaging:
 
     projector: Projector
     photons: float | None = None  # as for `project_run`
+    dead_time: tuple[float, str] = (0.0, "non-paralysable")  # of each module, s, and its kind
 
     @property
     def model(self) -> Model:
@@ -39,7 +42,27 @@ class Imaging:
         return self.projector.model
 
     def images(self, volume: Volume, mu: Floats32 | None = None, progress: Progress | None = None) -> Floats32:
-        """The expected images (M, n_v, n_u) of a volume, the background included.
+        """The expected images (M, n_v, n_u) of a volume: the background included, less what dead time takes."""
+        images = self.expected(volume, mu, progress)
+        images *= self.recorded_shares(images)
+        return images
+
+    def recorded_shares(self, images: Floats32) -> Floats32:
+        """The shares (M, 1, 1) of expected images that modules record beside their dead time; a warning says where they
+        are beyond what a paralysable counter can record, so that the counts are those of a smaller rate.
+        """
+        (tau, kind), model = self.dead_time, self.model
+        if not tau or not isinstance(model, Emission):
+            return np.ones((1, 1, 1), np.float32)
+        totals = np.maximum(images.sum(axis=(1, 2), dtype=float), 1e-30)
+        if kind == "paralysable" and (beyond := totals / model.time > 1 / tau).any():
+            numbers = ", ".join(map(str, model.system.numbers[beyond][:5]))
+            warn(f"dead time: so many photons that more of them would be fewer counts, in module {numbers}")
+        recorded: Array = dead_time_counts(totals, model.time, tau, kind) / totals  # type: ignore[arg-type]
+        return recorded.astype(np.float32)[:, None, None]
+
+    def expected(self, volume: Volume, mu: Floats32 | None = None, progress: Progress | None = None) -> Floats32:
+        """The expected images (M, n_v, n_u) of a volume, the background included, without dead time.
 
         `mu`, 1/mm, attenuates in place of the model's, on whose grid it is. `progress` is called after every view.
         `InputError` where the model has no meaning for the volume. Warnings say where images hardly are what is wanted.
@@ -78,6 +101,7 @@ def project_run(
     photons: float | None = None,
     noise_seed: int | None = None,
     progress: Progress | None = None,
+    dead_time: tuple[float, str] = (0.0, "non-paralysable"),
 ) -> ProjectionRun:
     """Project `volume` into every module of `system`.
 
@@ -98,6 +122,9 @@ def project_run(
         With an `Emission` or `photons`: the run holds counts drawn with this seed (`sample_counts`), not their means.
     progress
         Called after every view.
+    dead_time
+        With an `Emission`: that of each module, s, and its kind, "non-paralysable" or "paralysable". The expected counts,
+        before noise, are less by it (`dead_time_counts`); the run's background is what is recorded of it.
 
     Raises
     ------
@@ -113,9 +140,11 @@ def project_run(
     n_v, n_u = views.shape
     each = 4.0 if noise_seed is None else 20.0  # bytes; counts are drawn from float64, as int64
     require(each * len(views) * n_v * n_u, f"a set of {len(views)} projections of {n_v} x {n_u} pixels")
-    imaging = Imaging(Projector(volume.grid, views, model, backend, threads), photons)
+    imaging = Imaging(Projector(volume.grid, views, model, backend, threads), photons, dead_time)
     model = imaging.model
-    images = imaging.images(volume, progress=progress)
+    images = imaging.expected(volume, progress=progress)
+    shares = imaging.recorded_shares(images)
+    images *= shares
     if noise_seed is not None:
         images = sample_counts(images, noise_seed).astype(np.float32)
     record = {
@@ -125,7 +154,7 @@ def project_run(
     }  # fmt: skip
     return ProjectionRun(
         images, system, views, volume, unit=imaging.unit(volume), settings=record, seed=noise_seed,
-        background=model.background,
+        background=scaled(model.background, shares), efficiency=model.efficiency,
     )  # fmt: skip
 
 

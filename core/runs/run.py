@@ -50,6 +50,7 @@ class ProjectionRun:
     workbook_sha256: str = ""
     versions: Mapping[str, str] = field(default_factory=versions)  # of mphDRR and what it ran on
     background: float | Floats = 0.0  # besides the volume, as in `Emission`: (), (M,) or images
+    efficiency: float | Floats = 1.0  # of the pixels, in the same forms
 
     def __post_init__(self) -> None:
         self.views.require_pinholes("run")
@@ -59,8 +60,9 @@ class ProjectionRun:
         name = "run: projections"
         projections = checked(real_numbers(self.projections, name), name, shape, False)
         object.__setattr__(self, "projections", freeze(projections.view()))
-        background = checked_background(self.background, "run: background", len(self.views), self.views.shape)
-        object.__setattr__(self, "background", background)
+        for form in ("background", "efficiency"):
+            found = checked_background(getattr(self, form), f"run: {form}", len(self.views), self.views.shape)
+            object.__setattr__(self, form, found)
         if not self.unit:
             if self.volume is None:
                 raise InputError("run: without a volume, say the unit of the projections, such as counts")

@@ -23,17 +23,19 @@ from ..physics.ct_numbers import hu_to_mu
 from ..physics.isotopes import photon_energy
 from ..progress import Progress, Stages
 from ..projector import Emission, InverseSquareSum, Model, Projector, Transmission
+from ..projector.models import each_pixel
 from ..volumes.rearranging import centered
 from ..volumes.volume import Volume
 from ..volumes.volume_files import read_volume, read_volume_of
 from ..workbook import read_scanner
+from .counting import dead_time_of, live_shares_of, recipe_efficiency, scaled
 from .measured import recipe_counts
 from .projecting import LINES, Imaging, project_run, warn_of_energy
 from .recipe import Recipe, recorded_recipe
 from .run import ProjectionRun
 
 _MODELS: dict[str, Any] = {"transmission": Transmission, "emission": Emission, "inverse-square": InverseSquareSum}
-_MODULES = "system.modules"
+_MODULES, _EFFICIENCY = "system.modules", "model.efficiency"
 _MOST_MU = 500.0
 """1/mm: more than any material of the tables attenuates photons of 10 keV or more."""
 
@@ -92,7 +94,7 @@ def run_recipe(
             system, source, **_detector(recipe), backend=recipe["compute.backend"], threads=recipe["compute.threads"],
             settings={"volume": _volume_name(record), **converted, "recipe": record.tables()},
             model=recipe_model(recipe, system, mu_of_it), photons=recipe["model.photons"],
-            noise_seed=record["noise.seed"], progress=stages("projecting"),
+            noise_seed=record["noise.seed"], progress=stages("projecting"), dead_time=dead_time_of(recipe),
         )  # fmt: skip
 
 
@@ -124,8 +126,12 @@ def _detector(recipe: Recipe) -> dict[str, Any]:
     return {"shape": shape, "detector": recipe["detector.plane"], **given}
 
 
-def recipe_model(recipe: Recipe, system: Scanner, mu: Volume | None = None) -> Model:
-    """The model that a recipe asks for; `mu` is what attenuates. `InputError` where the settings do not go together."""
+def recipe_model(recipe: Recipe, system: Scanner, mu: Volume | None = None, run: ProjectionRun | None = None) -> Model:
+    """The model that a recipe asks for; `mu` is what attenuates. `InputError` where the settings do not go together.
+
+    Of a `run` it has the efficiencies, if they are the recipe's, and what dead time has left of its photons is, as a part
+    of them, in its efficiency and background: so counts have Poisson's noise.
+    """
     cls = _MODELS[recipe["model.kind"]]
     given = recipe.fields("model", cls)
     if given.get("pixel_points") == "auto":
@@ -134,6 +140,13 @@ def recipe_model(recipe: Recipe, system: Scanner, mu: Volume | None = None) -> M
         if "model.opening_angle_degrees" in recipe.given:
             given["opening_angle"] = math.radians(recipe["model.opening_angle_degrees"])
         given["mu"] = mu
+        if run is not None and "recipe" in run.settings and run.recipe[_EFFICIENCY] == recipe[_EFFICIENCY]:
+            given["efficiency"] = run.efficiency
+        else:
+            given["efficiency"] = recipe_efficiency(recipe)
+        if run is not None and recipe["model.dead_time"]:
+            shares = live_shares_of(recipe, run.projections)
+            given |= {name: scaled(given.get(name, 0.0), shares) for name in ("background", "efficiency")}
     return cls(**given) if cls is Transmission else cls(system, **given)
 
 
@@ -171,7 +184,7 @@ def projector_of_run(
     """
     recipe = run.recipe if recipe is None else recipe
     if mu is None and recipe["model.kind"] == "emission":
-        model = recipe_model(recipe, run.system)
+        model = recipe_model(recipe, run.system, run=run)
         if recipe["attenuation.of_phantom"]:
             mu = _mu_of_phantom(recipe_phantom(recipe), phantom_pose(recipe), grid, model, stages)
         elif recipe["volume.center"] and recipe["attenuation.file"] is not None:
@@ -180,10 +193,11 @@ def projector_of_run(
             )
         else:
             mu = _attenuation(recipe, model, stages)
-    model = recipe_model(recipe, run.system, mu)
-    if isinstance(model, Emission) and np.ndim(run.background):  # such as scatter; the recipe has what is in all pixels
-        own = run.recipe["model.background"] if "recipe" in run.settings else 0.0
-        model = replace(model, background=np.maximum(run.background + (recipe["model.background"] - own), 0))
+    model = recipe_model(recipe, run.system, mu, run)
+    if isinstance(model, Emission) and np.ndim(run.background) == 3:  # such as scatter: no recipe says it
+        own = recipe_model(run.recipe, run.system, run=run).background if "recipe" in run.settings else 0.0
+        more = np.maximum(run.background - each_pixel(own), 0)
+        model = replace(model, background=each_pixel(model.background) + more)
     return Projector(grid, run.views, model, backend, threads)
 
 
@@ -193,7 +207,7 @@ def recipe_imaging(
 ) -> Imaging:  # fmt: skip
     """What makes a recipe's images of volumes on a grid; `mu` is what attenuates."""
     projector = Projector(grid, views, recipe_model(recipe, system, mu), backend, threads)
-    return Imaging(projector, recipe["model.photons"])
+    return Imaging(projector, recipe["model.photons"], dead_time_of(recipe))
 
 
 def _volume_name(record: Recipe) -> str:

@@ -9,6 +9,7 @@ import dataclasses
 import functools
 import operator
 from collections.abc import Collection, Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from inspect import Parameter
 from numbers import Integral, Real
@@ -53,6 +54,7 @@ class Setting:
     most: float | None = None
     slider: float | None = None  # the largest value that a slider reaches
     sizes: tuple[int, ...] | None = None  # how many values it may have, () for any number; None: one value alone
+    of_modules: bool = False  # whether it may be a list, or a text such as "10, 20", of one for each module
     is_path: bool = False  # whether it names a file
     endings: Collection[str] = ()  # in lower case, of files that it may name beside its words
     needs: tuple[str, ...] = ()
@@ -66,6 +68,8 @@ class Setting:
 
     def names_file(self, value: Any) -> bool:
         """Whether a value is a file's name."""
+        if self.of_modules and isinstance(value, tuple):
+            return False
         return self.is_path or (isinstance(value, str) and Path(value).suffix.lower() in self.endings)
 
     @property
@@ -78,9 +82,8 @@ class Setting:
     @property
     def expected(self) -> str:
         """What one value must be, for messages."""
-        words = f"one of {', '.join(self.words)}" if self.words else ""
-        if self.endings:
-            words += f" or a file ({', '.join(self.endings)})"
+        files = f"a file ({', '.join(self.endings)})" if self.endings else ""
+        words = " or ".join(filter(None, (f"one of {', '.join(self.words)}" if self.words else "", files)))
         if self.kind in (bool, str):
             return words or {bool: "true or false", str: "a text"}[self.kind]
         number = "a whole number" if self.kind is int else "a number"
@@ -92,6 +95,8 @@ class Setting:
         """`value` as a recipe keeps it, lists as tuples; `InputError` where it is not what is expected."""
         if self.kind is list:
             return tuple(map(tuple, real_array(value, self.key, (4, 4)).tolist()))
+        if self.of_modules:
+            return self._of_modules(value)
         if self.sizes is None:
             return self._one(value)
         values = value if isinstance(value, list | tuple) else [value]
@@ -100,11 +105,23 @@ class Setting:
             raise InputError(f"{self.key}: expected {count} values, got {len(values)}")
         return tuple(map(self._one, values))
 
+    def _of_modules(self, value: Any) -> Any:
+        if isinstance(value, str) and not self.names_file(value):
+            with suppress(ValueError):
+                value = list(map(float, value.replace(",", " ").split()))
+        if not isinstance(value, list | tuple):
+            return self._one(value)
+        values = tuple(self._one(one) for one in value)
+        if not values or any(isinstance(one, str) for one in values):
+            raise InputError(f"{self.key}: expected {self.expected}, or a number for each module, got {value!r:.60}")
+        return values if len(values) > 1 else values[0]
+
     def _one(self, value: Any) -> Any:
         if isinstance(value, str):
             if self.key == "compute.backend":
                 value = OLD_NAMES.get(value, value)
-            good = value in self.words or self.names_file(value) if self.words else self.kind is str
+            known = self.words or self.endings
+            good = value in self.words or self.names_file(value) if known else self.kind is str
         elif self.kind in (bool, str):
             good = isinstance(value, self.kind)
         else:
@@ -162,6 +179,9 @@ _SERIES = "The DICOM series with this number, description or UID, where the fold
 _AT_ENERGY = "Convert CT numbers to attenuation (1/mm) at this energy, or at an isotope's strongest line"
 _ISOTOPES = named(ISOTOPES, "Energy window 10 % around its strongest line")
 _BY_NAME = "As it attenuates the isotope's photons"
+
+
+_OF_MODULES = ", one number or one for each module that is used"
 
 
 def _argument(name: str, kind: type, text: str, absent: str = "", **more: Any) -> Setting:
@@ -264,7 +284,10 @@ _DECLARED = (
         "inverse-square": ("Inverse Square Sum", "Line integrals with each segment times a point source's sensitivity, "
                            "as 1/h^2: no counts, for comparison"),
     }),
-    Setting("model.time", float, 1.0, "Acquisition time", unit="s", above=0, needs=(_COUNTS,), label="Time (s)"),
+    Setting("model.time", float, 1.0, f"Acquisition time{_OF_MODULES}", unit="s", above=0, needs=(_COUNTS,),
+            label="Time (s)", of_modules=True),
+    Setting("model.start", float, 0.0, f"Start of the acquisition after the reference time of the activity{_OF_MODULES}",
+            unit="s", needs=(_COUNTS,), label="Start (s)", option="--start-time", of_modules=True),
     Setting("model.photons", float, None, "X-ray photons per pixel: a radiograph of attenuation coefficients then holds "
             "those that pass", "line integrals", above=0, slider=1e6, needs=("model.kind=transmission",)),
     Setting("model.isotope", str, None, "What decays: its photons are counted, and its activity falls during the "
@@ -316,6 +339,15 @@ _DECLARED = (
             label="Crystal's Side"),
     Setting("model.background", float, 0.0, "Counts of each pixel besides those of the volume, in the whole acquisition: "
             "scatter and dark counts", least=0, slider=100, needs=(_COUNTS,), option="--background-counts"),
+    Setting("model.efficiency", float, 1.0, f"Factor of the counts of the volume{_OF_MODULES}, or a file with an image for "
+            "each module, as counts flood writes it; 0: dead", least=0, slider=2, needs=(_COUNTS,), of_modules=True,
+            endings=(".npy", ".npz", ".h5", ".hdf5")),
+    Setting("model.dead_time", float, 0.0, "Time for which a module is busy after a photon", unit="µs", least=0, slider=20,
+            needs=(_COUNTS,), label="Dead Time (µs)"),
+    Setting("model.dead_time_kind", str, "non-paralysable", "What photons do to a module that is busy", words={
+        "non-paralysable": ("Non-Paralysable", "Nothing: m = n / (1 + n dead time)"),
+        "paralysable": ("Paralysable", "They make it busy anew: m = n exp(-n dead time)"),
+    }, needs=(_COUNTS, "model.dead_time")),
     Setting("model.pixel_points", int, None, "Points of each pixel's area, for each point of the hole; auto: as many as "
             "the tolerance asks for, which takes longer for small voxels", "auto for counts, 1, its centre, for "
             "radiographs", words={"auto": ("Automatic", "")}, least=1, slider=100, needs=(_RAYS,)),

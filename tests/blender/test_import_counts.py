@@ -59,6 +59,25 @@ def test_counts_become_the_shown_run(scanned, counts, scene, tmp_path):
     assert (settings.model, settings.time, settings.detector) == ("EMISSION", 60.0, "REAL")
 
 
+def test_the_files_own_times_are_taken(scanned, counts, scene, tmp_path):
+    frames = "".join(
+        f"!image duration (sec) := {10 + k}\nimage relative start time (sec) := {100 * k}\n" for k in range(8)
+    )
+    sizes = "matrix size [1] := 6\nmatrix size [2] := 6\n"
+    matrix = f"{sizes}number format := unsigned integer\nnumber of bytes per pixel := 2\n"
+    start = "!INTERFILE :=\nname of data file := c.sin\nimagedata byte order := LITTLEENDIAN\n"
+    (tmp_path / "c.hdr").write_text(f"{start}{matrix}{frames}")
+    counts.astype("<u2").tofile(tmp_path / "c.sin")
+    settings = scene.mphdrr_projections
+    settings.model, settings.isotope, settings.start, settings.time = "EMISSION", "Tc-99m", 60.0, 600.0
+    assert bpy.ops.mphdrr.import_counts(filepath=str(tmp_path / "c.hdr"), **(SAID | {"time": 0.0})) == {"FINISHED"}
+    run = read_run(storage.absolute(settings.run_file))
+    assert run.recipe["model.time"] == tuple(range(17, 9, -1))
+    assert run.recipe["model.start"] == tuple(range(760, 59, -100))
+    with pytest.raises(RuntimeError, match="leave it out to take the file's"):
+        bpy.ops.mphdrr.import_counts(filepath=str(tmp_path / "c.hdr"), **SAID)
+
+
 def test_frames_of_some_modules_from_several_files(scanned, scene, tmp_path):
     for number in (3, 4):
         np.save(tmp_path / f"head{number}.npy", np.full((4, 4), number))

@@ -15,6 +15,7 @@ import pytest
 
 from mphdrr.addon.blender import ids, jobs, storage
 from mphdrr.addon.pictures import images
+from mphdrr.addon.runs import runs
 from mphdrr.addon.runs.projection_properties import PROPERTIES, ProjectionSettings
 from mphdrr.addon.scanner import scanner
 from mphdrr.addon.volumes import volumes
@@ -110,6 +111,36 @@ def test_physics_of_the_panel_is_that_of_core(scanned, scene, body):
     assert (run.seed, run.settings["volume"]) == (5, "Derenzo")
     assert {name: run.settings[name] for name in IN_PYTHON} == IN_PYTHON
     assert (run.recipe["attenuation.object"], run.recipe["noise.seed"]) == ("Body", 5)
+
+
+def test_numbers_of_modules_are_texts_of_the_panel(scanned, scene, tmp_path):
+    """Times, starts, efficiencies: of the panel as of a recipe, and back from one; in files, too."""
+    settings, count = scene.mphdrr_projections, len(scanned)
+    efficiency = np.ones((count, 4, 6))
+    efficiency[0, 1, 2] = 0
+    np.save(tmp_path / "e.npy", efficiency)
+    settings.width, settings.height = 6, 4
+    times = [10.0 + 5 * m for m in range(count)]
+    settings.model, settings.isotope, settings.start, settings.dead_time = "EMISSION", "Tc-99m", 60.0, 2.0
+    settings.time_of_modules, settings.efficiency_of_modules = ", ".join(map(str, times)), str(tmp_path / "e.npy")
+    assert bpy.ops.mphdrr.render_projections() == {"FINISHED"}
+    run = read_run(storage.absolute(settings.run_file))
+    assert run.recipe["model.time"] == tuple(times) and run.recipe["model.start"] == 60.0
+    assert run.recipe["model.dead_time"] == 2.0 and run.recipe["model.dead_time_kind"] == "non-paralysable"
+    np.testing.assert_array_equal(run.efficiency, efficiency)
+    assert run.projections[0, 1, 2] == 0
+    assert runs.changes(scene) == []
+    settings.time_of_modules = settings.efficiency_of_modules = ""
+    settings.start = settings.dead_time = 0.0
+    assert runs.changes(scene) != []
+    assert bpy.ops.mphdrr.load_recipe(filepath=storage.absolute(settings.run_file).as_posix()) == {"FINISHED"}
+    assert settings.time_of_modules.startswith("10.0, 15.0") and runs.changes(scene) == []
+    settings.time_of_modules = "10, 20"
+    with pytest.raises(RuntimeError, match="time: expected one number, or"):
+        bpy.ops.mphdrr.render_projections()
+    settings.time_of_modules = "10, soon"
+    with pytest.raises(RuntimeError, match=r"model.time: expected a number above 0"):
+        bpy.ops.mphdrr.render_projections()
 
 
 def test_materials_of_the_panel_are_those_of_core(scanned, scene):

@@ -48,8 +48,7 @@ def test_the_files_time_and_pixels_reach_the_run_by_either_way(system, rng, tmp_
     pytest.importorskip("pydicom")
     path, side = tmp_path / "nm.dcm", system.detector_side
     dicom_files.write_frames(counted(rng), path, 90_000, PixelSpacing=["2.5", "2.5"])
-    time, pixels = both_ways(system, path, "101-112", "back-v", 30.0)
-    assert time == "nm.dcm: the file says an exposure of 90 s; taken as 30 s, as given"
+    (pixels,) = both_ways(system, path, "101-112", "back-v", 90.0)
     own = side[np.abs(side / 6 - 2.5) > 2.5e-3][0] / 6
     assert pixels.startswith(
         f"nm.dcm: the file says pixels of 2.5 x 2.5 mm; taken as {own:.4g} x {own:.4g} mm, so that"
@@ -59,8 +58,13 @@ def test_the_files_time_and_pixels_reach_the_run_by_either_way(system, rng, tmp_
     assert other.endswith("pixels of 2.5 x 2.5 mm; taken as 3 x 3 mm, as given")
     (of_side,) = both_ways(system, path, "101-112", "back-v", 90.0, pitch=2.5)
     assert of_side.startswith("6 pixels of 2.5 mm are 15 mm")
-    with pytest.raises(mph.InputError, match=r"exposure time in seconds \(--time; the file says 90 s: confirm it\)"):
-        mph.counts_run(mph.read_counts(path), system, "101-112", "back-v")
+    with recorded_warnings():
+        assert mph.counts_run(mph.read_counts(path), system, "101-112", "back-v").recipe["model.time"] == 90.0
+    contradicts = (
+        r"nm.dcm: frame 1 \(module 101\): the file says 90 s, the time \(--time\) is 30 s, and others of 11 frames more"
+    )
+    with pytest.raises(mph.InputError, match=contradicts):
+        both_ways(system, path, "101-112", "back-v", 30.0)
 
 
 @pytest.mark.parametrize("word", ["back-v", "front+u", "back-u", "front+v"])
@@ -84,7 +88,7 @@ def test_pixels_are_compared_along_rows_and_columns_however_frames_lie(system, r
     assert "pixels of 3 x 3 mm; taken as 3 x 4.8 mm" in virtual[0], "on the crystal, wherever the images are taken"
 
 
-def test_several_exposures_are_said_of_the_frames_that_are_used(system, rng, tmp_path):
+def test_several_exposures_are_those_of_the_frames_that_are_used(system, rng, tmp_path):
     pytest.importorskip("pydicom")
     from pydicom.dataset import Dataset
 
@@ -94,18 +98,19 @@ def test_several_exposures_are_said_of_the_frames_that_are_used(system, rng, tmp
     dicom_files.write_frames(
         counted(rng, (24, 6, 6)), path, RotationInformationSequence=parts, RotationVector=vector, NumberOfRotations=2
     )
-    (text,) = both_ways(system, path, "101-106, none*6, none*6, 107-112", "back-v", 20.0)
-    assert text == "d.dcm: the file says exposures of 20 and 35 s; taken as 20 s, as given"
+    mixed = "101-106, none*6, none*6, 107-112"
+    with pytest.raises(
+        mph.InputError, match=r"frame 19 \(module 107\): the file says 35 s, the time .* is 20 s, .* 5 frames more"
+    ):
+        both_ways(system, path, mixed, "back-v", 20.0)
     assert both_ways(system, path, "101-112, none*12", "back-v", 20.0) == []
-    (text,) = both_ways(system, path, "none*12, 101-112", "back-v", 20.0)
-    assert "an exposure of 35 s; taken as 20 s" in text
-    with pytest.raises(mph.InputError, match="the file says 20 and 35 s: confirm it"):
-        mph.counts_run(mph.read_counts(path), system, "101-112, none*12", "back-v")
+    with pytest.raises(mph.InputError, match=r"frame 13 \(module 101\): the file says 35 s"):
+        both_ways(system, path, "none*12, 101-112", "back-v", 20.0)
     counts = mph.read_counts(path)
-    for part, time in ((counts[12:], 35), (counts[:12], 20), (counts[np.arange(24) % 2 == 0], None)):
-        found = warned(lambda part=part: mph.counts_run(part, system, "101-112", "back-v", 20.0))
-        assert (found == []) == (time == 20)
-        assert time is not None or "exposures of 20 and 35 s" in found[0]
+    assert mph.counts_run(counts, system, mixed, "back-v").recipe["model.time"] == (20.0,) * 6 + (35.0,) * 6
+    assert both_ways(system, path, mixed, "back-v", [20.0] * 6 + [35.0] * 6) == []
+    for part, times in ((counts[12:], 35.0), (counts[:12], 20.0), (counts[::2], (20.0,) * 6 + (35.0,) * 6)):
+        assert mph.counts_run(part, system, "101-112", "back-v").recipe["model.time"] == times
 
 
 def test_exposures_of_an_interfile_are_those_of_its_images(system, rng, tmp_path):
@@ -117,8 +122,10 @@ def test_exposures_of_an_interfile_are_those_of_its_images(system, rng, tmp_path
         seconds = 600 if number < 7 else 150
         header = header.replace("!time per projection (sec) := 600", f"!image duration (sec) := {seconds}", 1)
     path.write_text(header)
-    (text,) = both_ways(system, path, "101-112", "back-v", 600.0)
-    assert "exposures of 150 and 600 s; taken as 600 s" in text
+    with pytest.raises(mph.InputError, match=r"frame 8 \(module 108\): the file says 150 s, .* 4 frames more"):
+        both_ways(system, path, "101-112", "back-v", 600.0)
+    run = mph.counts_run(mph.read_counts(path), system, "101-112", "back-v")
+    assert run.recipe["model.time"] == (600.0,) * 7 + (150.0,) * 5
     both_of_150 = "none*7, 101, 102, none*3"
     assert both_ways(system[:2], path, both_of_150, "back-v", 150.0) == []
     path.write_text(header + "\n" + "scaling factor (mm/pixel) [1] := 2\nscaling factor (mm/pixel) [2] := 2.1\n")
@@ -132,8 +139,8 @@ def test_several_files_say_each_its_own(system, rng, tmp_path):
         paths.append(tmp_path / f"{number}.hdr")
         write_hdr(counted(rng, (4, 6, 6)), paths[-1])
         paths[-1].write_text(paths[-1].read_text().replace(":= 600", f":= {time}"))
-    (text,) = both_ways(system, paths, "101-112", "back-v", 40.0)
-    assert text == "1.hdr, 2.hdr, 3.hdr: the file says exposures of 40 and 55 s; taken as 40 s, as given"
+    with pytest.raises(mph.InputError, match=r"1.hdr, 2.hdr, 3.hdr: frame 9 \(module 109\): the file says 55 s"):
+        both_ways(system, paths, "101-112", "back-v", 40.0)
     assert both_ways(system[:8], paths, "101-108, none*4", "back-v", 40.0) == []
 
 

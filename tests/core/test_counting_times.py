@@ -1,0 +1,308 @@
+"""Frames that do not last equally long, nor begin together: in models, recipes, runs and measured files."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import mphdrr.core as mph
+from mphdrr.addon.cli import main
+from mphdrr.core.recording import recorded_warnings
+from mphdrr.core.runs.mosaic import caption
+
+from . import dicom_files
+from .conftest import BACKENDS, emission
+from .test_measured_counts import write_hdr
+
+TIMES = np.array([10.0, 20, 30, 45, 60, 600, 3600, 5, 7, 9, 11, 1200])
+STARTS = np.array([0.0, 600, 1200, 5000, 21600, 40, 50, -300, 70, 80, 90, 100])
+BOTH = {"time": TIMES, "start": STARTS}
+
+
+def decays(isotope: mph.Isotope) -> np.ndarray:
+    """The integral of the activity over each frame, by that at the reference time."""
+    rate = np.log(2) / isotope.half_life
+    return np.exp(-rate * STARTS) * (1 - np.exp(-rate * TIMES)) / rate
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("hole", ["auto", "rays", "point"])
+def test_a_points_counts_are_the_integral_of_its_activity(system, backend, hole):
+    if (backend, hole) == ("numpy", "auto"):
+        pytest.skip("slow")
+    grid, views = mph.Grid.centered(3, 4.0 if hole == "auto" else 40.0), system.views((6, 6), "real")
+    x = np.zeros(grid.shape)
+    x[1, 1, 1] = 1e6
+    options = {
+        "hole": hole,
+        "aperture_points": 3 if hole == "rays" else None,
+        "pixel_points": None if hole == "auto" else 3,
+    }
+    for name in ("Tc-99m", "Lu-177"):
+        tc = mph.isotope(name)
+        one = mph.Projector(grid, views, emission(system, isotope=tc, **options), backend)
+        all_of = mph.Projector(grid, views, emission(system, isotope=tc, **BOTH, **options), backend)
+        share = all_of(x).sum((1, 2)) / one(x).sum((1, 2))
+        np.testing.assert_allclose(share, decays(tc) / tc.mean_decay_time(1.0), rtol=1e-6)
+        y = np.random.default_rng(1).uniform(0, 1, one.shape_out)
+        assert np.vdot(all_of(x), y) == pytest.approx(np.vdot(x, all_of.T(y)), rel=1e-6)
+    still = mph.Projector(grid, views, emission(system, **BOTH, **options), backend)
+    plain = mph.Projector(grid, views, emission(system, **options), backend)
+    np.testing.assert_allclose(still(x), TIMES[:, None, None] * plain(x), rtol=1e-6)
+    which = np.array([7, 2, 6])
+    part = mph.Projector(grid, views[which], still.model.of_views(which), backend)
+    np.testing.assert_allclose(part(x), still(x)[which], rtol=1e-6)
+    for subset in still.subsets(3):
+        np.testing.assert_allclose(subset(x), still(x)[subset.which], rtol=1e-6, atol=1e-9)
+
+
+def test_gradients_and_closed_forms_have_the_times(system, rng):
+    grid, views = mph.Grid.centered(5, 10.0), system.views((6, 6), "real")
+    tc = mph.isotope("Tc-99m")
+    factors = (decays(tc) / tc.mean_decay_time(1.0))[:, None, None]
+    x, y = rng.uniform(0, 1, grid.shape), rng.uniform(0, 1, (12, 6, 6))
+    one, all_of = (mph.Emission(system, isotope="Tc-99m", **times) for times in ({}, BOTH))
+    A, B = (mph.Projector(grid, views, model, double=True) for model in (one, all_of))
+    for found, expected in zip(mph.geometry_gradient(B, x, y), mph.geometry_gradient(A, x, factors * y), strict=True):
+        np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9 * np.abs(expected).max())
+    points = rng.uniform(-20, 20, (2, 3))
+    images, plain = (mph.point_images(model, views, points) for model in (all_of, one))
+    np.testing.assert_allclose(images, factors * plain, rtol=1e-12)
+
+
+def test_noise_free_mlem_returns_the_volume_of_the_reference_time(system, rng):
+    grid, views = mph.Grid.centered(6, 12.0), system.views((8, 8), "real")
+    A = mph.Projector(grid, views, emission(system, isotope="Tc-99m", **BOTH))
+    truth = rng.uniform(10, 50, grid.shape).astype(np.float32)
+    with recorded_warnings() as texts:
+        found = mph.mlem(A, A(truth), 2, start=truth)
+    assert not texts
+    np.testing.assert_allclose(found.volume.array, truth, rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    "wrong, said",
+    [
+        ({"time": [1.0] * 11}, "time: expected one number, or 12 numbers .one for each view., got 11"),
+        ({"time": [1.0] * 11 + [0.0]}, "time: expected more than 0 s, got 0"),
+        ({"start": [np.nan] * 12}, "start: nan is not a finite number"),
+        ({"start": np.zeros((12, 2))}, "start: expected one number, or 12 numbers .*got 12 x 2"),
+    ],
+)
+def test_what_are_no_times_is_refused(system, wrong, said):
+    with pytest.raises(mph.InputError, match=said):
+        mph.Emission(system, **wrong)
+
+
+SMALL = {
+    "phantom.text": "[[shape]]\nkind = 'sphere'\nradius = 30\nactivity = 5\n", "phantom.voxels": 8, "model.kind": "emission",
+    "model.isotope": "Tc-99m", "detector.plane": "real", "detector.rows": 4, "detector.columns": 6,
+}  # fmt: skip
+
+
+def test_recipes_and_runs_have_them(system, workbook, tmp_path):
+    given = {"model.time": TIMES.tolist(), "model.start": ", ".join(map(str, STARTS))}
+    recipe = mph.Recipe(SMALL | given)
+    assert recipe["model.time"] == tuple(TIMES) and recipe["model.start"] == tuple(STARTS)
+    mph.write_recipe(recipe, tmp_path / "study.toml")
+    assert mph.read_recipe(tmp_path / "study.toml") == recipe
+    (plain,), (run,) = (mph.run_recipe(r, system) for r in (mph.Recipe(SMALL), recipe))
+    tc = mph.isotope("Tc-99m")
+    factors = decays(tc) / tc.mean_decay_time(1.0)
+    np.testing.assert_allclose(run.projections, factors[:, None, None] * plain.projections, rtol=1e-5)
+    for suffix in (".h5", ".npz"):
+        mph.write_run(run, tmp_path / f"a{suffix}")
+        again = mph.read_run(tmp_path / f"a{suffix}")
+        assert again.recipe["model.time"] == tuple(TIMES) and again.settings["start"] == STARTS.tolist()
+        A = mph.projector_of_run(again, again.volume.grid)
+        np.testing.assert_array_equal(A(again.volume), again.projections)
+    assert mph.Recipe(SMALL | {"model.time": [60.0]})["model.time"] == 60.0
+    with pytest.raises(mph.InputError, match="time: expected one number, or 3 numbers"):
+        next(mph.run_recipe(recipe, system[:3]))
+    with pytest.raises(mph.InputError, match=r"model.time: expected a number above 0 \(s\), got -1"):
+        mph.Recipe(SMALL | {"model.time": [1.0, -1.0]})
+    output = tmp_path / "b.h5"
+    command = ["project", "--time", "10,20", str(workbook), "--modules", "2,5", "--emission", "--start-time", "0, 3600"]
+    assert main([*command, "--size", "4", "4", "--voxels", "8", "-o", str(output)]) == 0
+    assert (
+        mph.read_run(output).recipe.given | {"model.time": (10.0, 20.0), "model.start": (0.0, 3600.0)}
+        == mph.read_run(output).recipe.given
+    )
+
+
+# Measured files
+
+
+def counted(rng, shape=(12, 6, 6), mean=9.0) -> np.ndarray:
+    return rng.poisson(mean, shape).astype(np.uint16)
+
+
+def write_phases(frames, path, times, delays, **changes):
+    """A dynamic study: a phase a frame, each with its duration and the delay before it, s."""
+    from pydicom.dataset import Dataset
+
+    parts = []
+    for time, delay in zip(times, delays, strict=True):
+        part = Dataset()
+        part.ActualFrameDuration, part.PhaseDelay = round(1000 * time), round(1000 * delay)
+        part.PauseBetweenFrames, part.NumberOfFramesInPhase = 0, 1
+        parts.append(part)
+    vector = list(range(1, len(frames) + 1))
+    changes = {"PhaseInformationSequence": parts, "PhaseVector": vector, "NumberOfPhases": len(parts), **changes}
+    dicom_files.write_frames(frames, path, **changes)
+
+
+def test_dicoms_phases_say_when_frames_began_and_how_long_they_took(system, rng, tmp_path):
+    pytest.importorskip("pydicom")
+    path, times, delays = tmp_path / "d.dcm", np.arange(10.0, 22.0), np.arange(12.0) / 4
+    write_phases(counted(rng), path, times, delays)
+    begun = np.concatenate([[0], np.cumsum(times + np.append(delays[1:], 0))[:-1]])
+    run = mph.counts_run(mph.read_counts(path), system, "112-101", "back-v")
+    np.testing.assert_allclose(run.recipe["model.time"], times[::-1])
+    np.testing.assert_allclose(run.recipe["model.start"], begun[::-1])
+    assert "10 to 21 s" in caption(run)
+    recipe = mph.Recipe({
+        "counts.files": [str(path)], "counts.frames": "112-101", "counts.orientation": "back-v", "model.kind": "emission",
+        "model.start": 3600.0, "model.isotope": "Tc-99m",
+    })  # fmt: skip
+    (run,) = mph.run_recipe(recipe, system)
+    np.testing.assert_allclose(run.recipe["model.start"], 3600 + begun[::-1])
+    model = mph.projector_of_run(run, mph.Grid.centered(4, 20.0)).model
+    np.testing.assert_allclose(model.effective_time, model.isotope.mean_decay_time(times[::-1], 3600 + begun[::-1]))
+    (again,) = mph.run_recipe(run.recipe, system)
+    assert again.recipe == run.recipe, "what a run's recipe says does not contradict its file"
+    part = mph.counts_run(mph.read_counts(path)[[3, 5]], system[:2], "102,101", "back-v")
+    assert part.recipe["model.start"] == pytest.approx((begun[5] - begun[3], 0)), "after the first frame that is used"
+
+
+def test_frames_of_a_phase_follow_each_other(rng, tmp_path):
+    pytest.importorskip("pydicom")
+    from pydicom.dataset import Dataset
+
+    parts = [Dataset(), Dataset()]
+    for part, duration, count in zip(parts, (10_000, 30_000), (2, 1), strict=True):
+        part.ActualFrameDuration, part.NumberOfFramesInPhase, part.PauseBetweenFrames = duration, count, 500
+    path = tmp_path / "d.dcm"
+    vectors = {
+        "PhaseVector": [1, 1, 1, 1, 2, 2],
+        "TimeSliceVector": [1, 2, 1, 2, 1, 1],
+        "DetectorVector": [1, 1, 2, 2, 1, 2],
+    }
+    dicom_files.write_frames(
+        counted(rng, (6, 4, 4)), path, PhaseInformationSequence=parts, AcquisitionTime="101500.5", **vectors
+    )
+    about = mph.read_counts(path).about
+    np.testing.assert_allclose(about[:, 0], [10, 10, 10, 10, 30, 30])
+    np.testing.assert_allclose(about[:, 4], [0, 10.5, 0, 10.5, 20.5, 20.5])
+
+
+def test_files_say_when_they_began(rng, tmp_path):
+    pytest.importorskip("pydicom")
+    days = (("20260101", "235950"), ("20260102", "000010.500"))
+    for number, (day, clock) in enumerate(days):
+        changes = {"AcquisitionDate": day, "AcquisitionTime": clock}
+        dicom_files.write_frames(counted(rng, (2, 4, 4)), tmp_path / f"{number}.dcm", 5000, **changes)
+    about = mph.read_counts([tmp_path / "1.dcm", tmp_path / "0.dcm"]).about
+    np.testing.assert_allclose(about[:, 4], [20.5, 20.5, 0, 0])
+
+
+def interfile(rng, path, times, starts, key="image relative start time (sec)"):
+    write_hdr(counted(rng), path)
+    header = path.read_text()
+    for time, start in zip(times, starts, strict=True):
+        text = f"!image duration (sec) := {time}\n{key} := {start}"
+        header = header.replace("!time per projection (sec) := 600", text, 1)
+    path.write_text(header)
+
+
+def test_interfiles_images_say_when_they_began_and_how_long_they_took(system, rng, tmp_path):
+    path, times, begun = tmp_path / "c.hdr", np.arange(10, 22), 100 * np.arange(12)
+    interfile(rng, path, times, begun)
+    run = mph.counts_run(mph.read_counts(path), system, "101-112", "back-v")
+    assert run.recipe["model.time"] == tuple(times) and run.recipe["model.start"] == tuple(begun)
+    interfile(rng, path, times, [f"11:{k // 60:02}:{k % 60:02}" for k in begun], "image start time")
+    np.testing.assert_array_equal(mph.read_counts(path).about[:, 4], begun)
+
+
+def test_what_contradicts_a_file_is_refused(system, rng, tmp_path):
+    path, times, begun = tmp_path / "c.hdr", np.arange(10, 22), 100 * np.arange(12)
+    interfile(rng, path, times, begun)
+    counts = mph.read_counts(path)
+
+    def refused(said, **given):
+        with pytest.raises(mph.InputError, match=said) as error:
+            mph.counts_run(counts, system, "112-101", "back-v", **given)
+        assert "\n" not in str(error.value)
+
+    wrong = times[::-1] + np.where(np.arange(12) == 9, 1.0, 0.0)
+    refused(r"c.hdr: frame 3 \(module 110\): the file says 12 s, the time \(--time\) is 13 s; leave it out", time=wrong)
+    refused(
+        r"frame 12 \(module 101\): the file says 21 s, the time .* is 10 s, and others of 10 frames more;", time=10.0
+    )
+    refused(
+        r"frame 12 \(module 101\): the file says 1100 s after frame 1 \(module 112\), the starts .* 1150 s; give that of",
+        start=begun[::-1] + np.where(np.arange(12) == 0, 50.0, 0.0),
+    )
+    run = mph.counts_run(counts, system, "112-101", "back-v", times[::-1] * 1.0001, start=60.0 + begun[::-1])
+    assert run.recipe["model.start"][0] == 1160.0
+    plain = mph.counts_run(np.asarray(counts), system, "101-112", "back-v", 30.0, start=60.0)
+    assert (plain.recipe["model.time"], plain.recipe["model.start"]) == (30.0, 60.0)
+
+
+def test_a_time_that_only_some_frames_have_is_asked_for(system, rng, tmp_path):
+    for number, frames in enumerate((5, 7)):
+        write_hdr(counted(rng, (frames, 6, 6)), tmp_path / f"{number}.hdr")
+    text = (tmp_path / "1.hdr").read_text()
+    (tmp_path / "1.hdr").write_text("\n".join(line for line in text.splitlines() if "time per projection" not in line))
+    counts = mph.read_counts([tmp_path / "0.hdr", tmp_path / "1.hdr"])
+    with pytest.raises(
+        mph.InputError, match=r"frame 6 \(module 106\): the file says no time, of others it does; say it"
+    ):
+        mph.counts_run(counts, system, "101-112", "back-v")
+    assert mph.counts_run(counts, system, "101-112", "back-v", 600.0).recipe["model.time"] == 600.0
+
+
+# Dead and hot
+
+
+def warned(call) -> list[str]:
+    with recorded_warnings() as texts:
+        call()
+    return texts
+
+
+FRAMES = {"frames": "112-101", "orientation": "front+u"}
+
+
+@pytest.mark.parametrize("detector", ["real", "virtual"])
+def test_dead_and_hot_pixels_are_said_unless_declared(system, rng, detector):
+    counts = counted(rng, (12, 9, 9), 60.0).astype(int)
+    counts[2, 3, 5] = counts[2, 3, 6] = counts[4, 0, 8] = 0
+    counts[7, 1, 1], counts[10] = 10**6, 0
+    call = {"counts": counts, "system": system, **FRAMES, "time": 60.0, "detector": detector}
+    empty, dead, hot = warned(lambda: mph.counts_run(**call))
+    assert empty.startswith("counts: no counts in frame 11 (module 102), ")
+    dead_ones = [(3, 110, 4, 6), (3, 110, 4, 7), (5, 108, 1, 9)]
+    places = "; ".join("frame {} (module {}), row {}, column {}".format(*one) for one in dead_ones)
+    assert dead.startswith(f"counts: no counts in {places}, 25 and more around; if they are dead, say so")
+    assert hot.startswith("counts: frame 8 (module 105), row 2, column 2: 1e+06 counts")
+    marks = counts.copy()
+    marks[:] = 1
+    marks[2, 3, 5:7] = marks[4, 0, 8] = marks[7, 1, 1] = marks[10] = 0
+    with recorded_warnings():
+        efficiency = mph.counts_run(**{**call, "counts": marks}).projections
+    assert warned(lambda: mph.counts_run(**call, efficiency=efficiency)) == []
+    run = mph.counts_run(**call, efficiency=efficiency)
+    A = mph.projector_of_run(run, mph.Grid.centered(4, 20.0))
+    np.testing.assert_array_equal(A.living, efficiency > 0)
+
+
+def test_rates_are_what_is_compared(system, rng):
+    times = np.where(np.arange(12) % 2, 1.0, 1000.0)
+    counts = rng.poisson(0.02 * times[:, None, None], (12, 8, 8))
+    counts[1] = 0  # of 1 s: chance
+    call = {"counts": counts, "system": system, "frames": "101-112", "orientation": "back-v", "time": times}
+    assert warned(lambda: mph.counts_run(**call)) == []
+    counts[0] = 0
+    (text,) = warned(lambda: mph.counts_run(**call))
+    assert text.startswith("counts: no counts in frame 1 (module 101), ")

@@ -153,6 +153,17 @@ def test_one_recipe_imports_three_windows_and_reconstructions_expect_their_scatt
     np.testing.assert_allclose(more.background, run.background + 0.25, rtol=1e-6)
 
 
+def test_scatter_has_been_counted_with_the_dead_time_and_is_not_reduced_again(system, frames, tmp_path):
+    np.save(tmp_path / "c.npy", frames)
+    given = {"counts.window_widths": WIDTHS, "model.dead_time": 500.0, "model.background": 2.0}
+    (run,) = mph.run_recipe(recipe_of(tmp_path / "c.npy", **given), system)
+    A = mph.projector_of_run(run, mph.Grid.centered(4, 30.0))
+    np.testing.assert_allclose(A.background, run.background, rtol=1e-6)
+    live = mph.projector_of_run(run, A.grid, recipe=run.recipe.updated({"model.background": 0.0}))
+    np.testing.assert_allclose(live.background, scatter_of(frames), rtol=1e-6)
+    assert (A.background < live.background + 2.0).all()
+
+
 def test_the_script_says_the_same_windows_and_smooths(system, frames, tmp_path):
     given = (frames, system, ORDER["counts.frames"], "back-v", 60.0)
     windows = mph.ScatterWindows(ORDER["counts.lower_frames"], None, WIDTHS, 3.0)

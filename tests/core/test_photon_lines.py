@@ -150,6 +150,21 @@ def test_lines_apart_without_attenuation_have_their_own_holes_and_crystals(syste
     np.testing.assert_array_equal(model.effective_diameter, together.effective_diameter)
 
 
+def test_lines_apart_have_the_times_and_efficiencies_of_the_modules(system, rng):
+    grid, views = mph.Grid.centered((7, 6, 5), 12.0), system.views((8, 9))
+    x, y = rng.random(grid.shape), rng.random((12, 8, 9))
+    efficiency = rng.uniform(0.5, 1.5, (12, 8, 9)) * (rng.random((12, 8, 9)) > 0.1)
+    own = {"time": rng.uniform(10, 20, 12), "start": 3600.0 * np.arange(12), "lines": "apart"}
+    even, uneven = (
+        mph.Projector(grid, views, several(system, **own, efficiency=e), double=True) for e in (1.0, efficiency)
+    )
+    np.testing.assert_allclose(uneven(x), efficiency * even(x), rtol=1e-12)
+    np.testing.assert_allclose(uneven.T(y), even.T(efficiency * y), rtol=1e-9)
+    factor = several(system, **own).effective_time / several(system, time=10.0).effective_time
+    plain = mph.Projector(grid, views, several(system, lines="apart"), double=True)
+    np.testing.assert_allclose(even(x), factor[:, None, None] * plain(x), rtol=1e-12)
+
+
 def test_torch_knows_the_gradients_of_lines_apart(system, ct, rng):
     torch = pytest.importorskip("torch")
     system = system[:3]

@@ -28,8 +28,8 @@ def decays(isotope: mph.Isotope) -> np.ndarray:
 @pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("hole", ["auto", "rays", "point"])
 def test_a_points_counts_are_the_integral_of_its_activity(system, backend, hole):
-    if (backend, hole) == ("numpy", "auto"):
-        pytest.skip("slow")
+    if backend != "cpu" and hole == "auto":
+        pytest.skip("numpy is slow, and torch takes the same kernels")
     grid, views = mph.Grid.centered(3, 4.0 if hole == "auto" else 40.0), system.views((6, 6), "real")
     x = np.zeros(grid.shape)
     x[1, 1, 1] = 1e6

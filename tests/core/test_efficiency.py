@@ -14,12 +14,18 @@ from .conftest import BACKENDS, emission
 
 
 @pytest.fixture
-def forms(system, rng):
-    """One number, one for each module, and images of 4 x 6 pixels, some of them dead."""
-    images = rng.uniform(0.2, 1.8, (len(system), 4, 6))
+def few(system):
+    """Five of the modules."""
+    return system[:5]
+
+
+@pytest.fixture
+def forms(few, rng):
+    """One number, one for each of five modules, and images of 4 x 6 pixels, some of them dead."""
+    images = rng.uniform(0.2, 1.8, (len(few), 4, 6))
     images[:, 1, 2] = 0
     images[3] = 0
-    return 0.7, np.where(np.arange(len(system)) == 4, 0, rng.uniform(0.5, 1.5, len(system))), images
+    return 0.7, np.where(np.arange(len(few)) == 4, 0, rng.uniform(0.5, 1.5, len(few))), images
 
 
 def each(values):
@@ -29,22 +35,22 @@ def each(values):
 
 @pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("hole", ["auto", "point"])
-def test_the_projector_and_its_adjoint_are_weighted(system, forms, rng, backend, hole):
+def test_the_projector_and_its_adjoint_are_weighted(few, forms, rng, backend, hole):
     if backend != "cpu" and hole == "auto":
         pytest.skip("numpy is slow, and torch takes the same kernels")
-    grid, views = mph.Grid.centered(6, 60.0), system.views((4, 6), pitch=90.0)
+    grid, views = mph.Grid.centered(6, 60.0), few.views((4, 6), pitch=90.0)
     mu = mph.Volume(np.full((3, 3, 3), 0.01), grid.box([2, 2, 2], (3, 3, 3)), "mu")
     options = {"hole": hole, "mu": mu, "intrinsic_fwhm": 4.0, "pixel_points": 1 if hole == "point" else None}
-    x, y = rng.uniform(0, 1, grid.shape), rng.uniform(0, 1, (len(system), 4, 6))
-    bare = mph.Projector(grid, views, mph.Emission(system, **options), backend, double=True)
+    x, y = rng.uniform(0, 1, grid.shape), rng.uniform(0, 1, (len(few), 4, 6))
+    bare = mph.Projector(grid, views, mph.Emission(few, **options), backend, double=True)
     assert bool(bare._close_parts) == (hole == "auto"), "rays project voxels close to pinholes, by the whole hole"
     for efficiency in forms:
-        A = mph.Projector(grid, views, mph.Emission(system, efficiency=efficiency, **options), backend, double=True)
+        A = mph.Projector(grid, views, mph.Emission(few, efficiency=efficiency, **options), backend, double=True)
         np.testing.assert_allclose(A(x), each(efficiency) * bare(x), rtol=1e-9, atol=1e-12)
         np.testing.assert_allclose(A.T(y), bare.T(each(efficiency) * y), rtol=1e-9, atol=1e-12)
         assert np.vdot(A(x), y) == pytest.approx(np.vdot(x, A.T(y)), rel=1e-6)
         np.testing.assert_array_equal(A.living, np.broadcast_to(each(efficiency) > 0, y.shape))
-    which = np.array([7, 4, 3])
+    which = np.array([4, 0, 3])
     part = mph.Projector(grid, views[which], A.model.of_views(which), backend, double=True)
     np.testing.assert_allclose(part(x), A(x)[which], rtol=1e-6)
     for subset in A.subsets(3):
@@ -52,16 +58,16 @@ def test_the_projector_and_its_adjoint_are_weighted(system, forms, rng, backend,
 
 
 @pytest.mark.parametrize("hole", ["auto", "point"])
-def test_gradients_are_weighted(system, forms, rng, hole):
+def test_gradients_are_weighted(few, forms, rng, hole):
     torch = pytest.importorskip("torch")
-    grid, views = mph.Grid.centered(7, 52.0), system.views((4, 6), pitch=90.0)
+    grid, views = mph.Grid.centered(7, 52.0), few.views((4, 6), pitch=90.0)
     mu = mph.Volume(np.full(grid.shape, 0.002), grid, "mu")
     options = {"hole": hole, "mu": mu, "intrinsic_fwhm": 4.0, "pixel_points": 1 if hole == "point" else None}
-    x, y = (torch.tensor(rng.uniform(0, 1, shape)) for shape in (grid.shape, (len(system), 4, 6)))
-    bare = mph.Projector(grid, views, mph.Emission(system, **options), "cpu", double=True)
+    x, y = (torch.tensor(rng.uniform(0, 1, shape)) for shape in (grid.shape, (len(few), 4, 6)))
+    bare = mph.Projector(grid, views, mph.Emission(few, **options), "cpu", double=True)
     assert bool(bare._close_parts) == (hole == "auto")
     efficiency = forms[2]
-    A = mph.Projector(grid, views, mph.Emission(system, efficiency=efficiency, **options), "cpu", double=True)
+    A = mph.Projector(grid, views, mph.Emission(few, efficiency=efficiency, **options), "cpu", double=True)
 
     def gradients(projector, weights):
         own = [x.clone().requires_grad_(), torch.tensor(mu.array, dtype=torch.float64).requires_grad_()]
@@ -80,13 +86,13 @@ def test_gradients_are_weighted(system, forms, rng, hole):
     assert (gradients(A, y)[1] * step).sum() == pytest.approx(slope, rel=1e-5)
 
 
-def test_the_geometrys_gradient_is_weighted(system, forms, rng):
-    grid, views = mph.Grid.centered(6, 10.0), system.views((4, 6), "real")
-    x, y = rng.uniform(0, 1, grid.shape), rng.uniform(0, 1, (len(system), 4, 6))
+def test_the_geometrys_gradient_is_weighted(few, forms, rng):
+    grid, views = mph.Grid.centered(6, 10.0), few.views((4, 6), "real")
+    x, y = rng.uniform(0, 1, grid.shape), rng.uniform(0, 1, (len(few), 4, 6))
     options = {"intrinsic_fwhm": 3.0}
-    bare = mph.Projector(grid, views, mph.Emission(system, **options), double=True)
+    bare = mph.Projector(grid, views, mph.Emission(few, **options), double=True)
     for efficiency in forms:
-        A = mph.Projector(grid, views, mph.Emission(system, efficiency=efficiency, **options), double=True)
+        A = mph.Projector(grid, views, mph.Emission(few, efficiency=efficiency, **options), double=True)
         found, expected = mph.geometry_gradient(A, x, y), mph.geometry_gradient(bare, x, each(efficiency) * y)
         for one, other in zip(found, expected, strict=True):
             np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-12 * np.abs(other).max())
@@ -166,8 +172,8 @@ SMALL = {
 }  # fmt: skip
 
 
-def test_recipes_have_it_as_numbers_or_in_files(system, forms, tmp_path):
-    (plain,) = mph.run_recipe(mph.Recipe(SMALL | {"model.background": 0.0}), system)
+def test_recipes_have_it_as_numbers_or_in_files(few, forms, tmp_path):
+    (plain,) = mph.run_recipe(mph.Recipe(SMALL | {"model.background": 0.0}), few)
     np.save(tmp_path / "e.npy", forms[2])
     np.savez(tmp_path / "e.npz", efficiency=forms[2], other=np.ones(3))
     np.save(tmp_path / "of_modules.npy", forms[1])
@@ -179,9 +185,9 @@ def test_recipes_have_it_as_numbers_or_in_files(system, forms, tmp_path):
         (str(tmp_path / "e.npz"), forms[2]), (str(tmp_path / "of_modules.npy"), forms[1]),
     ):  # fmt: skip
         recipe = mph.Recipe(SMALL | {"model.efficiency": given, "noise.seed": 3})
-        (noisy,) = mph.run_recipe(recipe, system)
+        (noisy,) = mph.run_recipe(recipe, few)
         mean = each(expected) * plain.projections + (each(expected) > 0)
-        (run,) = mph.run_recipe(recipe.updated({"noise.seed": None}), system)
+        (run,) = mph.run_recipe(recipe.updated({"noise.seed": None}), few)
         np.testing.assert_allclose(run.projections, mean, rtol=1e-5)
         np.testing.assert_array_equal(noisy.projections, mph.sample_counts(run.projections, 3))
         for suffix in (".h5", ".npz"):
@@ -192,16 +198,16 @@ def test_recipes_have_it_as_numbers_or_in_files(system, forms, tmp_path):
     A = mph.projector_of_run(again, run.volume.grid)
     np.testing.assert_allclose(A(run.volume) + A.background, run.projections, rtol=1e-5)
     with pytest.raises(mph.InputError, match=r"of_modules\.npy: no such file"):
-        next(mph.run_recipe(mph.Recipe(SMALL | {"model.efficiency": str(tmp_path / "of_modules.npy")}), system))
+        next(mph.run_recipe(mph.Recipe(SMALL | {"model.efficiency": str(tmp_path / "of_modules.npy")}), few))
     with pytest.raises(mph.InputError, match="efficiency: expected one number, 3 numbers"):
-        next(mph.run_recipe(mph.Recipe(SMALL | {"model.efficiency": [1.0] * 4}), system[:3]))
+        next(mph.run_recipe(mph.Recipe(SMALL | {"model.efficiency": [1.0] * 4}), few[:3]))
     for bad in ([], ["a.npy", 1.0], "much", [-1.0, 2.0]):
         with pytest.raises(mph.InputError, match=r"model\.efficiency: expected a"):
             mph.Recipe(SMALL | {"model.efficiency": bad})
 
 
-def test_line_integrals_of_runs_know_it(system, forms):
-    runs = [next(mph.run_recipe(mph.Recipe(SMALL | {"model.efficiency": e}), system)) for e in (1.0, list(forms[1]))]
+def test_line_integrals_of_runs_know_it(few, forms):
+    runs = [next(mph.run_recipe(mph.Recipe(SMALL | {"model.efficiency": e}), few)) for e in (1.0, list(forms[1]))]
     plain, found = (mph.run_line_integrals(run) for run in runs)
     np.testing.assert_allclose(found, np.where(each(forms[1]) > 0, plain, 0), rtol=1e-4, atol=1e-4 * plain.max())
 

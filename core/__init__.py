@@ -53,6 +53,7 @@ if TYPE_CHECKING:
     from .phantoms.torso import CardiacTorso
     from .physics.ct_numbers import diffdrr_density, hu_to_mu, mu_to_hu
     from .physics.dead_time import dead_time_corrected, dead_time_counts
+    from .physics.energy_window import energy_window_scatter
     from .physics.flood import FloodEfficiency, flood_efficiency
     from .physics.isotopes import ISOTOPES, Isotope, isotope
     from .physics.maps import completeness_map, modules_map, resolution_map, sensitivity_map
@@ -108,6 +109,7 @@ if TYPE_CHECKING:
     from .runs.reconstructing import reconstruct_run
     from .runs.run import ProjectionRun
     from .runs.run_recipe import projector_of_run, run_recipe
+    from .runs.scatter_windows import ScatterWindows
     from .system_source import SystemSource
     from .volumes.meshes.mesh import Mesh, read_mesh, write_mesh
     from .volumes.meshes.surface import volume_to_mesh

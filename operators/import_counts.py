@@ -3,7 +3,7 @@
 from typing import Any
 
 import bpy
-from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntVectorProperty, StringProperty
+from bpy.props import BoolProperty, EnumProperty, FloatProperty, FloatVectorProperty, IntVectorProperty, StringProperty
 
 from ..addon.blender import choices, decimals, jobs, layouts, storage
 from ..addon.blender.file_properties import DIRECTORY, file_property, files_property, shown_files
@@ -52,6 +52,21 @@ class MPHDRR_OT_import_counts(jobs.JobOperator, bpy.types.Operator):
     )  # fmt: skip
     modules: StringProperty(name="Modules", description="That have frames, such as 1-40. Empty: all")
     expected: BoolProperty(name="Expected Means", description="The numbers are expected counts, which may be fractions")
+    lower_frames: StringProperty(
+        name="Lower Window", description="Frames of the energy window below the peak's, as in Frames: scatter is estimated "
+        "from them, and expected in reconstructions. Empty: none",
+    )  # fmt: skip
+    upper_frames: StringProperty(
+        name="Upper Window", description="Frames of the energy window above the peak's, likewise. Empty: none"
+    )
+    window_widths: FloatVectorProperty(
+        name="Widths (keV)", description="Of the lower, the peak and the upper energy window; 0: what the file says",
+        size=3, default=(0.0, 0.0, 0.0), min=0.0,
+    )  # fmt: skip
+    scatter_fwhm: FloatProperty(
+        name="Smoothing (pixels)", description="FWHM of the Gaussian that smooths the estimate of scatter; 0: none",
+        default=0.0, min=0.0,
+    )  # fmt: skip
     dataset: StringProperty(name="Array", description="Its name in .npz and .h5. Empty: the only one of three axes")
     raw_type: EnumProperty(
         name="Type", description="Of the numbers in a raw file",
@@ -66,6 +81,9 @@ class MPHDRR_OT_import_counts(jobs.JobOperator, bpy.types.Operator):
         layout = layouts.labelled(self.layout)
         layouts.draw_all(layout, self, "frames", "orientation", "time")
         layouts.draw_all(layout.column(heading="If Needed"), self, "modules", "pixel", "expected", "dataset")
+        layouts.draw_all(
+            layout.column(heading="Scatter"), self, "lower_frames", "upper_frames", "window_widths", "scatter_fwhm"
+        )
         layouts.draw_all(layout.column(heading="Raw File"), self, "raw_type", "raw_shape", "raw_big_endian")
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
@@ -80,6 +98,10 @@ class MPHDRR_OT_import_counts(jobs.JobOperator, bpy.types.Operator):
             "counts.frames": self.frames or None,
             "counts.orientation": None if self.orientation == _NONE else [self.orientation],
             "counts.expected": self.expected or None,
+            "counts.lower_frames": self.lower_frames or None,
+            "counts.upper_frames": self.upper_frames or None,
+            "counts.window_widths": tuple(map(decimals.typed, self.window_widths)) if any(self.window_widths) else None,
+            "counts.scatter_fwhm": decimals.typed(self.scatter_fwhm) or None,
             "counts.dataset": self.dataset or None,
             "counts.raw_type": None if self.raw_type == _NONE else self.raw_type,
             "counts.raw_shape": tuple(self.raw_shape) if any(self.raw_shape) else None,

@@ -190,7 +190,7 @@ def _readers_of_mu(scene: bpy.types.Scene) -> dict[str, Callable[[], Volume]]:
     """What reads each attenuation of the scene, by its object's name, in a thread."""
     found = {}
     for item in volumes.volume_objects(scene):
-        if volumes.quantity_of(item) == "mu":
+        if volumes.quantity_of(item) in ("mu", "hu"):
             with suppress(InputError):  # its file is gone; another one may be meant
                 found[item.name] = volumes.reader(item)
     return found

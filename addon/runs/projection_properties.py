@@ -148,8 +148,8 @@ def _is_ours(self: ProjectionProperties, item: bpy.types.Object) -> bool:
     return volumes.is_volume(item) and volumes.quantity_of(item) not in MAPS
 
 
-def _is_mu(self: ProjectionProperties, item: bpy.types.Object) -> bool:
-    return volumes.is_volume(item) and volumes.quantity_of(item) == "mu"
+def _attenuates(self: ProjectionProperties, item: bpy.types.Object) -> bool:
+    return volumes.is_volume(item) and volumes.quantity_of(item) in ("mu", "hu")
 
 
 class RunProperties(bpy.types.PropertyGroup):
@@ -207,8 +207,9 @@ class ProjectionProperties(ProjectionSettings, bpy.types.PropertyGroup):
         name="Fitted Model", description="The model that the volume's quantity has chosen", options={"HIDDEN"}
     )
     mu: PointerProperty(
-        name="Attenuation", description="Volume of attenuation coefficients (1/mm) before the pinhole; empty: none",
-        type=bpy.types.Object, poll=_is_mu,
+        name="Attenuation", description="Volume of attenuation coefficients (1/mm) before the pinhole, or of CT numbers, "
+        "which attenuate each line of the isotope at its energy; empty: none",
+        type=bpy.types.Object, poll=_attenuates,
     )  # fmt: skip
     runs: CollectionProperty(type=RunProperties, name="Runs", options={"HIDDEN"})
     active_run: IntProperty(

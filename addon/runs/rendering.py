@@ -92,7 +92,8 @@ def sources(
     item = _chosen_volume(context, volume, taken, model.name)
     mu_item = _given(context, "mu", mu) if recipe["model.kind"] == "emission" else None
     if mu_item is not None:
-        require_quantity(volumes.quantity_of(mu_item), ("mu",), f"{mu_item.name!r} for attenuation")
+        attenuating = ("mu", "hu") if recipe["model.isotope"] else ("mu",)  # CT numbers at the isotope's energies
+        require_quantity(volumes.quantity_of(mu_item), attenuating, f"{mu_item.name!r} for attenuation")
     return item, mu_item
 
 

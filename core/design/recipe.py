@@ -48,7 +48,7 @@ _OBJECTIVES: Mapping[str, tuple[Setting, ...]] = {
     "regions": _BODIES,
 }  # fmt: skip
 """The kinds of objectives, and their settings."""
-_OPTICS = "time isotope window aperture_mu opening_angle_degrees crystal_mu intrinsic_fwhm background"
+_OPTICS = "time isotope window energy_fwhm aperture_mu opening_angle_degrees crystal_mu intrinsic_fwhm background"
 _ROWS = by_key((
     *(like(f"model.{name}", f"model.{name}") for name in _OPTICS.split()),
     Setting("imaging.voxels", int, 32, "Voxels along x, y and z", least=1),

@@ -32,7 +32,7 @@ _ROWS = (
     Drawn("file", str, None, "A phantom's shapes (.toml) or a volume", needs=("no kind",)),
     Drawn("mu_file", str, None, "What attenuates a volume, which is placed with it", needs=_OF_FILE),
     like("center", "volume.center", needs=_OF_FILE),
-    like("energy", "attenuation.energy", needs=_OF_FILE),
+    like("energy", "volume.energy", needs=_OF_FILE),
     Setting("gates", int, 1, "Phases of the beating torso, whose mean the event is", least=1, needs=("kind",)),
     like("pose.position", "phantom.position", Drawn),
     like("pose.euler_degrees", "phantom.euler_degrees", Drawn),

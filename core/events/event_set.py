@@ -20,6 +20,7 @@ from ..geometry.views import Views
 from ..physics.isotopes import isotope
 from ..physics.noise import draw_counts
 from ..runs.counting import live_shares_of, scaled
+from ..runs.projecting import LINES
 from ..runs.recipe import Recipe, recorded_recipe
 from ..runs.run import ProjectionRun
 from ..runs.run_recipe import recipe_model, with_phantom
@@ -254,7 +255,7 @@ class Event:
         planned, recipe = self.planned, self._folder.recipe
         files = {key: model[key] for key in ("system.file", "system.columns", "attenuation.file")}
         changes: dict[str, Any] = {key: str(recipe.input(name).path) for key, name in files.items() if name is not None}
-        if "attenuation.file" in changes:
+        if "attenuation.file" in changes and model["attenuation.energy"] != LINES:
             changes |= {"attenuation.energy": None}  # the set's copy holds mu
         record = recorded_recipe(recipe.placed(model.updated(changes)))
         if planned.phantom is not None and planned.entry["gates"] == 1 and planned.activity_factor == 1:

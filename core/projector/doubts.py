@@ -8,6 +8,7 @@ from ..arrays import Floats32
 from ..geometry.grid import Grid
 from ..geometry.views import Views
 from ..physics.materials import APERTURES, attenuation
+from ..volumes.volume import Volume
 from .emission import Emission
 from .models import Model
 
@@ -29,12 +30,17 @@ def doubts(grid: Grid, views: Views, model: Model) -> Iterator[str]:
         yield f"the grid is {wide:.3g} mm wide, {near:.3g} mm from the sources: lengths are in mm; is it in metres?"
     if not isinstance(model, Emission):
         return
+    yield from dict.fromkeys(text for part in model.parts() for text in _doubts_of_coefficients(part))
+
+
+def _doubts_of_coefficients(model: Emission) -> Iterator[str]:
+    """Of what attenuates photons of one model's energies."""
     most = max(_largest(model, metal) for metal in APERTURES)
     for name in ("aperture_mu", "crystal_mu"):
         value = np.max(0.0 if getattr(model, name) is None else getattr(model, name))
         if value > _ABOVE_METALS * most:
             yield f"{name} is {value:g} 1/mm, more than any material's at its energy ({most:.3g}): is it in 1/cm?"
-    if model.mu is not None:
+    if isinstance(model.mu, Volume):
         yield from doubts_of_mu(model.mu.array, model)
 
 
@@ -47,5 +53,4 @@ def doubts_of_mu(mu: Floats32, model: Emission) -> Iterator[str]:
 
 def _largest(model: Emission, material: str) -> float:
     """A material's largest coefficient at the energies that are counted, 1/mm."""
-    lines = model.isotope.lines_within(*model.window) if model.isotope else ()  # type: ignore[union-attr, misc]
-    return max(attenuation(material, energy) for energy, _ in lines or _UNNAMED)
+    return max(attenuation(material, energy) for energy, _ in model.photon_lines or _UNNAMED)

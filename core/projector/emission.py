@@ -2,10 +2,10 @@
 
 import functools
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import partial
-from typing import Any, Literal, Self
+from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,13 +19,15 @@ from ..geometry.views import Views
 from ..physics.aperture import Opening
 from ..physics.aperture import points_needed as hole_points_needed
 from ..physics.crystal import gaussian_blur
-from ..physics.isotopes import Isotope, isotope
+from ..physics.energy_window import FWHM_PER_SIGMA
+from ..physics.isotopes import Isotope
 from ..physics.optics import Edge, Optics
 from ..validation import instance, positive, real_array, strict_whole
-from ..volumes.volume import Volume, require_quantity
+from ..volumes.volume import Volume
 from .bundles import Beam
 from .hole_response import WholeHoles
 from .models import Model, checked_background, checked_times
+from .photon_lines import checked_mu, checked_photons, models_of_lines
 from .pixel_points import TOLERANCE, expected_error, lattices, offsets, points_needed, require_points, shadow_edges
 from .rays import Fan, view_rays
 
@@ -33,7 +35,6 @@ from .rays import Fan, view_rays
 _SAME_PLACE = 1e-3
 _SAME_DIRECTION = 1e-6
 
-_FWHM_PER_SIGMA = 2 * math.sqrt(2 * math.log(2))
 # A box of this width has the same variance as a Gaussian of sigma 1.
 _BOX_PER_SIGMA = math.sqrt(12)
 
@@ -62,10 +63,12 @@ class Emission(Model):
     system : PinholeSystem
         The modules, as many as the views and in their order: ``Emission(system[0:20])`` for
         ``system[0:20].views(...)``.
-    mu : Volume, optional
+    mu : Volume, or a sequence of them, optional
         Attenuation coefficients ("mu", 1/mm) at the energy that is counted, on the activity's grid or any other. The
         result is exact for piecewise constant volumes: nothing is resampled, the planes of both grids cut the rays, and
-        ``exp(-integral of mu)`` is integrated in closed form inside a voxel. None: no attenuation.
+        ``exp(-integral of mu)`` is integrated in closed form inside a voxel. CT numbers ("hu") attenuate each of
+        `photon_lines` as `hu_to_mu` says for its energy; several volumes are of these lines, in their order. None: no
+        attenuation.
     time : float or array (M,)
         The acquisition's, s; or those of the modules' frames.
     start : float or array (M,)
@@ -75,6 +78,14 @@ class Emission(Model):
         during `time`. None: one photon per decay, and constant activity.
     window : tuple of (float, float), optional
         Energies, keV, between which the isotope's photons are counted. None: 10 % around its strongest line.
+    energy_fwhm : float, optional
+        FWHM of the detector's energy resolution at the strongest line in the window, as a share of its energy; at an energy
+        E the FWHM is in proportion to sqrt(E). So a part of each line is counted, also of those beside the window, but for
+        lines that count less than 1e-4 of the one that counts most. None: all photons of the lines within the window.
+    lines : str
+        Several lines ``"together"`` are photons of one kind, with effective coefficients; ``"apart"`` each line has its own
+        mu, aperture and crystal, and the images are the sum of theirs, which takes their number times as long. With CT
+        numbers, or several volumes of mu, they are apart.
     photons_per_decay : float, optional
         Instead of the isotope's.
     pixel_points : int, optional
@@ -142,7 +153,7 @@ class Emission(Model):
     """
 
     system: PinholeSystem
-    mu: Volume | None = None
+    mu: Volume | Sequence[Volume] | None = None  # type: ignore[assignment]  # several only of several lines
     time: float | Floats = 1.0
     photons_per_decay: float = None  # type: ignore[assignment]  # always a number once made
     aperture_points: int | None = None
@@ -164,19 +175,17 @@ class Emission(Model):
     hole: Hole = "auto"
     start: float | Floats = 0.0
     efficiency: float | Floats = 1.0  # type: ignore[assignment]  # likewise
+    energy_fwhm: float | None = None
+    lines: Literal["together", "apart"] = "together"
+
+    photon_lines: ClassVar[tuple[tuple[float, float], ...]] = ()  # each model's own once made
+    """The isotope's lines that are counted: energies, keV, in order, and counted photons per decay."""
 
     name = "emission"
     takes = ("activity",)
 
     def __post_init__(self) -> None:
         instance(self.system, PinholeSystem, "emission")
-        if self.mu is not None:
-            if not isinstance(self.mu, Volume):
-                hint = "; tensors of it go to the projector, A(x, mu=...)" if is_tensor(self.mu) else ""
-                raise InputError(f"emission: expected mu to be a Volume, got {type(self.mu).__name__}{hint}")
-            require_quantity(self.mu.quantity, ("mu",), "emission: mu")
-            if self.mu.array.min() < 0:
-                raise InputError(f"emission: mu must not be negative, got {self.mu.array.min():g} 1/mm")
         self._set_optics()
         self._set("tolerance", positive(self.tolerance, "emission: tolerance"))
         self._set("time", checked_times(self.time, "emission: time", len(self.system)))
@@ -220,27 +229,32 @@ class Emission(Model):
 
     def _set_optics(self) -> None:
         """Make `isotope` an Isotope, `window` numbers, and the fields that are of `Optics` what those are, numbers."""
-        if self.window is not None and self.isotope is None:
-            raise InputError("emission: window needs an isotope")
-        lines: tuple[tuple[float, float], ...] = ()
-        if self.isotope is not None:
-            if not isinstance(self.isotope, Isotope):
-                self._set("isotope", isotope(self.isotope))
-            known: Isotope = self.isotope  # type: ignore[assignment]
-            low, high = known.window if self.window is None else real_array(self.window, "emission: window", (2,))
-            self._set("window", (float(low), float(high)))
-            lines = known.lines_within(low, high)
-            if not lines and self.photons_per_decay is None:
-                energies = ", ".join(f"{energy:g}" for energy, _ in known.lines)
-                raise InputError(
-                    f"emission: {known.name} has no photons from {low:g} to {high:g} keV; its lines: {energies}"
-                )
+        for name, value in checked_photons(self).items():
+            self._set(name, value)
+        self._set("mu", checked_mu(self.mu, self.photon_lines))
         with naming("emission"):
             given = {f.name: getattr(self, f.name) for f in fields(Optics)}
             given = {name: real_array(x, name, None) if is_tensor(x) else x for name, x in given.items()}
-            optics = Optics.of(self.system, lines, **given)
+            optics = Optics.of(self.system, self.photon_lines, **given)
+        if self._is_apart:  # coefficients stay as they are given, for each line
+            self._set("optics", optics)
         for f in fields(Optics):
-            self._set(f.name, getattr(optics, f.name))
+            if not (self._is_apart and f.name.endswith("_mu") and np.ndim(given[f.name]) == 0):
+                self._set(f.name, getattr(optics, f.name))
+
+    @property
+    def _is_apart(self) -> bool:
+        """Whether each line has a model of its own."""
+        is_one = self.mu is None or (isinstance(self.mu, Volume) and self.mu.quantity == "mu")
+        return len(self.photon_lines) > 1 and (self.lines == "apart" or not is_one)
+
+    def parts(self) -> tuple[Self, ...]:
+        """The model of each line, where they are apart; else the model alone."""
+        return self._models_of_lines if self._is_apart else (self,)
+
+    @functools.cached_property
+    def _models_of_lines(self) -> tuple[Self, ...]:
+        return models_of_lines(self, self.photon_lines)
 
     def record(self) -> dict[str, Any]:
         """The settings, for a run's record: of mu its grid, of the isotope its name, of a background's images a word."""
@@ -250,8 +264,10 @@ class Emission(Model):
         for name, value in settings.items():
             if isinstance(value, np.ndarray):
                 settings[name] = value.tolist() if value.ndim == 1 else "images"
-        if self.mu is not None:
-            settings["mu"] = {"shape": list(self.mu.grid.shape), "affine": self.mu.grid.affine.tolist()}
+        volumes: Any = self.mu if isinstance(self.mu, tuple) else [self.mu]
+        grids = [{"shape": list(mu.grid.shape), "affine": mu.grid.affine.tolist()} for mu in volumes if mu is not None]
+        if grids:
+            settings["mu"] = grids if isinstance(self.mu, tuple) else grids[0]
         return settings
 
     @property
@@ -267,7 +283,10 @@ class Emission(Model):
     def of_views(self, which: NDArray[np.integer]) -> Self:
         """The model of the modules `which` (indices) alone."""
         own = {f.name: getattr(self, f.name) for f in fields(self) if isinstance(getattr(self, f.name), np.ndarray)}
-        return replace(self, system=self.system[which], **{name: values[which] for name, values in own.items()})
+        changed = replace(self, system=self.system[which], **{name: values[which] for name, values in own.items()})
+        if self._is_apart:  # their attenuation is made only once
+            changed._set("_models_of_lines", tuple(part.of_views(which) for part in self.parts()))
+        return changed
 
     def check(self, views: Views) -> None:
         """Raise `InputError` unless `views` are of this system."""
@@ -385,7 +404,7 @@ class Emission(Model):
         """The intrinsic blur of view m: matrices (n_v, n_v) along v and (n_u, n_u) along u."""
         if not np.any(self.intrinsic_fwhm):
             return None
-        sigma = self._optics_of(m).intrinsic_fwhm / _FWHM_PER_SIGMA
+        sigma = self._optics_of(m).intrinsic_fwhm / FWHM_PER_SIGMA
         pitch_u, pitch_v = self.crystal_pitch(views, m)
         n_v, n_u = views.shape
         return gaussian_blur(n_v, sigma / pitch_v), gaussian_blur(n_u, sigma / pitch_u)
@@ -403,7 +422,8 @@ class Emission(Model):
             return everywhere.pixel_weights(m, u, v, (1.0, 1.0), float(self.system.collimator_length[m]), opening)
 
         of_modules = self._frames, self.system.collimator_length, self.effective_diameter, sides, weigh
-        return WholeHoles(views, grid, *of_modules, self.mu, self.hole == "depth")
+        mu: Any = self.mu  # of models that are computed as a whole one volume
+        return WholeHoles(views, grid, *of_modules, mu, self.hole == "depth")
 
     def caution(self, views: Views, grid: Grid) -> str | None:
         """A warning where there are too few rays for the tolerance."""
@@ -436,7 +456,7 @@ class Emission(Model):
             return self.aperture_points or 1
         l, b = self.system.collimator_length[m], self.system.pinhole_distance[m]
         pitch_u, pitch_v = self.crystal_pitch(views, m)
-        sigma = self._optics_of(m).intrinsic_fwhm / _FWHM_PER_SIGMA
+        sigma = self._optics_of(m).intrinsic_fwhm / FWHM_PER_SIGMA
         voxel = grid.voxel_volume ** (1 / 3) * l / b
         blur = math.hypot(voxel, _BOX_PER_SIGMA * sigma)
         shadow = self.effective_diameter[m] * (1 + l / b)

@@ -69,6 +69,9 @@ def geometry_gradient(A: Projector, volume: Volume | Floats | Floats32, images: 
     InputError
         Another model or shape; voxels so close to a pinhole that rays project them.
     """
+    if A._parts:
+        of_parts = [geometry_gradient(part, volume, images) for part in A._parts]
+        return GeometryGradient(*(np.sum(own, axis=0) for own in zip(*of_parts, strict=True)))
     holes, model = A._depths, A.model
     if holes is None or not isinstance(model, Emission):
         raise InputError(

@@ -57,6 +57,10 @@ class Model(ABC):
         """The model of the views `which` (indices) alone."""
         return self
 
+    def parts(self) -> tuple[Model, ...]:
+        """Models whose images add up to this one's: itself alone, if it is computed as a whole."""
+        return (self,)
+
     def check_volume(self, volume: Volume) -> None:
         """Raise `InputError` where the model is not for such a volume."""
         require_quantity(volume.quantity, self.takes, self.name)

@@ -15,7 +15,7 @@ from ..errors import InputError, warn
 from ..geometry.grid import Grid
 from ..geometry.views import Views
 from ..memory import Requirements
-from ..progress import Progress, tell
+from ..progress import Progress, part_of, tell
 from ..recording import recorded_warnings
 from ..validation import freeze, shape_text
 from ..volumes.images import Images
@@ -66,7 +66,7 @@ class Projector(LinearOperator):
     The results are float32; float64 with `double` or ``backend="numpy"``, and for tensors of float64 with all backends but
     cuda.
     On a GPU the adjoint of the torch and cuda backends adds in no fixed order: it differs by float32 rounding from
-    call to call. Up to 128 MiB of rays and their weights are kept from call to call.
+    call to call. Up to 128 MiB of rays and their weights are kept from call to call, of lines apart for each line.
 
     Examples
     --------
@@ -118,7 +118,10 @@ class Projector(LinearOperator):
         self.threads = thread_count(threads)
         self.which = freeze(np.arange(len(views)))
         self._bundles = Bundles(len(views), self._bundle)
-        self._depths = model.by_depth(views, grid)
+        parts = model.parts()
+        with recorded_warnings():  # this projector has given them
+            self._parts = [Projector(grid, views, part, **self._settings) for part in parts if part is not model]
+        self._depths = None if self._parts else model.by_depth(views, grid)
 
     def __call__(
         self, x: Volume | ArrayOrTensor, progress: Progress | None = None, mu: ArrayOrTensor | None = None
@@ -151,6 +154,10 @@ class Projector(LinearOperator):
         x = self._check(x)
         if self.model.mu is None:
             raise InputError("mu: the projector's model has none; give it one to say on which grid mu is")
+        if any(part.model.mu is not self.model.mu for part in self._parts):
+            raise InputError(
+                "mu: each of the model's lines has its own; give the model one volume of mu for all of them"
+            )
         x, mu = promote(x, require_no_negative(checked(mu, "mu", self.model.mu.grid.shape, self._float64)))
         if not getattr(mu, "requires_grad", False):
             return self._apply(x, progress, mu)
@@ -251,6 +258,9 @@ class Projector(LinearOperator):
     def _run_back(
         self, y: ArrayOrTensor, progress: Progress | None = None, mu: ArrayOrTensor | None = None
     ) -> ArrayOrTensor:
+        if self._parts:
+            n = len(self._parts)
+            return sum(A._run_back(y, part_of(progress, k, n), mu) for k, A in enumerate(self._parts))
         execution = self._execution(y)
         given = images = execution.to_backend(y)
         needed = images.itemsize * self.grid.n_voxels + self._extra_bytes(images.itemsize)
@@ -276,6 +286,9 @@ class Projector(LinearOperator):
 
     def _images(self, x: ArrayOrTensor, mu: ArrayOrTensor = None) -> Iterator[ArrayOrTensor]:
         """Images of a checked volume, as the backend computes them."""
+        if self._parts:
+            yield from map(sum, zip(*(A._images(x, mu) for A in self._parts), strict=True))
+            return
         self._require_rays()
         execution = self._execution(x)
         for m, image in enumerate(self._projected(execution, x, mu)):
@@ -304,6 +317,8 @@ class Projector(LinearOperator):
 
     def _mu_gradient(self, images: ArrayOrTensor, x: ArrayOrTensor, mu: ArrayOrTensor) -> ArrayOrTensor:
         """The gradient of <A x, images> by mu, on mu's whole grid; of a batch the sum."""
+        if self._parts:
+            return sum(A._mu_gradient(images, x, mu) for A in self._parts)
         execution = self._execution(x)
         total = zeros(mu.shape, images)
         for index in np.ndindex(x.shape[:-3]):
@@ -397,6 +412,8 @@ class Projector(LinearOperator):
 
     def _extra_bytes(self, itemsize: int) -> int:
         """Bytes of a copy of mu, and of voxel weights and the volume that they weight."""
+        if self._parts:
+            return max(part._extra_bytes(itemsize) for part in self._parts)
         mu = 0 if self.model.mu is None else self.model.mu.grid.n_voxels
         return itemsize * mu + (2 * itemsize + 8) * self.grid.n_voxels * self.model.weights_voxels
 

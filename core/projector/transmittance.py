@@ -19,8 +19,8 @@ from .rays import Fan
 from .tracing import gradient_by_fans
 
 # Rays across a voxel, where that is farthest and looks narrowest. Across a voxel of mu there are not fewer than its edges
-# need, nor more than they show.
-_RAYS_ACROSS, _RAYS_ACROSS_MU = 4, (1.5, 6)
+# need, nor more than they show; but a ray meets every voxel, since a lattice's holes are sqrt(2) times its step wide.
+_RAYS_ACROSS, _RAYS_ACROSS_MU, _RAYS_TO_MEET = 4, (1.5, 6), math.sqrt(2)
 # What rays are cast beyond the outermost pixels, as a slope, since their lattice is turned by up to 1/2 % from the module.
 _TURNED = 0.015
 # The rays' lattice is turned by this slope, along which no edges of voxels run: they meet the rays at many different places.
@@ -79,7 +79,7 @@ class VoxelRays:
         sides = far * (np.linalg.norm(across, axis=1) / middle[2] + margin)
         each = (np.linalg.svd(frame[:2] @ g.affine[:3, :3], compute_uv=False)[-1] for g in (grid, self.mu.grid))
         (width, mu_width), (fewest, most) = map(float, each), _RAYS_ACROSS_MU
-        step = max(min(width / _RAYS_ACROSS, mu_width / fewest), min(width, mu_width / most))
+        step = max(min(width / _RAYS_ACROSS, mu_width / fewest), min(width / _RAYS_TO_MEET, mu_width / most))
         turned = np.array([[1, _SLOPE], [-_SLOPE, 1]]) / math.hypot(1, _SLOPE)
         rows, columns = np.ceil(np.abs(turned) @ sides / step).astype(int).tolist()
         row_step, column_step = step * turned @ frame[1::-1]

@@ -42,9 +42,10 @@ class Counts(np.ndarray[Any, Any]):
 
     Attributes
     ----------
-    about : array (frames, 5)
+    about : array (frames, 7)
         Of each frame its exposure, s, the size of its pixels along a row and down the columns, mm, the number of its energy
-        window, and its start, s after that of the first frame of all; NaN where the file does not say it.
+        window, its start, s after that of the first frame of all, and the lowest and highest energy of its window, keV; NaN
+        where the file does not say it.
     kind : str
         What the frames are of, such as "2 energy windows".
     name : str
@@ -56,7 +57,7 @@ class Counts(np.ndarray[Any, Any]):
     def __array_finalize__(self, source: Any) -> None:
         self.kind, self.name = getattr(source, "kind", ""), getattr(source, "name", "counts")
         is_same = isinstance(source, Counts) and source.shape == self.shape
-        self.about = source.about if is_same else np.full((*self.shape[:1], 5), math.nan)
+        self.about = source.about if is_same else np.full((*self.shape[:1], 7), math.nan)
 
     def __getitem__(self, key: Any) -> Any:
         found = super().__getitem__(key)
@@ -172,8 +173,9 @@ def _reader(path: Path, ending: str) -> Callable[[Path, Layout], Counts]:
 def _counts(array: Array, kind: str = "", **known: Sequence[float]) -> Counts:
     """Checked frames, with an axis of frames also where there is only one, and what is `known` about them from the file.
 
-    That is their `time` (s), `pixel` (along a row and down the columns, mm), energy `window` (number) and `start` (s after
-    any moment). Of these, fewer than frames are those of blocks of frames, which follow each other.
+    That is their `time` (s), `pixel` (along a row and down the columns, mm), energy `window` (number) with its `low` and
+    `high` energy (keV), and `start` (s after any moment). Of these, fewer than frames are those of blocks of frames, which
+    follow each other.
     """
     array = array[None] if array.ndim == 2 else array
     if array.ndim != 3 or not array.size:
@@ -182,7 +184,7 @@ def _counts(array: Array, kind: str = "", **known: Sequence[float]) -> Counts:
         raise InputError(f"expected whole or real numbers, found {array.dtype}")
     counts = array.view(Counts)
     counts.kind, counts.about[:, 1:3] = kind, known.get("pixel", math.nan)
-    for column, name in ((0, "time"), (3, "window"), (4, "start")):
+    for column, name in ((0, "time"), (3, "window"), (4, "start"), (5, "low"), (6, "high")):
         each = np.array(known.get(name) or [math.nan])
         counts.about[:, column] = each[np.arange(len(array)) * len(each) // len(array)]
     return counts
@@ -297,7 +299,13 @@ def _interfile(path: Path, layout: Layout) -> Counts:
     pixel = [float(text(f"scaling factor (mm/pixel) [{i}]", "nan")) for i in (1, 2)]
     kind = f"{windows} energy windows" if windows > 1 else ""
     frames = _numbers(data, type_, (count, rows, columns), skip)
-    return _counts(frames, kind, time=times, pixel=pixel, window=range(1, windows + 1), start=starts)
+    low, high = (
+        [float(text(f"energy window {word} level [{i}]", "nan")) for i in range(1, windows + 1)]
+        for word in ("lower", "upper")
+    )
+    return _counts(
+        frames, kind, time=times, pixel=pixel, window=range(1, windows + 1), start=starts, low=low, high=high
+    )
 
 
 def _seconds_of_day(text: str) -> float:
@@ -315,7 +323,8 @@ def _interfile_header(path: Path) -> dict[str, list[str]]:
     for line in lines:
         key, assigned, value = line.partition(":=")
         if assigned and not line.lstrip().startswith(";"):
-            header.setdefault(" ".join(key.strip().lstrip("!").lower().split()), []).append(value.strip())
+            key = " ".join(key.strip().lstrip("!").lower().replace("[", " [").split())
+            header.setdefault(key, []).append(value.strip())
     return header
 
 
@@ -347,8 +356,9 @@ def _dicom(path: Path, layout: Layout) -> Counts:
     kind = ", ".join(f"{n} {name.lower()}s" for name, n in several.items() if n > 1)
     pixel = [float(size) for size in data.get("PixelSpacing") or (math.nan, math.nan)][::-1]
     windows = _which(data, "Energy Window", several["Energy Window"])
+    low, high = ([_dicom_energy(data, number, word) for number in windows] for word in ("Lower", "Upper"))
     times, starts = _dicom_times(data), _dicom_starts(data, len(array))
-    return _counts(array, kind, time=times, pixel=pixel, window=windows, start=starts)
+    return _counts(array, kind, time=times, pixel=pixel, window=windows, start=starts, low=low, high=high)
 
 
 _VECTORS = ("Energy Window", "Detector", "Phase", "Rotation", "RR Interval", "Time Slot")
@@ -362,6 +372,14 @@ def _dicom_times(data: Any) -> list[float]:
         if any(map(math.isfinite, parts)):
             return [parts[number - 1] for number in _which(data, name, len(parts))]
     return [_dicom_time(data)]
+
+
+def _dicom_energy(data: Any, number: int, word: str) -> float:
+    """The lower or the upper limit of the energy window of a number, keV; NaN of one that is not a single range."""
+    windows = data.get("EnergyWindowInformationSequence") or ()
+    ranges: Any = windows[number - 1].get("EnergyWindowRangeSequence") or () if 0 < number <= len(windows) else ()
+    limit = ranges[0].get(f"EnergyWindow{word}Limit") if len(ranges) == 1 else None
+    return math.nan if limit is None else float(limit)
 
 
 def _dicom_starts(data: Any, count: int) -> list[float]:

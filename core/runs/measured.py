@@ -28,6 +28,7 @@ from .frame_files import Counts, Layout, differs, read_frames
 from .orientations import ORIENTATIONS, on_crystal
 from .recipe import Recipe, recorded_recipe
 from .run import ProjectionRun
+from .scatter_windows import ScatterWindows
 
 _MOST_NUMBERS = 1 << 20  # in a list of frames
 _MOST_EXACT = 1 << 24  # whole numbers above are rounded in float32
@@ -49,6 +50,7 @@ def counts_run(
     pitch: ArrayLike | None = None,
     recipe: Recipe | None = None,
     settings: Mapping[str, Any] | None = None,
+    scatter: ScatterWindows | None = None,
 ) -> ProjectionRun:
     """The run of a scanner that has measured `counts`.
 
@@ -82,6 +84,8 @@ def counts_run(
         Says the rest of the model, for reconstruction: isotope, aperture, crystal, attenuation.
     settings
         More to record in the run.
+    scatter
+        Frames of other energy windows, from which the scatter in `frames` is estimated: it is added to the run's background.
 
     Returns
     -------
@@ -99,8 +103,7 @@ def counts_run(
     numbers = frame_numbers(frames, len(array), system)
     words = _words(orientation, len(array))
     recipe = recipe or Recipe()
-    place = {number: k for k, number in enumerate(numbers) if number is not None}
-    used = [place[int(number)] for number in system.numbers]
+    used = _in_order(numbers, system)
     called = [f"frame {k + 1} (module {number})" for k, number in enumerate(numbers)]
     time = _times(time, found, used, called)
     start = _starts(recipe["model.start"] if start is None else start, found, used, called)
@@ -109,9 +112,14 @@ def counts_run(
     turned = [on_crystal(frame, word) for frame, word in zip(array, words, strict=True)]
     if len({image.shape for image in turned}) > 1:
         raise InputError("orientation (--orientation): frames that are not square cannot lie both upright and turned")
-    images = np.stack([turned[k] for k in used]).astype(np.float32)
+    frames_of = {"peak": used}
+    for word, own in {} if scatter is None else scatter.frames.items():
+        with naming(f"{word}_frames (--{word}-frames)"):
+            frames_of[word] = _in_order(frame_numbers(own, len(array), system), system)
+    of_windows = {word: np.stack([turned[k] for k in own]).astype(np.float32) for word, own in frames_of.items()}
     if detector == "virtual":  # upright, the crystal's image point-inverted
-        images = images[:, ::-1, ::-1]
+        of_windows = {word: images[:, ::-1, ::-1] for word, images in of_windows.items()}
+    images = of_windows["peak"]
     n_v, n_u = images.shape[1:]
     views = system.views((n_v, n_u), detector, magnification, pitch)
     given = {key: value for key, value in recipe.given.items() if key.startswith(_KEPT)}
@@ -128,6 +136,9 @@ def counts_run(
     efficiency = recipe_efficiency(recipe) if efficiency is None else efficiency
     efficiency = checked_background(efficiency, "efficiency (--efficiency)", len(system), (n_v, n_u))
     background = scaled(made["model.background"], live_shares_of(made, images))
+    if scatter is not None:
+        estimate, record["scatter"] = scatter.estimate(of_windows, frames_of, found)
+        background = each_pixel(background) + estimate
     known: Any = {"settings": record, "background": background, "efficiency": efficiency}
     run = ProjectionRun(images, system, views, unit="counts", **known)
     _warn_of_others(found, used, words, run)
@@ -147,10 +158,17 @@ def recipe_counts(recipe: Recipe, system: Scanner, stages: Stages = lambda stage
             found, system, frames, orientation[0] if orientation and len(orientation) == 1 else orientation,
             recipe.given.get("model.time"), expected=recipe["counts.expected"],
             detector=recipe.given.get("detector.plane", "real"), magnification=recipe["detector.magnification"],
-            pitch=recipe["detector.pitch"], recipe=recipe, settings={"counts": found.name},
+            pitch=recipe["detector.pitch"], recipe=recipe, settings={"counts": found.name}, scatter=_scatter(recipe),
         )  # fmt: skip
     _require_size(recipe, run, found.name)
     return run
+
+
+def _scatter(recipe: Recipe) -> ScatterWindows | None:
+    """The windows of a recipe from which scatter is estimated."""
+    names = "lower_frames", "upper_frames", "window_widths", "scatter_fwhm"
+    given = [recipe[f"counts.{name}"] for name in names]
+    return None if given[:2] == [None, None] else ScatterWindows(*given)
 
 
 def require_given(frames: Any, orientation: Any, time: Any, found: Counts) -> None:
@@ -183,6 +201,11 @@ def frame_numbers(frames: Any, count: int, system: Scanner) -> list[int | None]:
     if without := sorted(own - set(numbers)):
         raise InputError(f"{name}: module {_listed(without)} has no frame; leave such modules out with --modules")
     return found
+
+
+def _in_order(numbers: list[int | None], system: Scanner) -> list[int]:
+    """The frames of the system's modules."""
+    return [numbers.index(int(number)) for number in system.numbers]
 
 
 def _parsed(text: str) -> list[int | None]:

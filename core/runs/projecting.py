@@ -24,6 +24,9 @@ from ..volumes.volume import Volume
 from .counting import scaled
 from .run import ProjectionRun
 
+LINES = "lines"
+"""In place of the energy at which CT numbers become mu: they attenuate each line of the isotope at its own."""
+
 
 @dataclass(frozen=True, eq=False)
 class Imaging:
@@ -161,7 +164,7 @@ def warn_of_energy(model: Model, energy: float | str | None, source: str) -> Non
     `source` names what the mu is of.
     """
     window = model.window if isinstance(model, Emission) else None
-    if window is None or energy is None:
+    if window is None or energy in (None, LINES):
         return
     energy = photon_energy(energy)
     if not window[0] <= energy <= window[1]:

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,13 +23,14 @@ from ..physics.ct_numbers import hu_to_mu
 from ..physics.isotopes import photon_energy
 from ..progress import Progress, Stages
 from ..projector import Emission, InverseSquareSum, Model, Projector, Transmission
+from ..projector.models import each_pixel
 from ..volumes.rearranging import centered
 from ..volumes.volume import Volume
 from ..volumes.volume_files import read_volume, read_volume_of
 from ..workbook import read_scanner
 from .counting import dead_time_of, live_shares_of, recipe_efficiency, scaled
 from .measured import recipe_counts
-from .projecting import Imaging, project_run, warn_of_energy
+from .projecting import LINES, Imaging, project_run, warn_of_energy
 from .recipe import Recipe, recorded_recipe
 from .run import ProjectionRun
 
@@ -84,7 +86,7 @@ def run_recipe(
         sources = _from_phantom(recipe, recorded, model, mu, stages)
     frames = frames_of(recipe)
     energy = recipe["volume.energy"] or recipe["attenuation.energy"]
-    converted = {} if energy is None else {"ct_converted_at_kev": photon_energy(energy)}
+    converted = {} if energy in (None, LINES) else {"ct_converted_at_kev": photon_energy(energy)}
     for number, ((source, mu_of_it, record), times) in enumerate(_in_frames(sources, frames)):
         record, seed = record.updated(times), recipe["noise.seed"]
         if seed is not None:  # noise of its own for each
@@ -216,7 +218,12 @@ def projector_of_run(
             )
         else:
             mu = _attenuation(recipe, model, stages)
-    return Projector(grid, run.views, recipe_model(recipe, run.system, mu, run), backend, threads)
+    model = recipe_model(recipe, run.system, mu, run)
+    if isinstance(model, Emission) and np.ndim(run.background) == 3:  # such as scatter: no recipe says it
+        own = recipe_model(run.recipe, run.system, run=run).background if "recipe" in run.settings else 0.0
+        more = np.maximum(run.background - each_pixel(own), 0)
+        model = replace(model, background=each_pixel(model.background) + more)
+    return Projector(grid, run.views, model, backend, threads)
 
 
 def recipe_imaging(
@@ -287,12 +294,12 @@ def _read(path: str, recipe: Recipe, progress: Progress | None) -> Volume:
 def read_mu(
     path: str | Path, energy: float | str | None, series: str | None = None, progress: Progress | None = None
 ) -> Volume:
-    """The volume of mu in a file: as it is, or from CT numbers at `energy` (keV, or an isotope's)."""
+    """The volume of mu in a file: as it is, or from CT numbers at `energy` (keV, an isotope's); for `LINES` CT numbers."""
     if energy is not None:
         volume = read_volume(path, series=series, progress=progress)
         if volume.quantity != "hu":
             raise InputError(f"{path}: it holds {volume.quantity}; an energy (--energy) is for CT numbers (hu)")
-        return hu_to_mu(volume, photon_energy(energy))
+        return volume if energy == LINES else hu_to_mu(volume, photon_energy(energy))
     advice = "; of CT numbers, give the energy (--energy) to convert them"
     volume = read_volume_of(path, "mu", advice, series=series, progress=progress)
     lowest, highest = float(volume.array.min()), float(volume.array.max())

@@ -171,6 +171,7 @@ _METHOD_OF_COUNTS = _alternatives("reconstruction.method", [name for name, m in 
 _RAYS = "model.kind=transmission or model.hole=rays or model.hole=point"
 _FILE = "volume.file or volume.states"
 _MADE = "no counts.files"
+_SCATTER = "counts.lower_frames or counts.upper_frames"
 _PHANTOM = ("no volume.file", "no volume.states", _MADE)
 _PHANTOM_NUMBER = (*_PHANTOM, "no phantom.file", "no phantom.text")
 _NO_PHANTOM = ("no phantom.kind", "no phantom.file", "no phantom.text")
@@ -243,7 +244,8 @@ _DECLARED = (
     Setting("attenuation.object", str, None, "Name of its object in a Blender scene",
             needs=(_COUNTS, "no attenuation.file", "no attenuation.of_phantom"), option="--mu-object"),
     Setting("attenuation.series", str, None, _SERIES, needs=("attenuation.file",), option="--mu-series"),
-    Setting("attenuation.energy", float, None, _AT_ENERGY, unit="keV", words=_ISOTOPES, above=0,
+    Setting("attenuation.energy", float, None, _AT_ENERGY + "; lines: for each of the isotope's lines at its own",
+            unit="keV", words={**_ISOTOPES, "lines": ("Lines", "Each of the isotope's lines at its own energy")}, above=0,
             needs=("attenuation.file",), option="--mu-energy"),
     Setting("attenuation.of_phantom", bool, False, "The phantom attenuates by its own coefficients",
             needs=(_COUNTS, *_PHANTOM, "no attenuation.file"), option="--phantom-mu"),
@@ -268,6 +270,14 @@ _DECLARED = (
             needs=("counts.files",)),
     Setting("counts.raw_big_endian", bool, False, "The most significant byte of a raw file's numbers comes first",
             needs=("counts.files",)),
+    Setting("counts.lower_frames", str, None, "Frames of the energy window below the peak's, from which scatter is "
+            "estimated: which module each is of, as in counts.frames", needs=("counts.files",)),
+    Setting("counts.upper_frames", str, None, "Frames of the energy window above the peak's, likewise",
+            needs=("counts.files",)),
+    Setting("counts.window_widths", float, None, "Widths of the lower, the peak and the upper energy window", "what the "
+            "file says", unit="keV", above=0, sizes=(3,), needs=("counts.files", _SCATTER)),
+    Setting("counts.scatter_fwhm", float, None, "FWHM of the Gaussian that smooths the estimate of scatter", "it is not "
+            "smoothed", unit="pixels", above=0, needs=("counts.files", _SCATTER)),
     Setting("model.kind", str, "transmission", "What a pixel holds", label="Model", option="--model", words={
         "transmission": ("Radiograph", "Line integrals of the volume"),
         "emission": ("SPECT Counts", "Photons of a volume of activity that the crystal counts"),
@@ -285,6 +295,13 @@ _DECLARED = (
     Setting("model.window", float, None, "Energies that are counted, from and to", "10 % around the isotope's strongest "
             "line", unit="keV", least=0, slider=1000, sizes=(2,), needs=(_COUNTS, "model.isotope"),
             label="Window (keV)"),
+    Setting("model.energy_fwhm", float, None, "FWHM of the detector's energy resolution at the window's line, as a share of "
+            "its energy: of each line, also beside the window, a part is counted", "all photons within the window",
+            above=0, most=0.99, slider=0.3, needs=(_COUNTS, "model.isotope"), label="Energy FWHM"),
+    Setting("model.lines", str, "together", "How several lines of the isotope are computed", label="Lines", words={
+        "together": ("Together", "As photons of one kind, with effective coefficients"),
+        "apart": ("Apart", "Each with its own attenuation, penetration and absorption: takes their number times as long"),
+    }, needs=(_COUNTS, "model.isotope")),
     Setting("model.hole", str, "auto", "What photons pass: the whole hole (auto; depth, never by rays), points "
             "of it (rays), or its middle alone (point)", label="Hole", option="--hole", words={
         "auto": ("Automatic", "The depth-dependent pinhole response; rays where that cannot be"),

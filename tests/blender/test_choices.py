@@ -100,7 +100,7 @@ DEFAULTS = {
     "isotope": "NONE", "aperture_material": "NUMBER", "edge": "PAIX", "crystal_material": "NUMBER",
     "detector": "VIRTUAL", "backend": "AUTO", "rows": "BY_NUMBER", "unit": "NONE",
     "colors": "INFERNO", "scale": "LINEAR", "planes": "ALL", "look": "DENSITY", "figure": "SCANNER",
-    "method": "OSEM", "prior": "NONE", "hole": "AUTO", "dead_time_kind": "NON_PARALYSABLE",
+    "method": "OSEM", "prior": "NONE", "hole": "AUTO", "lines": "TOGETHER", "dead_time_kind": "NON_PARALYSABLE",
     "how": "SUM", "uniform": "K", "MixturePhantomProperties.look": "solids",
 }  # fmt: skip
 """What files mean that do not hold a choice, because nobody has made it."""

@@ -11,6 +11,7 @@ from mphdrr.addon.pictures import images
 from mphdrr.addon.runs import runs
 from mphdrr.addon.scanner import scanner
 from mphdrr.core.geometry.system import PinholeSystem
+from mphdrr.core.physics.energy_window import energy_window_scatter
 from mphdrr.core.runs.files import read_run
 
 
@@ -87,6 +88,21 @@ def test_frames_of_some_modules_from_several_files(scanned, scene, tmp_path):
     run = read_run(storage.absolute(scene.mphdrr_projections.run_file))
     assert run.projections.mean(axis=(1, 2)).tolist() == [3, 4] and run.system.numbers.tolist() == [3, 4]
     assert run.recipe["detector.pitch"] == 2.0 and not runs.changes(scene)
+
+
+def test_frames_of_other_energy_windows_give_the_background(scanned, scene, tmp_path):
+    frames = np.random.default_rng(3).poisson(5.0, (24, 6, 6))
+    np.save(tmp_path / "tew.npy", frames)
+    said = SAID | {"frames": "1-8, none*16", "lower_frames": "none*8, 1-8, none*8", "upper_frames": "none*16, 1-8"}
+    with pytest.raises(RuntimeError, match="window-widths"):
+        bpy.ops.mphdrr.import_counts(filepath=str(tmp_path / "tew.npy"), **said)
+    widths = {"window_widths": (4.0, 28.0, 7.0), "scatter_fwhm": 2.0}
+    assert bpy.ops.mphdrr.import_counts(filepath=str(tmp_path / "tew.npy"), **said, **widths) == {"FINISHED"}
+    run = read_run(storage.absolute(scene.mphdrr_projections.run_file))
+    peak, lower, upper = frames.reshape(3, 8, 6, 6)
+    expected, _ = energy_window_scatter(lower, peak, upper, (4.0, 28.0, 7.0), 2.0)
+    np.testing.assert_allclose(run.background, expected, rtol=1e-6)
+    assert run.recipe["counts.scatter_fwhm"] == 2.0
 
 
 @pytest.mark.parametrize(

@@ -462,6 +462,21 @@ def test_a_moved_ct_is_converted_where_it_is_and_in_every_state(scene, scanned):
         np.testing.assert_allclose(got.grid.affine, expected.grid.affine, atol=1e-9)
 
 
+def test_ct_numbers_attenuate_each_line_of_the_isotope(scene, scanned, ct):
+    settings = scene.mphdrr_projections
+    settings.model, settings.isotope, settings.window, settings.energy_fwhm = "EMISSION", "In-111", (150, 270), 0.1
+    settings.mu = ct
+    assert bpy.ops.mphdrr.render_projections(width=12, height=10, volume="Derenzo") == {"FINISHED"}
+    run = read_run(storage.absolute(settings.run_file))
+    volume, mu = (volumes.volume_from_object(item) for item in (bpy.data.objects["Derenzo"], ct))
+    model = Emission(scanned, mu, isotope="In-111", window=(150, 270), energy_fwhm=0.1)
+    assert len(model.parts()) == 2
+    np.testing.assert_array_equal(run.projections, Projector(volume.grid, scanned.views((10, 12)), model)(volume))
+    settings.mu, settings.lines = None, "APART"
+    assert bpy.ops.mphdrr.render_projections(width=12, height=10, volume="Derenzo") == {"FINISHED"}
+    assert read_run(storage.absolute(settings.run_file)).recipe["model.lines"] == "apart"
+
+
 def test_counts_are_of_activity_alone(scene, scanned, ct, body):
     for name in ("CT", "Body"):
         with pytest.raises(RuntimeError, match=f"'{name}' for emission: expected a volume of activity"):

@@ -220,6 +220,21 @@ def centres(grid):
     return np.moveaxis(np.indices(grid.shape), 0, -1) @ grid.affine[:3, :3].T + grid.affine[:3, 3]
 
 
+@pytest.mark.parametrize("wide", [4.0, 80.0, 500.0])
+def test_every_voxel_loses_photons_however_wide_those_of_mu_are(wide):
+    """Behind a slab of mu, of voxels as wide as this, exp(-mu d / cos(psi)) are left."""
+    system = mph.PinholeSystem([[200.0, 0.0, 0.0]], 2.0, 60.0, 50.0, 10.0, roi_radius=60.0)
+    n = max(1, round(120 / wide))
+    slab = mph.Volume(
+        np.full((1, n, n), 0.02), mph.Grid.centered((1, n, n), (40.0, wide, wide), (60.0, 0.0, 0.0)), "mu"
+    )
+    grid = mph.Grid.centered(24, 1.5)
+    bare, behind = (depth_projector(grid, 32, system=system, mu=mu).T(np.ones((1, 32, 32))) for mu in (None, slab))
+    x, y, z = np.meshgrid(*[1.5 * (np.arange(24) - 11.5)] * 3, indexing="ij")
+    secant = np.sqrt(1 + (y**2 + z**2) / (200 - x) ** 2)
+    np.testing.assert_allclose(behind / bare, np.exp(-0.02 * 40 * secant), rtol=1e-3)
+
+
 def test_grids_near_the_pinhole_are_refused():
     A = depth_projector(mph.Grid.centered((4, 4, 4), 90.0), 8)
     refused(lambda: A(np.ones(A.shape_in)), "take a smaller grid", "hole 'auto' or 'rays'")

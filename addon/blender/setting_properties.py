@@ -69,7 +69,7 @@ def properties_of(settings: Settings) -> dict[str, Any]:
         if each := of_modules(name, setting):
             or_file = f", or a file with an image for each ({', '.join(setting.endings)})" if setting.endings else ""
             made[each] = StringProperty(
-                name=f"{setting.label.partition(' (')[0]} by Module",
+                name=f"Each {setting.label.partition(' (')[0]}",
                 description=f"A number for each module that is projected, such as 10, 20, 30{or_file}. Empty: one for all",
             )
     return made

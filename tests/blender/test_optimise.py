@@ -132,7 +132,9 @@ def moved(scene, recipe, looks: int) -> tuple[jobs.Job, list[mph.PinholeSystem]]
     return job, seen
 
 
-@pytest.mark.parametrize("has", ["none", "these modules", "other modules"])
+@pytest.mark.parametrize(
+    "has", ["none", *(pytest.param(has, marks=pytest.mark.long) for has in ("these modules", "other modules"))]
+)
 def test_it_moves_while_it_works_and_cancelling_takes_all_back(scene, recipe, like, ring_system, has):
     scene.render.resolution_x, scene.camera = 777, None
     if has != "none":

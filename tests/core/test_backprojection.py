@@ -283,6 +283,7 @@ def derenzo_scores(system, pixels, spacing, ways=WAYS) -> dict[tuple[str, str], 
     return scores
 
 
+@pytest.mark.long
 def test_with_ideal_holes_the_product_shows_rods_and_with_the_scanners_it_does_not(scanner):
     """Of 20 modules: the finding below in little time."""
     scores = derenzo_scores(scanner[::4], 64, 1.0, ["product"])

@@ -102,6 +102,7 @@ def test_without_prior_it_is_as_likely_as_mlem_gets(small):
     assert ours.objective[-1] >= mlem.objective[-1] - 1e-6 * abs(mlem.objective[-1])
 
 
+@pytest.mark.long
 def test_a_prior_of_no_weight_is_none(small):
     given = (small.A, small.counts, 3, 2)
     plain = mph.bsrem(*given, background=0.3)

@@ -176,6 +176,7 @@ def test_real_and_virtual_detectors_tell_the_same(some):
     assert np.allclose(found.chi_square, real.chi_square, atol=1e-6)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("fault", ["one image shifted", "another module's", "upside down", "a double spot"])
 def test_a_module_with_wrong_images_is_named_and_spoils_no_other(some, fault):
     measured = Measured(some)

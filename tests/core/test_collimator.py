@@ -260,6 +260,7 @@ def test_the_path_through_the_drawn_plate_is_that_of_the_physics(scanner, tmp_pa
         np.testing.assert_allclose(np.exp(-mu * path_in_material(solid, air, rays)), expected, rtol=1e-6)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("place", PLACES[:1])
 def test_open_share_is_that_of_rays(scanner, rng, place):
     """Of random parallel rays through the hole, by the mesh; a straight hole of 2 mm loses a third and more at the rim."""

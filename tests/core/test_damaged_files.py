@@ -118,6 +118,7 @@ def test_no_flipped_bit_is_silent_in_many(tmp_path, run, volume, seed):
         only_refused(flips(tmp_path / f"volume{ending}", mph.read_volume, 1000, seed))
 
 
+@pytest.mark.long
 def test_every_bit_of_a_seal_counts(tmp_path):
     """Also of what it says beside the content, such as an event's number."""
     whole = bytes(hdf5.pack("mphDRR thing", {"number": "12"}, lambda file: file.create_dataset("a", data=[1.0, 2.0])))

@@ -80,6 +80,7 @@ def test_attenuated_too(rng):
     assert np.abs(plain - by_centers).max() > 0.1 * np.abs(by_centers).max()
 
 
+@pytest.mark.long
 def test_the_reference_and_float32_agree_with_it(rng):
     x, weights = numbers(rng)
     A = projector()

@@ -155,6 +155,7 @@ def test_a_search_gets_better_and_passes_the_checks(tmp_path):
     assert mph.check_geometry(mph.read_system(tmp_path / "found.xlsx")).ok
 
 
+@pytest.mark.long
 def test_a_search_that_is_stopped_keeps_the_best_and_goes_on(tmp_path):
     recipe, state = small_design(), tmp_path / "state.json"
 
@@ -234,6 +235,7 @@ def test_a_generator_without_its_numbers_is_refused():
         mph.design.optimize(small_design(generator=given))
 
 
+@pytest.mark.long
 def test_a_front_is_a_table_and_a_plot(tmp_path):
     search = {"starts": 1, "coarse_steps": 4, "steps": 1}
     pareto = {"entry": "objectives.size", "values": [6.0, 10.0]}
@@ -273,6 +275,7 @@ def test_the_template_is_a_recipe_that_begins_with_a_scanner_that_passes(tmp_pat
     assert "it exists" in capsys.readouterr().err
 
 
+@pytest.mark.long
 def test_the_command_finds_what_the_function_finds(tmp_path, capsys):
     path, out = tmp_path / "design.toml", tmp_path / "new.xlsx"
     path.write_text(TEXT)

@@ -254,6 +254,7 @@ def test_attenuation_at_another_energy_is_named_in_events_too(tmp_path):
     assert len(found) == 1 and "holds at 71 keV, photons of 126.45 to 154.55 keV are counted" in found[0]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", sorted(set(TEMPLATES) - {"files"}))  # whose files are the user's
 def test_templates_of_event_recipes_are_taken_without_a_word(name, tmp_path):
     text = template_text(name, WORKBOOK).replace("[system]", '[system]\nmodules = "1-3"')

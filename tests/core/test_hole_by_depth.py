@@ -114,6 +114,7 @@ def assert_right(errors):
     assert totals.max() < 1e-3, totals
 
 
+@pytest.mark.long
 def test_voxels_of_any_size_have_the_whole_holes_image_as_near_to_the_pinhole_as_it_goes(rng):
     far = [error for sizes in SIZES for error in errors_of_voxels(rng, *sizes)]
     assert_right(far + [error for sizes in NEAR for error in errors_of_voxels(rng, *sizes, near=True)])
@@ -273,6 +274,7 @@ def test_attenuation_given_in_the_call_is_that_of_the_model(backend, rng):
     np.testing.assert_allclose(x.grad, expected.T(y), rtol=1e-6)
 
 
+@pytest.mark.long
 def test_gradients_by_attenuation_are_central_differences(rng):
     """Also where some voxels are so close to a pinhole that rays project them."""
     torch = pytest.importorskip("torch")
@@ -313,6 +315,7 @@ def test_a_part_of_a_volume_has_its_part_of_the_images(rng):
     {"edge": "path", "aperture_mu": 3.0, "aperture_points": 4}, {"crystal_mu": 0.2, "depth_layers": 2}, {"pixel_points": 4},
     {"aperture_points": 5}, {"aperture_tolerance": 0.3}, {"edge": "path", "aperture_mu": 3.0},
 ])  # fmt: skip
+@pytest.mark.long
 def test_by_itself_it_takes_rays_where_depth_cannot_be_and_where_they_are_asked_for(changes, rng):
     grid, views = mph.Grid.centered((6, 6, 6), 8.0), SYSTEM.views((8, 8))
     x, common = rng.random(grid.shape), {"tolerance": 1e9, **changes}

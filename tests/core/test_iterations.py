@@ -54,6 +54,7 @@ class TestEveryMethod:
         assert_same(rest, whole)
         assert seen == [3, 4, 5]
 
+    @pytest.mark.long
     def test_other_data_cannot_go_on_with_it(self, problem, method):
         """Refused in a line, that names what differs; its volume is taken as the start of a new one."""
         A, counts, truth = problem
@@ -74,6 +75,7 @@ class TestEveryMethod:
             assert "\n" not in str(caught.value)
             assert method(B, other, 1, start=half.volume, **more).iterations == 1
 
+    @pytest.mark.long
     def test_cancelled_in_the_middle_it_can_be_resumed(self, problem, method):
         A, counts, _ = problem
         calls = 0

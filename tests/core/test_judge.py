@@ -80,6 +80,7 @@ def halved(run):
 METHODS = [JudgedMethod("truth", truth, "truth-1"), JudgedMethod("half", halved, "half-1")]
 
 
+@pytest.mark.long
 def test_the_truth_has_no_error_and_half_of_it_half(folder, tmp_path):
     found = judge(read_judge_recipe(folder / "judge.toml"), tmp_path, METHODS)
     rows = {(row["method"], row["level"]): row for row in found.rows}
@@ -132,6 +133,7 @@ position = [{ from = -5, to = 5 }, 0, 0]
 )
 
 
+@pytest.mark.long
 def test_the_observer_finds_the_defect_in_the_truth_and_not_in_an_even_volume(tmp_path, monkeypatch):
     for module, name, number in (
         (painting, "_SAMPLES_OF_OVERLAP", 1 << 13), (painting, "_MAX_SAMPLES", 1 << 7),

@@ -54,6 +54,7 @@ def test_rods_of_the_truth_have_all_of_their_contrast_and_empty_places_none():
     np.testing.assert_allclose(rod_contrasts(empty, phantom, pose, phantom.rods()), 0, atol=0.01)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("look", ["solids", "lumps"])
 def test_mixtures_follow_from_their_seed_and_stay_in_their_ball(look, monkeypatch):
     monkeypatch.setattr(painting, "_SAMPLES_OF_OVERLAP", 1 << 13)  # totals to some percent are enough

@@ -24,6 +24,7 @@ def coverage(draws, interval, truth):
     return np.mean([estimate.low <= truth <= estimate.high for estimate in found])
 
 
+@pytest.mark.long
 def test_paired_intervals_hold_the_truth_about_95_times_of_100(monkeypatch):
     monkeypatch.setattr(statistics, "_RESAMPLES", 400)  # enough for the coverage, and ten times as fast
     rng = np.random.default_rng(1)

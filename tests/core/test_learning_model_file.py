@@ -161,6 +161,7 @@ def test_a_judgement_is_kept_without_a_change_of_what_the_network_does(folder, m
     assert mph.learning.read_model(tmp_path / "m.pt").contents.judgement == judged.contents.judgement
 
 
+@pytest.mark.long
 def test_networks_of_one_setup_share_osems_volumes_and_say_the_seconds_that_it_saved(model, run, tmp_path, monkeypatch):
     monkeypatch.setattr(model_file, "_SETUPS", {})
     weights = {name: 2 * values for name, values in model.contents.weights.items()}

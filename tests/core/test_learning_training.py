@@ -226,6 +226,7 @@ def test_the_loss_is_the_nrmse_and_a_share_of_those_on_the_way():
     assert torch.isfinite(estimate.grad).all()
 
 
+@pytest.mark.long
 def test_a_stopped_and_resumed_training_gives_the_same_weights_bit_for_bit(recipe, tmp_path):
     recipe, told = changed(recipe, "steps = 6", "steps = 60"), []  # three steps a round, a mean of more than one
     whole = mph.learning.train(
@@ -259,6 +260,7 @@ def test_a_stopped_and_resumed_training_gives_the_same_weights_bit_for_bit(recip
     )
 
 
+@pytest.mark.long
 def test_a_folder_of_another_training_is_not_gone_on_with(recipe, tmp_path):
     with pytest.raises(mph.InputError, match="Lightning refuses"):
         mph.learning.train(changed(recipe, "batch = 2", 'batch = 2\nstrategy = "words"'), tmp_path / "m.pt")
@@ -271,6 +273,7 @@ def test_a_folder_of_another_training_is_not_gone_on_with(recipe, tmp_path):
         mph.learning.train(recipe, tmp_path / "m.pt")
 
 
+@pytest.mark.long
 def test_a_warm_start_takes_the_weights_of_equal_names_and_shapes(recipe, tmp_path):
     first = mph.learning.train(recipe, tmp_path / "first.pt")
     slow = 'kind = "toy"\nweights_from = "first.pt"'

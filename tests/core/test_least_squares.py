@@ -54,6 +54,7 @@ def test_sirt_finds_the_truth_of_exact_images():
     assert np.sqrt(np.mean((result.volume.array - TRUTH) ** 2)) < 0.03
 
 
+@pytest.mark.long
 def test_cgls_reaches_the_solution_of_numpys_lstsq():
     solution = np.linalg.lstsq(matrix(), NOISY.ravel().astype(float), rcond=None)[0].reshape(GRID.shape)
     result = mph.cgls(A, NOISY, 200)
@@ -80,6 +81,7 @@ def cgls_of_double_precision(B, images, iterations, mask):
     return found
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("case", ["few views", "scanner", "scanner in a mask", "even"])
 def test_cgls_keeps_to_double_precision_or_says_where_it_leaves_it(case, scanner):
     rng = np.random.default_rng(7)

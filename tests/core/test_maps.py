@@ -123,6 +123,7 @@ def test_pinholes_all_around_leave_no_gap(rng):
     assert gaps[-1] < 1.5 * DEGREE
 
 
+@pytest.mark.long
 def test_gap_is_the_largest_of_all_planes(system, rng):
     """Against a million normals, within the tolerance and their own distance."""
     points = rng.uniform(-60, 60, (3, 3))

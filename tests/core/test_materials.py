@@ -112,6 +112,7 @@ def test_names_are_told_apart_and_energies_checked():
             mph.attenuation("lead", energy)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("edge", ["paix", "path"])
 def test_a_material_by_name_is_its_coefficient_at_the_isotopes_photons(edge, system, rng):
     grid, views = mph.Grid.centered(6, 12.0), system.views((8, 8))

@@ -376,6 +376,7 @@ def test_what_cannot_be_is_refused_in_one_line(make, message):
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.long
 def test_what_just_fits_is_made_and_holds_its_parts():
     body, ball = np.pi * (147**2 + 77**2) / 2 + 140 * 77, np.pi / 6  # mm^2; times the diameter's cube
     cylinder, none = np.pi * 108**2 * 186, (0,) * 6

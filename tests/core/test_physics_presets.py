@@ -43,6 +43,7 @@ def test_a_preset_is_the_model_of_its_materials(system, name):
     assert model.record() == expected.record()
 
 
+@pytest.mark.long
 def test_crystals_and_apertures_count_as_their_materials_stop_photons(system):
     """NaI stops fewer of Tc-99m's photons than CZT; the edge of lead lets more pass than that of tungsten."""
     czt, nai, lead = (

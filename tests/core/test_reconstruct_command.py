@@ -167,6 +167,7 @@ def projector(run: mph.ProjectionRun, recipe: mph.Recipe) -> mph.Projector:
     return mph.projector_of_run(run, reconstruction_grid(run, recipe), None, model_of(run, recipe))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", METHODS)
 def test_each_method_has_its_own_defaults_wherever_it_is_chosen(name, run, radiograph, tmp_path, capsys):
     """Command line, recipe and record say what its function says where nothing is given; what is resumed counts on."""

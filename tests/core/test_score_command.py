@@ -167,6 +167,7 @@ def test_a_run_knows_its_phantom_or_its_volume(files, expected, system, tmp_path
     assert "run.h5: the run was measured: nobody knows the truth" in capsys.readouterr().err
 
 
+@pytest.mark.long
 def test_that_a_score_flatters_stays_with_it(system, tmp_path, capsys):
     """As JSON, on standard error, and of a reconstruction in its settings and its file."""
     made = {"model.kind": "emission", "model.aperture_points": 7, "model.time": 60.0, "detector.plane": "real",

@@ -140,6 +140,7 @@ def test_kerma_at_the_isocentre():
         assert got == pytest.approx(tube.kerma * mas * (1000 / 300) ** 2, rel=1e-9)
 
 
+@pytest.mark.long
 def test_spect_with_the_mu_of_the_ct():
     grid = mph.Grid.centered((44, 32, 54), 8.0, (35, -30, -30))
     fine = mph.Grid.centered((88, 64, 108), 4.0, (35, -30, -30))

@@ -8,6 +8,7 @@ from bpy.props import BoolProperty, FloatProperty, FloatVectorProperty, StringPr
 from ..addon.blender import file_properties, jobs, layouts, storage
 from ..addon.phantoms import phantoms
 from ..addon.phantoms.phantom_properties import FILE, PhantomSettings, identifier, sampling, settings_class
+from ..addon.runs import projection_properties
 from ..addon.scanner import scanner
 from ..core import Phantom, euler_pose, read_phantom
 from ..core.phantoms.kinds import KINDS
@@ -30,6 +31,12 @@ class AddPhantom(jobs.JobOperator):
         collection = scanner.active_scanner(context.scene)
         self.attenuation |= collection is not None and "activity" not in scanner.kind_of(collection).takes
         return super().ask(context)
+
+    def invoke(self: Any, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        """From the window: the model, too, is one that suits what the phantom holds."""
+        if self.confirmed:
+            projection_properties.fit_model(context.scene.mphdrr_projections, self.quantity)
+        return super().invoke(context, event)
 
     def draw(self: Any, context: bpy.types.Context) -> None:
         layout = layouts.labelled(self.layout)

@@ -2,18 +2,20 @@
 
 import bpy
 
-from ..addon.blender import ids, jobs, layouts
+from ..addon.blender import ids, layouts
 from ..addon.events import event_notes
+from ..addon.scanner import scanner
 from .sidebar import Folded, draw_hint, draw_text
 
 
 class MPHDRR_PT_event_set(Folded, bpy.types.Panel):
     bl_order = ids.ORDER_EVENTS
 
+    poll = layouts.shown_where(lambda context: scanner.active_scanner(context.scene) is not None)
+
     def draw(self, context: bpy.types.Context) -> None:
         layout = layouts.invoking(layouts.labelled(self.layout))
         settings = context.scene.mphdrr_events
-        jobs.draw_job(layout)
         column = layout.column(align=True)
         column.prop(settings, "recipe")
         column.operator_menu_enum("mphdrr.new_event_recipe", "like", text="New Recipe", icon="FILE_NEW")

@@ -8,7 +8,7 @@ from bpy.props import BoolProperty, EnumProperty, FloatProperty, FloatVectorProp
 from ...core.errors import InputError
 from ...core.runs.recipe import is_met
 from ...core.runs.settings import Setting
-from . import choices, decimals
+from . import choices, decimals, layouts
 
 Settings = Mapping[str, Setting]
 """Settings by the names of their properties. A coefficient has a second property, of its material."""
@@ -62,6 +62,32 @@ def properties_of(settings: Settings) -> dict[str, Any]:
             default = setting.default[0] if isinstance(setting.default, tuple) else setting.default or 0
             made[name] = make(default=default, **common)
     return made
+
+
+def unset_of(settings: Settings) -> dict[str, Any]:
+    """Check marks for a panel's class, one for each number that need not be given: whether it is not."""
+    return {
+        layouts.unset_name(name): _check_mark(name, setting)
+        for name, setting in settings.items()
+        if setting.kind in (int, float) and setting.default is None and material_of(name, setting) is None
+    }
+
+
+def _check_mark(name: str, setting: Setting) -> Any:
+    """The check mark of a number; where it is taken away, the number is a tenth of what its slider reaches."""
+    first = setting.kind((setting.slider or 10) / 10)
+
+    def give(owner: Any, is_unset: bool) -> None:
+        owner.property_unset(name)
+        if not is_unset:
+            setattr(owner, name, [first * (k + 1) for k in range(setting.sizes[0])] if _is_vector(setting) else first)  # type: ignore[index]
+
+    def is_unset(owner: Any) -> bool:
+        value = getattr(owner, name)
+        return not (any(value) if _is_vector(setting) else value)
+
+    text = f"{setting.unset}: {setting.absent}. Take the check mark away to give a number"
+    return BoolProperty(name=setting.unset, description=text, get=is_unset, set=give)
 
 
 def values_of(settings: Settings, get: Callable[[str], Any]) -> dict[str, Any]:

@@ -107,6 +107,13 @@ def shown(scene: bpy.types.Scene) -> bpy.types.PropertyGroup | None:
     return next((item for item in settings.runs if item.file == settings.run_file), None)
 
 
+def holds_counts(scene: bpy.types.Scene) -> bool | None:
+    """Whether the `shown` run is of SPECT counts; None where that is not known."""
+    item = shown(scene)
+    settings = json.loads(item.state).get("settings") if item is not None and item.state else None
+    return None if settings is None else settings.get("model.kind", _DEFAULTS["model.kind"]) == "emission"
+
+
 def required(scene: bpy.types.Scene, to_do: str) -> bpy.types.PropertyGroup:
     """The `shown` run; `InputError`, with what there was `to_do`, where there is none."""
     item = shown(scene)

@@ -58,6 +58,7 @@ class Setting:
     needs: tuple[str, ...] = ()
     option: str = ""  # on the command line; by default made from the key, like the next
     label: str = ""  # in Blender
+    unset: str = "Auto"  # what Blender's panels show of a number that is not given
 
     def __post_init__(self) -> None:
         name = self.key.rpartition(".")[2].removesuffix("_degrees")
@@ -256,7 +257,7 @@ _DECLARED = (
     }),
     Setting("model.time", float, 1.0, "Acquisition time", unit="s", above=0, needs=(_COUNTS,), label="Time (s)"),
     Setting("model.photons", float, None, "X-ray photons per pixel: a radiograph of attenuation coefficients then holds "
-            "those that pass", "line integrals", above=0, slider=1e6, needs=("model.kind=transmission",)),
+            "those that pass", "line integrals", above=0, slider=1e6, needs=("model.kind=transmission",), unset="None"),
     Setting("model.isotope", str, None, "What decays: its photons are counted, and its activity falls during the "
             "acquisition", "one photon per decay, and a constant activity", words=_ISOTOPES, needs=(_COUNTS,)),
     Setting("model.window", float, None, "Energies that are counted, from and to", "10 % around the isotope's strongest "

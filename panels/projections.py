@@ -129,7 +129,7 @@ class MPHDRR_PT_export(Folded, bpy.types.Panel):
         row.operator("mphdrr.export_dataset", text="Export Dataset", icon="EXPORT")
         layout.operator("mphdrr.export_figure", text="Export Figure", icon="IMAGE_DATA")
         if run_file:
-            kept = run_file if run_file.startswith("//") else iface("kept when the .blend is saved")
-            layout.label(text=iface("Shown run: {file}").format(file=kept), icon="FILE")
+            kept = run_file if run_file.startswith("//") else iface("Kept when the .blend is saved")
+            layout.label(text=kept, translate=False, icon="FILE")
         for line in runs.change_lines(context.scene):
             draw_text(layout, line)

@@ -36,7 +36,7 @@ def draw_settings(
 
     A number with a check mark, by `unset_name`, is shown only where the mark does not say that it is not given.
     """
-    known = settings.bl_rna.properties
+    known = getattr(settings, "properties", settings).bl_rna.properties  # an operator keeps them apart
     for name, is_active in names:
         mark = unset_name(name)
         row = layout.row(heading=known[name].name if mark in known else "")

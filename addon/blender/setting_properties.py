@@ -65,29 +65,33 @@ def properties_of(settings: Settings) -> dict[str, Any]:
 
 
 def unset_of(settings: Settings) -> dict[str, Any]:
-    """Check marks for a panel's class, one for each number that need not be given: whether it is not."""
-    return {
-        layouts.unset_name(name): _check_mark(name, setting)
-        for name, setting in settings.items()
-        if setting.kind in (int, float) and setting.default is None and material_of(name, setting) is None
-    }
+    """Check marks for a panel's class, one for each number that need not be given: whether it is not.
+
+    Where it is taken away, the number becomes a tenth of what its slider reaches.
+    """
+    marks = {}
+    for name, setting in settings.items():
+        if setting.kind in (int, float) and setting.default is None and material_of(name, setting) is None:
+            first = setting.kind((setting.slider or 10) / 10)
+            values = tuple(first * (k + 1) for k in range(setting.sizes[0])) if _is_vector(setting) else first  # type: ignore[index]
+            marks[layouts.unset_name(name)] = check_mark(name, setting.unset, setting.absent, values)
+    return marks
 
 
-def _check_mark(name: str, setting: Setting) -> Any:
-    """The check mark of a number; where it is taken away, the number is a tenth of what its slider reaches."""
-    first = setting.kind((setting.slider or 10) / 10)
-
-    def give(owner: Any, is_unset: bool) -> None:
-        owner.property_unset(name)
-        if not is_unset:
-            setattr(owner, name, [first * (k + 1) for k in range(setting.sizes[0])] if _is_vector(setting) else first)  # type: ignore[index]
+def check_mark(name: str, word: str, text: str, first: Any) -> Any:
+    """A check mark, called by a word: whether a number is 0 and not given. Where it is taken away, it becomes `first`."""
+    nothing = (0.0,) * len(first) if isinstance(first, tuple) else type(first)(0)
 
     def is_unset(owner: Any) -> bool:
         value = getattr(owner, name)
-        return not (any(value) if _is_vector(setting) else value)
+        return not (any(value) if isinstance(first, tuple) else value)
 
-    text = f"{setting.unset}: {setting.absent}. Take the check mark away to give a number"
-    return BoolProperty(name=setting.unset, description=text, get=is_unset, set=give)
+    def give(owner: Any, unset: bool) -> None:
+        if unset != is_unset(owner):
+            setattr(owner, name, nothing if unset else first)
+
+    description = f"{word}: {text}. Take the check mark away to give a number"
+    return BoolProperty(name=word, description=description, get=is_unset, set=give)
 
 
 def values_of(settings: Settings, get: Callable[[str], Any]) -> dict[str, Any]:

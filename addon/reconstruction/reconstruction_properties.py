@@ -113,7 +113,7 @@ class ReconstructionProperties(ReconstructionSettings, bpy.types.PropertyGroup):
 
     @property
     def known(self) -> Mapping[str, Any]:
-        """What is known of the last reconstruction: `title`, `objective` by iteration, `name`, `scores`, `flatters`, `run`."""
+        """What is known of the last reconstruction: `title`, `objective`, its `name`, `scores`, `flatters` and its `run`."""
         return json.loads(self.record) if self.record else {}
 
 

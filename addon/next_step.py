@@ -43,12 +43,12 @@ def stages(context: bpy.types.Context) -> list[Stage]:
     """The stages in their order."""
     scene = context.scene
     collection, run, known = scanner.active_scanner(scene), runs.shown(scene), _phantoms(scene)
-    scores = _reconstruction(scene).get("scores", ())
+    stale, scores = _stale(scene), _reconstruction(scene).get("scores", ())
     made = event_notes.of_set(scene.mphdrr_events.folder)
     return [
         Stage("Scanner", collection.name if collection else ""),
         Stage("Phantom", known[0].name if len(known) == 1 else f"{len(known)} volumes" if known else ""),
-        Stage("Run", run.summary.partition(",")[0] if run else "", is_stale=bool(run and _is_stale(scene))),
+        Stage("Run", stale[0] if stale else run.summary.partition(",")[0] if run else "", bool(stale)),
         Stage("Reconstruction", ": ".join(scores[0]) if scores else "not scored" if _reconstruction(scene) else ""),
         Stage("Event Set", made.text.partition(",")[0] if made else ""),
     ]
@@ -59,7 +59,7 @@ def next_step(context: bpy.types.Context) -> Step:
     scene, run = context.scene, runs.shown(context.scene)
     if run is None and scanner.active_scanner(scene) is None:
         return Step("mphdrr.load_example", "Load Example", "PLAY")
-    if run is None or _is_stale(scene):
+    if run is None or _stale(scene):
         if not _phantoms(scene):
             return Step("mphdrr.add_derenzo", "Add Phantom", "OUTLINER_DATA_VOLUME", {"confirmed": True})
         return _RENDER if run is None else Step(_RENDER.operator, "Render Again", "FILE_REFRESH")
@@ -93,6 +93,7 @@ def _reconstruction(scene: bpy.types.Scene) -> Mapping[str, Any]:
     return known if run.file.endswith(known.get("run", "")) else {}
 
 
-def _is_stale(scene: bpy.types.Scene) -> bool:
-    """Whether the shown run can be rendered again, and would be another one."""
-    return runs.change_lines(scene) not in ([], [runs.UNKNOWN]) and not runs.measured_text(scene)
+def _stale(scene: bpy.types.Scene) -> list[str]:
+    """What has changed since the shown run, if it can be rendered again."""
+    lines = runs.change_lines(scene)
+    return [] if lines == [runs.UNKNOWN] or runs.measured_text(scene) else lines

@@ -84,6 +84,7 @@ class ScannerPanel(Folded):
     """Mixed into panels inside Geometry that need a scanner; they draw by `draw_scanner`."""
 
     bl_parent_id = "MPHDRR_PT_geometry"
+    bl_order = 1  # after the modules
 
     poll = layouts.shown_where(lambda context: scanner.active_scanner(context.scene) is not None)
 
@@ -98,6 +99,8 @@ class ScannerPanel(Folded):
 
 
 class MPHDRR_PT_modules(ScannerPanel, bpy.types.Panel):
+    bl_order = 0
+
     def draw_scanner(self, context: bpy.types.Context, collection: bpy.types.Collection) -> None:
         layout = self.layout
         state = context.scene.mphdrr_geometry
@@ -116,7 +119,7 @@ class MPHDRR_PT_modules(ScannerPanel, bpy.types.Panel):
         head.label(text="", icon="BLANK1")
         head.separator(factor=2.0)  # the list's scroll bar
         layout.template_list(
-            "MPHDRR_UL_modules", "", collection, "all_objects", state, "active_index", rows=6, maxrows=12
+            "MPHDRR_UL_modules", "", collection, "all_objects", state, "active_index", rows=5, maxrows=8
         )
 
         camera = selection.listed_module(context.scene)

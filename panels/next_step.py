@@ -5,7 +5,7 @@ from bpy.app.translations import pgettext_iface as iface
 
 from ..addon import next_step
 from ..addon.blender import ids, jobs, layouts
-from .sidebar import Sidebar
+from .sidebar import Sidebar, draw_text
 
 
 class MPHDRR_PT_next_step(Sidebar, bpy.types.Panel):
@@ -34,9 +34,9 @@ class MPHDRR_PT_next_step(Sidebar, bpy.types.Panel):
             layout.operator("mphdrr.import_geometry", text="Import Geometry", icon="IMPORT")
 
 
-def _draw_stage(column: bpy.types.UILayout, stage: next_step.Stage) -> None:
-    row = column.row()
-    row.active, row.alert = bool(stage.found), stage.is_stale
+def _draw_stage(layout: bpy.types.UILayout, stage: next_step.Stage) -> None:
+    column = layout.column(align=True)
+    column.active, column.alert = bool(stage.found), stage.is_stale
     icon = "ERROR" if stage.is_stale else "CHECKMARK" if stage.found else "RADIOBUT_OFF"
     text = iface("{stage}: {found}").format(stage=iface(stage.name), found=stage.found) if stage.found else stage.name
-    row.label(text=text, icon=icon)
+    draw_text(column, text, icon)

@@ -72,7 +72,8 @@ def add(
         if not settings.runs[index].is_saved:
             remove_file(settings.runs[index])
         settings.runs.remove(index)
-    name = ", ".join(run.settings[key] for key in ("volume", "counts", "model") if run.settings.get(key)) or "Run"
+    what = [run.settings.get(key) for key in ("volume", "counts")]
+    name = ", ".join(filter(None, [*what, _label("model.kind", run.settings.get("model"))])) or "Run"
     known, number = {item.name for item in settings.runs}, 2
     unique = name
     while unique in known:
@@ -97,8 +98,14 @@ def mark_shown(scene: bpy.types.Scene, index: int) -> None:
 def summary_of(run: ProjectionRun) -> str:
     """How many images of which size a run has, of what, computed by what."""
     n_v, n_u = run.views.shape
-    what = [run.settings.get(name) for name in ("volume", "counts", "backend")]
+    backend = _label("compute.backend", run.settings.get("backend"))
+    what = [run.settings.get("volume"), run.settings.get("counts"), backend]
     return ", ".join([f"{len(run.views)} views of {n_u} × {n_v}", *(text for text in what if text)])
+
+
+def _label(key: str, word: Any) -> str | None:
+    """What the window calls a word of a setting."""
+    return SETTINGS[key].words.get(word, (word,))[0]
 
 
 def shown(scene: bpy.types.Scene) -> bpy.types.PropertyGroup | None:

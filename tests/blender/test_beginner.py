@@ -11,8 +11,9 @@ import blf
 import bpy
 import pytest
 
-from mphdrr.addon import registration
+from mphdrr.addon import next_step, registration
 from mphdrr.addon.scanner import scanner
+from mphdrr.addon.volumes import slices, volumes
 
 PANELS = [cls for cls in registration.CLASSES if issubclass(cls, bpy.types.Panel) and cls.bl_space_type == "VIEW_3D"]
 WIDTH = 236  # pixels for a panel's contents, in a sidebar of Blender's default width
@@ -194,7 +195,60 @@ def test_a_beginner_sees_little(worked):
 @pytest.mark.parametrize("model", ["TRANSMISSION", "EMISSION"])
 def test_everything_is_explained_and_fits(worked, model):
     settings, camera = worked.mphdrr_projections, scanner.module(scanner.active_scanner(worked), 3)
+    worked.mphdrr_reconstruction.record = ""  # scores are of all lengths
     for hole, active in itertools.product(("AUTO", "RAYS"), (camera, worked.objects["Derenzo"])):
         settings.model, settings.hole = model, hole
         bpy.context.view_layer.objects.active = active
         check(drawn(is_open=True))
+
+
+def test_what_is_proposed_leads_to_a_score(scene, small_workbook):
+    def press() -> str:
+        step = next_step.next_step(bpy.context)
+        group, name = step.operator.split(".")
+        assert getattr(getattr(bpy.ops, group), name)("INVOKE_DEFAULT", **step.settings) == {"FINISHED"}
+        return step.text
+
+    bpy.ops.mphdrr.import_geometry(filepath=str(small_workbook))
+    settings, reconstruction = scene.mphdrr_projections, scene.mphdrr_reconstruction
+    settings.width = settings.height = reconstruction.voxels = 12
+    assert [press(), press(), press()] == ["Add Phantom", "Render Projections", "Reconstruct"]
+    assert (settings.model, reconstruction.method) == ("EMISSION", "OSEM"), "which suit a phantom of activity"
+    assert "NRMSE" in {name for name, _ in reconstruction.known["scores"]}
+    assert next_step.next_step(bpy.context).text == "Export Dataset"
+    scanner.module(scanner.active_scanner(scene), 3).location.x += 1.0
+    bpy.context.view_layer.update()
+    run = next(stage for stage in next_step.stages(bpy.context) if stage.name == "Run")
+    assert run.is_stale and run.found == "Module 03 moved"
+    check(drawn())
+    assert [press(), press()] == ["Render Again", "Reconstruct"]
+    scene.mphdrr_events.recipe = "//heart.toml"
+    assert scene.mphdrr_events.folder == "//heart-events"
+    assert next_step.next_step(bpy.context).text == "Make Event Set"
+
+
+def test_a_number_that_is_not_given_is_auto(scene):
+    settings = scene.mphdrr_projections
+    assert settings.threads_unset and settings.window_unset
+    settings.threads_unset = settings.window_unset = False
+    assert settings.threads == 6 and tuple(settings.window) == (100, 200)
+    settings.threads_unset = True
+    assert settings.threads == 0 and not settings.window_unset
+
+
+def test_the_numbers_of_the_only_volume_are_shown_whatever_is_selected(scene, ring_system):
+    camera = scanner.module(scanner.build_scanner(scene, ring_system), 1)
+    bpy.ops.mphdrr.add_points(voxels=8)
+    item = bpy.context.object
+    bpy.context.view_layer.objects.active = camera
+    assert volumes.meant(bpy.context) == item
+    assert {"MPHDRR_PT_look", "MPHDRR_PT_phantom_settings"} <= drawn(is_open=True).keys()
+    with bpy.context.temp_override(object=item):  # as the panel's buttons have it
+        bpy.ops.mphdrr.add_slices()
+    planes = slices.planes_of(item)
+    item.hide_set(True)
+    bpy.context.view_layer.update()
+    assert not any(plane.visible_get() for plane in planes)
+    item.hide_set(False)
+    bpy.context.view_layer.update()
+    assert all(plane.visible_get() for plane in planes)

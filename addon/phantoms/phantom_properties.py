@@ -123,7 +123,10 @@ def sampling(update: Any = None) -> dict[str, Any]:
             name="Quantity", description="What the voxels hold", default="activity", update=update,
             items=choices.items(choices.QUANTITIES, quantities),
         ),
-        "voxels": IntProperty(name="Voxels per Side", default=128, min=4, soft_max=512, max=4096, update=update),
+        "voxels": IntProperty(
+            name="Voxels per Side", description="How many the grid has along each of its sides", default=128, min=4,
+            soft_max=512, max=4096, update=update,
+        ),
         "voxel_size": FloatProperty(
             name="Voxel Size (mm)", description="0 fits the grid to the phantom", min=0.0, soft_max=10.0, precision=3,
             update=update,

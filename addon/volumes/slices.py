@@ -182,7 +182,7 @@ def before_save(*_: object) -> None:
 
 def after_update(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
     """Volumes were hidden or shown: their planes, too."""
-    if scene != bpy.context.scene or not all(map(depsgraph.id_type_updated, ("SCENE", "COLLECTION"))):
+    if scene != bpy.context.scene or not depsgraph.id_type_updated("SCENE"):
         return
     for item in volumes.volume_objects(scene):
         for plane in planes_of(item):

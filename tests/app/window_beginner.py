@@ -3,16 +3,15 @@
 import bpy
 from driving import editor, is_idle, open_tab, ours, picture, run, seen, sidebar, xdotool
 
-_HEADER, _STAGE, _BUTTON = 26, 20, 16  # pixels: the panel's header, a line, and half of the button
+_FIRST, _LATER = 44, 160  # pixels from the sidebar's top to the button, without the lines of what there is, and with them
 _MOST = 6
 
 
 def click() -> None:
     """Click on the button at the top of the tab."""
     region, window = sidebar(), editor()[0]
-    lines = 0 if seen["clicks"] == 0 else 5
-    down = _HEADER + lines * _STAGE + _BUTTON
-    xdotool("mousemove", region.x + 0.4 * region.width, window.height - region.y - region.height + down)
+    down = _LATER if seen["clicks"] else _FIRST
+    xdotool("mousemove", round(region.x + 0.4 * region.width), window.height - region.y - region.height + down)
     xdotool("click", 1)
 
 

@@ -13,7 +13,6 @@ from ..addon.blender import choices, layouts
 from ..addon.blender.decimals import typed
 from ..addon.blender.reports import Reported
 from ..addon.figures import studio
-from ..addon.reconstruction import reconstruction_properties
 from ..addon.scanner import scanner
 from ..core import xray_arc, xray_ring
 
@@ -89,5 +88,6 @@ class MPHDRR_OT_add_xray_system(Reported, bpy.types.Operator):
         context.view_layer.update()  # so that scripts find the children's matrix_world in place
         panel, reconstruction = context.scene.mphdrr_projections, context.scene.mphdrr_reconstruction
         panel.model = panel.fitted = "TRANSMISSION"
-        reconstruction_properties.fit_method(reconstruction, of_counts=False)
+        if not reconstruction.is_property_set("method"):  # else for counts
+            reconstruction.method = reconstruction.fitted = "SIRT"
         return f"Added {len(system)} X-ray sources and panels as '{collection.name}'"

@@ -10,7 +10,7 @@ import bpy
 from bpy.props import EnumProperty, PointerProperty, StringProperty
 
 from ...core.perspective.backprojection import HOW
-from ...core.reconstruction.methods import METHOD_FILES
+from ...core.reconstruction.methods import METHOD_FILES, METHODS
 from ...core.runs.recipe import Recipe, fitting_recipe
 from ...core.runs.settings import SETTINGS
 from ..blender import choices
@@ -87,9 +87,10 @@ def settings_recipe(get: Callable[[str], Any], is_given: Callable[[str], bool]) 
 
 
 def fit_method(settings: ReconstructionProperties, of_counts: bool) -> None:
-    """Choose the method by what the run holds, unless the user has chosen one: counts, or line integrals."""
-    if not settings.is_property_set("method") or settings.method == settings.fitted:
-        settings.method = settings.fitted = "OSEM" if of_counts else "SIRT"
+    """Choose the method by what the run holds, counts or line integrals, unless the user has chosen one."""
+    is_free = not settings.is_property_set("method") or settings.method == settings.fitted
+    if is_free and METHODS[settings.method.lower()].of_counts != of_counts:
+        settings.method = settings.fitted = "OSEM" if of_counts else "CGLS"
 
 
 def drawn(settings: ReconstructionProperties) -> Iterator[tuple[str, bool]]:

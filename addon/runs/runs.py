@@ -204,7 +204,10 @@ def _look() -> None:
     """Compare the shown runs with their scenes, and have the panels drawn where that has changed."""
     if bpy.app.background:
         return
-    found = {window.scene.name: changes(window.scene) for window in bpy.context.window_manager.windows}
+    shown_in = bpy.context.window_manager.windows
+    for window in shown_in:
+        window.view_layer.update()  # a module that is being moved may not have been aimed yet
+    found = {window.scene.name: changes(window.scene) for window in shown_in}
     if any(_looked.get(name) != lines for name, lines in found.items()):
         _looked.update(found)
         windows.redraw_sidebars()

@@ -23,6 +23,7 @@ def steps():
     yield 1
     seen["clicks"], seen["proposed"] = 0, []
     scene = bpy.context.scene
+    scene.mphdrr_reconstruction.voxels, scene.mphdrr_reconstruction.iterations = 32, 10  # for speed
     picture("empty")
     while not scene.mphdrr_reconstruction.known.get("scores") and seen["clicks"] < _MOST:
         seen["proposed"].append(ours("addon.next_step").next_step(bpy.context).text)

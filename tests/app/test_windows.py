@@ -36,6 +36,14 @@ def test_main_path_runs_in_the_window(window, work_folder):
     assert np.mean((red > 110) & (red - green > 20) & (blue - green > 5)) > 0.3
 
 
+def test_clicks_on_what_is_proposed_lead_to_a_score(window, work_folder):
+    seen = window("beginner")
+    assert seen["example"] == ["Load Example", "Reconstruct", "TRANSMISSION", "CGLS", "NRMSE", "Export Dataset"]
+    done, found = seen["workbook"][:3], seen["workbook"][3:]
+    assert done == ["Add Phantom", "Render Projections", "Reconstruct"]
+    assert found == ["EMISSION", "OSEM", "NRMSE", "Export Dataset"], "what suits a phantom of activity"
+
+
 def close(one: dict, other: dict) -> None:
     assert one.keys() == other.keys()
     for name, value in one.items():

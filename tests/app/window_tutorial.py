@@ -57,7 +57,7 @@ def step(function: Callable) -> Callable:
 
 @step
 def load():
-    opened("MPHDRR_PT_design", "MPHDRR_PT_display")
+    opened("MPHDRR_PT_design", "MPHDRR_PT_display", "MPHDRR_PT_export")
     _, area, _ = editor("VIEW_3D")
     area.spaces.active.show_region_ui = True
     yield 1

@@ -153,7 +153,7 @@ def test_physics_panel_shows_settings_that_exist(scanned, scene, model):
     shown = {name.removesuffix("_unset"): owner for (owner, name), _ in layout.prop.call_args_list}
     assert all(name in owner.bl_rna.properties for name, owner in shown.items())
     assert {"noise", "seed"} <= shown.keys()
-    of_counts = {"mu", *PHYSICS} - {"time", "hole", "aperture_points", "pixel_points"}  # in the panel above, or not shown
+    of_counts = {"mu", *PHYSICS} - {"time", "hole", "aperture_points", "pixel_points"}  # above, or not shown
     assert (of_counts <= shown.keys()) == (model == "EMISSION")
 
 

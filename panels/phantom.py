@@ -78,7 +78,7 @@ class _OfVolume(Folded):
     poll = layouts.shown_where(volumes.meant)
 
     def draw(self, context: bpy.types.Context) -> None:
-        item, layout = volumes.meant(context), layouts.invoking(layouts.labelled(self.layout))  # type: ignore[attr-defined]
+        layout, item = layouts.invoking(layouts.labelled(self.layout)), volumes.meant(context)  # type: ignore[attr-defined]
         if item is not None:  # the scene may have changed since poll
             layout.context_pointer_set("object", item)  # which the buttons work on, active or not
             self.draw_volume(layout, item)
@@ -162,8 +162,7 @@ class MPHDRR_PT_perspective(Folded, bpy.types.Panel):
         if camera is None or item is None:  # the scene may have changed since poll
             return
         layout.context_pointer_set("object", item)
-        name = item.name
-        text = iface("{volume}, by {module}").format(volume=name, module=camera.name)
+        text = iface("{volume}, by {module}").format(volume=item.name, module=camera.name)
         layout.label(text=text, translate=False, icon="VIEW_PERSPECTIVE")
         layouts.draw_all(layout.column(align=True), settings, "uniform", "planes")
         row = layout.row(align=True)

@@ -13,15 +13,8 @@ from ...core.physics.maps import MAPS
 from ...core.runs.presets import PRESETS
 from ...core.runs.recipe import Recipe, fitting_recipe
 from ...core.runs.settings import SETTINGS
-from ..blender.setting_properties import (
-    drawn_of,
-    identifier,
-    material_of,
-    properties_of,
-    set_property,
-    unset_of,
-    values_of,
-)
+from ..blender import setting_properties
+from ..blender.setting_properties import drawn_of, identifier, material_of, properties_of, set_property, values_of
 from ..blender.updates import on_edit
 from ..scanner import scanner
 from ..volumes import volumes
@@ -222,6 +215,6 @@ class ProjectionProperties(ProjectionSettings, bpy.types.PropertyGroup):
     run_summary: StringProperty(name="Shown Run", description="What the shown run is", options={"HIDDEN"})
 
 
-ProjectionProperties.__annotations__.update(unset_of(PROPERTIES))
+ProjectionProperties.__annotations__.update(setting_properties.unset_of(PROPERTIES))
 
 CLASSES = (RunProperties, ProjectionProperties)

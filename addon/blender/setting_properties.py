@@ -71,7 +71,7 @@ def unset_of(settings: Settings) -> dict[str, Any]:
     """
     marks = {}
     for name, setting in settings.items():
-        if setting.kind in (int, float) and setting.default is None and material_of(name, setting) is None:
+        if setting.kind in (int, float) and setting.default is None:
             first = setting.kind((setting.slider or 10) / 10)
             values = tuple(first * (k + 1) for k in range(setting.sizes[0])) if _is_vector(setting) else first  # type: ignore[index]
             marks[layouts.unset_name(name)] = check_mark(name, setting.unset, setting.absent, values)

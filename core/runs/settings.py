@@ -278,7 +278,7 @@ _DECLARED = (
             needs=(_COUNTS, "model.hole=rays"), label="Hole Tolerance"),
     Setting("model.aperture_mu", float, None, "Material of the aperture's edge, or its attenuation coefficient at the "
             "photons' energy", "nothing penetrates it", unit="1/mm", words=named(APERTURES, _BY_NAME), above=0,
-            slider=10, needs=(_COUNTS,), label="Aperture"),
+            slider=10, needs=(_COUNTS,), label="Aperture", unset="None"),
     Setting("model.opening_angle_degrees", float, 90.0, "Full angle of the knife edge's cone", unit="degrees", above=0,
             most=179.9, needs=(_COUNTS, "model.aperture_mu or model.within_cone")),
     Setting("model.edge", str, "paix", "How photons penetrate the aperture's edge", label="Knife Edge", words={
@@ -287,7 +287,7 @@ _DECLARED = (
     }, needs=(*_BY_RAYS, "model.aperture_mu")),
     Setting("model.crystal_mu", float, None, "Material of the crystal that stops the photons, or its attenuation "
             "coefficient at their energy", "all photons are counted", unit="1/mm", words=named(CRYSTALS, _BY_NAME),
-            above=0, slider=5, needs=(_COUNTS,), label="Crystal"),
+            above=0, slider=5, needs=(_COUNTS,), label="Crystal", unset="None"),
     Setting("model.depth_layers", int, 1, "Depths in the crystal at which photons are recorded (parallax); 1: where they "
             "enter", least=1, slider=8, needs=(*_BY_RAYS, "model.crystal_mu")),
     Setting("model.intrinsic_fwhm", float, 0.0, "Full width at half maximum of the detector's own blur, on the crystal",

@@ -253,3 +253,23 @@ def test_the_numbers_of_the_only_volume_are_shown_whatever_is_selected(scene, ri
     item.hide_set(False)
     bpy.context.view_layer.update()
     assert all(plane.visible_get() for plane in planes)
+
+
+def test_every_operator_and_setting_is_explained(scene):
+    silent = []
+    for cls in registration.CLASSES:
+        if issubclass(cls, bpy.types.Operator):
+            group, name = cls.bl_idname.split(".")
+            known = getattr(getattr(bpy.ops, group), name).get_rna_type()
+            silent += [] if known.description.strip() else [cls.bl_idname]
+        elif issubclass(cls, bpy.types.PropertyGroup):
+            known = cls.bl_rna
+        else:
+            continue
+        for each in known.properties:
+            is_group = each.type == "COLLECTION" or isinstance(
+                getattr(each, "fixed_type", None), bpy.types.PropertyGroup
+            )
+            is_own = each.identifier not in ("rna_type", "name") and not each.is_hidden and not is_group
+            silent += [f"{cls.__name__}.{each.identifier}"] if is_own and not each.description.strip() else []
+    assert not silent

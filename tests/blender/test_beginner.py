@@ -12,6 +12,7 @@ import bpy
 import pytest
 
 from mphdrr.addon import next_step, registration
+from mphdrr.addon.blender import reports
 from mphdrr.addon.scanner import scanner
 from mphdrr.addon.volumes import slices, volumes
 
@@ -273,3 +274,11 @@ def test_every_operator_and_setting_is_explained(scene):
             is_own = each.identifier not in ("rna_type", "name") and not each.is_hidden and not is_group
             silent += [f"{cls.__name__}.{each.identifier}"] if is_own and not each.description.strip() else []
     assert not silent
+
+
+def test_words_of_the_command_line_do_not_appear():
+    said = "no energy (--energy KEV): hu_to_mu(volume, energy), `mphdrr volume convert FILE`, or CT to Attenuation"
+    assert reports.in_window(said) == "no energy: hu_to_mu(volume, energy), or CT to Attenuation"
+    assert reports.in_window("a map can help (columns='map.toml', --columns map.toml; docs)") == (
+        "a map can help (columns='map.toml'; docs)"
+    )

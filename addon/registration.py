@@ -97,7 +97,9 @@ MENUS += [(menu, _draw_submenu(*submenu)) for menu, submenu in SUBMENUS.items()]
 MENUS.append((bpy.types.WM_MT_splash, _draw_splash))
 
 _UNDONE = (recoloring.check, runs.after_update, live_scanner.after_undo, slices.after_undo, framing.after_undo)
-_UPDATED = (live_scanner.after_update, selection.after_update, planes.after_update, frustums.after_update)
+_UPDATED = (
+    live_scanner.after_update, selection.after_update, planes.after_update, frustums.after_update, slices.after_update,
+)  # fmt: skip
 _LOADED = (volumes.after_load, recovery.after_load, live_scanner.after_load, runs.after_load, recoloring.check)
 _FRAME = (runs.after_update, live_scanner.after_frame, preview.after_update, slices.after_frame_change)
 # By lists of bpy.app.handlers; all of them stay when a file is loaded.

@@ -7,7 +7,8 @@ from bpy.props import BoolProperty, FloatProperty, FloatVectorProperty, StringPr
 
 from ..addon.blender import file_properties, jobs, layouts, storage
 from ..addon.phantoms import phantoms
-from ..addon.phantoms.phantom_properties import FILE, PhantomSettings, identifier, sampling, settings_class
+from ..addon.phantoms.phantom_properties import FILE, FITTED, PhantomSettings, identifier, sampling, settings_class
+from ..addon.runs import projection_properties
 from ..addon.scanner import scanner
 from ..core import Phantom, euler_pose, read_phantom
 from ..core.phantoms.kinds import KINDS
@@ -25,11 +26,14 @@ class AddPhantom(jobs.JobOperator):
     theta: FloatProperty(name="Theta", description="Turn about world y, after psi", subtype="ANGLE")
     psi: FloatProperty(name="Psi", description="Turn about the phantom's own axis, done first", subtype="ANGLE")
 
-    def ask(self: Any, context: bpy.types.Context) -> set[str] | None:
-        """Where the chosen scanner sees attenuation alone, offer to add it."""
-        collection = scanner.active_scanner(context.scene)
-        self.attenuation |= collection is not None and "activity" not in scanner.kind_of(collection).takes
-        return super().ask(context)
+    def invoke(self: Any, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        """From the window: attenuation, too, where the scanner sees that alone; else a model that suits the phantom."""
+        sees_activity = _sees_activity(context)
+        if not self.properties.is_property_set("attenuation"):
+            self.attenuation = not sees_activity
+        if self.confirmed and sees_activity:
+            projection_properties.fit_model(context.scene.mphdrr_projections, self.quantity)
+        return super().invoke(context, event)
 
     def draw(self: Any, context: bpy.types.Context) -> None:
         layout = layouts.labelled(self.layout)
@@ -43,6 +47,12 @@ class AddPhantom(jobs.JobOperator):
     def adding(self: Any, name: str) -> jobs.Job:
         pose = euler_pose(self.phi, self.theta, self.psi, self.location)
         return phantoms.adding(self, name, pose, self.attenuation)
+
+
+def _sees_activity(context: bpy.types.Context) -> bool:
+    """Whether the chosen scanner, if there is one, is of those that see activity."""
+    collection = scanner.active_scanner(context.scene)
+    return collection is None or "activity" in scanner.kind_of(collection).takes
 
 
 class AddKind(AddPhantom):
@@ -76,6 +86,7 @@ class MPHDRR_OT_import_phantom(PhantomSettings, AddPhantom, bpy.types.Operator):
         "filter_glob": file_properties.shown_files((".toml",)),
         "name": StringProperty(name="Name", description="Of the object; empty: the phantom's", options={"SKIP_SAVE"}),
         **sampling(),
+        **FITTED,
     }
     identifier = FILE
     asks_for = "filepath"

@@ -81,7 +81,7 @@ class MPHDRR_OT_import_geometry(bpy.types.Operator):
             if self._dialog_can_help(form, error):
                 return self._ask_columns(context)
             column_maps.clear(form)
-            self.report({"ERROR"}, str(error))
+            self.report({"ERROR"}, reports.in_window(error))
             return {"CANCELLED"}
         old = scanner.find_scanner(context.scene, self.name or scanner.default_name(system))
         if old is not None and not self.replace and self._has_window():
@@ -158,7 +158,7 @@ class MPHDRR_OT_import_geometry(bpy.types.Operator):
     def _dialog_can_help(self, form: column_maps.ColumnMapProperties, error: InputError) -> bool:
         """Whether the column map dialog can answer what the reader refused; its settings are then filled."""
         if self._dialog == "COLUMNS":
-            form.refusal = str(error)
+            form.refusal = reports.in_window(error)
             return True
         try:
             return self._has_window() and column_maps.fill(form, self._workbook(), self._columns())

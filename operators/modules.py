@@ -17,6 +17,7 @@ class MPHDRR_OT_show_modules(selection.OnScanner, bpy.types.Operator):
     last: IntProperty(name="Last", description="Last module number of the range", default=1)
     mode: EnumProperty(
         name="Mode",
+        description="What becomes of the modules of the range, and of the others",
         items=[
             ("ONLY", "Show Only", "Show the modules of the range and hide all others", 0),
             ("SHOW", "Show", "Show the modules of the range; the others stay as they are", 1),

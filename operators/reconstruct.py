@@ -21,6 +21,13 @@ class MPHDRR_OT_reconstruct(reconstruction_properties.ReconstructionSettings, jo
 
     poll = needs(_RUN)
 
+    def ask(self, context: bpy.types.Context) -> set[str] | None:
+        """Nothing; but of a button the method is one that suits the run."""
+        of_counts = runs.holds_counts(context.scene)
+        if of_counts is not None:
+            reconstruction_properties.fit_method(context.scene.mphdrr_reconstruction, of_counts)
+        return super().ask(context)
+
     def job(self, context: bpy.types.Context) -> jobs.Job:
         return reconstructions.reconstructing(
             context,

@@ -89,5 +89,5 @@ class MPHDRR_OT_add_xray_system(Reported, bpy.types.Operator):
         panel, reconstruction = context.scene.mphdrr_projections, context.scene.mphdrr_reconstruction
         panel.model = panel.fitted = "TRANSMISSION"
         if not reconstruction.is_property_set("method"):  # else for counts
-            reconstruction.method = "SIRT"
+            reconstruction.method = reconstruction.fitted = "SIRT"
         return f"Added {len(system)} X-ray sources and panels as '{collection.name}'"

@@ -7,7 +7,7 @@ import bpy
 import numpy as np
 from bpy.app.translations import pgettext_iface as iface
 
-from ..addon.blender import jobs, layouts
+from ..addon.blender import layouts
 from ..addon.scanner import columns, following, module_values, pinholes, scanner, selection
 from .geometry import ScannerPanel
 from .sidebar import draw_facts, draw_text
@@ -47,7 +47,6 @@ class MPHDRR_PT_design(ScannerPanel, bpy.types.Panel):
             row.operator("mphdrr.aim_modules")
         column = layouts.invoking(layout.column(align=True))
         column.operator("mphdrr.optimise", text="Optimise", icon="OPTIONS")
-        jobs.draw_job(column)
         for text in json.loads(properties.design or "[]"):
             draw_text(column, text, icon="DOT")
 
@@ -80,7 +79,6 @@ class MPHDRR_PT_scanner_design(ScannerPanel, bpy.types.Panel):
         column = layouts.invoking(layout.column(align=True))
         if pinholes.has_pinholes(kind):
             column.operator_menu_enum("mphdrr.add_map", "quantity", text="Add Map", icon="OUTLINER_DATA_VOLUME")
-        jobs.draw_job(column)
         column = layouts.invoking(layout.column(align=True))
         column.operator("mphdrr.export_geometry", text="Export Workbook", icon="EXPORT")
         column.operator("mphdrr.export_for_program", text="Export for a Program", icon="EXPORT")
@@ -155,7 +153,6 @@ class MPHDRR_PT_calibration(ScannerPanel, bpy.types.Panel):
     def draw_scanner(self, context: bpy.types.Context, collection: bpy.types.Collection) -> None:
         layout = layouts.invoking(self.layout)
         layout.operator("mphdrr.calibrate", icon="TRACKER")
-        jobs.draw_job(layout)
         lines = json.loads(collection.mphdrr_scanner.calibration or "[]")
         box = layout.box().column() if lines else layout
         for line in lines:

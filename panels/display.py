@@ -53,7 +53,7 @@ class MPHDRR_PT_display(_Display, Folded, bpy.types.Panel):
     bl_parent_id = "MPHDRR_PT_projections"
 
     def draw(self, context: bpy.types.Context) -> None:
-        super().draw(context)
+        _Display.draw(self, context)
         layout, settings = self.layout, context.scene.mphdrr_display
         layout.prop(settings, "planes")
         column = layout.column()

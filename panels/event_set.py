@@ -2,18 +2,20 @@
 
 import bpy
 
-from ..addon.blender import ids, jobs, layouts
+from ..addon.blender import ids, layouts
 from ..addon.events import event_notes
+from ..addon.scanner import scanner
 from .sidebar import Folded, draw_hint, draw_text
 
 
 class MPHDRR_PT_event_set(Folded, bpy.types.Panel):
     bl_order = ids.ORDER_EVENTS
 
+    poll = layouts.shown_where(lambda context: scanner.active_scanner(context.scene) or _is_chosen(context.scene))
+
     def draw(self, context: bpy.types.Context) -> None:
         layout = layouts.invoking(layouts.labelled(self.layout))
         settings = context.scene.mphdrr_events
-        jobs.draw_job(layout)
         column = layout.column(align=True)
         column.prop(settings, "recipe")
         column.operator_menu_enum("mphdrr.new_event_recipe", "like", text="New Recipe", icon="FILE_NEW")
@@ -37,6 +39,11 @@ class MPHDRR_PT_event_set(Folded, bpy.types.Panel):
             column.prop(settings, "opened")
             column.prop(settings, "model", placeholder="First")
             column.operator("mphdrr.open_event", icon="OUTLINER_OB_VOLUME")
+
+
+def _is_chosen(scene: bpy.types.Scene) -> bool:
+    """Whether there is a recipe or a set, which need no scanner in the scene."""
+    return bool(scene.mphdrr_events.recipe or scene.mphdrr_events.folder)
 
 
 def _draw_note(layout: bpy.types.UILayout, note: event_notes.Note) -> None:

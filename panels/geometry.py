@@ -6,10 +6,10 @@ import bpy
 import numpy as np
 from bpy.app.translations import pgettext_iface as iface
 
-from ..addon.blender import ids, jobs, layouts
+from ..addon.blender import ids, layouts
 from ..addon.scanner import following, pinholes, scanner, selection
 from ..addon.scanner.module_values import kind_of
-from .sidebar import Folded, Sidebar, draw_facts, draw_hint, draw_text
+from .sidebar import Folded, draw_facts, draw_text
 
 
 class MPHDRR_UL_modules(bpy.types.UIList):
@@ -45,23 +45,17 @@ class MPHDRR_UL_modules(bpy.types.UIList):
         return flags, np.argsort(by_number).tolist()  # the place of each item
 
 
-class MPHDRR_PT_geometry(Sidebar, bpy.types.Panel):
+class MPHDRR_PT_geometry(Folded, bpy.types.Panel):
     """Import, which scanner it is, and which part of it is shown."""
 
     bl_order = ids.ORDER_GEOMETRY
 
+    poll = layouts.shown_where(lambda context: scanner.active_scanner(context.scene) is not None)
+
     def draw(self, context: bpy.types.Context) -> None:
         layout = layouts.invoking(self.layout)
         collection = scanner.active_scanner(context.scene)
-        if collection is None and not jobs.is_running():
-            row = layout.row()
-            row.scale_y = 1.4
-            row.operator("mphdrr.load_example", icon="PLAY")
-        layout.operator("mphdrr.import_geometry", text="Import Workbook", icon="IMPORT")
-        layout.operator("mphdrr.add_xray_system", icon="LIGHT_SPOT")
-        if collection is None:
-            draw_hint(layout, "Or drop one on the viewport.")
-            jobs.draw_job(layout)
+        if collection is None:  # the scene may have changed since poll
             return
         if len(scanner.scanners(context.scene)) > 1:
             layout.prop(context.scene.mphdrr_geometry, "scanner", text="")
@@ -81,12 +75,16 @@ class MPHDRR_PT_geometry(Sidebar, bpy.types.Panel):
         for first, last in json.loads(properties.quick_ranges or "[]"):
             _show(row, f"{first}-{last}", first, last, "ONLY")
         _show(row, "All", 0, 0, "ALL")
+        column = layout.column(align=True)
+        column.operator("mphdrr.import_geometry", text="Import Workbook", icon="IMPORT")
+        column.operator("mphdrr.add_xray_system", icon="LIGHT_SPOT")
 
 
 class ScannerPanel(Folded):
     """Mixed into panels inside Geometry that need a scanner; they draw by `draw_scanner`."""
 
     bl_parent_id = "MPHDRR_PT_geometry"
+    bl_order = 1  # after the modules
 
     poll = layouts.shown_where(lambda context: scanner.active_scanner(context.scene) is not None)
 
@@ -101,6 +99,8 @@ class ScannerPanel(Folded):
 
 
 class MPHDRR_PT_modules(ScannerPanel, bpy.types.Panel):
+    bl_order = 0
+
     def draw_scanner(self, context: bpy.types.Context, collection: bpy.types.Collection) -> None:
         layout = self.layout
         state = context.scene.mphdrr_geometry
@@ -119,7 +119,7 @@ class MPHDRR_PT_modules(ScannerPanel, bpy.types.Panel):
         head.label(text="", icon="BLANK1")
         head.separator(factor=2.0)  # the list's scroll bar
         layout.template_list(
-            "MPHDRR_UL_modules", "", collection, "all_objects", state, "active_index", rows=6, maxrows=12
+            "MPHDRR_UL_modules", "", collection, "all_objects", state, "active_index", rows=5, maxrows=8
         )
 
         camera = selection.listed_module(context.scene)

@@ -1,21 +1,23 @@
 """Sidebar, second step: the phantom, its numbers and looks; below it, the active volume as the active module sees it."""
 
-from typing import Any
-
 import bpy
 from bpy.app.translations import pgettext_iface as iface
 
 from ..addon import recovery
-from ..addon.blender import ids, jobs, layouts, storage
+from ..addon.blender import ids, layouts, storage
 from ..addon.perspective import frustums
 from ..addon.phantoms import phantom_properties, phantoms
-from ..addon.scanner import selection
+from ..addon.scanner import scanner, selection
 from ..addon.volumes import slices, volumes
-from .sidebar import Folded, Sidebar, draw_facts, draw_hint, draw_text
+from .sidebar import Folded, draw_facts, draw_hint, draw_text
 
 
-class MPHDRR_PT_phantom(Sidebar, bpy.types.Panel):
+class MPHDRR_PT_phantom(Folded, bpy.types.Panel):
     bl_order = ids.ORDER_PHANTOM
+
+    poll = layouts.shown_where(
+        lambda context: scanner.active_scanner(context.scene) is not None or volumes.volume_objects(context.scene)
+    )
 
     def draw(self, context: bpy.types.Context) -> None:
         layout = layouts.invoking(layouts.labelled(self.layout))
@@ -25,17 +27,11 @@ class MPHDRR_PT_phantom(Sidebar, bpy.types.Panel):
         column.operator("mphdrr.import_volume", text="Import Volume", icon="IMPORT")
         if storage.missing_volumes():
             _draw_missing(adding.column(align=True), context.scene)
-        item = context.object
-        if not volumes.is_volume(item):
-            known = volumes.volume_objects(context.scene)
-            draw_hint(layout, "Select a volume to see its numbers." if known else "No volume in the scene yet.")
-            return
-        _draw_numbers(layout, item)
-        _draw_display(layout, item)
-        phantom = phantoms.settings_of(item)
-        if phantom is not None:
-            _draw_phantom(layout, item, phantom)
-        layout.operator("mphdrr.clean_volume_files", icon="TRASH")
+        item = volumes.meant(context)
+        if item is not None:
+            _draw_numbers(layout, item)
+        elif volumes.volume_objects(context.scene):
+            draw_hint(layout, "Select a volume to see its numbers.")
 
 
 def _draw_missing(column: bpy.types.UILayout, scene: bpy.types.Scene) -> None:
@@ -65,6 +61,56 @@ def _draw_numbers(layout: bpy.types.UILayout, item: bpy.types.Object) -> None:
         *([("State", volumes.state_text(item))] if item.data.is_sequence else []),
         ("File", volumes.file_state(item)),
     )
+    settings = item.mphdrr_volume
+    if settings.message:
+        column = layout.column()
+        column.alert = settings.outdated
+        draw_text(column, settings.message, "ERROR" if settings.outdated else "INFO")
+    if settings.outdated:
+        _draw_update(layout, item)
+
+
+class _OfVolume(Folded):
+    """Mix into panels of the volume that is meant; they draw by `draw_volume`."""
+
+    bl_parent_id = "MPHDRR_PT_phantom"
+
+    poll = layouts.shown_where(volumes.meant)
+
+    def draw(self, context: bpy.types.Context) -> None:
+        layout, item = layouts.invoking(layouts.labelled(self.layout)), volumes.meant(context)  # type: ignore[attr-defined]
+        if item is not None:  # the scene may have changed since poll
+            layout.context_pointer_set("object", item)  # which the buttons work on, active or not
+            self.draw_volume(layout, item)
+
+    def draw_volume(self, layout: bpy.types.UILayout, item: bpy.types.Object) -> None:
+        """Draw the panel for a volume."""
+        raise NotImplementedError
+
+
+class MPHDRR_PT_look(_OfVolume, bpy.types.Panel):
+    """How the volume is drawn, and what is made of it."""
+
+    def draw_volume(self, layout: bpy.types.UILayout, item: bpy.types.Object) -> None:
+        _draw_display(layout, item)
+        layout.operator("mphdrr.clean_volume_files", icon="TRASH")
+
+
+class MPHDRR_PT_phantom_settings(_OfVolume, bpy.types.Panel):
+    """What the phantom is made from."""
+
+    bl_label = "Settings"
+
+    poll = layouts.shown_where(lambda context: phantoms.settings_of(volumes.meant(context)) is not None)
+
+    def draw_volume(self, layout: bpy.types.UILayout, item: bpy.types.Object) -> None:
+        phantoms.settings_of(item).draw_settings(layout)
+        column = layout.column(align=True)
+        _draw_update(column, item)
+        column.operator("mphdrr.apply_phantom_pose", icon="OBJECT_ORIGIN")
+        shown = phantoms.outline_of(item) is not None
+        text = "Hide Outline" if shown else "Show Outline"
+        column.operator("mphdrr.show_phantom_outline", text=text, icon="SHADING_WIRE", depress=shown)
 
 
 def _draw_display(layout: bpy.types.UILayout, item: bpy.types.Object) -> None:
@@ -95,37 +141,28 @@ def _draw_display(layout: bpy.types.UILayout, item: bpy.types.Object) -> None:
         layout.operator("mphdrr.add_slices", icon="MESH_PLANE")
 
 
-def _draw_phantom(layout: bpy.types.UILayout, item: bpy.types.Object, phantom: Any) -> None:
-    """A phantom's settings, what is wrong with them, and what can be done to it."""
-    settings = item.mphdrr_volume
-    phantom.draw_settings(layout)
-    if settings.message:
-        column = layout.column()
-        column.alert = settings.outdated
-        draw_text(column, settings.message, "ERROR" if settings.outdated else "INFO")
-    column = layout.column(align=True)
-    row = column.row(align=True)
-    row.alert = settings.outdated
-    text = "Changed: Update" if settings.outdated else "Update Phantom"
+def _draw_update(layout: bpy.types.UILayout, item: bpy.types.Object) -> None:
+    """The button that makes a phantom as its settings say."""
+    row = layout.row(align=True)
+    row.alert = item.mphdrr_volume.outdated
+    row.context_pointer_set("object", item)
+    text = "Changed: Update" if row.alert else "Update Phantom"
     row.operator("mphdrr.update_phantom", text=text, icon="FILE_REFRESH")
-    column.operator("mphdrr.apply_phantom_pose", icon="OBJECT_ORIGIN")
-    shown = phantoms.outline_of(item) is not None
-    text = "Hide Outline" if shown else "Show Outline"
-    column.operator("mphdrr.show_phantom_outline", text=text, icon="SHADING_WIRE", depress=shown)
 
 
 class MPHDRR_PT_perspective(Folded, bpy.types.Panel):
     bl_parent_id = "MPHDRR_PT_phantom"
 
+    poll = layouts.shown_where(lambda context: selection.active_module(context) and volumes.meant(context))
+
     def draw(self, context: bpy.types.Context) -> None:
         layout = layouts.invoking(layouts.labelled(self.layout))
         settings, camera = context.scene.mphdrr_perspective, selection.active_module(context)
-        if camera is None:
-            draw_hint(layout, "Import a geometry first.")
+        item = volumes.meant(context)
+        if camera is None or item is None:  # the scene may have changed since poll
             return
-        jobs.draw_job(layout)
-        name = context.object.name if volumes.is_volume(context.object) else iface("no volume is selected")
-        text = iface("{volume}, by {module}").format(volume=name, module=camera.name)
+        layout.context_pointer_set("object", item)
+        text = iface("{volume}, by {module}").format(volume=item.name, module=camera.name)
         layout.label(text=text, translate=False, icon="VIEW_PERSPECTIVE")
         layouts.draw_all(layout.column(align=True), settings, "uniform", "planes")
         row = layout.row(align=True)

@@ -3,28 +3,32 @@
 import bpy
 from bpy.app.translations import pgettext_iface as iface
 
-from ..addon.blender import ids, jobs, layouts
+from ..addon.blender import ids, layouts
 from ..addon.runs import preview, rendering, runs
 from ..addon.runs.projection_properties import drawn, makes_counts
 from ..addon.scanner import scanner
 from ..addon.volumes import volumes
-from .runs import draw_changes
-from .sidebar import Folded, Sidebar, draw_hint, draw_text
+from .sidebar import Folded, draw_text
 
-_MAIN = ("time", "photons", "hole", "aperture_points", "pixel_points")
-"""Settings of models that the panel itself shows; the others stand under Physics."""
+_MAIN = ("model", "time", "hole", "height", "width")
+"""A beginner's settings, which the panel itself shows."""
+_PHYSICS = (
+    "photons", "isotope", "window", "aperture_material", "aperture_mu", "crystal_material", "crystal_mu",
+    "intrinsic_fwhm", "background",
+)  # fmt: skip
+"""Settings under Physics; all others stand under Advanced."""
 
 
-class MPHDRR_PT_projections(Sidebar, bpy.types.Panel):
+class MPHDRR_PT_projections(Folded, bpy.types.Panel):
     bl_order = ids.ORDER_PROJECTIONS
+
+    poll = layouts.shown_where(lambda context: _can_render(context) or context.scene.mphdrr_projections.runs)
 
     def draw(self, context: bpy.types.Context) -> None:
         layout = layouts.labelled(self.layout)
         settings = context.scene.mphdrr_projections
-        jobs.draw_job(layout)  # at the top, where it is seen on small screens too
         column = layout.column()
         column.prop(settings, "volume", placeholder="Active volume")
-        column.prop(settings, "model")
         layouts.draw_settings(column, settings, (each for each in drawn(settings, "model") if each[0] in _MAIN))
         collection = scanner.active_scanner(context.scene)
         own = collection and scanner.own_pixels(collection)
@@ -35,33 +39,27 @@ class MPHDRR_PT_projections(Sidebar, bpy.types.Panel):
             name.label(text="Pixels")
             split.label(text=iface("{columns} × {rows}, its own").format(rows=own[0], columns=own[1]), translate=False)
         else:
-            layouts.draw_settings(column, settings, drawn(settings, "detector"))
-        modules = column.column(align=True)
-        modules.prop(settings, "all_modules")
-        if not settings.all_modules:
-            layouts.draw_all(modules, settings, "first", "last")
-        layouts.draw_settings(column, settings, drawn(settings, "compute"))
+            layouts.draw_settings(column, settings, (each for each in drawn(settings, "detector") if each[0] in _MAIN))
         row = layouts.invoking(layout.row())
         row.scale_y = 1.4
-        has_scanner = collection is not None
-        has_volume = bool(volumes.volume_objects(context.scene))
-        row.enabled = has_scanner and has_volume
+        row.enabled = _can_render(context)
         row.operator("mphdrr.render_projections", icon="RENDER_STILL")
-        layout.operator("mphdrr.load_recipe", icon="FILE_FOLDER")
-        if not has_scanner:
-            draw_hint(layout, "Needs a scanner: Load Example.")
-        elif not has_volume:
-            draw_hint(layout, "Needs a volume: Add Phantom.")
-        elif rendering.integrates_activity(context):
+        if rendering.integrates_activity(context):
             draw_text(layout, "Line integrals of activity: for counts choose the model SPECT Counts.", icon="INFO")
         if settings.run_file:
             layout.operator("mphdrr.show_projections", text="Show Mosaic", icon="IMAGE_DATA")
-            draw_changes(layout, context.scene)
 
 
-class MPHDRR_PT_preview(Sidebar, bpy.types.Panel):
+def _can_render(context: bpy.types.Context) -> bool:
+    """Whether there is a scanner and a volume."""
+    return scanner.active_scanner(context.scene) is not None and bool(volumes.volume_objects(context.scene))
+
+
+class MPHDRR_PT_preview(Folded, bpy.types.Panel):
     bl_label = "Live Preview"
     bl_parent_id = "MPHDRR_PT_projections"
+
+    poll = layouts.shown_where(_can_render)
 
     def draw(self, context: bpy.types.Context) -> None:
         layout, session = self.layout, preview.session()
@@ -88,11 +86,7 @@ class MPHDRR_PT_physics(Folded, bpy.types.Panel):
         column = layout.column(align=True)
         if settings.model == "EMISSION":
             column.prop(settings, "mu", placeholder="None")
-            collection = scanner.active_scanner(context.scene)
-            if collection is not None:
-                column.prop(collection.mphdrr_scanner, "opening_angle")
-        others = (each for each in drawn(settings, "model") if each[0] not in (*_MAIN, "model"))
-        layouts.draw_settings(column, settings, others)
+        layouts.draw_settings(column, settings, (each for each in drawn(settings, "model") if each[0] in _PHYSICS))
         row = layout.row(heading="Poisson Noise")
         row.active = makes_counts(settings)
         row.prop(settings, "noise", text="")
@@ -101,8 +95,31 @@ class MPHDRR_PT_physics(Folded, bpy.types.Panel):
         seed.prop(settings, "seed")
 
 
-class MPHDRR_PT_export(Sidebar, bpy.types.Panel):
+class MPHDRR_PT_advanced(Folded, bpy.types.Panel):
+    """What few change: the hole's edge, rays, the virtual detector, which modules, what computes."""
+
+    bl_parent_id = "MPHDRR_PT_projections"
+    bl_order = 1  # after the others
+
+    def draw(self, context: bpy.types.Context) -> None:
+        layout = layouts.labelled(self.layout)
+        settings, collection = context.scene.mphdrr_projections, scanner.active_scanner(context.scene)
+        column = layout.column(align=True)
+        if settings.model == "EMISSION" and collection is not None:
+            column.prop(collection.mphdrr_scanner, "opening_angle")
+        for table in ("model", "detector", "compute"):
+            others = (each for each in drawn(settings, table) if each[0] not in (*_MAIN, *_PHYSICS))
+            layouts.draw_settings(column, settings, others)
+        column.prop(settings, "all_modules")
+        if not settings.all_modules:
+            layouts.draw_all(column, settings, "first", "last")
+        layout.operator("mphdrr.load_recipe", icon="FILE_FOLDER")
+
+
+class MPHDRR_PT_export(Folded, bpy.types.Panel):
     bl_order = ids.ORDER_EXPORT
+
+    poll = layouts.shown_where(lambda context: scanner.active_scanner(context.scene) is not None)
 
     def draw(self, context: bpy.types.Context) -> None:
         layout = layouts.invoking(self.layout)
@@ -112,9 +129,7 @@ class MPHDRR_PT_export(Sidebar, bpy.types.Panel):
         row.operator("mphdrr.export_dataset", text="Export Dataset", icon="EXPORT")
         layout.operator("mphdrr.export_figure", text="Export Figure", icon="IMAGE_DATA")
         if run_file:
-            kept = run_file if run_file.startswith("//") else iface("kept when the .blend is saved")
-            layout.label(text=iface("Shown run: {file}").format(file=kept), icon="FILE")
-        else:
-            draw_hint(layout, "Render projections first.")
+            kept = run_file if run_file.startswith("//") else iface("Kept when the .blend is saved")
+            layout.label(text=kept, translate=False, icon="FILE")
         for line in runs.change_lines(context.scene):
             draw_text(layout, line)

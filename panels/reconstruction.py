@@ -3,27 +3,26 @@
 import bpy
 from bpy.app.translations import pgettext_iface as iface
 
-from ..addon.blender import ids, jobs, layouts, plots
+from ..addon.blender import ids, layouts, plots
 from ..addon.reconstruction.reconstruction_properties import drawn
 from ..addon.runs import runs
-from .sidebar import Folded, Sidebar, draw_hint, draw_text
+from .sidebar import Folded, draw_text
 
-_MAIN = ("method", "method_file", "iterations", "subsets", "voxels", "spacing")
-"""Settings that the panel itself shows; the others stand under Model and Prior."""
+_MAIN = ("method", "iterations", "voxels")
+"""A beginner's settings, which the panel itself shows; the others stand under Advanced."""
 _PLOT = 6.0  # of a button's heights
 
 
-class MPHDRR_PT_reconstruction(Sidebar, bpy.types.Panel):
+class MPHDRR_PT_reconstruction(Folded, bpy.types.Panel):
     bl_order = ids.ORDER_RECONSTRUCTION
+
+    poll = layouts.shown_where(lambda context: runs.shown(context.scene) is not None)
 
     def draw(self, context: bpy.types.Context) -> None:
         layout = layouts.labelled(self.layout)
         settings = context.scene.mphdrr_reconstruction
         run = runs.shown(context.scene)
-        if run is None:
-            draw_hint(layout, "Render projections first.")
-        else:
-            jobs.draw_job(layout)
+        if run is not None:  # the scene may have changed since poll
             layout.label(text=iface("Of {run}").format(run=run.name), translate=False, icon="RENDER_STILL")
         layouts.draw_settings(layout.column(), settings, (each for each in drawn(settings) if each[0] in _MAIN))
         row = layouts.invoking(layout.row())
@@ -55,7 +54,8 @@ def _draw_result(layout: bpy.types.UILayout, settings: bpy.types.PropertyGroup, 
 
 
 class MPHDRR_PT_reconstruction_model(Folded, bpy.types.Panel):
-    bl_label = "Model and Prior"
+    bl_label = "Advanced"
+    bl_order = 1  # after the other
     bl_parent_id = "MPHDRR_PT_reconstruction"
 
     def draw(self, context: bpy.types.Context) -> None:

@@ -6,7 +6,7 @@ from bpy.app.translations import pgettext_iface as iface
 from ..addon.blender import ids, jobs, layouts
 from ..addon.pictures import images
 from ..addon.runs import runs
-from .sidebar import ImagesSidebar, Sidebar, draw_text
+from .sidebar import Folded, ImagesSidebar, draw_text
 
 
 class MPHDRR_UL_runs(bpy.types.UIList):
@@ -60,7 +60,7 @@ class _Runs:
                 draw_text(layout, text, icon="INFO")
 
 
-class MPHDRR_PT_runs(_Runs, Sidebar, bpy.types.Panel):
+class MPHDRR_PT_runs(_Runs, Folded, bpy.types.Panel):
     bl_order = ids.ORDER_RUNS
 
 

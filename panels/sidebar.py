@@ -18,7 +18,7 @@ class Sidebar:
 
 
 class Folded(Sidebar):
-    """Mixed into panels that are closed to begin with, so that the steps of the work are in sight."""
+    """Mixed into panels that are closed to begin with: all but the next step."""
 
     bl_options = {"DEFAULT_CLOSED"}
 

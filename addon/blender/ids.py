@@ -6,7 +6,7 @@ PREFIX = "mphdrr"
 CATEGORY = "mphDRR"  # the sidebar tab
 
 # --- Panels, drawn in the order of the work: bl_order -----------------------------------------------------------------
-ORDER_GEOMETRY, ORDER_PHANTOM, ORDER_PROJECTIONS, ORDER_RUNS, ORDER_RECONSTRUCTION = 0, 10, 20, 25, 27
+ORDER_NEXT, ORDER_GEOMETRY, ORDER_PHANTOM, ORDER_PROJECTIONS, ORDER_RUNS, ORDER_RECONSTRUCTION = 0, 1, 10, 20, 25, 27
 ORDER_EVENTS, ORDER_EXPORT = 28, 30
 
 # --- Datablocks ---------------------------------------------------------------------------------------------

@@ -307,7 +307,7 @@ class JobOperator:
                 self._tick(context, _STEP)
                 self._left = time.perf_counter()
                 for text in worker.caught:
-                    self.report({"WARNING"}, text)
+                    self.report({"WARNING"}, reports.in_window(text))
                 if worker.error is not None or worker.cancel.is_set():
                     raise worker.error or Cancelled()
                 worker.steps = _finishing(job, worker.result)
@@ -384,7 +384,7 @@ class JobOperator:
     def _failed(self, error: BaseException) -> set[str]:
         if not isinstance(error, Exception):
             raise error  # KeyboardInterrupt and the like
-        level, text = "ERROR", str(error)
+        level, text = "ERROR", reports.in_window(error)
         if isinstance(error, Cancelled):
             left = "nothing was changed" if self._job is None else self._job.left()
             level, text = "WARNING", f"{self.bl_label}: cancelled, {left}"

@@ -32,8 +32,21 @@ def draw_all(layout: bpy.types.UILayout, settings: Any, *names: str) -> None:
 def draw_settings(
     layout: bpy.types.UILayout, settings: bpy.types.PropertyGroup, names: Iterable[tuple[str, bool]]
 ) -> None:
-    """Draw settings, each with whether it has an effect; those without are greyed out."""
+    """Draw settings, each with whether it has an effect; those without are greyed out.
+
+    A number with a check mark, by `unset_name`, is shown only where the mark does not say that it is not given.
+    """
+    known = getattr(settings, "properties", settings).bl_rna.properties  # an operator keeps them apart
     for name, is_active in names:
-        row = layout.row()
+        mark = unset_name(name)
+        row = layout.row(heading=known[name].name if mark in known else "")
         row.active = is_active
-        row.prop(settings, name)
+        if mark in known:
+            row.prop(settings, mark)
+        if not getattr(settings, mark, False):
+            row.prop(settings, name, **({"text": ""} if mark in known else {}))
+
+
+def unset_name(name: str) -> str:
+    """The check mark of a number: whether it is not given."""
+    return f"{name}_unset"

@@ -1,5 +1,6 @@
 """What core says to the user, as Blender's reports."""
 
+import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -9,10 +10,16 @@ import bpy
 from ...core.errors import InputError
 from ...core.recording import recorded_warnings
 
+_OPTIONS = re.compile(r" \(--[^()]*\)|, --[a-z-]+ [^;,)]+|, `mphdrr [^`]*`")
 _MOST = 5  # nobody reads more lines than that
 
 Need = tuple[Callable[[bpy.types.Context], Any], str]
 """What an operator needs of the context, and the tooltip's words where that is not so."""
+
+
+def in_window(text: object) -> str:
+    """What core says, without the options of the command line."""
+    return _OPTIONS.sub("", str(text))
 
 
 @contextmanager
@@ -23,7 +30,7 @@ def warnings_reported(operator: bpy.types.Operator) -> Iterator[None]:
             yield
         finally:
             for text in caught[:_MOST]:
-                operator.report({"WARNING"}, text)
+                operator.report({"WARNING"}, in_window(text))
             if len(caught) > _MOST:
                 operator.report({"WARNING"}, f"... and {len(caught) - _MOST} more warnings of this kind")
 
@@ -56,7 +63,7 @@ def run_reported(operator: bpy.types.Operator, action: Callable[[], str | None])
         with warnings_reported(operator):
             text = action()
     except (InputError, MemoryError) as error:
-        operator.report({"ERROR"}, str(error) or "not enough memory")
+        operator.report({"ERROR"}, in_window(error) or "not enough memory")
         return {"CANCELLED"}
     if text:
         operator.report({"INFO"}, text)

@@ -8,7 +8,7 @@ from bpy.props import BoolProperty, EnumProperty, FloatProperty, FloatVectorProp
 from ...core.errors import InputError
 from ...core.runs.recipe import is_met
 from ...core.runs.settings import Setting
-from . import choices, decimals, storage
+from . import choices, decimals, layouts, storage
 
 Settings = Mapping[str, Setting]
 """Settings by the names of their properties. A coefficient has a second property, of its material."""
@@ -73,6 +73,36 @@ def properties_of(settings: Settings) -> dict[str, Any]:
                 description=f"A number for each module that is projected, such as 10, 20, 30{or_file}. Empty: one for all",
             )
     return made
+
+
+def unset_of(settings: Settings) -> dict[str, Any]:
+    """Check marks for a panel's class, one for each number that need not be given: whether it is not.
+
+    Where it is taken away, the number becomes a tenth of what its slider reaches.
+    """
+    marks = {}
+    for name, setting in settings.items():
+        if setting.kind in (int, float) and setting.default is None:
+            first = setting.kind((setting.slider or 10) / 10)
+            values = tuple(first * (k + 1) for k in range(setting.sizes[0])) if _is_vector(setting) else first  # type: ignore[index]
+            marks[layouts.unset_name(name)] = check_mark(name, setting.unset, setting.absent, values)
+    return marks
+
+
+def check_mark(name: str, word: str, text: str, first: Any) -> Any:
+    """A check mark, called by a word: whether a number is 0 and not given. Where it is taken away, it becomes `first`."""
+    nothing = (0.0,) * len(first) if isinstance(first, tuple) else type(first)(0)
+
+    def is_unset(owner: Any) -> bool:
+        value = getattr(owner, name)
+        return not (any(value) if isinstance(first, tuple) else value)
+
+    def give(owner: Any, unset: bool) -> None:
+        if unset != is_unset(owner):
+            setattr(owner, name, nothing if unset else first)
+
+    description = f"{word}: {text}. Take the check mark away to give a number"
+    return BoolProperty(name=word, description=description, get=is_unset, set=give)
 
 
 def values_of(settings: Settings, get: Callable[[str], Any]) -> dict[str, Any]:

@@ -13,10 +13,21 @@ def _models(self: bpy.types.PropertyGroup, context: bpy.types.Context, typed: st
     return [name for name in event_notes.models(self.folder) if typed.lower() in name.lower()]
 
 
-RECIPE = StringProperty(
-    name="Recipe", description="Text (.toml) that says from which phantoms, poses and models events are drawn",
-    subtype="FILE_PATH", options={"SKIP_SAVE", "PATH_SUPPORTS_BLEND_RELATIVE"},
-)  # fmt: skip
+def recipe(update: Any = None) -> Any:
+    """A property for a recipe's file."""
+    return StringProperty(
+        name="Recipe", description="Text (.toml) that says from which phantoms, poses and models events are drawn",
+        subtype="FILE_PATH", options={"SKIP_SAVE", "PATH_SUPPORTS_BLEND_RELATIVE"}, update=update,
+    )  # fmt: skip
+
+
+def _propose_folder(self: Any, context: bpy.types.Context) -> None:
+    """Of a recipe that is chosen: a folder of its name beside it, unless the user has chosen another."""
+    if self.recipe and self.folder == self.proposed:
+        self.folder = self.proposed = self.recipe.removesuffix(".toml") + "-events"
+
+
+RECIPE = recipe()
 FOLDER = StringProperty(
     name="Folder", description="Of the event set: its recipe, its index and a file for each event", subtype="DIR_PATH",
     options={"SKIP_SAVE", "PATH_SUPPORTS_BLEND_RELATIVE"},
@@ -43,7 +54,7 @@ OPENED = number("Number of the event to open, from 0")
 class EventProperties(bpy.types.PropertyGroup):
     """State of the Event Set panel."""
 
-    recipe: RECIPE
+    recipe: recipe(_propose_folder)
     number: NEXT
     folder: FOLDER
     count: COUNT
@@ -56,6 +67,10 @@ class EventProperties(bpy.types.PropertyGroup):
     truth: PointerProperty(
         name="Truth", description="Of the event that was opened last", type=bpy.types.Object,
         poll=lambda self, item: volumes.is_volume(item), options={"HIDDEN"},
+    )  # fmt: skip
+    proposed: StringProperty(
+        name="Proposed Folder", description="That the recipe has proposed", subtype="DIR_PATH",
+        options={"HIDDEN", "PATH_SUPPORTS_BLEND_RELATIVE"},
     )  # fmt: skip
     tried: StringProperty(name="Tried", description="What the phantom in the scene is", options={"HIDDEN"})
 

@@ -23,6 +23,7 @@ from ...core.phantoms.kinds import KINDS, Kind
 from ...core.phantoms.language import parse_phantom
 from ...core.volumes.volume import UNITS
 from ..blender import choices, decimals, layouts
+from ..blender.setting_properties import check_mark
 from ..blender.updates import on_edit
 
 FILE = "file"  # beside the names of `KINDS`: a phantom that a text in TOML describes
@@ -84,7 +85,7 @@ class PhantomSettings:
                         row.prop(self, name, index=k, text="")
             else:
                 own.prop(self, name)
-        layouts.draw_all(layout.column(align=True), self, *sampling())
+        layouts.draw_settings(layout.column(align=True), self, ((name, True) for name in sampling()))
 
 
 class KindSettings(PhantomSettings):
@@ -122,12 +123,18 @@ def sampling(update: Any = None) -> dict[str, Any]:
             name="Quantity", description="What the voxels hold", default="activity", update=update,
             items=choices.items(choices.QUANTITIES, quantities),
         ),
-        "voxels": IntProperty(name="Voxels per Side", default=128, min=4, soft_max=512, max=4096, update=update),
+        "voxels": IntProperty(
+            name="Voxels per Side", description="How many the grid has along each of its sides", default=128, min=4,
+            soft_max=512, max=4096, update=update,
+        ),
         "voxel_size": FloatProperty(
             name="Voxel Size (mm)", description="0 fits the grid to the phantom", min=0.0, soft_max=10.0, precision=3,
             update=update,
         ),
     }  # fmt: skip
+
+
+FITTED = {layouts.unset_name("voxel_size"): check_mark("voxel_size", "Auto", "fits the grid to the phantom", 1.0)}
 
 
 def settings_class(kind: Kind, name: str, bases: tuple[type, ...], update: Any = None, **members: Any) -> Any:
@@ -138,7 +145,7 @@ def settings_class(kind: Kind, name: str, bases: tuple[type, ...], update: Any =
             name="Frames", description="States of the heart's cycle; 1: it stands still at its phase", default=1, min=1,
             soft_max=48, max=1000, update=update, options={"SKIP_SAVE"},
         )  # fmt: skip
-    members["__annotations__"] = members.get("__annotations__", {}) | own | sampling(update)
+    members["__annotations__"] = members.get("__annotations__", {}) | own | sampling(update) | FITTED
     members |= {"kind": kind, "identifier": identifier(kind), "own_names": tuple(own)}
     return type(name, (KindSettings, *bases), members)
 
@@ -227,6 +234,7 @@ class PhantomTextProperties(PhantomSettings, bpy.types.PropertyGroup):
             name="Text", description="Describes the phantom in TOML", type=bpy.types.Text, update=on_edit("phantom")
         ),
         **sampling(on_edit("phantom")),
+        **FITTED,
     }
     identifier = FILE
     own_names = ("text",)

@@ -10,11 +10,11 @@ import bpy
 from bpy.props import EnumProperty, PointerProperty, StringProperty
 
 from ...core.perspective.backprojection import HOW
-from ...core.reconstruction.methods import METHOD_FILES
+from ...core.reconstruction.methods import METHOD_FILES, METHODS
 from ...core.runs.recipe import Recipe, fitting_recipe
 from ...core.runs.settings import SETTINGS
 from ..blender import choices
-from ..blender.setting_properties import drawn_of, properties_of, values_of
+from ..blender.setting_properties import drawn_of, properties_of, unset_of, values_of
 from ..volumes import volumes
 
 _BY_COMMAND_LINE = ("anatomy", "allow", "stop_change", "stop_noise", "stop_region", "stop_seconds")
@@ -86,6 +86,13 @@ def settings_recipe(get: Callable[[str], Any], is_given: Callable[[str], bool]) 
     return fitting_recipe(values, given)
 
 
+def fit_method(settings: ReconstructionProperties, of_counts: bool) -> None:
+    """Choose the method by what the run holds, counts or line integrals, unless the user has chosen one."""
+    is_free = not settings.is_property_set("method") or settings.method == settings.fitted
+    if is_free and METHODS[settings.method.lower()].of_counts != of_counts:
+        settings.method = settings.fitted = "OSEM" if of_counts else "CGLS"
+
+
 def drawn(settings: ReconstructionProperties) -> Iterator[tuple[str, bool]]:
     """The properties that the chosen method and prior have, each with whether it has an effect."""
     shown = {name: PROPERTIES[name] for name in _OF_FILES} if settings.method_file else PROPERTIES
@@ -100,14 +107,17 @@ class ReconstructionProperties(ReconstructionSettings, bpy.types.PropertyGroup):
         name="Reconstruction", description="The last reconstructed volume", type=bpy.types.Object,
         poll=lambda self, item: volumes.is_volume(item), options={"HIDDEN"},
     )  # fmt: skip
+    fitted: StringProperty(
+        name="Fitted Method", description="The method that what a run holds has chosen", options={"HIDDEN"}
+    )
     record: StringProperty(name="Record", description="What is known of it, JSON", options={"HIDDEN"})
 
     @property
     def known(self) -> Mapping[str, Any]:
-        """What is known of the last reconstruction: `title`, `objective` by iteration, its name, `scores` and `flatters`."""
+        """What is known of the last reconstruction: `title`, `objective`, its `name`, `scores`, `flatters` and its `run`."""
         return json.loads(self.record) if self.record else {}
 
 
-ReconstructionProperties.__annotations__["how"] = _PUT_TOGETHER
+ReconstructionProperties.__annotations__.update(unset_of(PROPERTIES), how=_PUT_TOGETHER)
 
 CLASSES = (ReconstructionProperties,)

@@ -65,6 +65,7 @@ def reconstructing(context: bpy.types.Context, recipe: Recipe) -> jobs.Job:
             record = {
                 "title": ", ".join(filter(None, (method.label, iterations_text(len(objective))))),
                 "name": method.objective, "objective": list(objective), "scores": list(scores), "flatters": flatters,
+                "run": path.name,
             }  # fmt: skip
             picture = _picture(run, volume, record, name)
             stored = stored_volumes.store_volume(volume, folder, None, {"reconstruction_of": name, **recipe.tables()})

@@ -13,6 +13,7 @@ from ...core.physics.maps import MAPS
 from ...core.runs.presets import PRESETS
 from ...core.runs.recipe import Recipe, fitting_recipe
 from ...core.runs.settings import SETTINGS
+from ..blender import setting_properties
 from ..blender.setting_properties import (
     drawn_of,
     identifier,
@@ -136,7 +137,9 @@ def _set_time(settings: ProjectionProperties) -> None:
 
 def drawn(settings: ProjectionProperties, table: str) -> Iterator[tuple[str, bool]]:
     """The properties of a table that the chosen model and hole have, each with whether it has an effect."""
-    return drawn_of(PROPERTIES, settings, lambda need: "model.kind=" in need or "model.hole=rays" in need, table)
+    of_others = drawn_of(PROPERTIES, settings, lambda need: "model.kind=" in need or "model.hole=rays" in need, table)
+    for name, is_active in of_others:
+        yield name, is_active and (name != "magnification" or settings.detector == "VIRTUAL")
 
 
 def makes_counts(settings: ProjectionProperties) -> bool:
@@ -221,5 +224,7 @@ class ProjectionProperties(ProjectionSettings, bpy.types.PropertyGroup):
     )  # fmt: skip
     run_summary: StringProperty(name="Shown Run", description="What the shown run is", options={"HIDDEN"})
 
+
+ProjectionProperties.__annotations__.update(setting_properties.unset_of(PROPERTIES))
 
 CLASSES = (RunProperties, ProjectionProperties)

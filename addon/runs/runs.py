@@ -72,7 +72,8 @@ def add(
         if not settings.runs[index].is_saved:
             remove_file(settings.runs[index])
         settings.runs.remove(index)
-    name = ", ".join(run.settings[key] for key in ("volume", "counts", "model") if run.settings.get(key)) or "Run"
+    what = [run.settings.get(key) for key in ("volume", "counts")]
+    name = ", ".join(filter(None, [*what, _label("model.kind", run.settings.get("model"))])) or "Run"
     known, number = {item.name for item in settings.runs}, 2
     unique = name
     while unique in known:
@@ -97,14 +98,27 @@ def mark_shown(scene: bpy.types.Scene, index: int) -> None:
 def summary_of(run: ProjectionRun) -> str:
     """How many images of which size a run has, of what, computed by what."""
     n_v, n_u = run.views.shape
-    what = [run.settings.get(name) for name in ("volume", "counts", "backend")]
+    backend = _label("compute.backend", run.settings.get("backend"))
+    what = [run.settings.get("volume"), run.settings.get("counts"), backend]
     return ", ".join([f"{len(run.views)} views of {n_u} × {n_v}", *(text for text in what if text)])
+
+
+def _label(key: str, word: Any) -> str | None:
+    """What the window calls a word of a setting."""
+    return SETTINGS[key].words.get(word, (word,))[0]
 
 
 def shown(scene: bpy.types.Scene) -> bpy.types.PropertyGroup | None:
     """The run in the list whose images are shown; None where there is none."""
     settings = scene.mphdrr_projections
     return next((item for item in settings.runs if item.file == settings.run_file), None)
+
+
+def holds_counts(scene: bpy.types.Scene) -> bool | None:
+    """Whether the `shown` run is of SPECT counts; None where that is not known."""
+    item = shown(scene)
+    settings = json.loads(item.state).get("settings") if item is not None and item.state else None
+    return None if settings is None else settings.get("model.kind", _DEFAULTS["model.kind"]) == "emission"
 
 
 def required(scene: bpy.types.Scene, to_do: str) -> bpy.types.PropertyGroup:
@@ -190,7 +204,10 @@ def _look() -> None:
     """Compare the shown runs with their scenes, and have the panels drawn where that has changed."""
     if bpy.app.background:
         return
-    found = {window.scene.name: changes(window.scene) for window in bpy.context.window_manager.windows}
+    shown_in = bpy.context.window_manager.windows
+    for window in shown_in:
+        window.view_layer.update()  # a module that is being moved may not have been aimed yet
+    found = {window.scene.name: changes(window.scene) for window in shown_in}
     if any(_looked.get(name) != lines for name, lines in found.items()):
         _looked.update(found)
         windows.redraw_sidebars()

@@ -180,6 +180,15 @@ def before_save(*_: object) -> None:
                 image.pack()
 
 
+def after_update(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
+    """Volumes were hidden or shown: their planes, too."""
+    if scene != bpy.context.scene or not depsgraph.id_type_updated("SCENE"):
+        return
+    for item in volumes.volume_objects(scene):
+        for plane in planes_of(item):
+            objects.change(plane, hide_viewport=not item.visible_get())
+
+
 def after_frame_change(scene: bpy.types.Scene, *_: object) -> None:
     """The planes of a sequence show the current frame's state."""
     for item in volumes.volume_objects(scene):

@@ -215,6 +215,14 @@ def volume_objects(scene: bpy.types.Scene) -> list[bpy.types.Object]:
     return sorted((item for item in scene.objects if is_volume(item)), key=lambda item: item.name)
 
 
+def meant(context: bpy.types.Context) -> bpy.types.Object | None:
+    """The volume that panels show: the active one, else the scene's only one."""
+    if is_volume(context.object):
+        return context.object
+    known = volume_objects(context.scene)
+    return known[0] if len(known) == 1 else None
+
+
 def after_load(*_: Any) -> None:
     """Rewrite volumes of a .blend whose Blender draws voxels half a voxel elsewhere."""
     missing = storage.missing_volumes()

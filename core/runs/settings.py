@@ -60,6 +60,7 @@ class Setting:
     needs: tuple[str, ...] = ()
     option: str = ""  # on the command line; by default made from the key, like the next
     label: str = ""  # in Blender
+    unset: str = "Auto"  # what Blender's panels show of a number that is not given
 
     def __post_init__(self) -> None:
         name = self.key.rpartition(".")[2].removesuffix("_degrees")
@@ -289,7 +290,7 @@ _DECLARED = (
     Setting("model.start", float, 0.0, f"Start of the acquisition after the reference time of the activity{_OF_MODULES}",
             unit="s", needs=(_COUNTS,), label="Start (s)", option="--start-time", of_modules=True),
     Setting("model.photons", float, None, "X-ray photons per pixel: a radiograph of attenuation coefficients then holds "
-            "those that pass", "line integrals", above=0, slider=1e6, needs=("model.kind=transmission",)),
+            "those that pass", "line integrals", above=0, slider=1e6, needs=("model.kind=transmission",), unset="None"),
     Setting("model.isotope", str, None, "What decays: its photons are counted, and its activity falls during the "
             "acquisition", "one photon per decay, and a constant activity", words=_ISOTOPES, needs=(_COUNTS,)),
     Setting("model.window", float, None, "Energies that are counted, from and to", "10 % around the isotope's strongest "
@@ -317,7 +318,7 @@ _DECLARED = (
             needs=(_COUNTS, "model.hole=rays"), label="Hole Tolerance"),
     Setting("model.aperture_mu", float, None, "Material of the aperture's edge, or its attenuation coefficient at the "
             "photons' energy", "nothing penetrates it", unit="1/mm", words=named(APERTURES, _BY_NAME), above=0,
-            slider=10, needs=(_COUNTS,), label="Aperture"),
+            slider=10, needs=(_COUNTS,), label="Aperture", unset="None"),
     Setting("model.opening_angle_degrees", float, 90.0, "Full angle of the knife edge's cone", unit="degrees", above=0,
             most=179.9, needs=(_COUNTS, "model.aperture_mu or model.within_cone")),
     Setting("model.edge", str, "paix", "How photons penetrate the aperture's edge", label="Knife Edge", words={
@@ -326,7 +327,7 @@ _DECLARED = (
     }, needs=(*_BY_RAYS, "model.aperture_mu")),
     Setting("model.crystal_mu", float, None, "Material of the crystal that stops the photons, or its attenuation "
             "coefficient at their energy", "all photons are counted", unit="1/mm", words=named(CRYSTALS, _BY_NAME),
-            above=0, slider=5, needs=(_COUNTS,), label="Crystal"),
+            above=0, slider=5, needs=(_COUNTS,), label="Crystal", unset="None"),
     Setting("model.depth_layers", int, 1, "Depths in the crystal at which photons are recorded (parallax); 1: where they "
             "enter", least=1, slider=8, needs=(*_BY_RAYS, "model.crystal_mu")),
     Setting("model.intrinsic_fwhm", float, 0.0, "Full width at half maximum of the detector's own blur, on the crystal",

@@ -58,22 +58,30 @@ def open_tab(kind: str = "VIEW_3D") -> None:
     sidebar(kind).active_panel_category = "mphDRR"
 
 
+def panels() -> list:
+    """Our panels' classes, each after the one that it is in."""
+    found = [getattr(bpy.types, name) for name in dir(bpy.types) if name.startswith("MPHDRR_PT_")]
+    return sorted(found, key=lambda cls: hasattr(cls, "bl_parent_id"))
+
+
 def only(*names: str) -> None:
     """Only these panels are there, open, so that all of them is on the screen."""
-    panels = [getattr(bpy.types, name) for name in dir(bpy.types) if name.startswith("MPHDRR_PT_")]
-    others = [cls for cls in panels if cls.__name__ not in names]
-    for cls in sorted(others, key=lambda cls: not hasattr(cls, "bl_parent_id")):  # a panel after those in it
-        bpy.utils.unregister_class(cls)
+    for cls in reversed(panels()):
+        if cls.__name__ not in names:
+            bpy.utils.unregister_class(cls)
     opened(*names)
 
 
 def opened(*names: str, but_closed: tuple[str, ...] = ()) -> None:
-    """Have panels open from the start, and others closed."""
-    for name in (*names, *but_closed):
-        panel = getattr(bpy.types, name)
-        bpy.utils.unregister_class(panel)
-        panel.bl_options = {"DEFAULT_CLOSED"} if name in but_closed else set()
-        bpy.utils.register_class(panel)
+    """Have panels open from the start, with those that they are in, and others closed."""
+    known = panels()
+    to_open = {*names, *(getattr(cls, "bl_parent_id", "") for cls in known if cls.__name__ in names)}
+    for cls in reversed(known):
+        bpy.utils.unregister_class(cls)
+    for cls in known:  # all of them: a panel that is registered again forgets those in it
+        if cls.__name__ in (*to_open, *but_closed):
+            cls.bl_options = {"DEFAULT_CLOSED"} if cls.__name__ in but_closed else set()
+        bpy.utils.register_class(cls)
 
 
 def xdotool(*what: object) -> None:

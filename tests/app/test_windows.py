@@ -36,6 +36,14 @@ def test_main_path_runs_in_the_window(window, work_folder):
     assert np.mean((red > 110) & (red - green > 20) & (blue - green > 5)) > 0.3
 
 
+def test_clicks_on_what_is_proposed_lead_to_a_score(window, work_folder):
+    seen = window("beginner")
+    assert seen["example"] == ["Load Example", "Reconstruct", "TRANSMISSION", "CGLS", "NRMSE", "Export Dataset"]
+    done, found = seen["workbook"][:3], seen["workbook"][3:]
+    assert done == ["Add Phantom", "Render Projections", "Reconstruct"]
+    assert found == ["EMISSION", "OSEM", "NRMSE", "Export Dataset"], "what suits a phantom of activity"
+
+
 def close(one: dict, other: dict) -> None:
     assert one.keys() == other.keys()
     for name, value in one.items():
@@ -267,7 +275,7 @@ def test_events_are_tried_made_and_opened(window, work_folder):
 def test_measured_counts_are_imported_in_the_window(window, work_folder):
     seen = window("counts")
     assert seen["browsers"] == 1
-    assert seen["runs"] == ["counts.npy, emission"] and seen["image"] == ["mphDRR mosaic"]
+    assert seen["runs"] == ["counts.npy, SPECT Counts"] and seen["image"] == ["mphDRR mosaic"]
     assert seen["said"].startswith("counts.npy, 600 s, frames front+v.") and seen["changes"] == []
 
 

@@ -57,7 +57,7 @@ def step(function: Callable) -> Callable:
 
 @step
 def load():
-    opened("MPHDRR_PT_design", "MPHDRR_PT_display")
+    opened("MPHDRR_PT_design", "MPHDRR_PT_display", "MPHDRR_PT_export")
     _, area, _ = editor("VIEW_3D")
     area.spaces.active.show_region_ui = True
     yield 1
@@ -120,7 +120,7 @@ def render():
     yield 1
     yield is_idle
     counts = totals()
-    yield from scroll(6)
+    yield from scroll(18)
     return [f"{counts[55] / counts[54]:.1f} times", "SPECT Counts", "60", "128"]
 
 
@@ -131,7 +131,7 @@ def display():
     settings.colors, settings.scale = "VIRIDIS", "SQRT"
     yield 2
     assert totals() == before, "the numbers stay"
-    yield from scroll(14)
+    yield from scroll(3)
     return ["Viridis", "Square Root"]
 
 

@@ -32,7 +32,7 @@ from mphdrr.core.runs.mosaic import as_seen
 from mphdrr.core.runs.recipe import write_recipe
 from mphdrr.core.runs.settings import SAMPLING, SETTINGS
 from mphdrr.core.volumes.volume import Volume
-from mphdrr.panels.projections import MPHDRR_PT_physics, MPHDRR_PT_projections
+from mphdrr.panels.projections import MPHDRR_PT_advanced, MPHDRR_PT_physics, MPHDRR_PT_projections
 
 
 @pytest.fixture
@@ -179,11 +179,12 @@ def test_physics_panel_shows_settings_that_exist(scanned, scene, model):
     layout.row.return_value = layout.column.return_value = layout
     assert "DEFAULT_CLOSED" in MPHDRR_PT_physics.bl_options
     assert MPHDRR_PT_physics.poll(bpy.context) == (model != "INVERSE_SQUARE")
-    MPHDRR_PT_physics.draw(SimpleNamespace(layout=layout), bpy.context)
-    shown = {name: owner for (owner, name), _ in layout.prop.call_args_list}
+    for panel in (MPHDRR_PT_physics, MPHDRR_PT_advanced):
+        panel.draw(SimpleNamespace(layout=layout), bpy.context)
+    shown = {name.removesuffix("_unset"): owner for (owner, name), _ in layout.prop.call_args_list}
     assert all(name in owner.bl_rna.properties for name, owner in shown.items())
     assert {"noise", "seed"} <= shown.keys()
-    of_counts = {"mu", *PHYSICS} - {"time", "hole", "aperture_points", "pixel_points"}  # these are in the panel above
+    of_counts = {"mu", *PHYSICS} - {"time", "hole", "aperture_points", "pixel_points"}  # above, or not shown
     assert (of_counts <= shown.keys()) == (model == "EMISSION")
 
 
@@ -202,11 +203,11 @@ def test_numbers_of_rays_are_shown_where_rays_are_used(scanned, scene, model, ho
     settings = scene.mphdrr_projections
     settings.model, settings.hole = model, hole
     shown = {}
-    for panel in (MPHDRR_PT_projections, MPHDRR_PT_physics):
+    for panel in (MPHDRR_PT_projections, MPHDRR_PT_physics, MPHDRR_PT_advanced):
         layout = MagicMock()
         layout.row.return_value = layout.column.return_value = layout
         panel.draw(SimpleNamespace(layout=layout), bpy.context)
-        shown[panel] = {call.args[1] for call in layout.prop.call_args_list}
+        shown[panel] = {call.args[1].removesuffix("_unset") for call in layout.prop.call_args_list}
     sampling = {key.partition(".")[2] for key in SAMPLING}
     assert sampling & set().union(*shown.values()) == numbers
     assert ("hole" in shown[MPHDRR_PT_projections]) == (model == "EMISSION"), "the choice itself is easily found"

@@ -144,12 +144,12 @@ def test_what_does_not_change_the_images_leaves_the_run_current(render, scene):
 def test_a_module_moved_by_a_millimetre_is_said_by_panels_list_and_export(render, scene, tmp_path, capfd):
     item = render()
     before = array_of(item)
-    quiet = [drawn(name) for name in ("MPHDRR_PT_projections", "MPHDRR_PT_runs", "MPHDRR_PT_export")]
+    quiet = [drawn(name) for name in ("MPHDRR_PT_next_step", "MPHDRR_PT_runs", "MPHDRR_PT_export")]
     assert not any("moved" in text for texts in quiet for text in texts)
     move(module(3), 1.0)
-    names = "MPHDRR_PT_projections", "MPHDRR_PT_runs", "MPHDRR_PT_runs_of_images", "MPHDRR_PT_export"
+    names = "MPHDRR_PT_next_step", "MPHDRR_PT_runs", "MPHDRR_PT_runs_of_images", "MPHDRR_PT_export"
     for name in names:
-        assert "Module 03 moved" in drawn(name), name
+        assert "Module 03 moved" in " ".join(drawn(name)), name
         assert ("Render Again" in drawn(name)) == (name != "MPHDRR_PT_export")
     row = MagicMock()
     row.row.return_value = row
@@ -173,7 +173,7 @@ def test_the_list_keeps_two_and_what_is_renamed_or_pinned(render, scene):
     render("the first sight")
     render().keep = True
     second = storage.absolute(listed[0].file)
-    assert [item.name for item in listed] == ["Derenzo, emission", "the first sight", "Derenzo, emission 2"]
+    assert [item.name for item in listed] == ["Derenzo, SPECT Counts", "the first sight", "Derenzo, SPECT Counts 2"]
     for _ in range(3):
         render()
     assert [item.is_kept for item in listed] == [True, True, False, False]
@@ -220,7 +220,7 @@ def test_two_runs_survive_save_and_reopen(render, scene, tmp_path):
     bpy.ops.wm.open_mainfile(filepath=str(moved / "study.blend"))
     scene = bpy.context.scene
     settings = scene.mphdrr_projections
-    assert [item.name for item in settings.runs] == ["one", "Derenzo, emission"]
+    assert [item.name for item in settings.runs] == ["one", "Derenzo, SPECT Counts"]
     assert all(item.file.startswith("//study_mphdrr/") and item.is_saved for item in settings.runs)
     for item, expected in zip(settings.runs, before, strict=True):
         assert np.array_equal(array_of(item), expected)

@@ -1,0 +1,99 @@
+"""How far a scene is on the way from a scanner to training data, and the one step that comes next."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import bpy
+
+from ..core.physics.maps import MAPS
+from .events import event_notes
+from .preferences import website
+from .runs import runs
+from .scanner import scanner
+from .volumes import volumes
+
+_TOP = Path(__file__).parents[1]
+
+
+@dataclass(frozen=True)
+class Stage:
+    """A stage of the work, and what the scene has of it: "" for nothing."""
+
+    name: str
+    found: str = ""
+    is_stale: bool = False  # not of the scene as it is now
+
+
+@dataclass(frozen=True)
+class Step:
+    """What to do next: an operator, its settings, and what its button says."""
+
+    operator: str
+    text: str
+    icon: str
+    settings: Mapping[str, Any] = field(default_factory=dict)
+
+
+_RENDER = Step("mphdrr.render_projections", "Render Projections", "RENDER_STILL")
+
+
+def stages(context: bpy.types.Context) -> list[Stage]:
+    """The stages in their order."""
+    scene = context.scene
+    collection, run, known = scanner.active_scanner(scene), runs.shown(scene), _phantoms(scene)
+    stale, scores = _stale(scene), _reconstruction(scene).get("scores", ())
+    made = event_notes.of_set(scene.mphdrr_events.folder)
+    return [
+        Stage("Scanner", collection.name if collection else ""),
+        Stage("Phantom", known[0].name if len(known) == 1 else f"{len(known)} volumes" if known else ""),
+        Stage("Run", stale[0] if stale else run.summary.partition(",")[0] if run else "", bool(stale)),
+        Stage("Reconstruction", ": ".join(scores[0]) if scores else "not scored" if _reconstruction(scene) else ""),
+        Stage("Event Set", made.text.partition(",")[0] if made else ""),
+    ]
+
+
+def next_step(context: bpy.types.Context) -> Step:
+    """The step that comes next."""
+    scene, run = context.scene, runs.shown(context.scene)
+    if run is None and scanner.active_scanner(scene) is None:
+        return Step("mphdrr.load_example", "Load Example", "PLAY")
+    if run is None or _stale(scene):
+        if not _phantoms(scene):
+            return Step("mphdrr.add_derenzo", "Add Phantom", "OUTLINER_DATA_VOLUME", {"confirmed": True})
+        return _RENDER if run is None else Step(_RENDER.operator, "Render Again", "FILE_REFRESH")
+    if not _reconstruction(scene):
+        return Step("mphdrr.reconstruct", "Reconstruct", "OUTLINER_OB_VOLUME")
+    if scene.mphdrr_events.recipe:
+        return Step("mphdrr.make_event_set", "Make Event Set", "FILE_CACHE")
+    return Step("mphdrr.export_dataset", "Export Dataset", "EXPORT")
+
+
+def tutorial() -> str:
+    """The address of the tutorial: on the website, or beside this file, or of the README that the zip has."""
+    if website():
+        return f"{website().rstrip('/')}/tutorial.html"
+    page = _TOP / "docs" / "tutorial.md"
+    return (page if page.is_file() else _TOP / "README.md").as_uri()
+
+
+def _phantoms(scene: bpy.types.Scene) -> list[bpy.types.Object]:
+    """The volumes that may be projected: no maps, and not what was reconstructed."""
+    found = scene.mphdrr_reconstruction.volume
+    return [item for item in volumes.volume_objects(scene) if item != found and volumes.quantity_of(item) not in MAPS]
+
+
+def _reconstruction(scene: bpy.types.Scene) -> Mapping[str, Any]:
+    """What is known of the reconstruction of the shown run; empty where there is none."""
+    settings, run = scene.mphdrr_reconstruction, runs.shown(scene)
+    if run is None or settings.volume not in volumes.volume_objects(scene):
+        return {}
+    known = settings.known
+    return known if run.file.endswith(known.get("run", "")) else {}
+
+
+def _stale(scene: bpy.types.Scene) -> list[str]:
+    """What has changed since the shown run, if it can be rendered again."""
+    lines = runs.change_lines(scene)
+    return [] if lines == [runs.UNKNOWN] or runs.measured_text(scene) else lines

@@ -1,0 +1,284 @@
+"""What somebody sees who opens the tab for the first time: how much, whether it is explained, and whether it fits."""
+
+from __future__ import annotations
+
+import functools
+import itertools
+from collections.abc import Iterator
+from typing import Any
+
+import blf
+import bpy
+import pytest
+
+from mphdrr.addon import next_step, registration
+from mphdrr.addon.blender import reports
+from mphdrr.addon.scanner import scanner
+from mphdrr.addon.volumes import slices, volumes
+
+PANELS = [cls for cls in registration.CLASSES if issubclass(cls, bpy.types.Panel) and cls.bl_space_type == "VIEW_3D"]
+WIDTH = 236  # pixels for a panel's contents, in a sidebar of Blender's default width
+LABELS = 0.4  # share of settings' names, where they have a column of their own
+BESIDE = {"BOOLEAN": 20, "INT": 40, "FLOAT": 40}  # pixels beside a name in the same button: a box, or a number
+LETTERS, ICON, MARGIN, ROOM = 11, 20, 4, 24  # pixels: a button asks for more room than its text and margin need
+
+
+class Layout:
+    """Stands for Blender's layout: remembers what is drawn, and shares out the width as Blender does."""
+
+    def __init__(self, kind: str = "column", factor: float = 0.0, **settings: Any) -> None:
+        self.kind, self.factor, self.items = kind, factor, []
+        self.use_property_split, self.alignment = False, "EXPAND"
+        vars(self).update(settings)
+
+    def _inside(self, kind: str, factor: float = 0.0) -> Layout:
+        self.items.append(Layout(kind, factor, use_property_split=self.use_property_split))
+        return self.items[-1]
+
+    def column(self, heading: str = "", **_: Any) -> Layout:
+        return self._inside("column")
+
+    box = column
+
+    def row(self, heading: str = "", **_: Any) -> Layout:
+        if not heading:
+            return self._inside("row")
+        beside = self._inside("row", LABELS)
+        beside._leaf("label", heading)
+        beside.use_property_split = False
+        return beside._inside("row")
+
+    def split(self, factor: float = 0.0, **_: Any) -> Layout:
+        return self._inside("row", factor)
+
+    def grid_flow(self, columns: int, **_: Any) -> Layout:
+        return self._inside("grid", columns)
+
+    def _leaf(self, what: str, text: str, icon: str = "NONE", **more: Any) -> None:
+        self.items.append({"what": what, "text": text, "icon": icon not in ("NONE", ""), **more})
+
+    def label(self, text: str = "", icon: str = "NONE", **_: Any) -> None:
+        self._leaf("label", text, icon)
+
+    def operator(self, idname: str, text: str | None = None, icon: str = "NONE", **_: Any) -> Any:
+        group, name = idname.split(".")
+        known = getattr(getattr(bpy.ops, group), name).get_rna_type()
+        said = known.name if text is None else text
+        self._leaf("button", said, icon, explained=bool(known.description.strip()), name=idname)
+        return type("Given", (), {})()
+
+    def operator_menu_enum(self, idname: str, setting: str, **options: Any) -> None:
+        self.operator(idname, **options)
+
+    def menu(self, name: str, text: str = "", icon: str = "NONE") -> None:
+        self._leaf("button", text, icon, explained=True, name=name)
+
+    def prop(
+        self, owner: Any, name: str, text: str | None = None, icon: str = "NONE", expand: bool = False, **_: Any
+    ) -> None:
+        known = owner.bl_rna.properties[name]
+        said = known.name if text is None else text
+        is_split = self.use_property_split and said and known.type != "BOOLEAN"
+        if expand:
+            row = self.row()
+            for item in known.enum_items:
+                row._leaf("property", item.name, explained=bool(known.description), name=name)
+        else:
+            what = "name" if is_split else "property"
+            more = 0 if is_split or not said else BESIDE.get(known.type, 0)
+            self._leaf(what, said, icon, explained=bool(known.description.strip()), name=name, more=more)
+
+    def prop_enum(self, owner: Any, name: str, value: str) -> None:
+        known = owner.bl_rna.properties[name]
+        self._leaf("property", known.enum_items[value].name, explained=bool(known.description), name=name)
+
+    def template_list(self, *_: Any, **__: Any) -> None:
+        self._leaf("list", "")
+
+    def __getattr__(self, name: str) -> Any:
+        if name in ("separator", "template_icon", "progress", "context_pointer_set"):
+            return lambda *_, **__: None
+        raise AttributeError(name)
+
+    def leaves(self) -> Iterator[dict[str, Any]]:
+        """All that is drawn."""
+        for item in self.items:
+            yield from item.leaves() if isinstance(item, Layout) else [item]
+
+    def wanted(self) -> float:
+        """The width that it asks for."""
+        widths = [item.wanted() if isinstance(item, Layout) else _needed(item) + ROOM for item in self.items] or [0.0]
+        return sum(widths) if self.kind == "row" else max(widths)
+
+    def cut(self, width: float) -> Iterator[str]:
+        """The texts for which there is not enough room."""
+        wanted = [item.wanted() if isinstance(item, Layout) else _needed(item) + ROOM for item in self.items]
+        for k, (item, asked) in enumerate(zip(self.items, wanted, strict=True)):
+            if self.kind == "grid":
+                own = width / self.factor
+            elif self.kind == "column":
+                own = width
+            elif self.factor:
+                own = width * (self.factor if k == 0 else (1 - self.factor) / max(1, len(self.items) - 1))
+            else:
+                own = width * asked / sum(wanted)
+            if isinstance(item, Layout):
+                yield from item.cut(own)
+            elif item["text"] and _needed(item) > own * (LABELS if item["what"] == "name" else 1):
+                yield f"{item['text']} ({_needed(item):.0f} of {own:.0f})"
+
+
+def _needed(item: dict[str, Any]) -> float:
+    return blf.dimensions(0, item["text"])[0] + MARGIN + ICON * item["icon"] + item.get("more", 0)
+
+
+def drawn(is_open: bool = False) -> dict[str, Layout]:
+    """The panels that are drawn, by their classes' names: those in sight to begin with, or all of them, open."""
+    blf.size(0, LETTERS)
+    seen: dict[str, Layout] = {}
+    for cls in sorted(PANELS, key=lambda cls: hasattr(cls, "bl_parent_id")):
+        parent = getattr(cls, "bl_parent_id", None)
+        if (hasattr(cls, "poll") and not cls.poll(bpy.context)) or (
+            parent and not (parent in seen and seen[parent].is_open)
+        ):
+            continue
+        seen[cls.__name__] = layout = Layout(is_open=is_open or "DEFAULT_CLOSED" not in getattr(cls, "bl_options", ()))
+        if layout.is_open:
+            panel = type("Drawn", (), {"layout": layout})()
+            panel.draw_volume = functools.partial(getattr(cls, "draw_volume", len), panel)
+            panel.draw_scanner = functools.partial(getattr(cls, "draw_scanner", len), panel)
+            cls.draw(panel, bpy.context)
+    return seen
+
+
+def names(seen: dict[str, Layout], *what: str) -> list[str]:
+    return [
+        leaf["name"] for layout in seen.values() for leaf in layout.leaves() if leaf["what"] in what and "name" in leaf
+    ]
+
+
+def check(seen: dict[str, Layout]) -> None:
+    """Everything is explained, and no text is cut."""
+    leaves = [leaf for layout in seen.values() for leaf in layout.leaves()]
+    assert not [leaf for leaf in leaves if not leaf.get("explained", True)]
+    assert not {name: cut for name, layout in seen.items() if (cut := list(layout.cut(WIDTH)))}
+
+
+def test_an_empty_tab_shows_two_buttons(scene):
+    seen = drawn()
+    assert list(seen) == ["MPHDRR_PT_next_step"]
+    assert names(seen, "button") == ["mphdrr.load_example", "mphdrr.import_geometry"]
+    assert names(drawn(is_open=True), "property", "name") == []
+    check(seen)
+
+
+@pytest.fixture
+def worked(scene, dc_spect) -> Any:
+    """A scene with a scanner, a phantom, a run and its reconstruction."""
+    scanner.build_scanner(scene, dc_spect[:8])
+    bpy.ops.mphdrr.add_derenzo(voxels=12)
+    bpy.ops.mphdrr.render_projections(width=8, height=8)
+    bpy.ops.mphdrr.reconstruct(method="SIRT", voxels=12, iterations=2)
+    return scene
+
+
+def test_a_beginner_sees_little(worked):
+    seen = drawn()
+    assert len(seen) <= 8
+    assert len(names(seen, "button")) <= 14 and len(names(seen, "property", "name")) <= 12
+    for name, layout in drawn(is_open=True).items():
+        if not hasattr(getattr(bpy.types, name), "bl_parent_id"):
+            assert (
+                len(names({name: layout}, "button")) <= 14 and len(names({name: layout}, "property", "name")) <= 12
+            ), name
+    check(seen)
+
+
+@pytest.mark.parametrize("model", ["TRANSMISSION", "EMISSION"])
+def test_everything_is_explained_and_fits(worked, model):
+    settings, camera = worked.mphdrr_projections, scanner.module(scanner.active_scanner(worked), 3)
+    worked.mphdrr_reconstruction.record = ""  # scores are of all lengths
+    for hole, active in itertools.product(("AUTO", "RAYS"), (camera, worked.objects["Derenzo"])):
+        settings.model, settings.hole = model, hole
+        bpy.context.view_layer.objects.active = active
+        check(drawn(is_open=True))
+
+
+def test_what_is_proposed_leads_to_a_score(scene, small_workbook):
+    def press() -> str:
+        step = next_step.next_step(bpy.context)
+        group, name = step.operator.split(".")
+        assert getattr(getattr(bpy.ops, group), name)("INVOKE_DEFAULT", **step.settings) == {"FINISHED"}
+        return step.text
+
+    bpy.ops.mphdrr.import_geometry(filepath=str(small_workbook))
+    settings, reconstruction = scene.mphdrr_projections, scene.mphdrr_reconstruction
+    settings.width = settings.height = reconstruction.voxels = 12
+    reconstruction.method = "SIRT"  # without a window, what is chosen by the run is the default
+    assert [press(), press(), press()] == ["Add Phantom", "Render Projections", "Reconstruct"]
+    assert "NRMSE" in {name for name, _ in reconstruction.known["scores"]}
+    assert next_step.next_step(bpy.context).text == "Export Dataset"
+    scanner.module(scanner.active_scanner(scene), 3).location.x += 1.0
+    bpy.context.view_layer.update()
+    run = next(stage for stage in next_step.stages(bpy.context) if stage.name == "Run")
+    assert run.is_stale and run.found == "Module 03 moved"
+    check(drawn())
+    assert [press(), press()] == ["Render Again", "Reconstruct"]
+    scene.mphdrr_events.recipe = "//heart.toml"
+    assert scene.mphdrr_events.folder == "//heart-events"
+    assert next_step.next_step(bpy.context).text == "Make Event Set"
+
+
+def test_a_number_that_is_not_given_is_auto(scene):
+    settings = scene.mphdrr_projections
+    assert settings.threads_unset and settings.window_unset
+    settings.threads_unset = settings.window_unset = False
+    assert settings.threads == 6 and tuple(settings.window) == (100, 200)
+    settings.threads_unset = True
+    assert settings.threads == 0 and not settings.window_unset
+
+
+def test_the_numbers_of_the_only_volume_are_shown_whatever_is_selected(scene, ring_system):
+    camera = scanner.module(scanner.build_scanner(scene, ring_system), 1)
+    bpy.ops.mphdrr.add_points(voxels=8)
+    item = bpy.context.object
+    bpy.context.view_layer.objects.active = camera
+    assert volumes.meant(bpy.context) == item
+    assert {"MPHDRR_PT_look", "MPHDRR_PT_phantom_settings"} <= drawn(is_open=True).keys()
+    with bpy.context.temp_override(object=item):  # as the panel's buttons have it
+        bpy.ops.mphdrr.add_slices()
+    planes = slices.planes_of(item)
+    item.hide_set(True)
+    bpy.context.view_layer.update()
+    assert not any(plane.visible_get() for plane in planes)
+    item.hide_set(False)
+    bpy.context.view_layer.update()
+    assert all(plane.visible_get() for plane in planes)
+
+
+def test_every_operator_and_setting_is_explained(scene):
+    silent = []
+    for cls in registration.CLASSES:
+        if issubclass(cls, bpy.types.Operator):
+            group, name = cls.bl_idname.split(".")
+            known = getattr(getattr(bpy.ops, group), name).get_rna_type()
+            silent += [] if known.description.strip() else [cls.bl_idname]
+        elif issubclass(cls, bpy.types.PropertyGroup):
+            known = cls.bl_rna
+        else:
+            continue
+        for each in known.properties:
+            is_group = each.type == "COLLECTION" or isinstance(
+                getattr(each, "fixed_type", None), bpy.types.PropertyGroup
+            )
+            is_own = each.identifier not in ("rna_type", "name") and not each.is_hidden and not is_group
+            silent += [f"{cls.__name__}.{each.identifier}"] if is_own and not each.description.strip() else []
+    assert not silent
+
+
+def test_words_of_the_command_line_do_not_appear():
+    said = "no energy (--energy KEV): hu_to_mu(volume, energy), `mphdrr volume convert FILE`, or CT to Attenuation"
+    assert reports.in_window(said) == "no energy: hu_to_mu(volume, energy), or CT to Attenuation"
+    assert reports.in_window("a map can help (columns='map.toml', --columns map.toml; docs)") == (
+        "a map can help (columns='map.toml'; docs)"
+    )

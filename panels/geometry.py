@@ -69,7 +69,12 @@ class MPHDRR_PT_geometry(Folded, bpy.types.Panel):
             layout.split(factor=0.34),
             ("Scanner", collection.name),
             ("Workbook", bpy.path.basename(properties.workbook) or "none"),
-            ("Modules", iface("{count} in {rings} rings").format(count=properties.count, rings=n_rings)),
+            (
+                "Modules",
+                iface("{count} in {rings} rings" if n_rings > 1 else "{count} in a ring").format(
+                    count=properties.count, rings=n_rings
+                ),
+            ),
         )
         row = layout.row(align=True)
         for first, last in json.loads(properties.quick_ranges or "[]"):

@@ -12,7 +12,7 @@ from ..errors import InputError
 from ..figures.page import LARGEST, Page, box
 from ..figures.parts import number
 from ..runs import letters
-from ..runs.display import Display
+from ..runs.display import Display, unit_text
 from ..runs.mosaic import COLUMNS, as_seen, places
 from ..runs.resizing import resized
 from ..volumes.volume import Volume
@@ -276,8 +276,7 @@ def _bright(values: Floats32) -> float:
 
 def _range(window: tuple[float, float], unit: str) -> str:
     largest = f"{window[1]:.0f}" if window[1] >= 1000 else number(window[1], 3)
-    shown = unit.replace("1/mm mm", "").replace(" mm", " · mm")  # line integrals of mu are numbers
-    return f"0 to {largest} {shown}".rstrip()
+    return f"0 to {largest} {unit_text(unit)}".rstrip()
 
 
 def _listed(values: Floats) -> str:

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..runs import letters
-from ..runs.display import Display
+from ..runs.display import Display, unit_text
 from .page import Page, Point, box
 
 INK, FAINT = "#20262d", "#6b7480"
@@ -124,7 +124,7 @@ def color_bar(
     width = round(1.1 * em)
     ramp = [display.value_at(share, window) for share in np.linspace(1.0, 0.0, max(2, height))]
     page.image(display.colored(ramp, window)[:, None], left, top, width, height)
-    page.text(unit, left, top - 0.9 * em, 0.9 * em, INK)
+    page.text(unit_text(unit), left, top - 0.9 * em, 0.9 * em, INK)
     for share in (0.0, 0.25, 0.5, 0.75, 1.0):
         row = top + height * (1 - share)
         page.line([(left + width, row), (left + width + 0.3 * em, row)], INK, 0.06 * em)
@@ -135,4 +135,4 @@ def bar_width(page: Page, display: Display, window: tuple[float, float], unit: s
     """Columns that a colour bar takes."""
     texts = [number(display.value_at(share, window)) for share in (0.0, 0.25, 0.5, 0.75, 1.0)]
     numbers = 1.6 * page.em + max(letters.width(text, 0.9 * page.em) for text in texts)
-    return round(max(numbers, letters.width(unit, 0.9 * page.em)))
+    return round(max(numbers, letters.width(unit_text(unit), 0.9 * page.em)))

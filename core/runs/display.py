@@ -105,3 +105,8 @@ def _table(colors: str) -> NDArray[np.uint8]:
     places = np.linspace(0, len(anchors) - 1, 256)
     channels = [np.interp(places, np.arange(len(anchors)), channel) for channel in anchors.T]
     return np.rint(np.stack(channels, axis=1)).astype(np.uint8)
+
+
+def unit_text(unit: str) -> str:
+    """A unit as people write it: line integrals of mu are numbers."""
+    return unit.replace("1/mm mm", "").replace(" mm", " · mm")

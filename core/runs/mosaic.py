@@ -13,7 +13,7 @@ from ..errors import InputError
 from ..files import AnyPath, write_bytes
 from ..validation import real_numbers
 from . import letters
-from .display import Display
+from .display import Display, unit_text
 from .run import ProjectionRun
 
 
@@ -200,6 +200,7 @@ def places(rings: NDArray[np.int64], columns: int = COLUMNS) -> NDArray[np.int64
 
 def _color_bar(display: Display, window: tuple[float, float], unit: str, height: int, size: float) -> NDArray[np.uint8]:
     """A colour bar (height, width, 3) with its numbers and, above, its unit."""
+    unit = unit_text(unit)
     line, em = math.ceil(1.1 * size), round(size)
     top, bottom = 2 * line, height - line
     steps = next((n for n in (4, 2) if bottom - top >= n * line), 1)  # as many as have room

@@ -131,7 +131,7 @@ def pixels_of(shape: tuple[int, ...], rng: np.random.Generator) -> tuple[np.ndar
     dead.
     """
     v, u = (np.linspace(-1, 1, n) for n in shape[1:])
-    efficiency = (1 - 0.2 * (v[:, None] ** 2 + u**2)) * rng.normal(1, 0.04, shape)
+    efficiency = (1 - 0.1 * (v[:, None] ** 2 + u**2)) * rng.normal(1, 0.04, shape)
     chance = rng.random(shape)
     dead, hot = chance < 1 / 200, chance > 1 - 1 / 300
     dead[shape[0] // 3], hot[shape[0] // 3] = True, False

@@ -12,7 +12,6 @@ photon, and a quarter of the photons were scattered in the water. It takes a min
 from __future__ import annotations
 
 import argparse
-import shutil
 import time
 import warnings
 from collections.abc import Mapping
@@ -37,13 +36,12 @@ PHYSICS = {"isotope": "Tc-99m", "aperture_mu": "tungsten", "crystal_mu": "CZT", 
 RECIPE = """\
 [system]
 file = "scanner.xlsx"
-modules = "{modules}"
 
 [counts]
 files = ["scan.dcm"]
-frames = "none*{count}, {modules}, none*{count}"
-lower_frames = "{modules}, none*{twice}"
-upper_frames = "none*{twice}, {modules}"
+frames = "none*{count}, 1-{count}, none*{count}"
+lower_frames = "1-{count}, none*{twice}"
+upper_frames = "none*{twice}, 1-{count}"
 orientation = "back-v"
 scatter_fwhm = 4.0                # pixels
 
@@ -90,9 +88,9 @@ def write_study(folder: Path, modules: int = 80, pixels: int = 32, seed: int = 1
     folder.mkdir(parents=True, exist_ok=True)
     rng, system = np.random.default_rng(seed), mph.read_system(WORKBOOK)
     system = system[np.linspace(0, len(system) - 1, modules).round().astype(int)]
-    shutil.copy(WORKBOOK, folder / "scanner.xlsx")
-    numbers = "1-80" if modules == 80 else ",".join(map(str, system.numbers))
-    texts = {"modules": numbers, "count": modules, "twice": 2 * modules, "start": START, "dead_time": 1e6 * DEAD_TIME}
+    system = system.replace(numbers=np.arange(1, modules + 1))
+    mph.write_system(system, folder / "scanner.xlsx")
+    texts = {"count": modules, "twice": 2 * modules, "start": START, "dead_time": 1e6 * DEAD_TIME}
     (folder / "study.toml").write_text(RECIPE.format(**texts), encoding="utf-8")
 
     # What the modules would count in a second at the reference time, had they no faults.
@@ -250,11 +248,16 @@ def reconstructed(folder: Path) -> dict[str, mph.Volume]:
 def find_efficiency(folder: Path, recipe: mph.Recipe) -> None:
     """The efficiencies from the flood, as by `mphdrr project --counts flood.dcm` and `mphdrr counts flood`."""
     bare = {key: None for key in recipe.given if not key.startswith(("system.", "model.kind", "counts.orientation"))}
-    said = {"counts.files": [str(folder / "flood.dcm")], "counts.frames": recipe["system.modules"]}
+    said = {"counts.files": [str(folder / "flood.dcm")], "counts.frames": frames_of(folder)}
     (flood,) = runs_of(recipe.updated(bare | said))
     found = mph.flood_efficiency(flood.projections, smooth_order=0)
     print(found)
     np.save(folder / "efficiency.npy", found.efficiency.astype(np.float32))
+
+
+def frames_of(folder: Path) -> str:
+    """Which module each frame of a file with one energy window is of."""
+    return f"1-{len(mph.read_system(folder / 'scanner.xlsx'))}"
 
 
 def faultless(folder: Path, recipe: mph.Recipe) -> dict[str, Any]:
@@ -262,7 +265,7 @@ def faultless(folder: Path, recipe: mph.Recipe) -> dict[str, Any]:
     plain = {key: None for key in recipe.given if key.startswith("counts.") and key != "counts.orientation"}
     plain |= dict.fromkeys(("model.efficiency", "model.dead_time", "model.start"))
     files, seconds = [str(folder / "faultless.npy")], float(np.load(folder / "truth.npz")["times"].mean())
-    return plain | {"counts.files": files, "counts.frames": recipe["system.modules"], "model.time": seconds}
+    return plain | {"counts.files": files, "counts.frames": frames_of(folder), "model.time": seconds}
 
 
 def left_out(folder: Path, recipe: mph.Recipe) -> dict[str, dict[str, Any]]:

@@ -21,6 +21,9 @@ from typing import Any
 import numpy as np
 
 import mphdrr.core as mph
+from mphdrr.core.figures.page import Page
+from mphdrr.core.figures.parts import INK
+from mphdrr.core.runs.display import Display
 
 WORKBOOK = Path(__file__).with_name("dc-spect-80.xlsx")
 ACTIVITY, RADIUS, HEIGHT = 200.0, 55.0, 100.0  # kBq/mL, mm: a cylinder of water
@@ -125,8 +128,7 @@ def write_study(folder: Path, modules: int = 80, pixels: int = 32, seed: int = 1
 def pixels_of(shape: tuple[int, ...], rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The pixels' efficiencies, 0 where dead, and which are dead and which are hot (M, n_v, n_u).
 
-    Crystals count less at the edges, and pixels differ by 4 %. One pixel in 200 is dead, one in 300 is hot, and so is one module
-    dead.
+    Crystals count less at the edges, and pixels differ by 4 %. Dead are one pixel in 200 and one module, hot one in 300.
     """
     v, u = (np.linspace(-1, 1, n) for n in shape[1:])
     efficiency = (1 - 0.1 * (v[:, None] ** 2 + u**2)) * rng.normal(1, 0.04, shape)
@@ -236,7 +238,7 @@ def stored(frames: np.ndarray) -> np.ndarray:
 
 
 def reconstructed(folder: Path) -> dict[str, mph.Volume]:
-    """Volumes by the name of their row of the table: by the recipe, by the recipe with a correction left out, and without faults."""
+    """Volumes by the names of the table's rows: without faults, by the recipe, and by it with a correction left out each."""
     recipe = mph.read_recipe(folder / "study.toml")
     find_efficiency(folder, recipe)
     found = {"without faults": reconstruct(recipe.updated(faultless(folder, recipe)))}
@@ -294,8 +296,8 @@ def left_out(folder: Path, recipe: mph.Recipe) -> dict[str, dict[str, Any]]:
     return {
         "all corrections": {},
         "all, from Interfile": {"counts.files": [str(folder / "scan.hdr")]},
-        "exposures: their mean for all": silent | {"model.time": float(truth["times"].mean())},
-        "starts: the first one's for all": silent | {"model.start": START},
+        "exposures": silent | {"model.time": float(truth["times"].mean())},
+        "starts": silent | {"model.start": START},
         "decay before the scan": silent | {"model.start": truth["starts"].tolist()},
         "dead module": several["no_module"],
         "dead and hot pixels": several["no_pixels"],
@@ -334,6 +336,23 @@ def print_table(volumes: Mapping[str, mph.Volume]) -> None:
         values = middle(volume)
         off = f"{values.mean() / right - 1:+.1%}".replace("-", "−")
         print(f"| {name} | {values.mean():.1f} | {off} | {values.std() / values.mean():.1%} |", flush=True)
+
+
+def draw(volumes: Mapping[str, mph.Volume], path: str) -> None:
+    """Slices along the cylinder, in the same colors: without faults, with all corrections, and with one left out each."""
+    from PIL import Image
+
+    display, side, gap = Display(colors="inferno"), 200, 10
+    shown = [name for name in volumes if name not in ("all, from Interfile", "decay before the scan", "attenuation")]
+    columns = (len(shown) + 1) // 2
+    page = Page(columns * (side + gap) + gap, 2 * (side + 4 * gap))
+    for number, name in enumerate(shown):
+        row, column = divmod(number, columns)
+        left, top = gap + column * (side + gap), 3 * gap + row * (side + 4 * gap)
+        array = volumes[name].array
+        page.image(display.colored(array[:, array.shape[1] // 2].T[::-1], (0.0, 1.5 * ACTIVITY)), left, top, side, side)
+        page.text(name if number < 2 else f"no: {name}", left + side / 2, top - 0.7 * gap, 13, INK, "middle")
+    Image.fromarray(page.picture).save(path, quality=80)
 
 
 if __name__ == "__main__":

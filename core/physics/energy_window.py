@@ -125,7 +125,7 @@ def energy_window_scatter(
     sigma = positive(fwhm, f"{name}: fwhm", "pixels") / FWHM_PER_SIGMA
     along_v, along_u = (gaussian_blur(n, sigma) for n in shape[1:])
     shares = np.broadcast_to(real_array(efficiency, f"{name}: efficiency", None), shape)
-    around = along_v @ shares @ along_u.T  # normalises at the edges, too
-    factors = np.divide(shares, around, out=np.zeros(shape), where=shares > 0)
+    around = along_v @ shares @ along_u.T
+    factors: Floats = np.divide(shares, around, out=np.zeros(shape), where=shares > 0)
     scatter, variance = (np.where(shares > 0, x, 0.0) for x in (scatter, variance))
     return factors * (along_v @ scatter @ along_u.T), factors**2 * (along_v**2 @ variance @ (along_u**2).T)

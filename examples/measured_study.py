@@ -256,6 +256,7 @@ def find_efficiency(folder: Path, recipe: mph.Recipe) -> None:
     found = mph.flood_efficiency(flood.projections, smooth_order=0)
     print(found)
     np.save(folder / "efficiency.npy", found.efficiency.astype(np.float32))
+    np.save(folder / "levelled.npy", mph.flood_efficiency(flood.projections).efficiency)
 
 
 def frames_of(folder: Path) -> str:
@@ -273,10 +274,11 @@ def faultless(folder: Path, recipe: mph.Recipe) -> dict[str, Any]:
 
 def left_out(folder: Path, recipe: mph.Recipe) -> dict[str, dict[str, Any]]:
     """What the recipe says otherwise, by rows: nothing, Interfile instead of DICOM, and without a correction each."""
-    efficiency = np.load(folder / "efficiency.npy")
+    efficiency, levelled = (np.load(folder / f"{name}.npy") for name in ("efficiency", "levelled"))
     gone = np.zeros_like(efficiency) + ~efficiency.any((1, 2), keepdims=True)
     several = {
-        "no_map": (efficiency > 0),
+        "no_map": efficiency > 0,
+        "no_edges": levelled,
         "no_pixels": np.where((efficiency == 0) & (gone == 0), 1, efficiency),
         "no_module": efficiency + gone,
     }
@@ -303,6 +305,7 @@ def left_out(folder: Path, recipe: mph.Recipe) -> dict[str, dict[str, Any]]:
         "dead module": several["no_module"],
         "dead and hot pixels": several["no_pixels"],
         "efficiencies of the others": several["no_map"],
+        "efficiencies' smooth part": several["no_edges"],
         "dead time": {"model.dead_time": None},
         "scatter": scatter,
         "attenuation": {"attenuation.file": None},

@@ -333,8 +333,8 @@ def middle(volume: mph.Volume) -> np.ndarray:
 
 
 def numbers_of(volumes: Mapping[str, mph.Volume]) -> dict[str, tuple[float, float, float, float]]:
-    """Of each row the middle's mean, its difference from that without faults, its standard deviation, and how much its voxels
-    differ from those with all corrections (root mean square): all but the first as shares.
+    """Of each row the middle's mean, and as shares its difference from that without faults, its standard deviation, and how
+    much its voxels differ from those with all corrections (root mean square).
     """
     right, best = middle(volumes["without faults"]).mean(), middle(volumes[ALL])
     found = {}

@@ -1,6 +1,6 @@
-"""A scan as a real scanner makes it, with all its faults, from the scanner's files to a volume; each correction is left out once.
+"""A scan as a real scanner makes it, with all its faults, and what each correction of them is worth.
 
-    python measured_study.py [FOLDER] [--picture study.webp] [--modules 80] [--pixels 32]
+    python examples/measured_study.py [FOLDER] [--picture study.webp] [--modules 80] [--pixels 32]
 
 It writes into FOLDER what a scanner gives: a scan and the flood of an even source, as DICOM NM and as Interfile, and beside
 them attenuation, the scanner's workbook and one recipe, study.toml. Then it does what docs/measured-studies.md does by

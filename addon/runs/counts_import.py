@@ -24,7 +24,8 @@ def importing(context: bpy.types.Context, paths: list[Path], given: Mapping[str,
     """The job that reads measured counts as the run of the scene's scanner.
 
     `given` are entries of a recipe: of its table ``counts``, the time, the pixel size, the modules. The rest of the model,
-    such as isotope, aperture and attenuation, which a reconstruction needs, is the panel's. Raises InputError where there is no scanner.
+    such as isotope, aperture and attenuation, which a reconstruction needs, is the panel's. Raises InputError where there
+    is no scanner.
     """
     if not paths:
         raise InputError("no file given: set filepath to a file with counts")

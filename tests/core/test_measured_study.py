@@ -36,8 +36,12 @@ def test_one_recipe_imports_dicom_and_interfile(example, tmp_path):
         np.testing.assert_allclose(run.recipe["model.start"], 10_800 + truth["starts"])
     np.testing.assert_array_equal(dicom.efficiency == 0, truth["dead"] | truth["hot"])
     lives = dicom.efficiency > 0
-    off = (dicom.efficiency[lives] / truth["efficiency"][lives] - 1) * np.sqrt(example.FLOOD * truth["efficiency"][lives])
-    assert off.std() == pytest.approx(1, rel=0.1), "but for the flood's noise, the efficiencies are those that there were"
+    off = (dicom.efficiency[lives] / truth["efficiency"][lives] - 1) * np.sqrt(
+        example.FLOOD * truth["efficiency"][lives]
+    )
+    assert off.std() == pytest.approx(1, rel=0.1), (
+        "but for the flood's noise, the efficiencies are those that there were"
+    )
 
 
 @pytest.mark.long
@@ -47,7 +51,14 @@ def test_all_corrections_are_right_and_each_is_needed(example, tmp_path):
     _, off, deviation, _ = found[example.ALL]
     assert abs(off) < 0.02
     assert found["all, from Interfile"] == found[example.ALL]
-    for name in ("starts", "decay before the scan", "efficiencies of the others", "dead time", "scatter", "attenuation"):
+    for name in (
+        "starts",
+        "decay before the scan",
+        "efficiencies of the others",
+        "dead time",
+        "scatter",
+        "attenuation",
+    ):
         assert abs(found[name][1] - off) > 0.06, name
     for name in ("exposures", "dead module", "dead and hot pixels", "efficiencies of the others"):
         assert found[name][2] > 1.3 * deviation, name

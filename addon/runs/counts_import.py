@@ -12,6 +12,7 @@ from ...core.progress import Progress, stages_of
 from ...core.runs.measured import recipe_counts
 from ...core.runs.mosaic import caption
 from ..blender import jobs
+from ..phantoms import phantoms
 from ..pictures import images
 from ..scanner import scanner
 from . import rendering, runs
@@ -23,14 +24,18 @@ def importing(context: bpy.types.Context, paths: list[Path], given: Mapping[str,
     """The job that reads measured counts as the run of the scene's scanner.
 
     `given` are entries of a recipe: of its table ``counts``, the time, the pixel size, the modules. The rest of the model,
-    such as isotope and aperture, which a reconstruction needs, is the panel's. Raises InputError where there is no scanner.
+    such as isotope, aperture and attenuation, which a reconstruction needs, is the panel's. Raises InputError where there
+    is no scanner.
     """
     if not paths:
         raise InputError("no file given: set filepath to a file with counts")
     scene = context.scene
     collection = scanner.required_scanner(scene)
-    recipe = runs.panel_recipe(scene).updated(
-        {**dict.fromkeys(_OF_FRAMES), "model.time": None}
+    recipe = runs.panel_recipe(scene)
+    if (mu := rendering.attenuating(context, recipe)) is not None:
+        phantoms.require_current(mu)
+    recipe = recipe.updated(
+        {**dict.fromkeys(_OF_FRAMES), "model.time": None, "attenuation.object": mu and mu.name}
         | {"model.kind": "emission", "counts.files": [str(path) for path in paths]}
         | dict(given)
     )

@@ -90,11 +90,16 @@ def sources(
     taken = scanner.kind_of(scanner.required_scanner(context.scene)).takes
     taken = tuple(each for each in taken if each in (("mu",) if recipe["model.photons"] else model.takes))
     item = _chosen_volume(context, volume, taken, model.name)
-    mu_item = _given(context, "mu", mu) if recipe["model.kind"] == "emission" else None
-    if mu_item is not None:
-        attenuating = ("mu", "hu") if recipe["model.isotope"] else ("mu",)  # CT numbers at the isotope's energies
-        require_quantity(volumes.quantity_of(mu_item), attenuating, f"{mu_item.name!r} for attenuation")
-    return item, mu_item
+    return item, attenuating(context, recipe, mu)
+
+
+def attenuating(context: bpy.types.Context, recipe: Recipe, mu: str = "") -> bpy.types.Object | None:
+    """The object of what attenuates a recipe's photons, by default the panel's; errors as of `render_job`."""
+    item = _given(context, "mu", mu) if recipe["model.kind"] == "emission" else None
+    if item is not None:
+        taken = ("mu", "hu") if recipe["model.isotope"] else ("mu",)  # CT numbers at the isotope's energies
+        require_quantity(volumes.quantity_of(item), taken, f"{item.name!r} for attenuation")
+    return item
 
 
 def integrates_activity(context: bpy.types.Context) -> bool:
@@ -120,6 +125,9 @@ def load_recipe(scene: bpy.types.Scene, path: Path) -> None:
     _set_physics(scene, recipe)
     known = {item.name: item for item in volumes.volume_objects(scene)}
     settings.volume, settings.mu = known.get(recipe["volume.object"]), known.get(recipe["attenuation.object"])
+    name = recipe["attenuation.object"] or recipe["attenuation.file"]
+    if name is not None and settings.mu is None:
+        warn(f"the recipe's attenuation, {name}, is not chosen: import it if it is not here, and choose it in Physics")
 
 
 def _set_physics(scene: bpy.types.Scene, recipe: Recipe) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from ... import core as mph
-from ..files import write_bytes
+from ..files import require_ending, write_bytes
 from ..runs.files import FORMATS
 from . import COMMANDS
 from .options import add_command, add_run, output_path, print_answer
@@ -32,6 +32,7 @@ def _run(arguments: argparse.Namespace) -> None:
     mphdrr counts flood flood.h5 -o efficiency.npy
     """
     path, file = output_path(arguments.output, (".npy",)), Path(arguments.file)
+    require_ending(file, (*FORMATS, ".npy"))  # frames of other files may be of any module, and lie in any way
     run = mph.read_run(file) if file.suffix.lower() in FORMATS else None
     images = mph.read_counts(file) if run is None else run.projections
     numbers = list(range(1, len(images) + 1)) if run is None else run.system.numbers.tolist()

@@ -66,6 +66,7 @@ def energy_window_scatter(
     upper: ArrayLike | None,
     widths: Sequence[float | None],
     fwhm: float | None = None,
+    efficiency: ArrayLike = 1.0,
 ) -> tuple[Floats, Floats]:
     """Scattered photons in the peak window, from the counts in the windows below and above it.
 
@@ -84,6 +85,9 @@ def energy_window_scatter(
     fwhm : float, optional
         FWHM, in pixels, of a Gaussian that smooths the estimate: scatter is smoother than noise. Its weights within the
         image sum to 1 for each pixel, so an even estimate stays as it is.
+    efficiency : number or array (M, n_v, n_u)
+        Of the pixels, as in `Emission`: photons are smoothed, of which each pixel counts its share. Those of dead and hot
+        pixels, 0, are no part of it, and the smoothed estimate of them is 0.
 
     Returns
     -------
@@ -120,5 +124,8 @@ def energy_window_scatter(
         return scatter, variance
     sigma = positive(fwhm, f"{name}: fwhm", "pixels") / FWHM_PER_SIGMA
     along_v, along_u = (gaussian_blur(n, sigma) for n in shape[1:])
-    along_v, along_u = (matrix / matrix.sum(axis=1, keepdims=True) for matrix in (along_v, along_u))
-    return along_v @ scatter @ along_u.T, along_v**2 @ variance @ (along_u**2).T
+    shares = np.broadcast_to(real_array(efficiency, f"{name}: efficiency", None), shape)
+    around = along_v @ shares @ along_u.T
+    factors: Floats = np.divide(shares, around, out=np.zeros(shape), where=shares > 0)
+    scatter, variance = (np.where(shares > 0, x, 0.0) for x in (scatter, variance))
+    return factors * (along_v @ scatter @ along_u.T), factors**2 * (along_v**2 @ variance @ (along_u**2).T)

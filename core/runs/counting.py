@@ -1,6 +1,8 @@
 """What pixels and modules make of photons: efficiencies from files, and dead time, as recipes say them."""
 
+from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -42,10 +44,16 @@ def dead_time_of(recipe: Recipe) -> tuple[float, str]:
     return 1e-6 * recipe["model.dead_time"], recipe["model.dead_time_kind"]
 
 
-def live_shares_of(recipe: Recipe, counts: Array) -> Floats:
-    """The shares (M, 1, 1) of photons that modules with a recipe's dead time recorded, by their counts (M, n_v, n_u)."""
+def live_shares_of(recipe: Recipe, counts: Array, record: Mapping[str, Any] = MappingProxyType({})) -> Floats:
+    """The shares (M, 1, 1) of photons that modules with a recipe's dead time recorded, by their counts (M, n_v, n_u).
+
+    What a measured run's `record` says of scatter's energy windows has kept them busy, too.
+    """
     seconds, kind = dead_time_of(recipe)
-    return live_shares(counts, recipe["model.time"], seconds, kind) if seconds else np.ones((1, 1, 1))  # type: ignore[arg-type]
+    if not seconds:
+        return np.ones((1, 1, 1))
+    totals = counts.sum(axis=(1, 2), dtype=float) + record.get("scatter", {}).get("counts", 0.0)
+    return live_shares(totals[:, None, None], recipe["model.time"], seconds, kind)  # type: ignore[arg-type]
 
 
 def scaled(values: float | Floats, shares: Array) -> float | Floats:

@@ -135,10 +135,11 @@ def counts_run(
     }  # fmt: skip
     efficiency = recipe_efficiency(recipe) if efficiency is None else efficiency
     efficiency = checked_background(efficiency, "efficiency (--efficiency)", len(system), (n_v, n_u))
-    background = scaled(made["model.background"], live_shares_of(made, images))
+    estimate: Any = None
     if scatter is not None:
-        estimate, record["scatter"] = scatter.estimate(of_windows, frames_of, found)
-        background = each_pixel(background) + estimate
+        estimate, record["scatter"] = scatter.estimate(of_windows, frames_of, found, efficiency)
+    background = scaled(made["model.background"], live_shares_of(made, images, record))
+    background = background if estimate is None else each_pixel(background) + estimate
     known: Any = {"settings": record, "background": background, "efficiency": efficiency}
     run = ProjectionRun(images, system, views, unit="counts", **known)
     _warn_of_others(found, used, words, run)

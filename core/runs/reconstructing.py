@@ -189,6 +189,9 @@ def recipe_of(run: ProjectionRun, recipe: Recipe | None = None) -> Recipe:
     if recipe is None:
         return run.recipe
     given = {key: value for key, value in recipe.given.items() if key.partition(".")[0] in TABLES}
+    if run.is_measured and isinstance(given.get("model.start"), int | float):  # as in imports, of the first frame
+        starts = np.asarray(run.recipe["model.start"])
+        given["model.start"] = (given["model.start"] + starts - starts.min()).tolist()
     return Recipe(given) if "recipe" not in run.settings and "model.kind" in given else run.recipe.updated(given)
 
 

@@ -170,7 +170,7 @@ def recipe_model(recipe: Recipe, system: Scanner, mu: Volume | None = None, run:
         else:
             given["efficiency"] = recipe_efficiency(recipe)
         if run is not None and recipe["model.dead_time"]:
-            shares = live_shares_of(recipe, run.projections)
+            shares = live_shares_of(recipe, run.projections, run.settings)
             given |= {name: scaled(given.get(name, 0.0), shares) for name in ("background", "efficiency")}
     return cls(**given) if cls is Transmission else cls(system, **given)
 

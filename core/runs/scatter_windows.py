@@ -9,6 +9,7 @@ import numpy as np
 from ..arrays import Floats, Floats32
 from ..errors import InputError
 from ..physics.energy_window import energy_window_scatter
+from ..projector.models import each_pixel
 from .frame_files import Counts, differs
 
 _WORDS = ("lower", "peak", "upper")
@@ -49,19 +50,26 @@ class ScatterWindows:
         return {word: frames for word, frames in given.items() if frames is not None}
 
     def estimate(
-        self, images: Mapping[str, Floats32], used: Mapping[str, Sequence[int]], found: Counts
+        self,
+        images: Mapping[str, Floats32],
+        used: Mapping[str, Sequence[int]],
+        found: Counts,
+        efficiency: float | Floats = 1.0,
     ) -> tuple[Floats, dict[str, Any]]:
         """The scatter (M, n_v, n_u) in the images of the window "peak", and what is recorded of it.
 
-        `images` and the frames `used` for them, in the modules' order, are by the windows "peak", "lower" and "upper".
+        `images` and the frames `used` for them, in the modules' order, are by the windows "peak", "lower" and "upper"; the
+        `efficiency` is that of the images.
         `InputError` where the files say other windows or exposures, or nothing says the windows' widths.
         """
         _require_own_frames(used, found)
         widths = [None if word not in used else self._width(word, used[word], found) for word in _WORDS]
         (lower, peak, upper) = map(images.get, _WORDS)
         assert peak is not None
-        scatter, _ = energy_window_scatter(lower, peak, upper, widths, self.fwhm)
-        return scatter, {"windows": sorted(self.frames), "widths_keV": widths, "fwhm_pixels": self.fwhm}
+        scatter, _ = energy_window_scatter(lower, peak, upper, widths, self.fwhm, each_pixel(efficiency))
+        beside = sum(images[word].sum(axis=(1, 2), dtype=float) for word in self.frames)
+        record = {"windows": sorted(self.frames), "widths_keV": widths, "fwhm_pixels": self.fwhm}
+        return scatter, record | {"counts": np.asarray(beside).tolist()}
 
     def _width(self, word: str, used: Sequence[int], found: Counts) -> float:
         """The width of a window, keV: what is given, unless a file contradicts it, or what the files say."""

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import importlib.util
+from pathlib import Path
+
 import bpy
 import numpy as np
 import pytest
@@ -10,9 +13,14 @@ from mphdrr.addon.blender import ids, storage
 from mphdrr.addon.pictures import images
 from mphdrr.addon.runs import runs
 from mphdrr.addon.scanner import scanner
+from mphdrr.addon.volumes import volumes
 from mphdrr.core.geometry.system import PinholeSystem
 from mphdrr.core.physics.energy_window import energy_window_scatter
 from mphdrr.core.runs.files import read_run
+from mphdrr.core.runs.recipe import read_recipe
+from mphdrr.core.runs.reconstructing import reconstruct_run
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
 
 
 @pytest.fixture
@@ -57,6 +65,35 @@ def test_counts_become_the_shown_run(scanned, counts, scene, tmp_path):
     assert bpy.ops.mphdrr.compare_runs(other="0") == {"FINISHED"}
     assert bpy.ops.mphdrr.load_recipe(filepath=str(tmp_path / "out.npz")) == {"FINISHED"}
     assert (settings.model, settings.time, settings.detector) == ("EMISSION", 60.0, "REAL")
+
+
+def test_a_measured_study_is_the_run_of_its_recipe(scene, tmp_path):
+    """All corrections at once, by the window as by the command (docs/measured-studies.md)."""
+    spec = importlib.util.spec_from_file_location("measured_study", EXAMPLES / "measured_study.py")
+    study = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(study)
+    study.write_study(tmp_path, modules=6, pixels=12)
+    recipe = read_recipe(tmp_path / "study.toml")
+    study.find_efficiency(tmp_path, recipe)
+    assert bpy.ops.mphdrr.import_geometry(filepath=str(tmp_path / "scanner.xlsx")) == {"FINISHED"}
+    assert bpy.ops.mphdrr.import_volume(filepath=str(tmp_path / "water.nii.gz"), quantity="mu") == {"FINISHED"}
+    assert bpy.ops.mphdrr.load_recipe(filepath=str(tmp_path / "study.toml")) == {"FINISHED"}
+    scene.mphdrr_projections.mu = bpy.context.object
+    names = "frames", "lower_frames", "upper_frames", "scatter_fwhm"
+    given = {name: recipe[f"counts.{name}"] for name in names} | {"orientation": "back-v"}
+    assert bpy.ops.mphdrr.import_counts(filepath=str(tmp_path / "scan.dcm"), **given) == {"FINISHED"}
+    run, (own,) = read_run(storage.absolute(scene.mphdrr_projections.run_file)), study.runs_of(recipe)
+    for name in ("projections", "background", "efficiency"):
+        np.testing.assert_array_equal(getattr(run, name), getattr(own, name))
+    for name in ("time", "start", "dead_time", "isotope"):
+        assert run.recipe[f"model.{name}"] == own.recipe[f"model.{name}"]
+    settings = scene.mphdrr_reconstruction
+    settings.iterations, settings.subsets, settings.voxels, settings.spacing = 2, 2, 8, 20.0
+    assert bpy.ops.mphdrr.reconstruct() == {"FINISHED"}
+    said = {"iterations": 2, "subsets": 2, "voxels": 8, "spacing": 20.0}
+    found = reconstruct_run(own, recipe.updated({f"reconstruction.{name}": value for name, value in said.items()}))
+    shown = volumes.volume_from_object(settings.volume)
+    np.testing.assert_allclose(shown.array, found.volume.array, rtol=2e-2, atol=1e-2 * found.volume.array.max())
 
 
 def test_the_files_own_times_are_taken(scanned, counts, scene, tmp_path):

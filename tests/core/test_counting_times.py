@@ -175,6 +175,25 @@ def test_dicoms_phases_say_when_frames_began_and_how_long_they_took(system, rng,
     assert part.recipe["model.start"] == pytest.approx((begun[5] - begun[3], 0)), "after the first frame that is used"
 
 
+def test_a_recipe_that_imports_says_the_same_when_it_reconstructs(system, rng, tmp_path):
+    """Its start is that of the first frame; those of the others stay what the file says."""
+    pytest.importorskip("pydicom")
+    write_phases(counted(rng), tmp_path / "d.dcm", np.full(12, 60.0), np.full(12, 3600.0))
+    recipe = mph.Recipe({
+        "counts.files": [str(tmp_path / "d.dcm")], "counts.frames": "112-101", "counts.orientation": "back-v",
+        "model.kind": "emission", "model.start": 600.0, "model.isotope": "Tc-99m", "reconstruction.method": "mlem",
+        "reconstruction.iterations": 1, "reconstruction.voxels": 4, "reconstruction.spacing": 20.0,
+    })  # fmt: skip
+    (run,) = mph.run_recipe(recipe, system)
+    assert max(run.recipe["model.start"]) > 40_000
+    own = mph.reconstruct_run(run, run.recipe.updated({key: recipe[key] for key in recipe.given if "recon" in key}))
+    np.testing.assert_array_equal(mph.reconstruct_run(run, recipe).volume.array, own.volume.array)
+    later = mph.reconstruct_run(run, recipe.updated({"model.start": 600.0 + 21_600}))
+    tc = mph.isotope("Tc-99m")
+    factor = tc.mean_decay_time(60.0, 600.0) / tc.mean_decay_time(60.0, 22_200.0)
+    np.testing.assert_allclose(later.volume.array, factor * own.volume.array, rtol=1e-4)
+
+
 def test_frames_of_a_phase_follow_each_other(rng, tmp_path):
     pytest.importorskip("pydicom")
     from pydicom.dataset import Dataset

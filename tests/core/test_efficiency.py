@@ -317,3 +317,10 @@ def test_the_command_writes_what_recipes_read(workbook, rng, tmp_path, capsys):
     assert main(["project", str(workbook), *options, "--efficiency", str(tmp_path / "e.npy"), "-o", str(output)]) == 0
     found = mph.read_run(output)
     assert found.efficiency[1, 3, 4] == found.efficiency[0, 5, 6] == 0 and found.projections[1, 3, 4] == 0
+
+
+def test_floods_whose_modules_and_orientation_nobody_said_are_refused(tmp_path, capsys):
+    """Another program's frames: a flood must be imported first."""
+    (tmp_path / "flood.dcm").write_bytes(b"")
+    assert main(["counts", "flood", str(tmp_path / "flood.dcm"), "-o", str(tmp_path / "e.npy")]) == 1
+    assert "expected a name ending in .h5" in capsys.readouterr().err

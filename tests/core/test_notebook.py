@@ -87,6 +87,8 @@ def test_plot_drr_shows_each_image_as_it_is(pyplot, rng):
     assert not len(plot_drr(images[0, 0], ticks=False)[0].get_xticks())
     with pytest.raises(InputError, match="B x C x height x width, got 5"):
         plot_drr(images[0, 0, :, 0])
+    with pytest.raises(InputError, match="3 images, but 2 axes"):
+        plot_drr(images[0], axs=axes)
 
 
 def test_without_matplotlib_it_is_said(monkeypatch):

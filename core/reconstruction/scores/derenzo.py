@@ -23,6 +23,9 @@ RESOLVED_BELOW = 0.735
 NOISE_BELOW = 0.02
 """Chance that noise makes a sector's contrast: of one that is resolved it is less."""
 
+LIGHTS = {"green": "resolved", "amber": "seen, not resolved", "red": "not resolved"}
+"""What a sector is, by the colour of its dot. Amber: its rods stand out of the noise, but Rayleigh's limit is not reached."""
+
 _LENGTH = 0.5  # of the rods, around their middle, that profiles are means over: ends blur into what is beside them
 _WIDTH = 0.5  # of a rod's diameter, that profiles are means over
 _ACROSS = 5  # lines over that width
@@ -85,10 +88,21 @@ class DerenzoSector:
         return float(np.mean([profile.valley_to_peak < RESOLVED_BELOW for profile in self.profiles] or np.nan))
 
     @property
+    def light(self) -> str:
+        """A key of `LIGHTS`: "green" if it is `resolved`, "amber" if only `chance` is low enough, else "red"; "" if unknown."""
+        if self.note or not self.profiles:
+            return ""
+        return "green" if self.resolved else "amber" if self.chance < NOISE_BELOW else "red"
+
+    @property
+    def contrast(self) -> str:
+        """The contrast recovery in words."""
+        return f"{np.round(100 * self.contrast_recovery) + 0.0:.0f} %"
+
+    @property
     def words(self) -> str:
         """The score in a line: whether it is resolved, and by what; or why there is none."""
-        score = f"valley/peak {self.valley_to_peak:.2f}, contrast {np.round(100 * self.contrast_recovery) + 0.0:.0f} %"
-        return self.note or f"{'resolved' if self.resolved else 'not resolved'}, {score}"
+        return self.note or f"{LIGHTS[self.light]}, valley/peak {self.valley_to_peak:.2f}, contrast {self.contrast}"
 
 
 class DerenzoScore(Rows[DerenzoSector]):

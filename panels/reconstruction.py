@@ -45,13 +45,28 @@ def _draw_result(layout: bpy.types.UILayout, settings: bpy.types.PropertyGroup, 
         column.label(text=known["name"].capitalize())
         column.label(text=f"{known['objective'][-1]:.7g}", translate=False)
     scores = box.column(align=True)
-    for name, value in known["scores"]:
+    for name, value in (*known["scores"], *([("Voxels", known["voxels"])] if "voxels" in known else ())):
         row = scores.split(factor=0.3)
         row.label(text=name, translate=False)
-        row.label(text=value, translate=False)
+        draw_text(row, value, "NONE")
+    rods = known.get("rods", ())
+    if rods:
+        row = scores.split(factor=0.4)
+        row.label(text="Rods")
+        for text in ("Valley/Peak", "Contrast"):
+            row.label(text=text)
+    for name, light, valley, contrast in rods:
+        row = scores.split(factor=0.4)
+        row.label(
+            text=name, translate=False, **({"icon_value": plots.dot_icon(light)} if light else {"icon": "BLANK1"})
+        )
+        for text in filter(None, (valley, contrast)):
+            row.label(text=text, translate=False)
     for text in known.get("flatters", ()):
         draw_text(box, text)
-    box.operator("mphdrr.show_reconstruction", text="Show Slices", icon="IMAGE_DATA")
+    row = layouts.invoking(box.row())
+    row.operator("mphdrr.continue_reconstruction", text="Continue (+10)", icon="FORWARD")
+    row.operator("mphdrr.show_reconstruction", text="Show Slices", icon="IMAGE_DATA")
 
 
 class MPHDRR_PT_reconstruction_model(Folded, bpy.types.Panel):

@@ -31,8 +31,8 @@ _FONTS = "DejaVu Sans, Verdana, Arial, sans-serif"
 class Page:
     """A page of `width` x `height` pixels; places are in pixels from its top left corner, colours like "#20262d".
 
-    `em` is the size of its text, by default one that suits the page. `ink` and `faint` are the colours of text and lines, and
-    of notes, that suit its paper.
+    `em` is the size of its text, by default one that suits the page. `ink` and `faint` are the colours that suit its paper:
+    of text and lines, and of notes.
     """
 
     def __init__(self, width: int, height: int, paper: str = "#ffffff", em: float = 0.0) -> None:

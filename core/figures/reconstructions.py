@@ -64,7 +64,9 @@ def draw(
         planes, kinds = best[:count], len(known)
         sizes = [(extent[across], extent[up]) for _, across, up in planes for _ in known]
         beside, below = [range(len(sizes))], [range(i, i + kinds) for i in range(0, len(sizes), kinds)]
-        pixels, places = arranged(sizes, margins, room, beside, below, [range(k, len(sizes), kinds) for k in range(kinds)])
+        pixels, places = arranged(
+            sizes, margins, room, beside, below, [range(k, len(sizes), kinds) for k in range(kinds)]
+        )
         if max(extent) * pixels >= _LEGIBLE * em:
             break
     at = full_slices(known[0][1])
@@ -73,7 +75,7 @@ def draw(
         place = grid.center[axis] + (at[axis] - (grid.shape[axis] - 1) / 2) * grid.spacing[axis]
         text = f"{name}, {_NAMES[axis]} = {number(round(float(place), 2) + 0.0)} mm" if kind == 0 else name
         size = 0.9 * em * min(1.0, width * pixels / letters.width(text, 0.9 * em))
-        page.text(text, x, y - 0.4 * em, size, page.ink if kind == 0 else page.faint)
+        page.text(text, x, y - 0.4 * em, size, page.ink)
         look = errors if name == "Error" else colors
         picture = look[0].colored(values.take(at[axis], axis).T[::-1], look[1])
         page.image(picture, round(x), round(y), round(width * pixels), round(height * pixels))
@@ -92,21 +94,32 @@ def _draw_texts(
     """Write what is known of a reconstruction beside its slices, and draw the objective where there is room for it."""
     em, width = page.em, page.width - left - page.em
     row = 0.3 * em
-    for text, size, color in ((title, 1.15 * em, page.ink), *((line, 0.9 * em, page.faint) for line in lines)):
-        row += 1.35 * size
-        page.text(text, left, row, size * min(1.0, width / letters.width(text, size)), color)
-    columns = left + 1.2 * em, left + min(0.45 * width, 8 * em), left + min(0.9 * width, 15 * em)
+
+    def write(text: str, size: float, color: str) -> None:
+        nonlocal row
+        for line in letters.wrapped(text, lambda piece: letters.width(piece, size) <= width):
+            row += 1.35 * size
+            page.text(line, left, row, size, color)
+
+    write(title, 1.1 * em, page.ink)
+    for line in lines[:1]:
+        write(line, 0.9 * em, page.faint)
     table = [("", "rods", "valley/peak", "contrast")] if rods else []
     table += [(s.light, f"{s.rod_diameter:g} mm", s.note or f"{s.valley_to_peak:.2f}", s.contrast) for s in rods]
-    row += 0.5 * em
+    columns = left + 1.2 * em, left + min(0.38 * width, 8 * em), left + min(0.74 * width, 15 * em)
+    row += 0.4 * em
     step = min(1.4 * em, (page.height - row - 0.4 * em) / max(len(table), 1))
     for light, *cells in table:
         row += step
         if light:
             page.area(_disc(left + 0.5 * em, row - 0.32 * em, 0.36 * em), LIGHTS[light])
         for x, cell in zip(columns, cells, strict=True):
-            page.text("" if cell == "nan %" else cell, x, row, 0.9 * em, page.ink if light else page.faint)
-    room = page.height - row - 5.5 * em
+            page.text("" if cell.startswith("nan") else cell, x, row, 0.9 * em, page.ink if light else page.faint)
+    row += 0.4 * em
+    for line in lines[1:]:
+        if row + 1.5 * em * (2 + len(line) // 45) < page.height:
+            write(line, 0.9 * em, page.faint)
+    room = page.height - row - 6.2 * em
     if len(objective) and room > 4 * em:
         place = left + 5.5 * em, row + 2.8 * em, width - 5.5 * em, min(room, 0.8 * width)
         draw_objective(page, objective, place, objective_name)

@@ -235,8 +235,14 @@ def reconstruction_grid(run: ProjectionRun, recipe: Recipe, method: Method | Non
     return Grid.centered((n_x, n_y, n_z), np.broadcast_to(spacing, 3), recipe["reconstruction.center"])
 
 
+def voxels_text(grid: Grid) -> str:
+    """A grid's voxels in words: "64 x 64 x 64 voxels of 1.5 mm"."""
+    sizes = list(dict.fromkeys(f"{size:.3g}" for size in grid.spacing))
+    return f"{' x '.join(map(str, grid.shape))} voxels of {' x '.join(sizes)} mm"
+
+
 def _detail(run: ProjectionRun) -> float:
-    """What there is to be seen of the run's volume, mm: its smallest rod, else the resolution; infinite where it is unknown."""
+    """What there is to be seen of the run's volume, mm: its smallest rod, else the resolution; infinite if unknown."""
     truth = None if run.volume is None else truth_of_run(run)[0]
     rods = [shape.rod_diameters for shape in getattr(truth, "shapes", ()) if isinstance(shape, DerenzoRods)]
     if rods and (found := [d for diameters in rods for d in diameters if d > 0]):

@@ -19,9 +19,9 @@ def full_slices(values: ArrayLike) -> NDArray[np.int64]:
 
 
 def bright_value(values: ArrayLike) -> float:
-    """The value that the last colour suits: single hot voxels of a reconstruction, which exceed it, do not darken the others.
+    """The value that the last colour suits: the voxels that exceed it hold 2 % of all. 0 where no value is above 0.
 
-    The voxels that exceed it hold 2 % of all; 0 where no value is above 0.
+    So single hot voxels of a reconstruction do not darken all others.
     """
     above = np.sort(np.asarray(values, np.float64).ravel())
     above = above[above > 0]

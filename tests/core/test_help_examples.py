@@ -101,7 +101,9 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     seen = {"system.file": str(folder / "both.xlsx"), "system.kind": "x-ray", "model.kind": "transmission"}
     (radiographs,) = mph.run_recipe(mph.Recipe(seen), volume=tissue)
     mph.write_run(radiographs, folder / "radiographs.h5")
-    mph.write_volume(mph.Volume(np.where(body > 0, 10.0, 0.0).astype(np.float32), grid, "activity"), folder / "spect.nii.gz")
+    mph.write_volume(
+        mph.Volume(np.where(body > 0, 10.0, 0.0).astype(np.float32), grid, "activity"), folder / "spect.nii.gz"
+    )
     (folder / "points.toml").write_text('[runs]\nfiles = ["point0.h5", "point1.h5", "point2.h5"]\n')
     return folder
 

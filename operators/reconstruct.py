@@ -13,8 +13,8 @@ _RUN: Need = (lambda context: runs.shown(context.scene) is not None, "No run yet
 
 
 class MPHDRR_OT_reconstruct(reconstruction_properties.ReconstructionSettings, jobs.JobOperator, bpy.types.Operator):
-    """Find the volume that the shown run's projections are of. It is in the scene from its first iterations on, and the truth
-    is hidden; Cancel asks whether to keep what there is. The settings are what the panel says now, unless a script gives
+    """Find the volume that the shown run's projections are of. It is in the scene from its first iterations on, the truth is
+    hidden; Cancel asks whether to keep what there is. The settings are what the panel says now, unless a script gives
     others
     """
 

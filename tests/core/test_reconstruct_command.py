@@ -6,6 +6,7 @@ import inspect
 import re
 import runpy
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -327,9 +328,16 @@ def test_a_prior_makes_it_smoother(run):
 
 
 def test_voxels_cover_the_roi_and_the_model_is_that_of_the_run(run):
-    grid = reconstruction_grid(run, run.recipe)
-    assert grid.shape == (64, 64, 64)
-    np.testing.assert_allclose(grid.spacing * 64, 2 * run.system.roi_radius.max())
+    side = 2 * run.system.roi_radius.max()
+    for rods, voxels in (((12.0, 0.0), 64), ((12.0, side / 40), 80), ((12.0, 1.0), 128)):
+        recipe = run.recipe.updated({"phantom.matrix": np.eye(4).tolist(), "phantom.rod_diameters": rods})
+        of_rods = replace(run, settings={**run.settings, "recipe": recipe.tables()})
+        grid = reconstruction_grid(of_rods, of_rods.recipe)
+        assert grid.shape == (voxels,) * 3, "half of the smallest rod, 64 to 128 along a side"
+        np.testing.assert_allclose(grid.spacing * voxels, side)
+        asked = {"reconstruction.voxels": 20}
+        assert reconstruction_grid(of_rods, of_rods.recipe.updated(asked)).shape == (20, 20, 20)
+        assert reconstruction_grid(of_rods, of_rods.recipe.updated({"reconstruction.spacing": 2.0})).shape == (64,) * 3
 
     def model(**changes):
         recipe = run.recipe.updated({key.replace("__", "."): value for key, value in changes.items()})
@@ -401,9 +409,9 @@ def test_the_picture_shows_slices_beside_the_truth_and_the_objective(run, file, 
     command(file, *SMALL, "--subsets", "5", "--picture", tmp_path / "p.svg")
     text = (tmp_path / "p.svg").read_text(encoding="utf-8")
     settings = "3 iterations, 5 subsets"
-    for words in ("Reconstruction", "Truth", "x y,  z = 2.5 mm", "Log-likelihood", "kBq/mL", settings, "20 mm"):
+    for words in ("Reconstruction", "Error", "Truth, z = 2.5 mm", "Log-likelihood", "kBq/mL", "error", settings, "20 mm"):
         assert f">{words}<" in text, words
-    assert text.count("<image") == 7  # two rows of slices and a colour bar
+    assert text.count("<image") == 11  # three slices of each, and two colour bars
     volume = mph.Volume(np.zeros((2, 2, 2)), mph.Grid.centered(2, 1.0))
     assert settings_line(mph.Reconstruction(volume, np.zeros(1))) == "1 iteration"
     assert settings_line(mph.Reconstruction(volume, np.zeros(2), {"subsets": 4})) == "2 iterations, 4 subsets"

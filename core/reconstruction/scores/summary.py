@@ -52,8 +52,8 @@ class VolumeScore:
         similarity = "" if self.ssim is None else f", SSIM {self.ssim:.3f}"
         lines = [f"All voxels: NRMSE {self.nrmse:.3f}, PSNR {_number(self.psnr, '.1f')} dB{similarity}"]
         if self.derenzo is not None:
-            rows = [(f"{s.rod_diameter:g} mm", s.light, s.words) for s in self.derenzo if s.rod_diameter]
-            lines += [f"{name:<6}  {light:<5}  {words}" for name, light, words in rows]
+            said = ((s.rod_diameter, ": ".join(filter(None, (s.light, s.words)))) for s in self.derenzo)
+            lines += [f"{diameter:g} mm  {words}" for diameter, words in said if diameter]
         if self.nema is not None:
             lines += _table(("Spheres", "contrast recovery", "background variability"), map(_sphere_row, self.nema))
             if not math.isnan(self.nema.lung_residual):

@@ -293,9 +293,9 @@ def _picture(
     room: tuple[int, int] | None, scale: float,
 ) -> bytes:  # fmt: skip
     """A picture that fills its editor's room, (width, height) in pixels, if there is one."""
-    em = _TEXT * scale if room else 0.0
-    size = SIZE if run.volume is None else SIZE_BESIDE_TRUTH
-    page = Page(*(tuple(max(side, SMALLEST) for side in room) if room else size), DARK, em)
+    usual = SIZE if run.volume is None else SIZE_BESIDE_TRUTH
+    fills = room is not None and min(room) >= SMALLEST
+    page = Page(*(room if room and fills else usual), DARK, _TEXT * scale if fills else 0.0)
     line = ", ".join([record["title"], *map(" ".join, record["scores"][:1]), record["voxels"]])
     lines = [line, *record["flatters"]]
     rods = [sector for sector in rods if sector.rod_diameter]

@@ -137,7 +137,8 @@ class Worker(threading.Thread):
         words = f"{words} {self.done} of {self.total}"
         if seconds < _SOON or not self.done:
             return words
-        return f"{words}, {_readable(seconds / self.done * (self.total - self.done))} left"
+        left = seconds / self.done * (self.total - self.done)
+        return f"{words}, {f'{left:.0f} s' if left < 100 else f'{left / 60:.0f} min'} left"
 
     @property
     def is_stoppable(self) -> bool:
@@ -165,10 +166,6 @@ class Worker(threading.Thread):
         self.since = time.monotonic()
         progress(0, 0)
         return progress
-
-
-def _readable(seconds: float) -> str:
-    return f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min"
 
 
 _current: Worker | None = None

@@ -339,7 +339,7 @@ def open_editor(context: bpy.types.Context) -> bool:
     new = [a for a in window.screen.areas if a not in before]
     area = min([*new, view], key=lambda a: a.y)
     area.type = "IMAGE_EDITOR"
-    area.spaces.active.image = None
+    area.spaces.active.image, area.spaces.active.show_gizmo = None, False  # they would hide the colour bar
     return True
 
 

@@ -127,7 +127,7 @@ def _reconstructing(
             return shelf.enough.is_set()
 
         mu = _mu(run, recipe, readers)
-        found = reconstruct_run(run, recipe, mu, last and last.found, watch, stages, method)
+        found = reconstruct_run(run, recipe, mu, last.found if last else None, watch, stages, method)
         score = _score(run, found.volume, stages("scoring"))
         return shown_of(found.volume.array, found.objective.tolist(), score, found.settings["flatters"]), found
 
@@ -234,32 +234,6 @@ class _Shelf:
                 bpy.data.images.remove(image)
             plots.forget()
         self.tidy()
-
-
-def _picture(run: ProjectionRun, volume: Volume, record: dict[str, Any], name: str) -> bytes:
-    page = Page(*(SIZE if run.volume is None else SIZE_BESIDE_TRUTH))
-    line = ", ".join([record["title"], *map(": ".join, record["scores"][:1])])
-    lines = [line, *record["flatters"]]
-    draw(page, volume, record["objective"], run.volume, f"Reconstruction of {name}", lines, record["name"])
-    return png(page.picture, _PNG_LEVEL)
-
-
-def _scores(run: ProjectionRun, volume: Volume, progress: Progress | None) -> list[tuple[str, str]]:
-    """The scores beside the truth, as names and values in words; none of a measured run."""
-    if run.volume is None:
-        return []
-    truth, pose = truth_of_run(run)
-    try:
-        score = score_volume(volume, truth, pose, progress)
-    except InputError as error:  # such as a truth that is the same everywhere: the reconstruction is worth keeping
-        return [("No score", str(error))]
-    lines = [("NRMSE", f"{score.nrmse:.3g}")]
-    for rods in score.derenzo or ():
-        lines.append((f"{rods.rod_diameter:g} mm rods", rods.words))
-    for sphere in score.nema or ():
-        score_text = f"{sphere.contrast_recovery:.1f} % contrast, {sphere.background_variability:.1f} % variability"
-        lines.append((f"{sphere.diameter:g} mm sphere", score_text))
-    return lines
 
 
 def _score(run: ProjectionRun, volume: Volume, progress: Progress | None) -> VolumeScore | str | None:

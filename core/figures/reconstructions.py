@@ -24,6 +24,7 @@ LIGHTS = {"green": "#4fb35a", "amber": "#e8a13a", "red": "#d9534a"}
 _SLICES = ((2, 0, 1), (1, 0, 2), (0, 1, 2))
 _NAMES = "xyz"
 _CURVE = "#e0604a"
+_SEEN, _MARGIN = 0.05, 0.06  # of the last colour's value, and of the volume's sides: what slices show, and around it
 _TEXTS = 25.0  # of the size of text: the width of what is written beside the slices
 _LEGIBLE = 11.0  # of the size of text: a slice's larger side, at least, where three or two of each volume are drawn
 
@@ -57,7 +58,11 @@ def draw(
     bars = [bar_width(page, *look, unit) + round(0.8 * em) for look, unit in zip((colors, errors), units, strict=False)]
     texts = page.width - min(_TEXTS * em, 0.42 * page.width)
     room = 0.6 * em, 0.4 * em, texts - sum(bars) - 1.6 * em, page.height - 0.8 * em
-    extent, margins = (grid.spacing * grid.shape).tolist(), (0.2 * em, 1.5 * em, 0.2 * em, 0.2 * em)
+    box = _box(known[0][1], window[1])
+    extent, margins = (
+        [grid.spacing[a] * (box[a].stop - box[a].start) for a in range(3)],
+        (0.2 * em, 1.5 * em, 0.2 * em, 0.2 * em),
+    )
     # Along rods a volume changes least: across them it shows them all.
     best = sorted(_SLICES, key=lambda plane: float(np.abs(np.diff(known[0][1], axis=plane[0])).sum()))
     for count in (3, 2, 1):
@@ -69,7 +74,7 @@ def draw(
         )
         if max(extent) * pixels >= _LEGIBLE * em:
             break
-    at = full_slices(known[0][1])
+    at = np.clip(full_slices(known[0][1]), [part.start for part in box], [part.stop - 1 for part in box])
     for i, ((x, y), (width, height)) in enumerate(zip(places, sizes, strict=True)):
         (name, values), (axis, _, _), kind = known[i % kinds], planes[i // kinds], i % kinds
         place = grid.center[axis] + (at[axis] - (grid.shape[axis] - 1) / 2) * grid.spacing[axis]
@@ -77,7 +82,7 @@ def draw(
         size = 0.9 * em * min(1.0, width * pixels / letters.width(text, 0.9 * em))
         page.text(text, x, y - 0.4 * em, size, page.ink)
         look = errors if name == "Error" else colors
-        picture = look[0].colored(values.take(at[axis], axis).T[::-1], look[1])
+        picture = look[0].colored(values[box].take(at[axis] - box[axis].start, axis).T[::-1], look[1])
         page.image(picture, round(x), round(y), round(width * pixels), round(height * pixels))
     _scale_bar(page, pixels, sizes[0][0], places[0][0] + 0.6 * em, places[0][1] + sizes[0][1] * pixels - 0.6 * em)
     x = max(x + width * pixels for (x, _), (width, _) in zip(places, sizes, strict=True)) + em
@@ -123,6 +128,18 @@ def _draw_texts(
     if len(objective) and room > 4 * em:
         place = left + 5.5 * em, row + 2.8 * em, width - 5.5 * em, min(room, 0.8 * width)
         draw_objective(page, objective, place, objective_name)
+
+
+def _box(values: ArrayLike, high: float) -> tuple[slice, slice, slice]:
+    """The part of values (n_x, n_y, n_z) that slices show: where there is something, and a margin around it."""
+    box = []
+    for axis in range(3):
+        seen = np.flatnonzero(np.max(np.abs(values), axis=tuple({0, 1, 2} - {axis})) > _SEEN * abs(high))
+        size = np.shape(values)[axis]
+        margin = round(_MARGIN * size)
+        start, stop = (seen[0], seen[-1] + 1) if len(seen) else (0, size)
+        box.append(slice(max(int(start) - margin, 0), min(int(stop) + margin, size)))
+    return box[0], box[1], box[2]
 
 
 def _disc(x: float, y: float, radius: float) -> list[tuple[float, float]]:

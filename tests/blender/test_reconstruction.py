@@ -307,7 +307,15 @@ def test_the_panel_draws_the_result(render, scene):
         getattr(layout, part).return_value = layout
     cls.draw(MagicMock(layout=layout), bpy.context)
     said = [options["text"] for _, _, options in layout.mock_calls if options.get("text")]
-    assert {"OSEM, 3 iterations", "Log-likelihood", "NRMSE", "8 mm", "Show Slices", "Continue (+10)", "Reconstruct"} <= set(said)
+    assert {
+        "OSEM, 3 iterations",
+        "Log-likelihood",
+        "NRMSE",
+        "8 mm",
+        "Show Slices",
+        "Continue (+10)",
+        "Reconstruct",
+    } <= set(said)
     flatters = scene.mphdrr_reconstruction.known["flatters"]
     assert flatters and all(word in " ".join(said) for word in " ".join(flatters).split()), (
         "the warning stays with the score"

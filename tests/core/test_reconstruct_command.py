@@ -409,7 +409,16 @@ def test_the_picture_shows_slices_beside_the_truth_and_the_objective(run, file, 
     command(file, *SMALL, "--subsets", "5", "--picture", tmp_path / "p.svg")
     text = (tmp_path / "p.svg").read_text(encoding="utf-8")
     settings = "3 iterations, 5 subsets"
-    for words in ("Reconstruction", "Error", "Truth, z = 2.5 mm", "Log-likelihood", "kBq/mL", "error", settings, "20 mm"):
+    for words in (
+        "Reconstruction",
+        "Error",
+        "Truth, z = 2.5 mm",
+        "Log-likelihood",
+        "kBq/mL",
+        "error",
+        settings,
+        "20 mm",
+    ):
         assert f">{words}<" in text, words
     assert text.count("<image") == 11  # three slices of each, and two colour bars
     volume = mph.Volume(np.zeros((2, 2, 2)), mph.Grid.centered(2, 1.0))

@@ -78,8 +78,9 @@ def draw(
     for i, ((x, y), (width, height)) in enumerate(zip(places, sizes, strict=True)):
         (name, values), (axis, _, _), kind = known[i % kinds], planes[i // kinds], i % kinds
         place = grid.center[axis] + (at[axis] - (grid.shape[axis] - 1) / 2) * grid.spacing[axis]
-        text = f"{name}, {_NAMES[axis]} = {number(round(float(place), 2) + 0.0)} mm" if kind == 0 else name
-        size = 0.9 * em * min(1.0, width * pixels / letters.width(text, 0.9 * em))
+        where = f"{_NAMES[axis]} = {number(round(float(place), 2) + 0.0)} mm" if kind == 0 else ""
+        text = ", ".join(filter(None, (name if i < kinds else "", where)))  # once is enough
+        size = 0.9 * em * min(1.0, width * pixels / letters.width(text or " ", 0.9 * em))
         page.text(text, x, y - 0.4 * em, size, page.ink)
         look = errors if name == "Error" else colors
         picture = look[0].colored(values[box].take(at[axis] - box[axis].start, axis).T[::-1], look[1])

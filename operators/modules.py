@@ -41,7 +41,8 @@ class MPHDRR_OT_look_through_module(selection.OnScanner, bpy.types.Operator):
         if context.area is not None and context.area.type == "VIEW_3D":
             context.area.spaces.active.region_3d.view_perspective = "CAMERA"
             if not bpy.app.background:
-                bpy.ops.view3d.view_center_camera()  # all of its image
+                bpy.ops.view3d.view_center_camera()  # all of its image, beside the headers
+                context.area.spaces.active.region_3d.view_camera_zoom -= 6.0
         return f"Looking through {context.scene.camera.name}"
 
 

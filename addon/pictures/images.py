@@ -27,6 +27,7 @@ _PIXELS = 2.2e7
 _PNG_LEVEL = 1  # fast
 BAR = 24
 """Pixels at a resolution scale of 1 at the bottom of an Image Editor that are left free for notes (`run_notes`)."""
+_SHARE = 0.97  # of its editor that a picture of another size takes: buttons at the edges do not cover it
 _BELOW = 0.4  # of the 3D view's height: an Image Editor that is opened below it
 _WAIT = 0.005  # s between two looks at a thread
 _SCANNER = "mphdrr_scanner"  # custom property of the mosaic: the collection of the scanner that the run is of
@@ -355,7 +356,7 @@ def _fit(window: bpy.types.Window, area: bpy.types.Area) -> None:
             with bpy.context.temp_override(window=window, area=area, region=region):
                 width, height = area.spaces.active.image.size
                 (across, up), whole = _room(area), region.height
-                zoom = min(across / width, up / height)
+                zoom = min(across / width, up / height) * (1.0 if (width, height) == (across, up) else _SHARE)
                 bpy.ops.image.view_all(fit_view=True)  # its middle is the region's
                 bpy.ops.image.view_zoom_ratio(ratio=zoom)
                 bpy.ops.image.view_pan(offset=(0.0, -(whole - up) / 2 / zoom))

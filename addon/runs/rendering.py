@@ -331,6 +331,8 @@ def _chosen_volume(context: bpy.types.Context, name: str, taken: Sequence[str], 
     fitting = [item for item in known if volumes.quantity_of(item) in taken]
     if context.object in fitting:
         return context.object
+    if len(fitting) > 1 and (last := runs.projected(context.scene)) in fitting:  # a reconstruction stands beside it
+        return last
     what = " or ".join(taken)
     if not fitting:
         raise InputError(f"no volume of {what} in the scene: add a phantom first")

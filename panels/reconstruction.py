@@ -10,7 +10,7 @@ from .sidebar import Folded, Sidebar, draw_hint, draw_text
 
 _MAIN = ("method", "method_file", "iterations", "subsets", "voxels", "spacing")
 """Settings that the panel itself shows; the others stand under Model and Prior."""
-_PLOT = 6.0  # of a button's heights
+_PLOT = 4.0  # of a button's heights
 
 
 class MPHDRR_PT_reconstruction(Sidebar, bpy.types.Panel):
@@ -50,18 +50,13 @@ def _draw_result(layout: bpy.types.UILayout, settings: bpy.types.PropertyGroup, 
         row.label(text=name, translate=False)
         draw_text(row, value, "NONE")
     rods = known.get("rods", ())
-    if rods:
-        row = scores.split(factor=0.4)
-        row.label(text="Rods")
-        for text in ("Valley/Peak", "Contrast"):
-            row.label(text=text)
-    for name, light, valley, contrast in rods:
-        row = scores.split(factor=0.4)
-        row.label(
-            text=name, translate=False, **({"icon_value": plots.dot_icon(light)} if light else {"icon": "BLANK1"})
-        )
-        for text in filter(None, (valley, contrast)):
-            row.label(text=text, translate=False)
+    for name, light, *values in [("Rods", "", "Valley/Peak", "Contrast"), *rods] if rods else ():
+        row = scores.split(factor=0.3)
+        icon = {"icon_value": plots.dot_icon(light)} if light else {"icon": "BLANK1"}
+        row.label(text=name, translate=name == "Rods", **icon)
+        row = row.split(factor=0.55) if values[1] else row
+        for text in filter(None, values):
+            row.label(text=text, translate=name == "Rods")
     for text in known.get("flatters", ()):
         draw_text(box, text)
     row = layouts.invoking(box.row())

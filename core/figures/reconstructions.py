@@ -120,7 +120,9 @@ def _draw_texts(
         if light:
             page.area(_disc(left + 0.5 * em, row - 0.32 * em, 0.36 * em), LIGHTS[light])
         for x, cell in zip(columns, cells, strict=True):
-            page.text("" if cell.startswith("nan") else cell, x, row, 0.9 * em, page.ink if light else page.faint)
+            cell = "" if cell.startswith("nan") else cell
+            size = 0.9 * em * min(1.0, (page.width - x - 0.3 * em) / letters.width(cell or " ", 0.9 * em))
+            page.text(cell, x, row, size, page.ink if light else page.faint)
     row += 0.4 * em
     for line in lines[1:]:
         if row + 1.5 * em * (2 + len(line) // 45) < page.height:

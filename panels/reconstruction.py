@@ -10,6 +10,8 @@ from .sidebar import Folded, Sidebar, draw_hint, draw_text
 
 _MAIN = ("method", "method_file", "iterations", "subsets", "voxels", "spacing")
 """Settings that the panel itself shows; the others stand under Model and Prior."""
+_DOTS = {"green": "NODE_SOCKET_SHADER", "amber": "NODE_SOCKET_OBJECT", "red": "NODE_SOCKET_MATERIAL"}
+"""Blender's icons that are dots in the colours of rods' lights."""
 _PLOT = 4.0  # of a button's heights
 
 
@@ -52,8 +54,7 @@ def _draw_result(layout: bpy.types.UILayout, settings: bpy.types.PropertyGroup, 
     rods = known.get("rods", ())
     for name, light, *values in [("Rods", "", "Valley/Peak", "Contrast"), *rods] if rods else ():
         row = scores.split(factor=0.3)
-        icon = {"icon_value": plots.dot_icon(light)} if light else {"icon": "BLANK1"}
-        row.label(text=name, translate=name == "Rods", **icon)
+        row.label(text=name, translate=name == "Rods", icon=_DOTS.get(light, "BLANK1"))
         row = row.split(factor=0.55) if values[1] else row
         for text in filter(None, values):
             row.label(text=text, translate=name == "Rods")

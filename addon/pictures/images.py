@@ -308,10 +308,13 @@ def _editors(context: bpy.types.Context) -> list[tuple[bpy.types.Window, bpy.typ
     return sorted(found, key=lambda each: each[1].width * each[1].height)
 
 
-def room(context: bpy.types.Context) -> tuple[int, int] | None:
-    """Width and height, pixels, that a picture fills in the editor in which `show` shows it; None where none is open."""
+def room(context: bpy.types.Context) -> tuple[int, int, float] | None:
+    """Width and height, pixels, that a picture fills in the editor in which `show` shows it, and the scale of its texts.
+
+    None where no such editor is open.
+    """
     editors = _editors(context)
-    return _room(editors[-1][1]) if editors else None
+    return (*_room(editors[-1][1]), context.preferences.system.ui_scale) if editors else None
 
 
 def _room(area: bpy.types.Area) -> tuple[int, int]:

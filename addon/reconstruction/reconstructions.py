@@ -13,13 +13,12 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core import InputError, ProjectionRun, Recipe, Reconstruction, Volume, VolumeScore, read_run, score_volume
+from ...core import InputError, ProjectionRun, Recipe, Reconstruction, Volume, read_run, score_volume
 from ...core.figures.page import DARK, SMALLEST, Page
 from ...core.figures.reconstructions import SIZE, SIZE_BESIDE_TRUTH, draw
 from ...core.progress import Progress, stages_of
 from ...core.reconstruction.methods import method_of
 from ...core.reconstruction.result import iterations_text
-from ...core.reconstruction.scores.derenzo import DerenzoSector
 from ...core.runs.mosaic import png
 from ...core.runs.reconstructing import reconstruct_run, reconstruction_grid, voxels_text
 from ...core.runs.run_recipe import truth_of_run
@@ -105,16 +104,15 @@ def _reconstructing(
         before = 0.0
 
         def shown_of(
-            values: NDArray[Any], objective: Sequence[float], score: VolumeScore | str | None = None, flatters: Any = ()
+            values: NDArray[Any], objective: Sequence[float], scores: Mapping[str, Any] = {}, flatters: Any = ()
         ) -> _Shown:
             volume = Volume(values, grid, "activity" if run.volume is None else run.volume.quantity)
             record = {
                 "title": ", ".join(filter(None, (method.label, iterations_text(len(objective))))),
                 "name": method.objective, "objective": list(objective), "voxels": voxels_text(grid),
-                "flatters": flatters, **_scores_record(score),
+                "scores": [], "rods": [], "flatters": flatters, **scores,
             }  # fmt: skip
-            rods = (score.derenzo or ()) if isinstance(score, VolumeScore) else ()
-            picture = _picture(run, volume, record, name, rods, shelf.room, shelf.scale)
+            picture = _picture(run, volume, record, name, shelf.room)
             stored = stored_volumes.store_volume(volume, folder, None, {"reconstruction_of": name, **recipe.tables()})
             shelf.files.append(stored.path)
             return _Shown(stored, picture, record)
@@ -128,8 +126,8 @@ def _reconstructing(
 
         mu = _mu(run, recipe, readers)
         found = reconstruct_run(run, recipe, mu, last.found if last else None, watch, stages, method)
-        score = _score(run, found.volume, stages("scoring"))
-        return shown_of(found.volume.array, found.objective.tolist(), score, found.settings["flatters"]), found
+        scores = _scores(run, found.volume, stages("scoring"))
+        return shown_of(found.volume.array, found.objective.tolist(), scores, found.settings["flatters"]), found
 
     def finish(result: tuple[_Shown, Reconstruction]) -> str:
         global _kept
@@ -155,7 +153,6 @@ class _Shelf:
         self.files: list[Path] = []
         self.latest: _Shown | None = None  # made by the thread
         self.room = images.room(context) if windows.has_window() else None  # that the picture fills
-        self.scale = context.preferences.system.ui_scale
         scene = context.scene
         settings = scene.mphdrr_reconstruction
         self._scene, self._item, self._is_shown = scene.session_uid, last.item if last else 0, False
@@ -236,44 +233,34 @@ class _Shelf:
         self.tidy()
 
 
-def _score(run: ProjectionRun, volume: Volume, progress: Progress | None) -> VolumeScore | str | None:
-    """The scores beside the truth, or why there are none; None of a measured run."""
+def _scores(run: ProjectionRun, volume: Volume, progress: Progress | None) -> dict[str, Any]:
+    """The scores beside the truth as the panel shows them; none of a measured run.
+
+    They are names and values in words; of rods their size, light, valley/peak, or why there is none, and contrast.
+    """
     if run.volume is None:
-        return None
+        return {}
     try:
-        return score_volume(volume, *truth_of_run(run), progress)
+        score = score_volume(volume, *truth_of_run(run), progress)
     except InputError as error:  # such as a truth that is the same everywhere: the reconstruction is worth keeping
-        return str(error)
-
-
-def _scores_record(score: VolumeScore | str | None) -> dict[str, Any]:
-    """What the panel shows of a score: names and values in words; of rods their size, light, valley/peak and contrast."""
-    if not isinstance(score, VolumeScore):
-        return {"scores": [] if score is None else [("No score", score)], "rods": []}
+        return {"scores": [("No score", str(error))]}
     lines = [("NRMSE", f"{score.nrmse:.3g}")]
     for sphere in score.nema or ():
         score_text = f"{sphere.contrast_recovery:.1f} % contrast, {sphere.background_variability:.1f} % variability"
         lines.append((f"{sphere.diameter:g} mm sphere", score_text))
-    rods = [
-        (f"{s.rod_diameter:g} mm", s.light, s.note or f"{s.valley_to_peak:.2f}", "" if s.note else s.contrast)
-        for s in score.derenzo or ()
-        if s.rod_diameter
-    ]
-    return {"scores": lines, "rods": rods}
+    return {"scores": lines, "rods": [sector.cells for sector in score.derenzo or () if sector.rod_diameter]}
 
 
 def _picture(
-    run: ProjectionRun, volume: Volume, record: dict[str, Any], name: str, rods: Sequence[DerenzoSector],
-    room: tuple[int, int] | None, scale: float,
-) -> bytes:  # fmt: skip
-    """A picture that fills its editor's room, (width, height) in pixels, if there is one."""
-    usual = SIZE if run.volume is None else SIZE_BESIDE_TRUTH
-    fills = room is not None and min(room) >= SMALLEST
-    page = Page(*(room if room and fills else usual), DARK, _TEXT * scale if fills else 0.0)
+    run: ProjectionRun, volume: Volume, record: dict[str, Any], name: str, room: tuple[int, int, float] | None
+) -> bytes:
+    """A picture that fills its editor's room, if there is one: width and height, pixels, and Blender's scale of texts."""
+    page = Page(*(SIZE if run.volume is None else SIZE_BESIDE_TRUTH), DARK)
+    if room is not None and min(room[:2]) >= SMALLEST:
+        page = Page(*room[:2], DARK, _TEXT * room[2])
     line = ", ".join([record["title"], *map(" ".join, record["scores"][:1]), record["voxels"]])
-    lines = [line, *record["flatters"]]
-    rods = [sector for sector in rods if sector.rod_diameter]
-    draw(page, volume, record["objective"], run.volume, f"Reconstruction of {name}", lines, record["name"], rods)
+    lines, title = [line, *record["flatters"]], f"Reconstruction of {name}"
+    draw(page, volume, record["objective"], run.volume, title, lines, record["name"], record["rods"])
     return png(page.picture, _PNG_LEVEL)
 
 

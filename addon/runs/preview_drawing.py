@@ -18,7 +18,7 @@ from ...core.runs.letters import wrapped
 from ..blender import windows
 
 _WIDTH, _LEAST = 170.0, 60.0  # of the picture in the corner, and its least height, in Blender's units of its interface
-_GIZMOS = 240.0  # of the view's height, in such units: in the corner above are the gizmos that turn it
+_ABOVE, _BESIDE = 130.0, 50.0  # in such units: for the gizmos that turn the view, above the picture and beside it
 _MARGIN, _TEXT = 20.0, 11.0
 _BACK, _FRONT = (0.05, 0.05, 0.05, 0.75), (1.0, 1.0, 1.0, 1.0)
 _TRIANGLES = ((0, 1, 2), (0, 2, 3))
@@ -61,7 +61,7 @@ def _draw_corner(session: Any) -> None:
     context = bpy.context
     unit = context.preferences.system.ui_scale
     margin, size = _MARGIN * unit, _TEXT * unit
-    right = context.region.width - margin - _covered(context)
+    right = context.region.width - margin - _BESIDE * unit - _covered(context)
     blf.size(0, size)
     shown, width, height = session.shown, _WIDTH * unit, 0.0
     lines = [
@@ -69,7 +69,7 @@ def _draw_corner(session: Any) -> None:
     ]
     if shown is not None:
         rows, columns = shown.picture.shape[:2]
-        free = context.region.height - _GIZMOS * unit - 2 * margin - (1.4 * len(lines) + 2) * size
+        free = context.region.height - _ABOVE * unit - 2 * margin - (1.4 * len(lines) + 2) * size
         aspect, most = columns / rows, max(free, _LEAST * unit)
         width, height = min(width, aspect * most), min(most, width / aspect)  # as large as fits
     left, top = right - max(width, _WIDTH * unit), margin + height + (1.4 * len(lines) + 2) * size

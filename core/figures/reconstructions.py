@@ -6,7 +6,6 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..reconstruction.scores.derenzo import DerenzoSector
 from ..runs import letters
 from ..runs.display import DARK_DIVERGING, Display
 from ..volumes.resampling import resample
@@ -37,12 +36,13 @@ def draw(
     title: str = "Reconstruction",
     lines: Sequence[str] = (),
     objective_name: str = "log-likelihood",
-    rods: Sequence[DerenzoSector] = (),
+    rods: Sequence[tuple[str, str, str, str]] = (),
 ) -> None:
     """Draw slices of a volume, beside those of `truth` and of the error, and what is known of it: scores, objective.
 
     Slices lie where there is much of the truth, or of the volume; as many as are legible, that which shows most first. The
-    truth is drawn on the reconstruction's voxels, as the mean over each. The volume's axes are along the world's.
+    truth is drawn on the reconstruction's voxels, as the mean over each. The volume's axes are along the world's. `rods` are
+    the `cells` of a Derenzo score's sectors.
     """
     em, grid = page.em, volume.grid
     known = [("Reconstruction", volume.array)]
@@ -94,8 +94,8 @@ def draw(
 
 
 def _draw_texts(
-    page: Page, left: float, title: str, lines: Sequence[str], rods: Sequence[DerenzoSector], objective: Sequence[float],
-    objective_name: str,
+    page: Page, left: float, title: str, lines: Sequence[str], rods: Sequence[tuple[str, str, str, str]],
+    objective: Sequence[float], objective_name: str,
 ) -> None:  # fmt: skip
     """Write what is known of a reconstruction beside its slices, and draw the objective where there is room for it."""
     em, width = page.em, page.width - left - page.em
@@ -110,19 +110,17 @@ def _draw_texts(
     write(title, 1.1 * em, page.ink)
     for line in lines[:1]:
         write(line, 0.9 * em, page.faint)
-    table = [("", "rods", "valley/peak", "contrast")] if rods else []
-    table += [(s.light, f"{s.rod_diameter:g} mm", s.note or f"{s.valley_to_peak:.2f}", s.contrast) for s in rods]
+    table = [("rods", "", "valley/peak", "contrast"), *rods] if rods else []
     columns = left + 1.2 * em, left + min(0.38 * width, 8 * em), left + min(0.74 * width, 15 * em)
     row += 0.4 * em
     step = min(1.4 * em, (page.height - row - 0.4 * em) / max(len(table), 1))
-    for light, *cells in table:
+    for size, light, *score in table:
         row += step
         if light:
             page.area(_disc(left + 0.5 * em, row - 0.32 * em, 0.36 * em), LIGHTS[light])
-        for x, cell in zip(columns, cells, strict=True):
-            cell = "" if cell.startswith("nan") else cell
-            size = 0.9 * em * min(1.0, (page.width - x - 0.3 * em) / letters.width(cell or " ", 0.9 * em))
-            page.text(cell, x, row, size, page.ink if light else page.faint)
+        for x, cell in zip(columns, (size, *score), strict=True):
+            fits = min(1.0, (page.width - x - 0.3 * em) / letters.width(cell or " ", 0.9 * em))
+            page.text(cell, x, row, 0.9 * em * fits, page.ink if light else page.faint)
     row += 0.4 * em
     for line in lines[1:]:
         if row + 1.5 * em * (2 + len(line) // 45) < page.height:

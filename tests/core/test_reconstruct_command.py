@@ -16,8 +16,8 @@ from PIL import Image
 import mphdrr.core as mph
 from mphdrr.addon.cli import main
 from mphdrr.core.cli.reconstruct import settings_line
-from mphdrr.core.figures.page import Page
-from mphdrr.core.figures.reconstructions import draw
+from mphdrr.core.figures.page import DARK, Page
+from mphdrr.core.figures.reconstructions import LIGHTS, draw
 from mphdrr.core.reconstruction.methods import METHOD_FILES, METHODS, PRIORS, Method
 from mphdrr.core.runs.recipe import recipe_of_tables
 from mphdrr.core.runs.reconstructing import model_of, reconstruction_grid
@@ -437,6 +437,32 @@ def test_slices_lie_on_the_page_and_have_the_right_colours(size):
     hot = (np.abs(picture.astype(int) - (252, 255, 164)).max(axis=2) < 8).sum()
     cold = (picture.max(axis=2) < 6).sum()
     assert hot > 0 and cold > 0 and hot < cold
+
+
+def test_a_picture_as_low_as_an_editor_has_legible_texts_and_all_that_matters(run, tmp_path):
+    """1048 x 223 pixels are what an editor below the 3D view has on a screen of 1280 x 800."""
+    page, grid = Page(1048, 223, DARK, 14.0), mph.Grid.centered(16, 6.0)
+    rods = [("8 mm", "green", "0.12", "80 %"), ("6 mm", "amber", "0.81", "9 %"), ("4 mm", "red", "1.02", "-1 %"),
+            ("2 mm", "", "voxels of 6 mm are larger than the rods", "")]  # fmt: skip
+    draw(
+        page,
+        mph.resample(run.volume, grid, "mean"),
+        [1.0, 2.0],
+        run.volume,
+        "Of it",
+        ["OSEM", "it flatters"],
+        "fit",
+        rods,
+    )
+    page.write(tmp_path / "p.svg")
+    marks = (tmp_path / "p.svg").read_text(encoding="utf-8")
+    sizes = re.findall(r'<text x="([0-9.]+)" y="([0-9.]+)" font-size="([0-9.]+)"', marks)
+    assert all(0 <= float(x) < 1048 and 0 < float(y) <= 223 and float(size) >= 10.9 for x, y, size in sizes)
+    for words in ("Truth, z = ", "Reconstruction", "Error", "8 mm", "0.81", "-1 %", "OSEM"):
+        assert words in marks, words
+    colors = {tuple(color) for color in page.picture.reshape(-1, 3).tolist()}
+    assert {tuple(bytes.fromhex(color[1:])) for color in LIGHTS.values()} < colors, "a dot for each light"
+    assert (page.picture.max(axis=2) < 40).mean() > 0.5, "a dark page"
 
 
 @pytest.mark.parametrize(

@@ -100,6 +100,12 @@ class DerenzoSector:
         return f"{np.round(100 * self.contrast_recovery) + 0.0:.0f} %"
 
     @property
+    def cells(self) -> tuple[str, str, str, str]:
+        """A row of a table: rod diameter, `light`, valley/peak or why there is none, and contrast recovery."""
+        score = (self.note, "") if self.note else (f"{self.valley_to_peak:.2f}", self.contrast)
+        return f"{self.rod_diameter:g} mm", self.light, *score
+
+    @property
     def words(self) -> str:
         """The score in a line: whether it is resolved, and by what; or why there is none."""
         return self.note or f"{LIGHTS[self.light]}, valley/peak {self.valley_to_peak:.2f}, contrast {self.contrast}"

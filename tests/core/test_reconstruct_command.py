@@ -436,7 +436,7 @@ def test_slices_lie_on_the_page_and_have_the_right_colours(size):
     picture = page.picture
     hot = (np.abs(picture.astype(int) - (252, 255, 164)).max(axis=2) < 8).sum()
     cold = (picture.max(axis=2) < 6).sum()
-    assert hot > 0 and cold > 0 and hot < cold
+    assert hot > cold > 0, "what is shown is where there is something, and a margin"
 
 
 def test_a_picture_as_low_as_an_editor_has_legible_texts_and_all_that_matters(run, tmp_path):

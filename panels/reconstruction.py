@@ -47,7 +47,8 @@ def _draw_result(layout: bpy.types.UILayout, settings: bpy.types.PropertyGroup, 
         column.label(text=known["name"].capitalize())
         column.label(text=f"{known['objective'][-1]:.7g}", translate=False)
     scores = box.column(align=True)
-    for name, value in (*known["scores"], *([("Voxels", known["voxels"])] if "voxels" in known else ())):
+    draw_text(scores, known.get("voxels", ""), "NONE")
+    for name, value in known["scores"]:
         row = scores.split(factor=0.3)
         row.label(text=name, translate=False)
         draw_text(row, value, "NONE")

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ...core.runs.letters import wrapped
 from ..blender import windows
 
-_WIDTH, _LEAST = 170.0, 60.0  # of the picture in the corner, and its least height, in Blender's units of its interface
+_WIDTH, _LEAST = 150.0, 60.0  # of the picture in the corner, and its least height, in Blender's units of its interface
 _ABOVE, _BESIDE = 130.0, 50.0  # in such units: for the gizmos that turn the view, above the picture and beside it
 _MARGIN, _TEXT = 20.0, 11.0
 _BACK, _FRONT = (0.05, 0.05, 0.05, 0.75), (1.0, 1.0, 1.0, 1.0)

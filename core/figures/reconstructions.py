@@ -2,10 +2,12 @@
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..arrays import Floats32
 from ..runs import letters
 from ..runs.display import DARK_DIVERGING, Display
 from ..volumes.resampling import resample
@@ -44,53 +46,65 @@ def draw(
     truth is drawn on the reconstruction's voxels, as the mean over each. The volume's axes are along the world's. `rods` are
     the `cells` of a Derenzo score's sectors.
     """
-    em, grid = page.em, volume.grid
-    known = [("Reconstruction", volume.array)]
-    if truth is not None:
-        true = truth.array if truth.grid is grid else resample(truth, grid, "mean").array
-        known = [("Truth", true), *known, ("Error", volume.array - true)]
-    display = Display(colors="inferno" if volume.quantity == "activity" else "grey")
-    # A hot voxel of the reconstruction must not darken all others: the truth says how bright things are.
-    low, high = display.window(known[0][1])
-    window = (low, high if truth is not None else bright_value(volume.array) or high)
-    colors, errors = (display, window), (Display(colors=DARK_DIVERGING), (low - window[1], window[1] - low))
-    units = (volume.unit, "error") if len(known) > 1 else (volume.unit,)
-    bars = [bar_width(page, *look, unit) + round(0.8 * em) for look, unit in zip((colors, errors), units, strict=False)]
-    texts = page.width - min(_TEXTS * em, 0.42 * page.width)
-    room = 0.6 * em, 0.4 * em, texts - sum(bars) - 1.6 * em, page.height - 0.8 * em
-    box = _box(known[0][1], window[1])
-    extent, margins = (
-        [grid.spacing[a] * (box[a].stop - box[a].start) for a in range(3)],
-        (0.2 * em, 1.5 * em, 0.2 * em, 0.2 * em),
-    )
+    em, grid, rows = page.em, volume.grid, _rows(volume, truth)
+    first = rows[0].values
+    bars = [row for row in rows if row.unit]
+    widths = [bar_width(page, row.display, row.window, row.unit) + round(0.8 * em) for row in bars]
+    left = page.width - min(_TEXTS * em, 0.42 * page.width)
+    room = 0.6 * em, 0.4 * em, left - sum(widths) - 1.6 * em, page.height - 0.8 * em
+    box = _box(first, rows[0].window[1])
+    extent = [float(grid.spacing[axis]) * (box[axis].stop - box[axis].start) for axis in range(3)]
     # Along rods a volume changes least: across them it shows them all.
-    best = sorted(_SLICES, key=lambda plane: float(np.abs(np.diff(known[0][1], axis=plane[0])).sum()))
+    best = sorted(_SLICES, key=lambda plane: float(np.abs(np.diff(first, axis=plane[0])).sum()))
     for count in (3, 2, 1):
-        planes, kinds = best[:count], len(known)
-        sizes = [(extent[across], extent[up]) for _, across, up in planes for _ in known]
-        beside, below = [range(len(sizes))], [range(i, i + kinds) for i in range(0, len(sizes), kinds)]
-        pixels, places = arranged(
-            sizes, margins, room, beside, below, [range(k, len(sizes), kinds) for k in range(kinds)]
-        )
+        shown = [(plane, row) for plane in best[:count] for row in rows]
+        sizes = [(extent[across], extent[up]) for (_, across, up), _ in shown]
+        n, kinds = len(shown), len(rows)
+        ways = [range(n)], [range(i, i + kinds) for i in range(0, n, kinds)], [range(k, n, kinds) for k in range(kinds)]
+        pixels, places = arranged(sizes, (0.2 * em, 1.5 * em, 0.2 * em, 0.2 * em), room, *ways)
         if max(extent) * pixels >= _LEGIBLE * em:
             break
-    at = np.clip(full_slices(known[0][1]), [part.start for part in box], [part.stop - 1 for part in box])
-    for i, ((x, y), (width, height)) in enumerate(zip(places, sizes, strict=True)):
-        (name, values), (axis, _, _), kind = known[i % kinds], planes[i // kinds], i % kinds
+    at = np.clip(full_slices(first), [part.start for part in box], [part.stop - 1 for part in box])
+    for i, ((x, y), (width, height), ((axis, _, _), row)) in enumerate(zip(places, sizes, shown, strict=True)):
         place = grid.center[axis] + (at[axis] - (grid.shape[axis] - 1) / 2) * grid.spacing[axis]
-        where = f"{_NAMES[axis]} = {number(round(float(place), 2) + 0.0)} mm" if kind == 0 else ""
-        text = ", ".join(filter(None, (name if i < kinds else "", where)))  # once is enough
+        where = "" if i % kinds else f"{_NAMES[axis]} = {number(round(float(place), 2) + 0.0)} mm"
+        text = ", ".join(filter(None, (row.name if i < kinds else "", where)))  # once is enough
         size = 0.9 * em * min(1.0, width * pixels / letters.width(text or " ", 0.9 * em))
         page.text(text, x, y - 0.4 * em, size, page.ink)
-        look = errors if name == "Error" else colors
-        picture = look[0].colored(values[box].take(at[axis] - box[axis].start, axis).T[::-1], look[1])
-        page.image(picture, round(x), round(y), round(width * pixels), round(height * pixels))
-    _scale_bar(page, pixels, sizes[0][0], places[0][0] + 0.6 * em, places[0][1] + sizes[0][1] * pixels - 0.6 * em)
+        picture = row.values[box].take(at[axis] - box[axis].start, axis).T[::-1]
+        frame = round(x), round(y), round(width * pixels), round(height * pixels)
+        page.image(row.display.colored(picture, row.window), *frame)
+    (x, y), (width, height) = places[0], sizes[0]
+    _scale_bar(page, pixels, width, x + 0.6 * em, y + height * pixels - 0.6 * em)
     x = max(x + width * pixels for (x, _), (width, _) in zip(places, sizes, strict=True)) + em
-    for look, width, unit in zip((colors, errors), bars, units, strict=False):
-        color_bar(page, *look, unit, round(x), round(places[0][1]), max(2, round(sizes[0][1] * pixels)))
-        x += width
-    _draw_texts(page, texts, title, lines, rods, objective, objective_name)
+    for row, step in zip(bars, widths, strict=True):
+        color_bar(page, row.display, row.window, row.unit, round(x), round(y), max(2, round(height * pixels)))
+        x += step
+    _draw_texts(page, left, title, lines, rods, objective, objective_name)
+
+
+class _Row(NamedTuple):
+    """A volume of which slices are drawn."""
+
+    name: str
+    values: Floats32
+    display: Display
+    window: tuple[float, float]
+    unit: str  # above its colour bar, which it shares with the one before if there is none
+
+
+def _rows(volume: Volume, truth: Volume | None) -> list[_Row]:
+    """The truth, the volume and the error; the volume alone where the truth is not known."""
+    display = Display(colors="inferno" if volume.quantity == "activity" else "grey")
+    if truth is None:
+        low, high = display.window(volume.array)
+        return [_Row("Reconstruction", volume.array, display, (low, bright_value(volume.array) or high), volume.unit)]
+    true = truth.array if truth.grid is volume.grid else resample(truth, volume.grid, "mean").array
+    # A hot voxel of the reconstruction must not darken all others: the truth says how bright things are.
+    low, high = window = display.window(true)
+    errors = _Row("Error", volume.array - true, Display(colors=DARK_DIVERGING), (low - high, high - low), "error")
+    row = _Row("Truth", true, display, window, volume.unit)
+    return [row, _Row("Reconstruction", volume.array, display, window, ""), errors]
 
 
 def _draw_texts(

@@ -106,18 +106,18 @@ def falsely_resolved(kind: str, volumes: int, grid: mph.Grid, seed: int) -> tupl
 
 
 @pytest.mark.parametrize("kind", list(NOISE)[::4])
-def test_noise_resolves_no_sector(kind):
-    """25 volumes of a kind; the long lane has 200 of each, in which the chance of a single sector shows."""
+def test_noise_resolves_hardly_any_sector(kind):
+    """25 volumes of a kind; the long lane has 200 of each. One in a thousand may be, by its own chance."""
     found, _ = falsely_resolved(kind, 25, mph.Grid.centered((31, 31, 9), 2.0), 3)
-    assert len(found) > 100 and not found.any()
+    assert len(found) > 100 and found.sum() <= 1
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("kind", NOISE)
-def test_noise_resolves_at_most_one_sector_in_a_hundred_of_200_volumes(kind):
+def test_noise_resolves_hardly_any_sector_of_200_volumes(kind):
     grid = mph.Grid.centered((31, 31, 9), 2.0)
     found, small = falsely_resolved(kind, 200, grid, 4)
-    assert found.mean() <= 0.01 and found[small].mean() <= 0.015
+    assert found.mean() <= 0.004 and found[small].mean() <= 0.008
 
 
 def test_pairs_by_themselves_prove_nothing():

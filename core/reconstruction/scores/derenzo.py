@@ -20,7 +20,7 @@ from .rows import Rows, column
 RESOLVED_BELOW = 0.735
 """Valley-to-peak of two points that are just resolved, by Rayleigh's criterion."""
 
-NOISE_BELOW = 0.002
+NOISE_BELOW = 0.001
 """Chance that noise makes a sector's contrast: of one that is resolved it is less."""
 
 LIGHTS = {"green": "resolved", "amber": "seen, not resolved", "red": "not resolved"}
@@ -134,9 +134,9 @@ def derenzo_score(
 
     A sector is resolved if two things hold. Its mean valley / mean peak is below 0.735, Rayleigh's criterion, which Hallen
     et al. propose for the pairs of hot-rod phantoms. And noise would make so large a difference of both means with a chance
-    below 0.2 %: it is compared with how rods scatter around their mean, and valleys around theirs (Student's t test of two
+    below 0.1 %: it is compared with how rods scatter around their mean, and valleys around theirs (Student's t test of two
     samples). Pairs by themselves prove nothing: in noise without any rods a third of the sectors may meet the first
-    condition, but at most 0.4 % met both. Contrast recovery is the mean peak minus the mean valley, by the same of the
+    condition, but less than 0.1 % of them met both. Contrast recovery is the mean peak minus the mean valley, by the same of the
     phantom: it is 1 only where the volume's values are right, too.
 
     Parameters

@@ -136,7 +136,7 @@ def derenzo_score(
     et al. propose for the pairs of hot-rod phantoms. And noise would make so large a difference of both means with a chance
     below 0.1 %: it is compared with how rods scatter around their mean, and valleys around theirs (Student's t test of two
     samples). Pairs by themselves prove nothing: in noise without any rods a third of the sectors may meet the first
-    condition, but less than 0.1 % of them met both. Contrast recovery is the mean peak minus the mean valley, by the same of the
+    condition, but less than 0.1 % met both. Contrast recovery is the mean peak minus the mean valley, by the same of the
     phantom: it is 1 only where the volume's values are right, too.
 
     Parameters

@@ -20,11 +20,11 @@ from .rows import Rows, column
 RESOLVED_BELOW = 0.735
 """Valley-to-peak of two points that are just resolved, by Rayleigh's criterion."""
 
-NOISE_BELOW = 0.001
-"""Chance that noise makes a sector's contrast: of one that is resolved it is less."""
+NOISE_BELOW, SEEN_BELOW = 0.001, 0.02
+"""Chance that noise makes a sector's contrast: of one that is resolved, and of one that is seen, it is less."""
 
 LIGHTS = {"green": "resolved", "amber": "seen, not resolved", "red": "not resolved"}
-"""What a sector is, by the colour of its dot. Amber: its rods stand out of the noise, but are above Rayleigh's limit."""
+"""What a sector is, by the colour of its dot. Amber: its rods stand out of the noise, but not enough."""
 
 _LENGTH = 0.5  # of the rods, around their middle, that profiles are means over: ends blur into what is beside them
 _WIDTH = 0.5  # of a rod's diameter, that profiles are means over
@@ -89,10 +89,10 @@ class DerenzoSector:
 
     @property
     def light(self) -> str:
-        """A key of `LIGHTS`: "green" if it is `resolved`, "amber" if only `chance` is low, else "red"; "" if unknown."""
+        """A key of `LIGHTS`: "green" if it is `resolved`, "amber" if it is seen, else "red"; "" if unknown."""
         if self.note or not self.profiles:
             return ""
-        return "green" if self.resolved else "amber" if self.chance < NOISE_BELOW else "red"
+        return "green" if self.resolved else "amber" if self.chance < SEEN_BELOW else "red"
 
     @property
     def contrast(self) -> str:

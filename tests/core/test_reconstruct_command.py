@@ -118,7 +118,7 @@ def test_the_command_does_what_python_does_and_logs_each_iteration(run, file, tm
     logged = [float(re.search(r"log-likelihood ([\d.e+-]+),", line)[1]) for line in lines]
     assert len(lines) == 3 and lines[2].startswith("iteration 3 of 3: ")
     np.testing.assert_allclose(logged, expected.objective, rtol=1e-6)
-    assert printed.out.startswith(f"{output}: OSEM, 3 iterations, 4 subsets, 20 x 20 x 20 voxels, largest ")
+    assert printed.out.startswith(f"{output}: OSEM, 3 iterations, 4 subsets, 20 x 20 x 20 voxels of 5 mm, largest ")
 
 
 def test_a_recipe_says_how_and_options_override_it(run, file, tmp_path, capsys):
@@ -262,7 +262,7 @@ def test_a_file_is_a_method_without_iterations_or_an_objective(toy, radiograph, 
     small = [tmp_path / "run.npz", "--voxels", "8", "--spacing", "12"]
     command(*small, "--method", toy, "-o", tmp_path / "a.npz", "--picture", tmp_path / "p.svg", "--save-state",
             tmp_path / "s.h5")  # fmt: skip
-    assert "Even, 8 x 8 x 8 voxels, largest 0 " in capsys.readouterr().out
+    assert "Even, 8 x 8 x 8 voxels of 12 mm, largest 0 " in capsys.readouterr().out
     assert "iteration" not in (tmp_path / "p.svg").read_text(encoding="utf-8")
     kept = mph.read_reconstruction(tmp_path / "s.h5")
     assert kept.objective.shape == (0,) and kept.iterations == 0
@@ -330,7 +330,8 @@ def test_a_prior_makes_it_smoother(run):
 def test_voxels_cover_the_roi_and_the_model_is_that_of_the_run(run):
     side = 2 * run.system.roi_radius.max()
     for rods, voxels in (((12.0, 0.0), 64), ((12.0, side / 40), 80), ((12.0, 1.0), 128)):
-        recipe = run.recipe.updated({"phantom.matrix": np.eye(4).tolist(), "phantom.rod_diameters": rods})
+        six = (*rods, 0.0, 0.0, 0.0, 0.0)
+        recipe = run.recipe.updated({"phantom.matrix": np.eye(4).tolist(), "phantom.rod_diameters": six})
         of_rods = replace(run, settings={**run.settings, "recipe": recipe.tables()})
         grid = reconstruction_grid(of_rods, of_rods.recipe)
         assert grid.shape == (voxels,) * 3, "half of the smallest rod, 64 to 128 along a side"

@@ -122,7 +122,7 @@ def _draw_texts(
             page.text(line, left, row, size, color)
 
     write(title, 1.1 * em, page.ink)
-    for line in lines[:1]:
+    for line in filter(None, lines[:1]):
         write(line, 0.9 * em, page.faint)
     table = [("rods", "", "valley/peak", "contrast"), *rods] if rods else []
     columns = left + 1.2 * em, left + min(0.38 * width, 8 * em), left + min(0.74 * width, 15 * em)

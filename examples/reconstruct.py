@@ -14,7 +14,7 @@ import time
 from pathlib import Path
 
 import mphdrr.core as mph
-from mphdrr.core.figures.page import Page
+from mphdrr.core.figures.page import DARK, Page
 from mphdrr.core.figures.reconstructions import SIZE_BESIDE_TRUTH, draw
 
 WORKBOOK = Path(__file__).with_name("dc-spect-80.xlsx")
@@ -61,9 +61,10 @@ def main() -> None:
     score = mph.score_volume(result.volume, phantom)
     print(*score.lines, sep="\n")
 
-    page = Page(*SIZE_BESIDE_TRUTH)
+    page = Page(*SIZE_BESIDE_TRUTH, DARK)
     lines = [f"{result.iterations} iterations, {arguments.subsets} subsets, NRMSE {score.nrmse:.3f}"]
-    draw(page, result.volume, result.objective.tolist(), truth, "OSEM of a Derenzo phantom", lines)
+    rods = [sector.cells for sector in score.derenzo or () if sector.rod_diameter]
+    draw(page, result.volume, result.objective.tolist(), truth, "OSEM of a Derenzo phantom", lines, rods=rods)
     page.write(arguments.picture)
     print(f"{arguments.picture}, {time.perf_counter() - began:.1f} s")
 

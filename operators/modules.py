@@ -41,6 +41,9 @@ class MPHDRR_OT_look_through_module(selection.OnScanner, bpy.types.Operator):
         scanner.fit_pixels(context.scene.render, context.scene.camera)
         if context.area is not None and context.area.type == "VIEW_3D":
             context.area.spaces.active.region_3d.view_perspective = "CAMERA"
+            if not bpy.app.background:
+                bpy.ops.view3d.view_center_camera()  # all of its image, beside the headers
+                context.area.spaces.active.region_3d.view_camera_zoom -= 6.0
         return f"Looking through {context.scene.camera.name}"
 
 

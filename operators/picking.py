@@ -1,5 +1,7 @@
 """Clicks on pictures and planes: pick a module, a pixel whose ray and epipolar lines are drawn, or an end of the window."""
 
+from contextlib import suppress
+
 import bpy
 import numpy as np
 from bpy.props import EnumProperty, FloatProperty, IntProperty
@@ -67,6 +69,8 @@ class MPHDRR_OT_pick_pixel(eyedropper.Eyedropper, reports.Reported, bpy.types.Op
 
     def takes(self, context: bpy.types.Context, found: tuple[int, int, int]) -> bool:
         self.module, self.column, self.row = found
+        with suppress(InputError):  # a module that is hidden, or not in the scene any more, has its pixel all the same
+            tiles.activate(context, self.module)
         return self.execute(context) == {"FINISHED"}
 
 

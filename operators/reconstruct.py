@@ -13,8 +13,9 @@ _RUN: Need = (lambda context: runs.shown(context.scene) is not None, "No run yet
 
 
 class MPHDRR_OT_reconstruct(reconstruction_properties.ReconstructionSettings, jobs.JobOperator, bpy.types.Operator):
-    """Find the volume that the shown run's projections are of. It is in the scene from its first iterations on; Cancel takes
-    it away again, Finish Now keeps what there is. The settings are what the panel says now, unless a script gives others
+    """Find the volume that the shown run's projections are of. It is in the scene from its first iterations on, the truth is
+    hidden; Cancel asks whether to keep what there is. The settings are what the panel says now, unless a script gives
+    others
     """
 
     bl_label = "Reconstruct Projections"
@@ -35,6 +36,15 @@ class MPHDRR_OT_reconstruct(reconstruction_properties.ReconstructionSettings, jo
                 self.given_or(context.scene.mphdrr_reconstruction), self.properties.is_property_set
             ),
         )
+
+
+class MPHDRR_OT_continue_reconstruction(jobs.JobOperator, bpy.types.Operator):
+    """Do ten more iterations of the last reconstruction, of the same run with the same settings, in the same volume"""
+
+    poll = needs((reconstructions.kept, "Nothing to continue: reconstruct first, in this session, by iterations"))
+
+    def job(self, context: bpy.types.Context) -> jobs.Job:
+        return reconstructions.continuing(context)
 
 
 class MPHDRR_OT_backproject(reconstruction_properties.BackprojectionSettings, jobs.JobOperator, bpy.types.Operator):

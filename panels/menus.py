@@ -116,6 +116,7 @@ class MPHDRR_MT_projections(bpy.types.Menu):
         layout.operator("mphdrr.clear_pixel", icon="X")
         layout.separator()
         layout.operator("mphdrr.reconstruct", icon="OUTLINER_OB_VOLUME")
+        layout.operator("mphdrr.continue_reconstruction", icon="FORWARD")
         layout.operator("mphdrr.show_reconstruction", icon="IMAGE_DATA")
         layout.operator_menu_enum("mphdrr.backproject", "how", icon="OUTLINER_DATA_VOLUME")
         layout.separator()

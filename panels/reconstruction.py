@@ -10,7 +10,9 @@ from .sidebar import Folded, draw_text
 
 _MAIN = ("method", "iterations", "voxels")
 """A beginner's settings, which the panel itself shows; the others stand under Advanced."""
-_PLOT = 6.0  # of a button's heights
+_DOTS = {"green": "NODE_SOCKET_SHADER", "amber": "NODE_SOCKET_OBJECT", "red": "NODE_SOCKET_MATERIAL"}
+"""Blender's icons that are dots in the colours of rods' lights."""
+_PLOT = 4.0  # of a button's heights
 
 
 class MPHDRR_PT_reconstruction(Folded, bpy.types.Panel):
@@ -44,13 +46,23 @@ def _draw_result(layout: bpy.types.UILayout, settings: bpy.types.PropertyGroup, 
         column.label(text=known["name"].capitalize())
         column.label(text=f"{known['objective'][-1]:.7g}", translate=False)
     scores = box.column(align=True)
+    draw_text(scores, known.get("voxels", ""), "NONE")
     for name, value in known["scores"]:
         row = scores.split(factor=0.3)
         row.label(text=name, translate=False)
-        row.label(text=value, translate=False)
+        draw_text(row, value, "NONE")
+    rods = known.get("rods", ())
+    for name, light, *values in [("Rods", "", "Valley/Peak", "Contrast"), *rods] if rods else ():
+        row = scores.split(factor=0.3)
+        row.label(text=name, translate=name == "Rods", icon=_DOTS.get(light, "BLANK1"))
+        row = row.split(factor=0.55) if values[1] else row
+        for text in filter(None, values):
+            row.label(text=text, translate=name == "Rods")
     for text in known.get("flatters", ()):
         draw_text(box, text)
-    box.operator("mphdrr.show_reconstruction", text="Show Slices", icon="IMAGE_DATA")
+    row = layouts.invoking(box.row())
+    row.operator("mphdrr.continue_reconstruction", text="Continue (+10)", icon="FORWARD")
+    row.operator("mphdrr.show_reconstruction", text="Show Slices", icon="IMAGE_DATA")
 
 
 class MPHDRR_PT_reconstruction_model(Folded, bpy.types.Panel):

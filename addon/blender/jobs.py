@@ -137,7 +137,8 @@ class Worker(threading.Thread):
         words = f"{words} {self.done} of {self.total}"
         if seconds < _SOON or not self.done:
             return words
-        return f"{words}, {_readable(seconds / self.done * (self.total - self.done))} left"
+        left = seconds / self.done * (self.total - self.done)
+        return f"{words}, {f'{left:.0f} s' if left < 100 else f'{left / 60:.0f} min'} left"
 
     @property
     def is_stoppable(self) -> bool:
@@ -165,10 +166,6 @@ class Worker(threading.Thread):
         self.since = time.monotonic()
         progress(0, 0)
         return progress
-
-
-def _readable(seconds: float) -> str:
-    return f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min"
 
 
 _current: Worker | None = None
@@ -288,7 +285,7 @@ class JobOperator:
             self.cancel(context)
             return {"CANCELLED"}
         if event.type == "ESC" and event.value == "PRESS" and worker is _current:
-            worker.cancel.set()
+            bpy.ops.mphdrr.cancel_job("INVOKE_DEFAULT")
             return {"RUNNING_MODAL"}
         if event.type != "TIMER":
             return {"PASS_THROUGH"}
@@ -423,12 +420,26 @@ class ExportJob(JobOperator, ExportHelper):
 
 
 class MPHDRR_OT_cancel_job(reports.Reported, bpy.types.Operator):
-    """Stop a job, or take it out of the queue; the scene stays as it was"""
+    """Stop a job, or take it out of the queue; the scene stays as it was. What can be kept of it is asked for first"""
 
     bl_label = "Cancel"
     bl_options = {"INTERNAL"}
 
     number: IntProperty(name="Job", description="Its number; 0: the running one", options={"HIDDEN", "SKIP_SAVE"})
+
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        """Ask whether to keep or to discard what the running job has made, if it can be kept."""
+        worker = _current
+        if worker is None or worker.enough is None or self.number not in (0, worker.number):
+            return self.execute(context)
+
+        def draw(menu: Any, context: bpy.types.Context) -> None:
+            menu.layout.operator("mphdrr.finish_job", text="Keep What There Is", icon="CHECKMARK")
+            menu.layout.operator_context = "EXEC_DEFAULT"
+            menu.layout.operator("mphdrr.cancel_job", text="Discard", icon="TRASH").number = worker.number
+
+        context.window_manager.popup_menu(draw, title=f"{worker.label}: Stop?", icon="QUESTION")
+        return {"CANCELLED"}
 
     def act(self, context: bpy.types.Context) -> None:
         """Ask it to stop at its next step."""
@@ -453,6 +464,7 @@ def draw_job(layout: bpy.types.UILayout) -> None:
     """Draw the running job's stage and those that wait, each with its Cancel button; nothing where there is none."""
     for worker in filter(None, (_current, *_waiting)):
         row = layout.row(align=True)
+        row.operator_context = "INVOKE_DEFAULT"
         if worker is _current:
             row.progress(factor=worker.share, type="BAR", text=worker.text)
             if worker.enough is not None:
@@ -466,7 +478,7 @@ def draw_status(header: bpy.types.Header, context: bpy.types.Context) -> None:
     """Draw the running job in Blender's status bar."""
     if _current is not None:
         row = header.layout.row(align=True)
-        row.ui_units_x = _STATUS_UNITS
+        row.ui_units_x, row.operator_context = _STATUS_UNITS, "INVOKE_DEFAULT"
         row.progress(factor=_current.share, type="BAR", text="mphDRR: " + _current.text)
         row.operator("mphdrr.cancel_job", text="", icon="CANCEL").number = _current.number
 

@@ -46,6 +46,23 @@ def draw_texts(texts: Iterable[tuple[str, float, float, tuple[float, ...]]], siz
     blf.disable(0, blf.SHADOW)
 
 
+def text_width(text: str, size: float) -> float:
+    """How wide a text is that `draw_texts` writes, pixels."""
+    blf.size(0, size)
+    return float(blf.dimensions(0, text)[0])
+
+
+def draw_rectangle(frame: tuple[float, float, float, float], color: tuple[float, ...]) -> None:
+    """Fill the rectangle from left, bottom to right, top, in pixels of the region."""
+    left, bottom, right, top = frame
+    shader = gpu.shader.from_builtin("UNIFORM_COLOR")
+    shader.uniform_float("color", color)
+    corners = [(left, bottom, 0.0), (right, bottom, 0.0), (left, top, 0.0), (right, top, 0.0)]
+    gpu.state.blend_set("ALPHA")
+    batch_for_shader(shader, "TRI_STRIP", {"pos": corners}).draw(shader)
+    gpu.state.blend_set("NONE")
+
+
 def draw_lines(points: Any, color: tuple[float, ...], width: float, kind: str = "LINES") -> None:
     """Draw lines `width` pixels wide through points (N, 3): by "LINES" two points each, by "LINE_STRIP" one through all."""
     shader = gpu.shader.from_builtin("POLYLINE_UNIFORM_COLOR")

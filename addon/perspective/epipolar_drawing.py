@@ -17,8 +17,8 @@ Floats = NDArray[np.float64]
 _LINE, _FAINT = (0.2, 0.85, 1.0, 1.0), (0.2, 0.85, 1.0, 0.35)  # colours: in the ROI, and outside
 _MARKER, _PIXEL = (0.45, 1.0, 0.3, 1.0), (1.0, 1.0, 1.0, 1.0)
 _OUTLINE = (0.0, 0.0, 0.0, 0.6)
-_WIDTH, _MARKER_WIDTH = 1.3, 2.0  # of lines, in pixels of the screen at a resolution scale of 1
-_RADIUS = 4.5  # of a marker over a picture, in such pixels
+_WIDTH, _MARKER_WIDTH = 1.3, 1.5  # of lines, in pixels of the screen at a resolution scale of 1
+_RADIUS = 8.0  # of a marker over a picture, in such pixels: a small source is seen within
 _SHARE = 0.05  # of a plane's width, or of the ROI's radius: the radius of a marker in the scene
 _BEFORE = 1.005  # of the way from the pinhole to a plane: where lines on it are drawn, so that it does not hide them
 

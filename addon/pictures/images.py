@@ -25,6 +25,10 @@ _ARRAYS = ("sources", "detector_centers", "u_steps", "v_steps")
 _PIXELS = 2.2e7
 """About as many all pictures have together: larger images are shown smaller, since drawing a picture takes memory again."""
 _PNG_LEVEL = 1  # fast
+BAR = 24
+"""Pixels at a resolution scale of 1 at the bottom of an Image Editor that are left free for notes (`run_notes`)."""
+_SHARE = 0.97  # of its editor that a picture of another size takes: buttons at the edges do not cover it
+_BELOW = 0.4  # of the 3D view's height: an Image Editor that is opened below it
 _WAIT = 0.005  # s between two looks at a thread
 _SCANNER = "mphdrr_scanner"  # custom property of the mosaic: the collection of the scanner that the run is of
 _TEXT = "mphdrr_difference"  # custom property of a difference: its numbers, in words
@@ -284,41 +288,67 @@ def projection_array(image: bpy.types.Image) -> NDArray[np.float32]:
 
 
 def show(image: bpy.types.Image, context: bpy.types.Context) -> bool:
-    """Show an image in the Image Editors that show none or one of ours; False if no such editor is open."""
-    shown = False
+    """Show an image in an Image Editor that shows it, or the largest one that shows none or one of ours; False without."""
+    editors = _editors(context)
+    chosen = [each for each in editors if each[1].spaces.active.image == image] or editors[-1:]
+    for window, area in chosen:
+        area.spaces.active.image = image
+        _fit(window, area)
+    return bool(chosen)
+
+
+def _editors(context: bpy.types.Context) -> list[tuple[bpy.types.Window, bpy.types.Area]]:
+    """The Image Editors that nobody works in: they show none, or one of our pictures; the largest is the last."""
+    found = []
     for window in context.window_manager.windows:
         for area in window.screen.areas:
             space = area.spaces.active
-            if area.type == "IMAGE_EDITOR" and (space.image is None or _KEY in space.image):
-                space.image = image
-                _fit(context, window, area)
-                shown = True
-    return shown
+            if area.type == "IMAGE_EDITOR" and space.mode == "VIEW" and (space.image is None or _KEY in space.image):
+                found.append((window, area))
+    return sorted(found, key=lambda each: each[1].width * each[1].height)
+
+
+def room(context: bpy.types.Context) -> tuple[int, int, float] | None:
+    """Width and height, pixels, that a picture fills in the editor in which `show` shows it, and the scale of its texts.
+
+    None where no such editor is open.
+    """
+    editors = _editors(context)
+    return (*_room(editors[-1][1]), context.preferences.system.ui_scale) if editors else None
+
+
+def _room(area: bpy.types.Area) -> tuple[int, int]:
+    region = next(region for region in area.regions if region.type == "WINDOW")
+    return region.width, region.height - round(BAR * bpy.context.preferences.system.ui_scale)
 
 
 PROJECTED: reports.Need = (lambda context: ids.MOSAIC in bpy.data.images, "No projections yet: render them first")
 
 
 def show_below(image: bpy.types.Image, context: bpy.types.Context) -> bool:
-    """Like `show`, but open an Image Editor below the largest 3D view if none is open; False without a window."""
-    if show(image, context):
-        return True
+    """Like `show`, but open an Image Editor below the largest 3D view if none is free; False without a window."""
+    return open_editor(context) and show(image, context)
+
+
+def open_editor(context: bpy.types.Context) -> bool:
+    """Open an Image Editor below the largest 3D view, unless there is one that nobody works in; False without a window."""
     window = context.window
     views = [a for a in window.screen.areas if a.type == "VIEW_3D"] if window else []
-    if not views:
-        return False
+    if _editors(context) or not views:
+        return bool(_editors(context))
     view = max(views, key=lambda a: a.width * a.height)
     before = set(window.screen.areas)
     with context.temp_override(window=window, area=view, region=view.regions[-1]):
-        bpy.ops.screen.area_split(direction="HORIZONTAL", factor=0.3)
+        bpy.ops.screen.area_split(direction="HORIZONTAL", factor=_BELOW)
     new = [a for a in window.screen.areas if a not in before]
     area = min([*new, view], key=lambda a: a.y)
     area.type = "IMAGE_EDITOR"
-    area.spaces.active.image = None
-    return show(image, context)
+    area.spaces.active.image, area.spaces.active.show_gizmo = None, False  # they would hide the colour bar
+    return True
 
 
-def _fit(context: bpy.types.Context, window: bpy.types.Window, area: bpy.types.Area) -> None:
+def _fit(window: bpy.types.Window, area: bpy.types.Area) -> None:
+    """Show all of an editor's image, above the bar where notes stand; one that is as large as its room, pixel by pixel."""
     region = next((r for r in area.regions if r.type == "WINDOW"), None)
     if region is None or bpy.app.background:
         return
@@ -327,8 +357,13 @@ def _fit(context: bpy.types.Context, window: bpy.types.Window, area: bpy.types.A
     def fit() -> None:  # after the redraw, when a new editor knows its size
         try:
             with bpy.context.temp_override(window=window, area=area, region=region):
-                bpy.ops.image.view_all(fit_view=True)
-        except (RuntimeError, ReferenceError, TypeError):
+                width, height = area.spaces.active.image.size
+                (across, up), whole = _room(area), region.height
+                zoom = min(across / width, up / height) * (1.0 if (width, height) == (across, up) else _SHARE)
+                bpy.ops.image.view_all(fit_view=True)  # its middle is the region's
+                bpy.ops.image.view_zoom_ratio(ratio=zoom)
+                bpy.ops.image.view_pan(offset=(0.0, -(whole - up) / 2 / zoom))
+        except (RuntimeError, ReferenceError, TypeError, AttributeError):
             pass  # the window or the editor was closed meanwhile
 
     bpy.app.timers.register(fit, first_interval=0.2)

@@ -112,14 +112,19 @@ def pick(context: bpy.types.Context, x: float, y: float) -> str | None:
     found = picture_at(image, *context.region.view2d.region_to_view(x, y))
     if images.tiles(image) is None or found is None:
         return None
-    collection = images.scanner_of(image)
+    return activate(context, found[0].number)
+
+
+def activate(context: bpy.types.Context, number: int) -> str:
+    """Make a module of the mosaic's scanner active, which has a frame around its image; returns its name."""
+    collection = images.scanner_of(bpy.data.images[ids.MOSAIC])
     if collection not in scanner.scanners(context.scene):
         raise InputError("the scanner of these projections is not in the scene: render them again")
-    camera = scanner.module(collection, found[0].number)
+    camera = scanner.module(collection, number)
     if not camera.visible_get():
         raise InputError(f"{camera.name} is hidden: show it in the Modules panel")
     selection.select(context, [camera])
-    return camera.name
+    return str(camera.name)
 
 
 def set_window(settings: bpy.types.PropertyGroup, end: str, value: float, window: Sequence[float]) -> None:
@@ -144,17 +149,24 @@ def active_tile(context: bpy.types.Context, image: bpy.types.Image | None) -> in
     return int(shown["numbers"].index(camera.mphdrr_module.number))
 
 
+def frame(context: bpy.types.Context, picture: Picture, size: Sequence[int]) -> tuple[float, float, float, float]:
+    """Left, bottom, right and top, in the Image Editor's region, of a picture in an image of that width and height."""
+    to_region, ((row, column), (rows, columns), (width, height)) = (
+        context.region.view2d.view_to_region,
+        (picture.corner, picture.size, size),
+    )
+    left, top = to_region(column / width, 1.0 - row / height, clip=False)
+    right, bottom = to_region((column + columns) / width, 1.0 - (row + rows) / height, clip=False)
+    return left, bottom, right, top
+
+
 def draw() -> None:
     """Draw the frame; Blender calls this for every Image Editor."""
     context = bpy.context
     image = context.space_data.image
-    index, tiles = active_tile(context, image), images.tiles(image)
-    if index is None or tiles is None:
+    index = active_tile(context, image)
+    if index is None:
         return
-    row, column = np.reshape(tiles["corners"], (-1, 2))[index]
-    (rows, columns), (width, height) = tiles["tile"], image.size
-    to_region = context.region.view2d.view_to_region
-    left, top = to_region(column / width, 1.0 - row / height, clip=False)
-    right, bottom = to_region((column + columns) / width, 1.0 - (row + rows) / height, clip=False)
+    left, bottom, right, top = frame(context, pictures(image)[index], image.size)
     corners = [(left, top, 0), (right, top, 0), (right, bottom, 0), (left, bottom, 0), (left, top, 0)]
     windows.draw_lines(corners, _ACTIVE, _WIDTH, "LINE_STRIP")

@@ -13,22 +13,26 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core import InputError, ProjectionRun, Recipe, Volume, read_run, score_volume
-from ...core.figures.page import Page
+from ...core import InputError, ProjectionRun, Recipe, Reconstruction, Volume, read_run, score_volume
+from ...core.figures.page import DARK, SMALLEST, Page
 from ...core.figures.reconstructions import SIZE, SIZE_BESIDE_TRUTH, draw
 from ...core.progress import Progress, stages_of
 from ...core.reconstruction.methods import method_of
 from ...core.reconstruction.result import iterations_text
 from ...core.runs.mosaic import png
-from ...core.runs.reconstructing import reconstruct_run, reconstruction_grid
+from ...core.runs.reconstructing import reconstruct_run, reconstruction_grid, voxels_text
 from ...core.runs.run_recipe import truth_of_run
+from ...core.volumes.sights import bright_value, full_slices
 from ..blender import ids, jobs, objects, plots, storage, windows
 from ..pictures import images
 from ..runs import rendering, runs
-from ..volumes import stored_volumes, volumes
+from ..volumes import slices, stored_volumes, volume_materials, volumes
 
 _BETWEEN = 2.0  # s at least between two pictures of a reconstruction that runs
 _PNG_LEVEL = 1  # fast
+_TEXT = 14.0  # size of text in a picture that fills an editor, pixels at a resolution scale of 1
+MORE = 10
+"""Iterations that Continue does."""
 
 
 @dataclass(frozen=True)
@@ -40,57 +44,103 @@ class _Shown:
     record: dict[str, Any]  # see `ReconstructionProperties.known`
 
 
+@dataclass(frozen=True)
+class _Kept:
+    """The last reconstruction of this session, to go on with."""
+
+    item: int  # its object's `session_uid`
+    found: Reconstruction
+    recipe: Recipe
+    path: Path  # of the run
+    name: str  # of the run
+    shown: _Shown
+
+
+_kept: _Kept | None = None
+
+
+def kept(context: bpy.types.Context) -> _Kept | None:
+    """What Continue goes on with: the panel's reconstruction, if it was made in this session by iterations."""
+    item = context.scene.mphdrr_reconstruction.volume
+    goes = _kept is not None and item is not None and item.session_uid == _kept.item and _kept.found.iterations
+    return _kept if goes else None
+
+
 def reconstructing(context: bpy.types.Context, recipe: Recipe) -> jobs.Job:
     """The job that reconstructs the scene's shown run as the [reconstruction] of `recipe` says; raises InputError.
 
     The volume comes into the scene with the first iteration that is shown. The object of an earlier reconstruction stays.
     """
-    scene, shown = context.scene, runs.required(context.scene, "reconstruct")
-    path, name, folder = rendering.file_of(shown.file), shown.name, storage.folder()
+    run = runs.required(context.scene, "reconstruct")
+    return _reconstructing(context, recipe, rendering.file_of(run.file), run.name)
+
+
+def continuing(context: bpy.types.Context) -> jobs.Job:
+    """The job that does some more iterations of the reconstruction in the panel, in the same object; raises InputError."""
+    last = kept(context)
+    if last is None:
+        raise InputError("nothing to continue: reconstruct first, in this session")
+    recipe = last.recipe.updated({"reconstruction.iterations": MORE})
+    return _reconstructing(context, recipe, last.path, last.name, last)
+
+
+def _reconstructing(
+    context: bpy.types.Context, recipe: Recipe, path: Path, name: str, last: _Kept | None = None
+) -> jobs.Job:
+    scene, folder = context.scene, storage.folder()
     method = method_of(recipe["reconstruction.method"])
     readers = _readers_of_mu(scene)
     uid, start = scene.session_uid, time.perf_counter()
     is_watched = windows.has_window()
-    shelf = _Shelf(scene, f"{name} {method.label}")
+    if is_watched:
+        images.open_editor(context)
+    shelf = _Shelf(context, f"{name} {method.label}", last)
 
-    def work(progress: Progress) -> _Shown:
+    def work(progress: Progress) -> tuple[_Shown, Reconstruction]:
         stages = stages_of(progress)
         stages("reading the run")
         run = read_run(path)
         grid = reconstruction_grid(run, recipe, method)  # refuses what cannot be, before the work begins
-        last = 0.0
+        before = 0.0
 
-        def shown_of(values: NDArray[Any], objective: Sequence[float], scores: Any = (), flatters: Any = ()) -> _Shown:
+        def shown_of(
+            values: NDArray[Any], objective: Sequence[float], scores: Mapping[str, Any] = {}, flatters: Any = ()
+        ) -> _Shown:
             volume = Volume(values, grid, "activity" if run.volume is None else run.volume.quantity)
             record = {
                 "title": ", ".join(filter(None, (method.label, iterations_text(len(objective))))),
-                "name": method.objective, "objective": list(objective), "scores": list(scores), "flatters": flatters,
-                "run": path.name,
+                "name": method.objective, "objective": list(objective), "voxels": voxels_text(grid),
+                "scores": [], "rods": [], "flatters": flatters, **scores, "run": path.name,
             }  # fmt: skip
-            picture = _picture(run, volume, record, name)
+            picture = _picture(run, volume, record, name, shelf.room)
             stored = stored_volumes.store_volume(volume, folder, None, {"reconstruction_of": name, **recipe.tables()})
             shelf.files.append(stored.path)
             return _Shown(stored, picture, record)
 
         def watch(iteration: int, values: NDArray[Any], objective: Sequence[float]) -> bool:
-            nonlocal last
-            if time.monotonic() - last > _BETWEEN and is_watched:
+            nonlocal before
+            if time.monotonic() - before > _BETWEEN and is_watched:
                 shelf.latest = shown_of(np.array(values), objective)
-                last = time.monotonic()
+                before = time.monotonic()
             return shelf.enough.is_set()
 
-        found = reconstruct_run(run, recipe, _mu(run, recipe, readers), watch=watch, stages=stages, method=method)
+        mu = _mu(run, recipe, readers)
+        found = reconstruct_run(run, recipe, mu, last.found if last else None, watch, stages, method)
         scores = _scores(run, found.volume, stages("scoring"))
-        return shown_of(found.volume.array, found.objective.tolist(), scores, found.settings["flatters"])
+        return shown_of(found.volume.array, found.objective.tolist(), scores, found.settings["flatters"]), found
 
-    def finish(result: _Shown) -> str:
+    def finish(result: tuple[_Shown, Reconstruction]) -> str:
+        global _kept
         jobs.scene_again(uid, "the reconstruction is")  # or an error
-        item = shelf.show(result)
+        shown, found = result
+        item = shelf.show(shown)
         volumes.make_active(bpy.context, item)
+        slices.add_slices(item, full_slices(found.volume.array).tolist())
         images.show_below(bpy.data.images[ids.RECONSTRUCTION], bpy.context)
         shelf.tidy()
+        _kept = _Kept(item.session_uid, found, recipe, path, name, shown)
         seconds = time.perf_counter() - start
-        return f"Reconstructed {item.name!r}: {result.record['title']}, in {seconds:.1f} s"
+        return f"Reconstructed {item.name!r}: {shown.record['title']}, {shown.record['voxels']}, in {seconds:.1f} s"
 
     return jobs.Job("Reconstructing", work, finish, shelf.clear, shelf.look, shelf.enough)
 
@@ -98,12 +148,15 @@ def reconstructing(context: bpy.types.Context, recipe: Recipe) -> jobs.Job:
 class _Shelf:
     """What a running reconstruction has put into the scene and on the disk, to be replaced, or taken back."""
 
-    def __init__(self, scene: bpy.types.Scene, name: str) -> None:
-        self.name, self.enough = name, threading.Event()
+    def __init__(self, context: bpy.types.Context, name: str, last: _Kept | None) -> None:
+        self.name, self.enough, self._last = name, threading.Event(), last
         self.files: list[Path] = []
         self.latest: _Shown | None = None  # made by the thread
+        self.room = images.room(context) if windows.has_window() else None  # that the picture fills
+        scene = context.scene
         settings = scene.mphdrr_reconstruction
-        self._scene, self._item = scene.session_uid, 0
+        self._scene, self._item, self._is_shown = scene.session_uid, last.item if last else 0, False
+        self._hidden: list[int] = []  # the truth, and an earlier reconstruction
         self._before = settings.volume, settings.record
         image = bpy.data.images.get(ids.RECONSTRUCTION)
         packed = None if image is None else image.packed_file
@@ -111,9 +164,10 @@ class _Shelf:
 
     def look(self) -> None:
         """Show what the thread has made since."""
+        self.room = images.room(bpy.context)
         latest, self.latest = self.latest, None
         if latest is not None:
-            is_first = not self._item
+            is_first = not self._is_shown
             self.show(latest)
             if is_first:
                 images.show_below(bpy.data.images[ids.RECONSTRUCTION], bpy.context)
@@ -122,16 +176,30 @@ class _Shelf:
         """Put a state of the reconstruction into the scene, in place of the one before."""
         scene = jobs.found_again(bpy.data.scenes, self._scene)
         item = jobs.found_again(bpy.data.objects, self._item)
+        if not self._is_shown:
+            self._is_shown = True
+            self._hide(runs.projected(scene), scene.mphdrr_reconstruction.volume if item is None else None)
         if item is None:  # or the user has deleted it
             item = volumes.add_stored(shown.stored, self.name, scene.collection)
             self._item = item.session_uid
         else:
             volumes.replace_stored(item, shown.stored)
+        factor = volume_materials.shown_unit(item.mphdrr_volume.quantity)[1]
+        bright = factor * bright_value(shown.stored.volume.array)
+        if bright > 0:  # the hottest voxel does not say how bright the others are
+            item.mphdrr_volume.display_high = bright
         images.store_drawn(ids.RECONSTRUCTION, shown.picture)
         settings = scene.mphdrr_reconstruction
         settings.volume, settings.record = item, json.dumps(shown.record)
         plots.forget()
         return item
+
+    def _hide(self, *items: bpy.types.Object | None) -> None:
+        """Hide what stands where the reconstruction is; the eye beside its name brings it back."""
+        for item in items:
+            if item is not None and item.name in bpy.context.view_layer.objects and not item.hide_get():
+                item.hide_set(True)
+                self._hidden.append(item.session_uid)
 
     def tidy(self) -> None:
         """Remove the files of states that are not shown any more."""
@@ -143,12 +211,16 @@ class _Shelf:
     def clear(self) -> None:
         """Take everything back."""
         item = jobs.found_again(bpy.data.objects, self._item)
-        if item is not None:
+        for hidden in filter(None, (jobs.found_again(bpy.data.objects, uid) for uid in self._hidden)):
+            hidden.hide_set(False)
+        if item is not None and self._last is not None:
+            volumes.replace_stored(item, self._last.shown.stored)
+        elif item is not None:
             materials = list(item.data.materials)
             objects.remove_objects([item, *item.children])
             objects.remove_unused(materials)
         scene = jobs.found_again(bpy.data.scenes, self._scene)
-        if scene is not None and self._item:
+        if scene is not None and self._is_shown:
             settings = scene.mphdrr_reconstruction
             with suppress(ReferenceError):
                 settings.volume, settings.record = self._before
@@ -161,30 +233,35 @@ class _Shelf:
         self.tidy()
 
 
-def _picture(run: ProjectionRun, volume: Volume, record: dict[str, Any], name: str) -> bytes:
-    page = Page(*(SIZE if run.volume is None else SIZE_BESIDE_TRUTH))
-    line = ", ".join([record["title"], *map(": ".join, record["scores"][:1])])
-    lines = [line, *record["flatters"]]
-    draw(page, volume, record["objective"], run.volume, f"Reconstruction of {name}", lines, record["name"])
-    return png(page.picture, _PNG_LEVEL)
+def _scores(run: ProjectionRun, volume: Volume, progress: Progress | None) -> dict[str, Any]:
+    """The scores beside the truth as the panel shows them; none of a measured run.
 
-
-def _scores(run: ProjectionRun, volume: Volume, progress: Progress | None) -> list[tuple[str, str]]:
-    """The scores beside the truth, as names and values in words; none of a measured run."""
+    They are names and values in words; of rods their size, light, valley/peak, or why there is none, and contrast.
+    """
     if run.volume is None:
-        return []
-    truth, pose = truth_of_run(run)
+        return {}
     try:
-        score = score_volume(volume, truth, pose, progress)
+        score = score_volume(volume, *truth_of_run(run), progress)
     except InputError as error:  # such as a truth that is the same everywhere: the reconstruction is worth keeping
-        return [("No score", str(error))]
+        return {"scores": [("No score", str(error))]}
     lines = [("NRMSE", f"{score.nrmse:.3g}")]
-    for rods in score.derenzo or ():
-        lines.append((f"{rods.rod_diameter:g} mm rods", rods.words))
     for sphere in score.nema or ():
         score_text = f"{sphere.contrast_recovery:.1f} % contrast, {sphere.background_variability:.1f} % variability"
         lines.append((f"{sphere.diameter:g} mm sphere", score_text))
-    return lines
+    return {"scores": lines, "rods": [sector.cells for sector in score.derenzo or () if sector.rod_diameter]}
+
+
+def _picture(
+    run: ProjectionRun, volume: Volume, record: dict[str, Any], name: str, room: tuple[int, int, float] | None
+) -> bytes:
+    """A picture that fills its editor's room, if there is one: width and height, pixels, and Blender's scale of texts."""
+    page = Page(*(SIZE if run.volume is None else SIZE_BESIDE_TRUTH), DARK)
+    if room is not None and min(room[:2]) >= SMALLEST:
+        page = Page(*room[:2], DARK, _TEXT * room[2])
+    line = ", ".join([record["title"], *map(" ".join, record["scores"][:1]), record["voxels"]])
+    lines, title = [line, *record["flatters"]], f"Reconstruction of {name}"
+    draw(page, volume, record["objective"], run.volume, title, lines, record["name"], record["rods"])
+    return png(page.picture, _PNG_LEVEL)
 
 
 def _readers_of_mu(scene: bpy.types.Scene) -> dict[str, Callable[[], Volume]]:

@@ -53,7 +53,7 @@ def importing(context: bpy.types.Context, paths: list[Path], given: Mapping[str,
         scene = jobs.scene_again(scene_uid, "the projections are")
         owner = jobs.found_again(bpy.data.collections, scanner_uid)
         state = runs.state_of(system, run.recipe, None, None) | {"measured": caption(run)}
-        images.show((yield from rendering.storing(scene, run, path, state, owner, made)), bpy.context)
+        images.show_below((yield from rendering.storing(scene, run, path, state, owner, made)), bpy.context)
         return (
             f"Imported {float(run.projections.sum(dtype=float)):.6g} counts of {len(run.views)} modules: {caption(run)}"
         )

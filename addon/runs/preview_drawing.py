@@ -14,7 +14,11 @@ import numpy as np
 from gpu_extras.batch import batch_for_shader
 from numpy.typing import NDArray
 
-_WIDTH = 250.0  # of the picture in the corner, in Blender's units of its interface
+from ...core.runs.letters import wrapped
+from ..blender import windows
+
+_WIDTH, _LEAST = 150.0, 60.0  # of the picture in the corner, and its least height, in Blender's units of its interface
+_ABOVE, _BESIDE = 130.0, 50.0  # in such units: for the gizmos that turn the view, above the picture and beside it
 _MARGIN, _TEXT = 20.0, 11.0
 _BACK, _FRONT = (0.05, 0.05, 0.05, 0.75), (1.0, 1.0, 1.0, 1.0)
 _TRIANGLES = ((0, 1, 2), (0, 2, 3))
@@ -57,17 +61,20 @@ def _draw_corner(session: Any) -> None:
     context = bpy.context
     unit = context.preferences.system.ui_scale
     margin, size = _MARGIN * unit, _TEXT * unit
-    right = context.region.width - margin - _covered(context)
+    right = context.region.width - margin - _BESIDE * unit - _covered(context)
     blf.size(0, size)
     shown, width, height = session.shown, _WIDTH * unit, 0.0
-    lines = [piece for line in session.lines for piece in _wrapped(line, width)]
+    lines = [
+        piece for line in session.lines for piece in wrapped(line, lambda text: blf.dimensions(0, text)[0] <= width)
+    ]
     if shown is not None:
         rows, columns = shown.picture.shape[:2]
-        aspect, most = columns / rows, 0.6 * context.region.height
+        free = context.region.height - _ABOVE * unit - 2 * margin - (1.4 * len(lines) + 2) * size
+        aspect, most = columns / rows, max(free, _LEAST * unit)
         width, height = min(width, aspect * most), min(most, width / aspect)  # as large as fits
     left, top = right - max(width, _WIDTH * unit), margin + height + (1.4 * len(lines) + 2) * size
     gpu.state.blend_set("ALPHA")
-    _rectangle(left - size, margin - size, right + size, top)
+    windows.draw_rectangle((left - size, margin - size, right + size, top), _BACK)
     if shown is not None:
         picture, colors = _textures(shown)
         _picture(picture, _box(left, margin + size, left + width, margin + size + height))
@@ -105,25 +112,6 @@ def _picture(texture: Any, places: list[Any]) -> None:
     shader.uniform_sampler("image", texture)
     corners = [(0, 1), (1, 1), (1, 0), (0, 0)]
     batch_for_shader(shader, "TRIS", {"pos": places, "texCoord": corners}, indices=_TRIANGLES).draw(shader)
-
-
-def _rectangle(left: float, bottom: float, right: float, top: float) -> None:
-    shader = gpu.shader.from_builtin("UNIFORM_COLOR")
-    shader.uniform_float("color", _BACK)
-    places = _box(left, bottom, right, top)
-    batch_for_shader(shader, "TRIS", {"pos": places}, indices=_TRIANGLES).draw(shader)
-
-
-def _wrapped(line: str, width: float) -> list[str]:
-    """A line as lines that are no wider than `width`, in pixels, where it has spaces."""
-    pieces = [""]
-    for word in line.split():
-        longer = f"{pieces[-1]} {word}".strip()
-        if pieces[-1] and blf.dimensions(0, longer)[0] > width:
-            pieces.append(word)
-        else:
-            pieces[-1] = longer
-    return pieces
 
 
 def _covered(context: bpy.types.Context) -> float:

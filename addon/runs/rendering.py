@@ -68,7 +68,7 @@ def render_job(context: bpy.types.Context, recipe: Recipe, volume: str = "", mu:
         run, made = result
         scene = jobs.scene_again(scene_uid, "the projections are")
         owner = jobs.found_again(bpy.data.collections, scanner_uid)  # which need not be the panel's any more
-        images.show((yield from storing(scene, run, path, state, owner, made)), bpy.context)
+        images.show_below((yield from storing(scene, run, path, state, owner, made)), bpy.context)
         where = path if bpy.data.filepath else f"{path} until the .blend is saved"
         seconds = time.perf_counter() - start
         return f"Projected {recipe['volume.object']!r} into {len(run.views)} modules in {seconds:.1f} s: {where}"
@@ -340,6 +340,8 @@ def _chosen_volume(context: bpy.types.Context, name: str, taken: Sequence[str], 
     fitting = [item for item in known if volumes.quantity_of(item) in taken]
     if context.object in fitting:
         return context.object
+    if len(fitting) > 1 and (last := runs.projected(context.scene)) in fitting:  # a reconstruction stands beside it
+        return last
     what = " or ".join(taken)
     if not fitting:
         raise InputError(f"no volume of {what} in the scene: add a phantom first")

@@ -3,28 +3,49 @@
 import bpy
 
 from ..blender import windows
-from ..pictures import images
+from ..pictures import images, tiles
 from . import runs
 
-_COLOR = (1.0, 0.45, 0.35, 1.0)
-_PLAIN = (1.0, 1.0, 1.0, 1.0)
-_SIZE, _LEFT, _BOTTOM = 13, 12, 12  # of the letters, and from the region's corner; pixels at a resolution scale of 1
+_COLOR = (1.0, 0.62, 0.2, 1.0)
+_PLAIN, _BACK = (1.0, 1.0, 1.0, 1.0), (0.08, 0.08, 0.08, 1.0)
+_SIZE, _LEFT = 13, 12  # of the letters, and from the region's corner; pixels at a resolution scale of 1
+_CORNER, _WIDTH = 0.3, 3.0  # of a tile's height: its stale corner's sides; and how thick they are, in such pixels
 
 
 def draw() -> None:
-    """Draw the line; Blender calls this for every Image Editor."""
+    """Draw the notes on a bar below the pictures, and a corner at each stale tile.
+
+    Blender calls this for every Image Editor.
+    """
     context = bpy.context
-    if not images.is_ours(context.space_data.image):
+    image = context.space_data.image
+    if not images.is_ours(image):
         return
-    lines = runs.change_lines(context.scene)
+    lines, stale = runs.change_lines(context.scene), runs.stale_modules(context.scene)
     if not images.is_of(context.scene):
-        lines = ["the projections of another scene"]
-    measured = runs.measured_text(context.scene)
-    texts = [(measured, _PLAIN)] if measured else []
-    if lines and lines != [runs.UNKNOWN]:
-        texts.append((f"Not of the scene as it is now: {', '.join(lines)}", _COLOR))
-    scale = context.preferences.system.ui_scale
-    up = (scale * (_BOTTOM + 1.5 * _SIZE * k) for k in range(len(texts)))
-    windows.draw_texts(
-        ((text, scale * _LEFT, y, color) for (text, color), y in zip(texts, up, strict=True)), scale * _SIZE
+        lines, stale = ["the projections of another scene"], None
+    texts = (
+        [(f"Not of the scene as it is now: {', '.join(lines)}", _COLOR)] if lines and lines != [runs.UNKNOWN] else []
     )
+    if measured := runs.measured_text(context.scene):
+        texts.append((measured, _PLAIN))
+    if not texts:
+        return
+    scale = context.preferences.system.ui_scale
+    bar, left, placed = scale * images.BAR, scale * _LEFT, []
+    windows.draw_rectangle((0.0, 0.0, context.region.width, bar), _BACK)
+    for text, color in texts:
+        placed.append((text, left, 0.3 * bar, color))
+        left += windows.text_width(text, scale * _SIZE) + 2 * scale * _LEFT
+    windows.draw_texts(placed, scale * _SIZE)
+    for picture in tiles.pictures(image):
+        if stale is None or picture.number in stale:
+            _draw_corner(tiles.frame(context, picture, image.size), scale)
+
+
+def _draw_corner(frame: tuple[float, float, float, float], scale: float) -> None:
+    """Draw the upper right corner of a frame from outside, so that nothing of the picture is covered."""
+    _, bottom, right, top = frame
+    side, out = _CORNER * (top - bottom), scale * _WIDTH / 2
+    corner = [(right + out - side, top + out, 0), (right + out, top + out, 0), (right + out, top + out - side, 0)]
+    windows.draw_lines(corner, _COLOR, scale * _WIDTH, "LINE_STRIP")

@@ -37,7 +37,8 @@ _DEFAULTS = {
 }
 """The settings that a run's numbers depend on."""
 
-_looked: dict[str, list[str]] = {}  # by scene: the lines that its panels show
+_Changes = list[tuple[str, list[int] | None]]  # words, and the modules' numbers, None where all images are concerned
+_looked: dict[str, _Changes] = {}  # by scene: what its panels show
 
 
 def state_of(
@@ -131,31 +132,49 @@ def required(scene: bpy.types.Scene, to_do: str) -> bpy.types.PropertyGroup:
 
 def changes(scene: bpy.types.Scene, item: bpy.types.PropertyGroup | None = None) -> list[str]:
     """What of the scene, and of its panel's settings, is not as it was for a run, by default the shown one, in words."""
+    return [text for text, _ in _changes(scene, item)]
+
+
+def _changes(scene: bpy.types.Scene, item: bpy.types.PropertyGroup | None = None) -> _Changes:
     item = item or shown(scene)
     if item is None:
         return []
     if not item.state:
-        return [UNKNOWN]
+        return [(UNKNOWN, [])]
     try:
         return list(_differences(scene, json.loads(item.state), item.scanner))
     except InputError as error:
-        return [str(error)]
+        return [(str(error), None)]
+
+
+def _last_changes(scene: bpy.types.Scene) -> _Changes:
+    """The changes of the shown run: in a window, as they were when it was last at rest."""
+    return _changes(scene) if bpy.app.background else _looked.get(scene.name, [])
+
+
+def stale_modules(scene: bpy.types.Scene) -> set[int] | None:
+    """The numbers of the modules whose images in the shown run are not of the scene as it is now; None: all of them."""
+    numbers = [numbers for _, numbers in _last_changes(scene)]
+    return None if None in numbers else {number for each in numbers for number in each or ()}
 
 
 def change_lines(scene: bpy.types.Scene) -> list[str]:
     """The `changes` of the shown run in a few lines, for panels: in a window, as they were when it was last at rest."""
-    found = changes(scene) if bpy.app.background else _looked.get(scene.name, [])
+    found = [text for text, _ in _last_changes(scene)]
     rest = len(found) - _MOST
     return found if rest <= 1 else [*found[:_MOST], f"and {rest} more changes"]
 
 
 def volume_to_render(scene: bpy.types.Scene) -> str:
     """Name of the volume that is projected if the shown run is rendered again; "" where it is the panel's own choice."""
-    item = shown(scene)
-    if scene.mphdrr_projections.volume is not None or item is None or not item.state:
-        return ""
-    found = _found(scene, json.loads(item.state)["volume"])
+    found = None if scene.mphdrr_projections.volume is not None else projected(scene)
     return "" if found is None else str(found.name)
+
+
+def projected(scene: bpy.types.Scene) -> bpy.types.Object | None:
+    """The volume that the shown run is of; None where there is none."""
+    item = shown(scene)
+    return _found(scene, json.loads(item.state)["volume"]) if item is not None and item.state else None
 
 
 def measured_text(scene: bpy.types.Scene) -> str:
@@ -207,7 +226,7 @@ def _look() -> None:
     shown_in = bpy.context.window_manager.windows
     for window in shown_in:
         window.view_layer.update()  # a module that is being moved may not have been aimed yet
-    found = {window.scene.name: changes(window.scene) for window in shown_in}
+    found = {window.scene.name: _changes(window.scene) for window in shown_in}
     if any(_looked.get(name) != lines for name, lines in found.items()):
         _looked.update(found)
         windows.redraw_sidebars()
@@ -235,7 +254,9 @@ def _settings(recipe: Recipe) -> dict[str, Any]:
     return {key: list(value) if isinstance(value, tuple) else value for key, value in found.items()}
 
 
-def _differences(scene: bpy.types.Scene, old: Mapping[str, Any], own: bpy.types.Collection | None) -> Iterator[str]:
+def _differences(
+    scene: bpy.types.Scene, old: Mapping[str, Any], own: bpy.types.Collection | None
+) -> Iterator[tuple[str, list[int] | None]]:
     collection = own if own in scanner.scanners(scene) else scanner.active_scanner(scene)
     yield from _of_modules(collection, old)
     if old["volume"] is None:
@@ -243,21 +264,27 @@ def _differences(scene: bpy.types.Scene, old: Mapping[str, Any], own: bpy.types.
     settings = _settings(panel_recipe(scene, collection))
     panel = scene.mphdrr_projections
     chosen = panel.volume or _found(scene, old["volume"])
-    yield from _of_volume(scene, "", old["volume"], chosen)
-    yield from _of_volume(scene, "attenuation ", old["mu"], panel.mu if settings["model.kind"] == "emission" else None)
-    yield from _of_settings(_settings(fitting_recipe(old["settings"])), settings)  # with an earlier version's hole
+    mu = panel.mu if settings["model.kind"] == "emission" else None
+    of_all = (
+        _of_volume(scene, "", old["volume"], chosen),
+        _of_volume(scene, "attenuation ", old["mu"], mu),
+        _of_settings(_settings(fitting_recipe(old["settings"])), settings),  # with an earlier version's hole
+    )
+    yield from ((text, None) for texts in of_all for text in texts)
 
 
-def _of_modules(collection: bpy.types.Collection | None, old: Mapping[str, Any]) -> Iterator[str]:
+def _of_modules(
+    collection: bpy.types.Collection | None, old: Mapping[str, Any]
+) -> Iterator[tuple[str, list[int] | None]]:
     if collection is None:
-        yield "the scanner is gone"
+        yield "the scanner is gone", None
         return
     kind, found = module_values.kind_of(collection), scanner.modules(collection)
     count, modes = len(found), {str(o.mphdrr_module.number): o.mphdrr_module.length_mode for o in found}
     now: dict[str, dict[str, Any]] = {}
     for _, system in module_values.readings(kind, found, objects.world_matrices(found)):
         if isinstance(system, InputError):
-            yield str(system)
+            yield str(system), None
         else:
             now |= _values_of(system)
     changed: dict[str, dict[int, tuple[Any, Any]]] = {}  # by column, then by module
@@ -272,7 +299,7 @@ def _of_modules(collection: bpy.types.Collection | None, old: Mapping[str, Any])
         axes = [name for name in changed if kind.columns[name].axis is not None and kind.columns[name].kind == what]
         numbers = sorted({number for name in axes for number in changed[name]})
         if numbers:
-            yield f"{_modules(numbers, count)} {verb}"
+            yield f"{_modules(numbers, count)} {verb}", numbers
     for column in kind.columns.scalars.values():
         pairs_of = changed.get(column.name, {})
         if pairs_of:
@@ -281,13 +308,13 @@ def _of_modules(collection: bpy.types.Collection | None, old: Mapping[str, Any])
             if not column.is_text:
                 old_value, new_value = old_value / factor, new_value / factor
             text = "changed" if others else _now(old_value, new_value, unit)
-            yield f"{_modules(sorted(pairs_of), count)}: {column.name} {text}"
+            yield f"{_modules(sorted(pairs_of), count)}: {column.name} {text}", sorted(pairs_of)
     gone = [int(number) for number in old["modules"] if number not in modes]
     if gone:
-        yield f"{_modules(gone, count)} {'are' if len(gone) > 1 else 'is'} gone"
+        yield f"{_modules(gone, count)} {'are' if len(gone) > 1 else 'is'} gone", gone
     new = [] if "system.modules" in old["settings"] else [int(n) for n in modes if n not in old["modules"]]
     if new:
-        yield f"{_modules(new, count)} added"
+        yield f"{_modules(new, count)} added", new
 
 
 def _values_of(system: Scanner) -> dict[str, dict[str, Any]]:

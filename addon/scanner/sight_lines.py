@@ -1,8 +1,12 @@
-"""What modules look at, drawn in the 3D views and never rendered: principal rays, fields of view, virtual detectors."""
+"""What modules look at, drawn in the 3D views and never rendered: principal rays, fields of view, virtual detectors.
+
+The active module's collimator and crystal are tinted.
+"""
 
 import bpy
 import gpu
 import numpy as np
+from gpu_extras.batch import batch_for_shader
 from numpy.typing import NDArray
 
 from ...core.geometry.system import PinholeSystem
@@ -15,6 +19,7 @@ _DRAWN = {
     "show_frustums": ((0.45, 0.8, 1.0, 0.35), [(0, 1), (0, 2), (0, 3), (0, 4)]),
     "show_detectors": ((0.45, 0.8, 1.0, 0.9), [(1, 2), (2, 3), (3, 4), (4, 1)]),
 }
+_TINT, _LARGER = (1.0, 0.55, 0.1, 0.55), 1.004  # of the active module's parts, drawn a little larger than they are
 _WIDTH = 1.5  # of the lines, in pixels of the screen
 _CORNERS = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
 
@@ -43,6 +48,26 @@ def lines(context: bpy.types.Context) -> dict[str, NDArray[np.float64]]:
     return {name: points[:, _DRAWN[name][1]].reshape(-1, 2, 3) for name in wanted}
 
 
+def active_faces(context: bpy.types.Context) -> NDArray[np.float64]:
+    """The triangles (N, 3, 3), world mm, of the active module's collimator and crystal where they are seen."""
+    camera = selection.active_module(context)
+    found = [np.empty((0, 3, 3))]
+    for part in camera.children if camera is not None else ():
+        if part.mphdrr_module.part not in ("COLLIMATOR", "CRYSTAL") or not part.visible_get():
+            continue
+        mesh, matrix = part.data, np.array(part.matrix_world)
+        points, corners = (
+            np.empty((len(mesh.vertices), 3), np.float32),
+            np.empty((len(mesh.loop_triangles), 3), np.int32),
+        )
+        mesh.vertices.foreach_get("co", points.reshape(-1))
+        mesh.loop_triangles.foreach_get("vertices", corners.reshape(-1))
+        middle = points.mean(axis=0)
+        points = middle + _LARGER * (points - middle)
+        found.append((points @ matrix[:3, :3].T + matrix[:3, 3])[corners])
+    return np.concatenate(found)
+
+
 def draw() -> None:
     """Draw them; Blender calls this for every 3D view."""
     context = bpy.context
@@ -50,6 +75,10 @@ def draw() -> None:
         return
     gpu.state.blend_set("ALPHA")
     gpu.state.depth_test_set("LESS_EQUAL")
+    if len(faces := active_faces(context)):
+        shader = gpu.shader.from_builtin("UNIFORM_COLOR")
+        shader.uniform_float("color", _TINT)
+        batch_for_shader(shader, "TRIS", {"pos": faces.reshape(-1, 3).astype(np.float32)}).draw(shader)
     for name, ends in lines(context).items():
         windows.draw_lines(ends.reshape(-1, 3).astype(np.float32), _DRAWN[name][0], _WIDTH)
     gpu.state.depth_test_set("NONE")

@@ -7,6 +7,7 @@ by the world axis closest to their normal.
 
 import itertools
 import json
+from collections.abc import Sequence
 from pathlib import Path
 
 import bpy
@@ -30,8 +31,11 @@ _last: tuple[Path, Volume] | None = None
 _painted: dict[int, tuple[Path, int, float, float]] = {}
 
 
-def add_slices(item: bpy.types.Object) -> list[bpy.types.Object]:
-    """Three planes through a volume's middle, in the order of the grid's axes, in place of those that it has."""
+def add_slices(item: bpy.types.Object, at: Sequence[int] | None = None) -> list[bpy.types.Object]:
+    """Three planes through a volume's voxel `at`, by default its middle one, in place of those that it has.
+
+    They are in the order of the grid's axes.
+    """
     volumes.require_volume(item)
     volume = _stored(item)
     remove_slices(item)
@@ -40,7 +44,7 @@ def add_slices(item: bpy.types.Object) -> list[bpy.types.Object]:
     toward /= np.linalg.norm(toward, axis=1, keepdims=True)
     best = max(itertools.permutations(range(3)), key=lambda order: sum(toward[a, w] for a, w in enumerate(order)))
     planes = [_plane(item, volume, axis, _PLANES[best[axis]]) for axis in range(3)]
-    item.mphdrr_volume.slices = [n // 2 for n in volume.grid.shape]  # which paints them
+    item.mphdrr_volume.slices = at or [n // 2 for n in volume.grid.shape]  # which paints them
     for screen in bpy.data.screens:
         for area in screen.areas:
             if area.type == "VIEW_3D":

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from ..errors import InputError
-from ..figures.page import SUFFIXES, Page
+from ..figures.page import DARK, SUFFIXES, Page
 from ..figures.reconstructions import SIZE, SIZE_BESIDE_TRUTH, draw
 from ..progress import Cancelled, Progress
 from ..reconstruction.files import read_reconstruction, write_reconstruction
@@ -16,7 +16,7 @@ from ..reconstruction.methods import Method, method_of
 from ..reconstruction.result import Reconstruction, iterations_text
 from ..runs.files import FORMATS, read_run
 from ..runs.recipe import Recipe, read_recipe, write_recipe
-from ..runs.reconstructing import TABLES, recipe_of, reconstruct_run
+from ..runs.reconstructing import TABLES, recipe_of, reconstruct_run, voxels_text
 from ..runs.run import ProjectionRun
 from ..runs.settings import SETTINGS
 from ..volumes.volume import Volume
@@ -108,11 +108,11 @@ def _run(arguments: argparse.Namespace) -> None:
     if path is not None:
         write_volume(found.volume, path)
     if picture is not None:
-        page = Page(*(SIZE if run.volume is None else SIZE_BESIDE_TRUTH))
+        page = Page(*(SIZE if run.volume is None else SIZE_BESIDE_TRUTH), DARK)
         draw(page, found.volume, found.objective.tolist(), run.volume, f"{method.label} of {arguments.file}",
              [settings_line(found), *found.settings["flatters"]], method.objective)  # fmt: skip
         page.write(picture)
-    voxels = f"{' x '.join(map(str, found.volume.grid.shape))} voxels"
+    voxels = voxels_text(found.volume.grid)
     largest = f"largest {float(found.volume.array.max()):.4g} {found.volume.unit}"
     print(f"{path or picture}: {', '.join(filter(None, (method.label, settings_line(found), voxels, largest)))}")
 

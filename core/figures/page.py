@@ -17,8 +17,10 @@ from ..runs.mosaic import png, write_png
 from ..runs.resizing import resized
 
 SUFFIXES = (".png", ".svg")
-SMALLEST, LARGEST = 240, 16384
+SMALLEST, LARGEST = 120, 16384
 """Limits of a page's sides, pixels."""
+DARK = "#14161a"
+"""The paper of pages that are looked at on a screen, beside dark editors."""
 
 Point = tuple[float, float]
 Anchor = Literal["start", "middle", "end"]
@@ -27,21 +29,22 @@ _FONTS = "DejaVu Sans, Verdana, Arial, sans-serif"
 
 
 class Page:
-    """A page of `width` x `height` pixels; places are in pixels from its top left corner, colours like "#20262d"."""
+    """A page of `width` x `height` pixels; places are in pixels from its top left corner, colours like "#20262d".
 
-    def __init__(self, width: int, height: int, paper: str = "#ffffff") -> None:
+    `em` is the size of its text, by default one that suits the page. `ink` and `faint` are the colours that suit its paper:
+    of text and lines, and of notes.
+    """
+
+    def __init__(self, width: int, height: int, paper: str = "#ffffff", em: float = 0.0) -> None:
         for side in (width, height):
             if not SMALLEST <= side <= LARGEST:
                 raise InputError(f"size {width}x{height}: expected {SMALLEST} to {LARGEST} pixels along each side")
         self.width, self.height = width, height
+        self.em = em or max(7.0, min(width, 1.8 * height) / 72)
+        self.ink, self.faint = ("#20262d", "#6b7480") if _rgb(paper).mean() > 127 else ("#eceef2", "#98a2b0")
         self._pixels = np.empty((height, width, 3), np.float32)
         self._pixels[:] = _rgb(paper)
         self._marks = [f'<rect width="{width}" height="{height}" fill="{paper}"/>']
-
-    @property
-    def em(self) -> float:
-        """The size of text that suits the page."""
-        return max(7.0, min(self.width, 1.8 * self.height) / 72)
 
     @property
     def picture(self) -> NDArray[np.uint8]:

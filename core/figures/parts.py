@@ -70,14 +70,14 @@ class Axes(NamedTuple):
         for value in xs:
             x, bottom = self.to(value, self.y[0])
             page.line([(x, bottom), (x, bottom + 0.3 * em)], self.ink, 0.06 * em)
-            page.text(number(value), x, bottom + 1.3 * em, 0.8 * em, INK, "middle")
+            page.text(number(value), x, bottom + 1.3 * em, 0.8 * em, page.ink, "middle")
         for value in ys:
             y = self.to(self.x[0], value)[1]
             page.line([(left - 0.3 * em, y), (left, y)], self.ink, 0.06 * em)
-            page.text(number(value, digits), left - 0.5 * em, y + 0.3 * em, 0.8 * em, INK, "end")
+            page.text(number(value, digits), left - 0.5 * em, y + 0.3 * em, 0.8 * em, page.ink, "end")
         for text, size, y in ((title, em, top - 0.6 * em), (below, 0.85 * em, top + height + 2.6 * em)):
             if text:
-                page.text(text, left + width / 2, y, size, INK, "middle")
+                page.text(text, left + width / 2, y, size, page.ink, "middle")
 
 
 def arranged(
@@ -124,11 +124,11 @@ def color_bar(
     width = round(1.1 * em)
     ramp = [display.value_at(share, window) for share in np.linspace(1.0, 0.0, max(2, height))]
     page.image(display.colored(ramp, window)[:, None], left, top, width, height)
-    page.text(unit_text(unit), left, top - 0.9 * em, 0.9 * em, INK)
+    page.text(unit_text(unit), left, top - 0.9 * em, 0.9 * em, page.ink)
     for share in (0.0, 0.25, 0.5, 0.75, 1.0):
         row = top + height * (1 - share)
-        page.line([(left + width, row), (left + width + 0.3 * em, row)], INK, 0.06 * em)
-        page.text(number(display.value_at(share, window)), left + width + 0.5 * em, row + 0.33 * em, 0.9 * em, INK)
+        page.line([(left + width, row), (left + width + 0.3 * em, row)], page.ink, 0.06 * em)
+        page.text(number(display.value_at(share, window)), left + width + 0.5 * em, row + 0.33 * em, 0.9 * em, page.ink)
 
 
 def bar_width(page: Page, display: Display, window: tuple[float, float], unit: str) -> int:

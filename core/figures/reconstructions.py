@@ -1,27 +1,33 @@
-"""A reconstruction as a picture: three slices, beside those of the truth where it is known, and the objective."""
+"""A reconstruction as a picture: slices beside those of the truth where it is known, the error, scores and the objective."""
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ..arrays import Floats32
-from ..geometry.grid import Grid
-from ..runs.display import Display
+from ..runs import letters
+from ..runs.display import DARK_DIVERGING, Display
 from ..volumes.resampling import resample
+from ..volumes.sights import bright_value, full_slices
 from ..volumes.volume import Volume
 from .page import Page
-from .parts import FAINT, INK, Axes, arranged, bar_width, color_bar, heading, number, ticks
+from .parts import Axes, arranged, bar_width, color_bar, number, ticks
 
 SIZE, SIZE_BESIDE_TRUTH = (1600, 500), (1600, 850)
 """Width and height, pixels, that suit a reconstruction alone, and one beside the truth."""
+LIGHTS = {"green": "#4fb35a", "amber": "#e8a13a", "red": "#d9534a"}
+"""Colours of the dots that say whether rods are resolved."""
 
 # The axis across a slice, and those to the right and upward: seen from the head, from the front and from the left.
 _SLICES = ((2, 0, 1), (1, 0, 2), (0, 1, 2))
 _NAMES = "xyz"
-_CURVE = "#c8442b"
-_PLOT = 0.27  # of the page's width
+_CURVE = "#e0604a"
+_SEEN, _MARGIN = 0.05, 0.06  # of the last colour's value, and of the volume's sides: what slices show, and around it
+_TEXTS = 25.0  # of the size of text: the width of what is written beside the slices
+_LEGIBLE = 11.0  # of the size of text: a slice's larger side, at least, where three or two of each volume are drawn
 
 
 def draw(
@@ -32,41 +38,128 @@ def draw(
     title: str = "Reconstruction",
     lines: Sequence[str] = (),
     objective_name: str = "log-likelihood",
+    rods: Sequence[tuple[str, str, str, str]] = (),
 ) -> None:
-    """Draw slices through the middle of a volume, in the same colours those of `truth`, and the objective by iteration.
+    """Draw slices of a volume, beside those of `truth` and of the error, and what is known of it: scores, objective.
 
-    The truth is drawn on the reconstruction's voxels, as the mean over each. The volume's axes are along the world's.
+    Slices lie where there is much of the truth, or of the volume; as many as are legible, that which shows most first. The
+    truth is drawn on the reconstruction's voxels, as the mean over each. The volume's axes are along the world's. `rods` are
+    the `cells` of a Derenzo score's sectors.
     """
-    em = page.em
-    top = heading(page, title, lines) + round(0.6 * em)
-    rows = [("Reconstruction", volume)] + ([] if truth is None else [("Truth", truth)])
-    pictures = [[_slice(each, volume.grid, axis) for axis, _, _ in _SLICES] for _, each in rows]
+    em, grid, rows = page.em, volume.grid, _rows(volume, truth)
+    first = rows[0].values
+    bars = [row for row in rows if row.unit]
+    widths = [bar_width(page, row.display, row.window, row.unit) + round(0.8 * em) for row in bars]
+    left = page.width - min(_TEXTS * em, 0.42 * page.width)
+    room = 0.6 * em, 0.4 * em, left - sum(widths) - 1.6 * em, page.height - 0.8 * em
+    box = _box(first, rows[0].window[1])
+    extent = [float(grid.spacing[axis]) * (box[axis].stop - box[axis].start) for axis in range(3)]
+    # Along rods a volume changes least: across them it shows them all.
+    best = sorted(_SLICES, key=lambda plane: float(np.abs(np.diff(first, axis=plane[0])).sum()))
+    for count in (3, 2, 1):
+        shown = [(plane, row) for plane in best[:count] for row in rows]
+        sizes = [(extent[across], extent[up]) for (_, across, up), _ in shown]
+        n, kinds = len(shown), len(rows)
+        ways = [range(n)], [range(i, i + kinds) for i in range(0, n, kinds)], [range(k, n, kinds) for k in range(kinds)]
+        pixels, places = arranged(sizes, (0.2 * em, 1.5 * em, 0.2 * em, 0.2 * em), room, *ways)
+        if max(extent) * pixels >= _LEGIBLE * em:
+            break
+    at = np.clip(full_slices(first), [part.start for part in box], [part.stop - 1 for part in box])
+    for i, ((x, y), (width, height), ((axis, _, _), row)) in enumerate(zip(places, sizes, shown, strict=True)):
+        place = grid.center[axis] + (at[axis] - (grid.shape[axis] - 1) / 2) * grid.spacing[axis]
+        where = "" if i % kinds else f"{_NAMES[axis]} = {number(round(float(place), 2) + 0.0)} mm"
+        text = ", ".join(filter(None, (row.name if i < kinds else "", where)))  # once is enough
+        size = 0.9 * em * min(1.0, width * pixels / letters.width(text or " ", 0.9 * em))
+        page.text(text, x, y - 0.4 * em, size, page.ink)
+        picture = row.values[box].take(at[axis] - box[axis].start, axis).T[::-1]
+        frame = round(x), round(y), round(width * pixels), round(height * pixels)
+        page.image(row.display.colored(picture, row.window), *frame)
+    (x, y), (width, height) = places[0], sizes[0]
+    _scale_bar(page, pixels, width, x + 0.6 * em, y + height * pixels - 0.6 * em)
+    x = max(x + width * pixels for (x, _), (width, _) in zip(places, sizes, strict=True)) + em
+    for row, step in zip(bars, widths, strict=True):
+        color_bar(page, row.display, row.window, row.unit, round(x), round(y), max(2, round(height * pixels)))
+        x += step
+    _draw_texts(page, left, title, lines, rods, objective, objective_name)
+
+
+class _Row(NamedTuple):
+    """A volume of which slices are drawn."""
+
+    name: str
+    values: Floats32
+    display: Display
+    window: tuple[float, float]
+    unit: str  # above its colour bar, which it shares with the one before if there is none
+
+
+def _rows(volume: Volume, truth: Volume | None) -> list[_Row]:
+    """The truth, the volume and the error; the volume alone where the truth is not known."""
     display = Display(colors="inferno" if volume.quantity == "activity" else "grey")
+    if truth is None:
+        low, high = display.window(volume.array)
+        return [_Row("Reconstruction", volume.array, display, (low, bright_value(volume.array) or high), volume.unit)]
+    true = truth.array if truth.grid is volume.grid else resample(truth, volume.grid, "mean").array
     # A hot voxel of the reconstruction must not darken all others: the truth says how bright things are.
-    window = display.window(np.concatenate([picture.ravel() for picture in pictures[-1]]))
-    grid, bar = volume.grid, bar_width(page, display, window, volume.unit)
-    extent = (grid.spacing * grid.shape).tolist()
-    sizes = [(extent[across], extent[up]) for _ in rows for _, across, up in _SLICES]
-    right = page.width * (1 - _PLOT if len(objective) else 1) - bar - 2.6 * em
-    room = 2.2 * em, float(top), right - 2.2 * em, page.height - top - 0.6 * em
-    in_rows = [range(i, i + 3) for i in range(0, len(sizes), 3)]
-    pixels, places = arranged(sizes, (0.4 * em, 1.5 * em, 0.4 * em, 0.4 * em), room, in_rows)
-    for i, ((x, y), (width, height)) in enumerate(zip(places, sizes, strict=True)):
-        (name, _), (axis, across, up), n = rows[i // 3], _SLICES[i % 3], grid.shape[_SLICES[i % 3][0]]
-        if i % 3 == 0:
-            page.text(name, x - 1.1 * em, y + height * pixels / 2, em, INK, "middle", upward=True)
-        at = grid.center[axis] + (n // 2 - (n - 1) / 2) * grid.spacing[axis]
-        text = f"{_NAMES[across]} {_NAMES[up]},  {_NAMES[axis]} = {number(round(float(at), 2) + 0.0)} mm"
-        page.text(text, x + width * pixels / 2, y - 0.4 * em, 0.9 * em, FAINT, "middle")
-        picture = display.colored(pictures[i // 3][i % 3].T[::-1], window)
-        page.image(picture, round(x), round(y), round(width * pixels), round(height * pixels))
-    x, y = x + width * pixels + 1.2 * em, y + height * pixels
-    first = round(min(place[1] for place in places))
-    _scale_bar(page, pixels, extent[0], places[-3][0] + 0.6 * em, y - 0.6 * em)
-    color_bar(page, display, window, volume.unit, round(x), first, max(2, round(y) - first))
-    if len(objective):
-        x, height = x + bar + 7.1 * em, min(0.9 * page.width * _PLOT, y - first - 3 * em)
-        draw_objective(page, objective, (x, first, page.width - x - 1.5 * em, height), objective_name)
+    low, high = window = display.window(true)
+    errors = _Row("Error", volume.array - true, Display(colors=DARK_DIVERGING), (low - high, high - low), "error")
+    row = _Row("Truth", true, display, window, volume.unit)
+    return [row, _Row("Reconstruction", volume.array, display, window, ""), errors]
+
+
+def _draw_texts(
+    page: Page, left: float, title: str, lines: Sequence[str], rods: Sequence[tuple[str, str, str, str]],
+    objective: Sequence[float], objective_name: str,
+) -> None:  # fmt: skip
+    """Write what is known of a reconstruction beside its slices, and draw the objective where there is room for it."""
+    em, width = page.em, page.width - left - page.em
+    row = 0.3 * em
+
+    def write(text: str, size: float, color: str) -> None:
+        nonlocal row
+        for line in letters.wrapped(text, lambda piece: letters.width(piece, size) <= width):
+            row += 1.35 * size
+            page.text(line, left, row, size, color)
+
+    write(title, 1.1 * em, page.ink)
+    for line in filter(None, lines[:1]):
+        write(line, 0.9 * em, page.faint)
+    table = [("rods", "", "valley/peak", "contrast"), *rods] if rods else []
+    columns = left + 1.2 * em, left + min(0.38 * width, 8 * em), left + min(0.74 * width, 15 * em)
+    row += 0.4 * em
+    step = min(1.4 * em, (page.height - row - 0.4 * em) / max(len(table), 1))
+    for size, light, *score in table:
+        row += step
+        if light:
+            page.area(_disc(left + 0.5 * em, row - 0.32 * em, 0.36 * em), LIGHTS[light])
+        for x, cell in zip(columns, (size, *score), strict=True):
+            fits = min(1.0, (page.width - x - 0.3 * em) / letters.width(cell or " ", 0.9 * em))
+            page.text(cell, x, row, 0.9 * em * fits, page.ink if light else page.faint)
+    row += 0.4 * em
+    for line in lines[1:]:
+        if row + 1.5 * em * (2 + len(line) // 45) < page.height:
+            write(line, 0.9 * em, page.faint)
+    room = page.height - row - 6.2 * em
+    if len(objective) and room > 4 * em:
+        place = left + 5.5 * em, row + 2.8 * em, width - 5.5 * em, min(room, 0.8 * width)
+        draw_objective(page, objective, place, objective_name)
+
+
+def _box(values: ArrayLike, high: float) -> tuple[slice, slice, slice]:
+    """The part of values (n_x, n_y, n_z) that slices show: where there is something, and a margin around it."""
+    box = []
+    for axis in range(3):
+        seen = np.flatnonzero(np.max(np.abs(values), axis=tuple({0, 1, 2} - {axis})) > _SEEN * abs(high))
+        size = np.shape(values)[axis]
+        margin = round(_MARGIN * size)
+        start, stop = (seen[0], seen[-1] + 1) if len(seen) else (0, size)
+        box.append(slice(max(int(start) - margin, 0), min(int(stop) + margin, size)))
+    return box[0], box[1], box[2]
+
+
+def _disc(x: float, y: float, radius: float) -> list[tuple[float, float]]:
+    angles = np.linspace(0, 2 * np.pi, 24, endpoint=False)
+    return [(x + radius * math.cos(a), y + radius * math.sin(a)) for a in angles]
 
 
 def draw_objective(
@@ -75,7 +168,7 @@ def draw_objective(
     place: tuple[float, float, float, float],
     name: str = "",
     color: str = _CURVE,
-    ink: str = INK,
+    ink: str = "",
     em: float | None = None,
 ) -> None:
     """Draw the objective by iteration into (left, top, width, height), with axes where it has a name.
@@ -87,7 +180,7 @@ def draw_objective(
     low, high = float(values.min()), float(values.max())
     spread = (high - low) or abs(high) or 1.0
     low, high = low - 0.06 * spread, high + 0.06 * spread
-    axes = Axes(page, place, (1, max(len(values), 2)), (low, high), em, ink)
+    axes = Axes(page, place, (1, max(len(values), 2)), (low, high), em, ink or page.ink)
     marks = ticks(low, high, 5) if name else []
     # The objective changes little beside its size: as many digits as tell the numbers from each other.
     digits = max(4, math.ceil(math.log10(max(abs(low), abs(high)) / (marks[1] - marks[0]))) + 1) if marks[1:] else 4
@@ -99,16 +192,6 @@ def draw_objective(
     for i in iterations if len(values) <= 30 else iterations[-1:]:
         (x, y), r = axes.to(i, values[i - 1]), 0.22 * em
         page.area([(x - r, y), (x, y - r), (x + r, y), (x, y + r)], color)
-
-
-def _slice(volume: Volume, grid: Grid, axis: int) -> Floats32:
-    """The middle slice of a grid across one of its axes, of a volume on any grid."""
-    index = grid.shape[axis] // 2
-    shape = [*grid.shape]
-    shape[axis] = 1
-    plane = grid.box(index * np.eye(3)[axis], tuple(shape))
-    values = volume.array.take([index], axis) if volume.grid is grid else resample(volume, plane, "mean").array
-    return np.asarray(values.squeeze(axis), np.float32)
 
 
 def _scale_bar(page: Page, pixels: float, extent: float, left: float, bottom: float) -> None:

@@ -12,6 +12,7 @@ from ..reconstruction.scores.summary import VolumeScore
 from ..runs import letters
 from ..runs.display import Display
 from ..volumes.resampling import values_at
+from ..volumes.sights import full_slices
 from ..volumes.volume import Volume
 from .page import Page
 from .parts import FAINT, INK, Axes, bar_width, color_bar, heading, number, ticks
@@ -23,7 +24,7 @@ _FOUND, _TRUE, _PAIR = "#b8433a", "#20262d", "#e3b9b4"  # colours of curves
 _ON_SLICE = "#56c7f2"
 _PLANES = ((0, 1), (0, 2), (1, 2))  # axes to the right and upward
 _MARGIN = 1.1  # of a phantom's box, that slices show
-_COARSE, _NEARLY = 65, 0.9  # points along an axis, and the share of the most, to choose where slices lie
+_COARSE = 65  # points along an axis, to choose where slices lie
 _MOST = 512  # pixels along the sides of a slice
 
 
@@ -88,12 +89,7 @@ def _middle(score: VolumeScore, low: Floats, high: Floats) -> Floats:
     shares = (np.arange(_COARSE) + 0.5) / _COARSE
     points = low + np.stack(np.meshgrid(shares, shares, shares, indexing="ij"), axis=-1).reshape(-1, 3) * (high - low)
     values = values_at(score.truth, moved(score.pose, points), "nearest").reshape((_COARSE,) * 3).astype(float)
-    best = []
-    for axis in range(3):
-        sums = np.abs(values).sum(axis=tuple({0, 1, 2} - {axis}))
-        good = np.flatnonzero(sums >= _NEARLY * sums.max())
-        best.append(shares[good[np.abs(shares[good] - 0.5).argmin()]])
-    return low + np.array(best) * (high - low)
+    return low + shares[full_slices(values)] * (high - low)
 
 
 def _shown(score: VolumeScore) -> tuple[Floats, Floats]:

@@ -32,7 +32,7 @@ _ROWS = by_key((
     Setting("data.levels", float, None, "Shares of the acquisition time, in turn", "those of the set's recipe", above=0,
             sizes=()),
     Setting("data.draws", int, 1, "How often noise is drawn for each event", least=1),
-    like("grid.voxels", "reconstruction.voxels"),
+    like("grid.voxels", "reconstruction.voxels", default=(64,), absent=""),
     like("grid.spacing", "reconstruction.spacing", absent=""),
     like("grid.center", "reconstruction.center"),
     Setting("osem.subsets", int, 10, "Of the modules", least=1),

@@ -19,10 +19,11 @@ _COLORS = {
     "d5e21a fde725",
     "grey": "000000 ffffff",
     "diverging": "04306b 2a6fbb 8fbfe6 f4f4f4 f0a58c c8402f 6b0410",
+    "dark diverging": "c4e6ff 5aaef0 2a6fbb 173a63 0c0d10 632018 c8402f f0805c ffd9c4",
 }
-DIVERGING = "diverging"
-"""Name of the colours of differences: blue below the middle, white there, red above it."""
-COLORS = tuple(name for name in _COLORS if name != DIVERGING)
+DIVERGING, DARK_DIVERGING = "diverging", "dark diverging"
+"""Names of the colours of differences: blue below the middle, white there, or nearly black on dark pages, red above it."""
+COLORS = tuple(name for name in _COLORS if name not in (DIVERGING, DARK_DIVERGING))
 """Names of the colour maps; all but grey are perceptually uniform."""
 SCALES = ("linear", "sqrt", "log")
 _DECADES = 3.0

@@ -3,6 +3,7 @@
 import base64
 import functools
 import zlib
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -34,6 +35,18 @@ def width(text: str, size: float) -> float:
     """Pixels that a line of text takes along its baseline."""
     letters = _letters()
     return sum(letters.get(character, letters["?"]).shape[1] for character in text) * size / _EM
+
+
+def wrapped(text: str, fits: Callable[[str], bool]) -> list[str]:
+    """A text as lines that fit, where it has spaces."""
+    lines = [""]
+    for word in text.split():
+        longer = f"{lines[-1]} {word}".strip()
+        if lines[-1] and not fits(longer):
+            lines.append(word)
+        else:
+            lines[-1] = longer
+    return lines
 
 
 @functools.cache

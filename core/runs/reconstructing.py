@@ -10,7 +10,10 @@ import numpy as np
 from ..arrays import Array, Floats32
 from ..errors import InputError, warn
 from ..geometry.grid import Grid
+from ..geometry.system import PinholeSystem
 from ..memory import require
+from ..phantoms.derenzo import DerenzoRods
+from ..physics.performance import resolution
 from ..progress import Stages
 from ..projector.backends import choose
 from ..reconstruction.methods import METHODS, PRIORS, Choice, Method, method_of
@@ -21,13 +24,15 @@ from ..volumes.volume import Volume
 from ..volumes.volume_files import read_volume
 from .recipe import Recipe
 from .run import ProjectionRun
-from .run_recipe import projector_of_run, recipe_model
+from .run_recipe import projector_of_run, recipe_model, truth_of_run
 from .settings import SAMPLING, SETTINGS
 
 Watch = Callable[[int, Array, Sequence[float]], bool | None]
 """Called as ``watch(iteration, values, objective)`` after each iteration, with the volume's values and the objective after
 all iterations so far; what is true ends the reconstruction there."""
 
+_FEWEST, _MOST = 64, 128
+"""Voxels along a side of the ROI's cube, where nobody says how many."""
 _POINTS = 7
 """Points of the hole: enough for its blur, and few enough for an iteration in a fraction of a second."""
 
@@ -216,13 +221,39 @@ def _compare_with_record(run: ProjectionRun, recipe: Recipe, has_mu: bool) -> No
 
 
 def reconstruction_grid(run: ProjectionRun, recipe: Recipe, method: Method | None = None) -> Grid:
-    """The voxels that a recipe asks for: by default the method's, or a cube around the run's ROI, 64 along each side."""
+    """The voxels that a recipe asks for: by default the method's, or a cube around the run's ROI, 64 to 128 along each side.
+
+    As many that they are of half the smallest rod of the run's phantom at most, or, where it has none, of half the finest
+    resolution at the isocentre.
+    """
     is_given = any(f"reconstruction.{name}" in recipe.given for name in ("voxels", "spacing", "center"))
     if method is not None and method.grid is not None and not is_given:
         return method.grid
-    n_x, n_y, n_z = np.broadcast_to(recipe["reconstruction.voxels"], 3).tolist()
-    spacing = recipe["reconstruction.spacing"] or 2 * run.system.region_radius() / np.array([n_x, n_y, n_z])
+    side, spacing = 2 * run.system.region_radius(), recipe["reconstruction.spacing"]
+    voxels = recipe["reconstruction.voxels"] or _FEWEST
+    if "reconstruction.voxels" not in recipe.given and spacing is None:
+        voxels = int(np.clip(np.ceil(2 * side / _detail(run)), _FEWEST, _MOST))
+    n_x, n_y, n_z = np.broadcast_to(voxels, 3).tolist()
+    spacing = spacing or side / np.array([n_x, n_y, n_z])
     return Grid.centered((n_x, n_y, n_z), np.broadcast_to(spacing, 3), recipe["reconstruction.center"])
+
+
+def voxels_text(grid: Grid) -> str:
+    """A grid's voxels in words: "64 x 64 x 64 voxels of 1.5 mm"."""
+    sizes = list(dict.fromkeys(f"{size:.3g}" for size in grid.spacing))
+    return f"{' x '.join(map(str, grid.shape))} voxels of {' x '.join(sizes)} mm"
+
+
+def _detail(run: ProjectionRun) -> float:
+    """What there is to be seen of the run's volume, mm: its smallest rod, else the resolution; infinite if unknown."""
+    truth = None if run.volume is None else truth_of_run(run)[0]
+    rods = [shape.rod_diameters for shape in getattr(truth, "shapes", ()) if isinstance(shape, DerenzoRods)]
+    if rods and (found := [d for diameters in rods for d in diameters if d > 0]):
+        return float(min(found))
+    if not isinstance(run.system, PinholeSystem):
+        return np.inf
+    fwhm = resolution(run.system, np.zeros((1, 3)))
+    return float(np.fmin.reduce(fwhm, axis=None, initial=np.inf))
 
 
 def model_of(run: ProjectionRun, recipe: Recipe) -> Recipe:

@@ -284,13 +284,16 @@ def test_a_reconstruction_is_seen_while_it_runs(window, work_folder):
     first, second = seen["iterations"]
     assert 1 <= first < second < 20000
     assert seen["while"] == seen["volume"] == seen["active"] and seen["volume"].endswith("OSEM")
-    assert seen["title"].startswith("OSEM, ") and seen["scores"][:2] == ["NRMSE", "8 mm rods"]
-    assert seen["image"] == "mphDRR reconstruction"
+    assert seen["asked"] and seen["continued"] == 10, "Escape asks, and Continue goes on"
+    assert seen["title"].startswith("OSEM, ") and seen["rods"][0] == "8 mm" and "Derenzo" in seen["hidden"]
+    assert seen["image"] == "mphDRR reconstruction" and seen["size"] == seen["room"][:2], "it fills its editor"
+    assert seen["zoom"] == pytest.approx([1.0, 1.0])
     screen = pixels(seen["screen"])
     left, top, width, height = seen["editor"]
     page = screen[top : top + height, left : left + width]
     assert (np.abs(page - (252, 255, 164)).max(axis=2) < 12).sum() > 50, "hot rods"
-    assert (np.abs(page - (200, 68, 43)).max(axis=2) < 40).sum() > 10, "the objective"
+    assert (np.abs(page - (224, 96, 74)).max(axis=2) < 20).sum() > 10, "the objective"
+    assert (page.max(axis=2) < 40).mean() > 0.5, "a dark page"
 
 
 def test_stale_runs_are_said_and_compared_in_the_window(window, work_folder):
@@ -303,8 +306,8 @@ def test_stale_runs_are_said_and_compared_in_the_window(window, work_folder):
     assert seen["image"] == "mphDRR difference"
     screen = pixels(seen["screen"])
     left, top, width, height = seen["editor"]
-    letters = np.abs(screen[top : top + height, left : left + width] - (255, 115, 89)).max(axis=2) < 12
-    assert letters.sum() > 100, "a line over the picture says it, in this colour"
+    letters = np.abs(screen[top : top + height, left : left + width] - (255, 158, 51)).max(axis=2) < 12
+    assert letters.sum() > 100, "a line below the picture says it, and the tile's corner, in this colour"
 
 
 SIZE = "360x240"

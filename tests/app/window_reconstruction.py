@@ -1,7 +1,7 @@
 """Counts of a few modules are reconstructed in the window: what is seen while it runs, then finished early."""
 
 import bpy
-from driving import WORKBOOK, editor, idle, only, open_tab, press, run, seen
+from driving import WORKBOOK, editor, idle, keys, only, open_tab, ours, press, run, seen
 
 seen |= {"iterations": []}
 
@@ -32,14 +32,26 @@ def steps():
         if known and len(known["objective"]) not in seen["iterations"]:
             seen["iterations"].append(len(known["objective"]))
             seen["while"] = bpy.context.scene.mphdrr_reconstruction.volume.name
+    keys("Escape")  # asks whether to keep or to discard
+    yield 1.0
+    seen["asked"] = ours("addon.blender.jobs").is_running()
+    keys("Escape")
     bpy.ops.mphdrr.finish_job()
     yield from idle()
     scene = bpy.context.scene
+    done = len(scene.mphdrr_reconstruction.known["objective"])
+    press(bpy.ops.mphdrr.continue_reconstruction)
+    yield from idle()
+    yield 1.0
     known = scene.mphdrr_reconstruction.known
-    seen["title"], seen["scores"] = known["title"], [name for name, _ in known["scores"]]
+    seen["continued"] = len(known["objective"]) - done
+    seen["title"], seen["rods"] = known["title"], [name for name, *_ in known["rods"]]
+    seen["hidden"] = [item.name for item in scene.objects if item.type == "VOLUME" and item.hide_get()]
     seen["active"], seen["volume"] = bpy.context.object.name, scene.mphdrr_reconstruction.volume.name
     window, area, _ = editor("IMAGE_EDITOR")
-    seen["image"] = area.spaces.active.image.name
+    image = area.spaces.active.image
+    seen["image"], seen["size"], seen["zoom"] = image.name, image.size[:], area.spaces.active.zoom[:]
+    seen["room"] = ours("addon.pictures.images").room(bpy.context)
     seen["editor"] = [area.x, window.height - area.y - area.height, area.width, area.height]
 
 

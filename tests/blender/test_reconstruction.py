@@ -15,12 +15,13 @@ from mphdrr.addon.blender import ids, jobs, plots, storage, windows
 from mphdrr.addon.reconstruction import reconstructions
 from mphdrr.addon.reconstruction.reconstruction_properties import PROPERTIES, drawn, settings_recipe
 from mphdrr.addon.scanner import scanner
-from mphdrr.addon.volumes import volumes
+from mphdrr.addon.volumes import slices, volumes
 from mphdrr.core.progress import Cancelled
 from mphdrr.core.reconstruction.methods import METHOD_FILES, METHODS, Method
 from mphdrr.core.runs.files import read_run
 from mphdrr.core.runs.run_recipe import truth_of_run
 from mphdrr.core.runs.settings import SETTINGS
+from mphdrr.core.volumes.sights import bright_value, full_slices
 
 SMALL = {"voxels": 14, "spacing": 7.0, "iterations": 3, "subsets": 2}
 
@@ -72,10 +73,14 @@ def test_the_volume_is_that_of_the_command_line(render, scene):
     known = scene.mphdrr_reconstruction.known
     assert known["title"] == "OSEM, 3 iterations" and known["name"] == "log-likelihood"
     np.testing.assert_allclose(known["objective"], expected.objective)
-    assert known["scores"][0][0] == "NRMSE" and len(known["scores"]) == 7
+    assert [name for name, _ in known["scores"]] == ["NRMSE"] and known["voxels"] == "14 x 14 x 14 voxels of 7 mm"
     assert known["flatters"] == expected.settings["flatters"]
     rods = mph.score_volume(expected.volume, *truth_of_run(run)).derenzo
-    assert [tuple(line) for line in known["scores"][1:]] == [(f"{s.rod_diameter:g} mm rods", s.words) for s in rods]
+    assert [tuple(row) for row in known["rods"]] == [sector.cells for sector in rods if sector.rod_diameter]
+    assert bpy.data.objects["Derenzo"].hide_get(), "the truth stands where the reconstruction is"
+    planes, at = slices.planes_of(item), full_slices(expected.volume.array)
+    assert len(planes) == 3 and item.mphdrr_volume.slices[:] == tuple(at)
+    assert item.mphdrr_volume.display_high == pytest.approx(bright_value(expected.volume.array), rel=1e-5)
     assert bpy.data.images[ids.RECONSTRUCTION].size[:] == (1600, 850)
 
 
@@ -223,7 +228,7 @@ def test_it_is_shown_while_it_runs_and_cancelled_without_a_trace(render, scene, 
     with pytest.raises(Cancelled):
         jobs.run(job, progress)
     assert sorted(set(seen)) == [1, 2]
-    assert state() == before and reconstructed() is None
+    assert state() == before and reconstructed() is None and not bpy.data.objects["Derenzo"].hide_get()
 
 
 def test_finish_now_keeps_what_there_is(render, scene, monkeypatch):
@@ -241,6 +246,33 @@ def test_finish_now_keeps_what_there_is(render, scene, monkeypatch):
     assert "OSEM, 2 iterations" in text and len(scene.mphdrr_reconstruction.known["objective"]) == 2
     assert len(set(storage.folder().iterdir()) - files) == 1, "files of states that were shown meanwhile are gone"
     assert len([item for item in volumes.volume_objects(scene) if "OSEM" in item.name]) == 1
+
+
+def test_continue_goes_on_as_if_there_had_been_no_break(render, scene, monkeypatch):
+    with pytest.raises(RuntimeError, match="poll"):
+        bpy.ops.mphdrr.continue_reconstruction()
+    bpy.ops.mphdrr.reconstruct(**SMALL)
+    first, record = reconstructed(), scene.mphdrr_reconstruction.record
+    array = volumes.volume_from_object(first).array
+    monkeypatch.setattr(windows, "has_window", lambda: True)
+    monkeypatch.setattr(reconstructions, "_BETWEEN", -1.0)
+    job = reconstructions.continuing(bpy.context)
+
+    def cancel(done: int, total: int) -> None:
+        job.look()
+        if len(scene.mphdrr_reconstruction.known["objective"]) > 4:
+            raise Cancelled
+
+    with pytest.raises(Cancelled):
+        jobs.run(job, cancel)
+    assert scene.mphdrr_reconstruction.record == record and reconstructed() == first
+    np.testing.assert_array_equal(volumes.volume_from_object(first).array, array)
+    assert bpy.ops.mphdrr.continue_reconstruction() == {"FINISHED"}
+    assert reconstructed() == first and scene.mphdrr_reconstruction.known["title"] == "OSEM, 13 iterations"
+    bpy.ops.mphdrr.reconstruct(**SMALL | {"iterations": 13})
+    assert first.hide_get() and reconstructed() != first
+    both = [volumes.volume_from_object(item).array for item in (first, reconstructed())]
+    np.testing.assert_allclose(*both, rtol=1e-5)
 
 
 def test_a_second_one_stands_beside_the_first(render, scene):
@@ -274,7 +306,15 @@ def test_the_panel_draws_the_result(render, scene):
         getattr(layout, part).return_value = layout
     cls.draw(MagicMock(layout=layout), bpy.context)
     said = [options["text"] for _, _, options in layout.mock_calls if options.get("text")]
-    assert {"OSEM, 3 iterations", "Log-likelihood", "NRMSE", "8 mm rods", "Show Slices", "Reconstruct"} <= set(said)
+    assert {
+        "OSEM, 3 iterations",
+        "Log-likelihood",
+        "NRMSE",
+        "8 mm",
+        "Show Slices",
+        "Continue (+10)",
+        "Reconstruct",
+    } <= set(said)
     flatters = scene.mphdrr_reconstruction.known["flatters"]
     assert flatters and all(word in " ".join(said) for word in " ".join(flatters).split()), (
         "the warning stays with the score"

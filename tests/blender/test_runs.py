@@ -192,7 +192,7 @@ def test_choosing_a_run_shows_its_images_and_removing_it_removes_its_file(render
     assert np.array_equal(shown_array(), new[2]) and not np.array_equal(old, new)
     settings.active_run = 0
     assert np.array_equal(shown_array(), old[2]) and settings.run_file == settings.runs[0].file
-    assert runs.changes(scene) == ["phantom Derenzo moved"]
+    assert runs.changes(scene) == ["phantom Derenzo moved"] and runs.stale_modules(scene) is None
     path = storage.absolute(settings.run_file)
     assert bpy.ops.mphdrr.remove_run(index=0) == {"FINISHED"}
     assert not path.exists() and len(settings.runs) == 1
@@ -293,7 +293,7 @@ def test_the_example_is_current(scene):
     (again,) = run_recipe(run.recipe, run.system)
     np.testing.assert_allclose(again.projections, run.projections, rtol=1e-3, atol=1e-3 * run.projections.max())
     move(module(30), 1.0)
-    assert runs.changes(scene) == ["Module 30 moved"]
+    assert runs.changes(scene) == ["Module 30 moved"] and runs.stale_modules(scene) == {30}
 
 
 def test_runs_from_outside_set_the_panel_and_say_what_the_scene_lacks(scene, ring_system, tmp_path):

@@ -196,7 +196,7 @@ def test_the_command_takes_runs_and_volumes(subject, tmp_path):
         (["nothing", "-o", "a.png"], "figure 'nothing': expected one of scanner, cut-away"),
         (["sums", "derenzo"], "nothing to write: give --output FILE"),
         (["sums", "derenzo", "-o", "a.jpg"], "a.jpg: expected a name ending in .png, .svg"),
-        (["sums", "derenzo", "-o", "a.png", "--size", "10x900"], "size 10x900: expected 240 to 16384 pixels"),
+        (["sums", "derenzo", "-o", "a.png", "--size", "10x900"], "size 10x900: expected 120 to 16384 pixels"),
         (["sums", WORKBOOK, "-o", "a.png"], "figure sums: needs a volume: give a volume file, a phantom, a run or a .blend"),
         (["mosaic", WORKBOOK, "-o", "a.png"], "figure mosaic: needs projections"),
         (["c-arm", WORKBOOK, "--modules", "90", "-o", "a.png"], "--modules '90': no module 90; there are 1 to 80"),

@@ -239,8 +239,8 @@ def test_the_command_line_reconstructs_with_a_model_and_says_so(folder, model, r
     more = ["-o", tmp_path / "v.nii.gz", "--picture", tmp_path / "p.svg", "--save-state", tmp_path / "s.h5"]
     assert main(["reconstruct", *map(str, [*command, *more])]) == 0
     out = capsys.readouterr()
-    assert "Network model.pt (Toy), 8 x 8 x 8 voxels, largest " in out.out
-    assert "Network model.pt (Toy) of " in (tmp_path / "p.svg").read_text(encoding="utf-8")
+    assert "Network model.pt (Toy), 8 x 8 x 8 voxels of 12 mm, largest " in out.out
+    assert ">Network model.pt (Toy)" in (tmp_path / "p.svg").read_text(encoding="utf-8")
     np.testing.assert_allclose(mph.read_volume(tmp_path / "v.nii.gz").array, model(run).array, rtol=1e-6)
     said = f"Reconstructed by a network model.pt (Toy), sha256 {model.sha256}"
     assert nibabel.load(tmp_path / "v.nii.gz").header.extensions[0].text == said

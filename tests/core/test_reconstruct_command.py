@@ -6,6 +6,7 @@ import inspect
 import re
 import runpy
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,8 +16,8 @@ from PIL import Image
 import mphdrr.core as mph
 from mphdrr.addon.cli import main
 from mphdrr.core.cli.reconstruct import settings_line
-from mphdrr.core.figures.page import Page
-from mphdrr.core.figures.reconstructions import draw
+from mphdrr.core.figures.page import DARK, Page
+from mphdrr.core.figures.reconstructions import LIGHTS, draw
 from mphdrr.core.reconstruction.methods import METHOD_FILES, METHODS, PRIORS, Method
 from mphdrr.core.runs.recipe import recipe_of_tables
 from mphdrr.core.runs.reconstructing import model_of, reconstruction_grid
@@ -117,7 +118,7 @@ def test_the_command_does_what_python_does_and_logs_each_iteration(run, file, tm
     logged = [float(re.search(r"log-likelihood ([\d.e+-]+),", line)[1]) for line in lines]
     assert len(lines) == 3 and lines[2].startswith("iteration 3 of 3: ")
     np.testing.assert_allclose(logged, expected.objective, rtol=1e-6)
-    assert printed.out.startswith(f"{output}: OSEM, 3 iterations, 4 subsets, 20 x 20 x 20 voxels, largest ")
+    assert printed.out.startswith(f"{output}: OSEM, 3 iterations, 4 subsets, 20 x 20 x 20 voxels of 5 mm, largest ")
 
 
 def test_a_recipe_says_how_and_options_override_it(run, file, tmp_path, capsys):
@@ -262,7 +263,7 @@ def test_a_file_is_a_method_without_iterations_or_an_objective(toy, radiograph, 
     small = [tmp_path / "run.npz", "--voxels", "8", "--spacing", "12"]
     command(*small, "--method", toy, "-o", tmp_path / "a.npz", "--picture", tmp_path / "p.svg", "--save-state",
             tmp_path / "s.h5")  # fmt: skip
-    assert "Even, 8 x 8 x 8 voxels, largest 0 " in capsys.readouterr().out
+    assert "Even, 8 x 8 x 8 voxels of 12 mm, largest 0 " in capsys.readouterr().out
     assert "iteration" not in (tmp_path / "p.svg").read_text(encoding="utf-8")
     kept = mph.read_reconstruction(tmp_path / "s.h5")
     assert kept.objective.shape == (0,) and kept.iterations == 0
@@ -328,9 +329,17 @@ def test_a_prior_makes_it_smoother(run):
 
 
 def test_voxels_cover_the_roi_and_the_model_is_that_of_the_run(run):
-    grid = reconstruction_grid(run, run.recipe)
-    assert grid.shape == (64, 64, 64)
-    np.testing.assert_allclose(grid.spacing * 64, 2 * run.system.roi_radius.max())
+    side = 2 * run.system.roi_radius.max()
+    for rods, voxels in (((12.0, 0.0), 64), ((12.0, side / 40), 80), ((12.0, 1.0), 128)):
+        six = (*rods, 0.0, 0.0, 0.0, 0.0)
+        recipe = run.recipe.updated({"phantom.matrix": np.eye(4).tolist(), "phantom.rod_diameters": six})
+        of_rods = replace(run, settings={**run.settings, "recipe": recipe.tables()})
+        grid = reconstruction_grid(of_rods, of_rods.recipe)
+        assert grid.shape == (voxels,) * 3, "half of the smallest rod, 64 to 128 along a side"
+        np.testing.assert_allclose(grid.spacing * voxels, side)
+        asked = {"reconstruction.voxels": 20}
+        assert reconstruction_grid(of_rods, of_rods.recipe.updated(asked)).shape == (20, 20, 20)
+        assert reconstruction_grid(of_rods, of_rods.recipe.updated({"reconstruction.spacing": 2.0})).shape == (64,) * 3
 
     def model(**changes):
         recipe = run.recipe.updated({key.replace("__", "."): value for key, value in changes.items()})
@@ -402,9 +411,18 @@ def test_the_picture_shows_slices_beside_the_truth_and_the_objective(run, file, 
     command(file, *SMALL, "--subsets", "5", "--picture", tmp_path / "p.svg")
     text = (tmp_path / "p.svg").read_text(encoding="utf-8")
     settings = "3 iterations, 5 subsets"
-    for words in ("Reconstruction", "Truth", "x y,  z = 2.5 mm", "Log-likelihood", "kBq/mL", settings, "20 mm"):
+    for words in (
+        "Reconstruction",
+        "Error",
+        "Truth, z = 2.5 mm",
+        "Log-likelihood",
+        "kBq/mL",
+        "error",
+        settings,
+        "20 mm",
+    ):
         assert f">{words}<" in text, words
-    assert text.count("<image") == 7  # two rows of slices and a colour bar
+    assert text.count("<image") == 11  # three slices of each, and two colour bars
     volume = mph.Volume(np.zeros((2, 2, 2)), mph.Grid.centered(2, 1.0))
     assert settings_line(mph.Reconstruction(volume, np.zeros(1))) == "1 iteration"
     assert settings_line(mph.Reconstruction(volume, np.zeros(2), {"subsets": 4})) == "2 iterations, 4 subsets"
@@ -420,7 +438,33 @@ def test_slices_lie_on_the_page_and_have_the_right_colours(size):
     picture = page.picture
     hot = (np.abs(picture.astype(int) - (252, 255, 164)).max(axis=2) < 8).sum()
     cold = (picture.max(axis=2) < 6).sum()
-    assert hot > 0 and cold > 0 and hot < cold
+    assert hot > cold > 0, "what is shown is where there is something, and a margin"
+
+
+def test_a_picture_as_low_as_an_editor_has_legible_texts_and_all_that_matters(run, tmp_path):
+    """1048 x 223 pixels are what an editor below the 3D view has on a screen of 1280 x 800."""
+    page, grid = Page(1048, 223, DARK, 14.0), mph.Grid.centered(16, 6.0)
+    rods = [("8 mm", "green", "0.12", "80 %"), ("6 mm", "amber", "0.81", "9 %"), ("4 mm", "red", "1.02", "-1 %"),
+            ("2 mm", "", "voxels of 6 mm are larger than the rods", "")]  # fmt: skip
+    draw(
+        page,
+        mph.resample(run.volume, grid, "mean"),
+        [1.0, 2.0],
+        run.volume,
+        "Of it",
+        ["OSEM", "it flatters"],
+        "fit",
+        rods,
+    )
+    page.write(tmp_path / "p.svg")
+    marks = (tmp_path / "p.svg").read_text(encoding="utf-8")
+    sizes = re.findall(r'<text x="([0-9.]+)" y="([0-9.]+)" font-size="([0-9.]+)"', marks)
+    assert all(0 <= float(x) < 1048 and 0 < float(y) <= 223 and float(size) >= 10.9 for x, y, size in sizes)
+    for words in ("Truth, z = ", "Reconstruction", "Error", "8 mm", "0.81", "-1 %", "OSEM"):
+        assert words in marks, words
+    colors = {tuple(color) for color in page.picture.reshape(-1, 3).tolist()}
+    assert {tuple(bytes.fromhex(color[1:])) for color in LIGHTS.values()} < colors, "a dot for each light"
+    assert (page.picture.max(axis=2) < 40).mean() > 0.5, "a dark page"
 
 
 @pytest.mark.parametrize(

@@ -49,13 +49,14 @@ def test_all_scores_are_those_of_their_functions(expected):
     assert score.nema is None and score.notes == ()
     lines = score.lines
     assert len(lines) == 6  # the empty sector is no line
-    assert re.fullmatch(r"5 mm  resolved, valley/peak \d\.\d\d, contrast \d+ %", lines[1])
-    assert lines[1:] == [f"{sector.rod_diameter:g} mm  {sector.words}" for sector in rods if sector.rod_diameter]
+    assert re.fullmatch(r"5 mm  green: resolved, valley/peak \d\.\d\d, contrast \d+ %", lines[1])
+    assert [line.rpartition(": ")[2] for line in lines[1:5]] == [sector.words for sector in rods if sector.light]
     assert lines[-1] == "1.2 mm  voxels of 1.35 mm are larger than the rods"
     record = json.loads(json.dumps(score.record, allow_nan=False))["derenzo"]
     assert record[2]["note"] == "no rods" and record[2]["resolved"] is None
     for said, sector in zip(record[:2], rods, strict=False):
         assert said["resolved"] is bool(sector.resolved) and said["chance"] == sector.chance < 0.02
+        assert said["light"] == sector.light == "green"
         assert said["pairs_resolved"] == sector.pairs_resolved == 1 and said["pairs"] == len(sector.profiles)
 
 

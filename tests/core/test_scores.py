@@ -12,6 +12,7 @@ from scipy.ndimage import gaussian_filter
 from scipy.special import i0e
 
 import mphdrr.core as mph
+from mphdrr.core.reconstruction.scores.derenzo import LIGHTS, SEEN_BELOW
 
 RODS = (6.0, 5.0, 4.0, 3.5, 3.0, 0.0)
 DISTANCES = np.concatenate([np.linspace(0, 15, 301), [100]])  # mm
@@ -105,18 +106,18 @@ def falsely_resolved(kind: str, volumes: int, grid: mph.Grid, seed: int) -> tupl
 
 
 @pytest.mark.parametrize("kind", list(NOISE)[::4])
-def test_noise_resolves_at_most_one_sector_in_twenty(kind):
-    """25 volumes of a kind; the long lane has 200 of each. The bound for one kind leaves room for their own chance."""
-    found, small = falsely_resolved(kind, 25, mph.Grid.centered((31, 31, 9), 2.0), 3)
-    assert found.mean() <= 0.05 and found[small].mean() <= 0.05
+def test_noise_resolves_hardly_any_sector(kind):
+    """25 volumes of a kind; the long lane has 200 of each. One in a thousand may be, by its own chance."""
+    found, _ = falsely_resolved(kind, 25, mph.Grid.centered((31, 31, 9), 2.0), 3)
+    assert len(found) > 100 and found.sum() <= 1
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("kind", NOISE)
-def test_noise_resolves_at_most_one_sector_in_twenty_of_200_volumes(kind):
+def test_noise_resolves_hardly_any_sector_of_200_volumes(kind):
     grid = mph.Grid.centered((31, 31, 9), 2.0)
     found, small = falsely_resolved(kind, 200, grid, 4)
-    assert found.mean() <= 0.03 and found[small].mean() <= 0.04
+    assert found.mean() <= 0.004 and found[small].mean() <= 0.008
 
 
 def test_pairs_by_themselves_prove_nothing():
@@ -144,11 +145,12 @@ def test_without_noise_rayleighs_limit_alone_decides(phantom, voxel):
         for sector in mph.derenzo_score(mph.Volume(blurred, truth.grid), phantom):
             if sector.profiles:
                 if (
-                    len(sector.profiles) == 1 and sector.chance > 0.01
+                    len(sector.profiles) == 1 and sector.chance > 0.001
                 ):  # a valley between two rods that differ proves little
                     continue
                 assert sector.resolved == (sector.valley_to_peak < 0.735), (fwhm, sector.rod_diameter)
-                assert sector.words.startswith("resolved, " if sector.resolved else "not resolved, ")
+                light = "green" if sector.resolved else "amber" if sector.chance < SEEN_BELOW else "red"
+                assert sector.light == light and sector.words.startswith(f"{LIGHTS[light]}, ")
                 seen.add(sector.resolved)
     assert seen == {0.0, 1.0}
 

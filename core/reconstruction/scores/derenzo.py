@@ -20,8 +20,11 @@ from .rows import Rows, column
 RESOLVED_BELOW = 0.735
 """Valley-to-peak of two points that are just resolved, by Rayleigh's criterion."""
 
-NOISE_BELOW = 0.02
-"""Chance that noise makes a sector's contrast: of one that is resolved it is less."""
+NOISE_BELOW, SEEN_BELOW = 0.001, 0.02
+"""Chance that noise makes a sector's contrast: of one that is resolved, and of one that is seen, it is less."""
+
+LIGHTS = {"green": "resolved", "amber": "seen, not resolved", "red": "not resolved"}
+"""What a sector is, by the colour of its dot. Amber: its rods stand out of the noise, but not enough."""
 
 _LENGTH = 0.5  # of the rods, around their middle, that profiles are means over: ends blur into what is beside them
 _WIDTH = 0.5  # of a rod's diameter, that profiles are means over
@@ -85,10 +88,27 @@ class DerenzoSector:
         return float(np.mean([profile.valley_to_peak < RESOLVED_BELOW for profile in self.profiles] or np.nan))
 
     @property
+    def light(self) -> str:
+        """A key of `LIGHTS`: "green" if it is `resolved`, "amber" if it is seen, else "red"; "" if unknown."""
+        if self.note or not self.profiles:
+            return ""
+        return "green" if self.resolved else "amber" if self.chance < SEEN_BELOW else "red"
+
+    @property
+    def contrast(self) -> str:
+        """The contrast recovery in words."""
+        return f"{np.round(100 * self.contrast_recovery) + 0.0:.0f} %"
+
+    @property
+    def cells(self) -> tuple[str, str, str, str]:
+        """A row of a table: rod diameter, `light`, valley/peak or why there is none, and contrast recovery."""
+        score = (self.note, "") if self.note else (f"{self.valley_to_peak:.2f}", self.contrast)
+        return f"{self.rod_diameter:g} mm", self.light, *score
+
+    @property
     def words(self) -> str:
         """The score in a line: whether it is resolved, and by what; or why there is none."""
-        score = f"valley/peak {self.valley_to_peak:.2f}, contrast {np.round(100 * self.contrast_recovery) + 0.0:.0f} %"
-        return self.note or f"{'resolved' if self.resolved else 'not resolved'}, {score}"
+        return self.note or f"{LIGHTS[self.light]}, valley/peak {self.valley_to_peak:.2f}, contrast {self.contrast}"
 
 
 class DerenzoScore(Rows[DerenzoSector]):
@@ -114,9 +134,9 @@ def derenzo_score(
 
     A sector is resolved if two things hold. Its mean valley / mean peak is below 0.735, Rayleigh's criterion, which Hallen
     et al. propose for the pairs of hot-rod phantoms. And noise would make so large a difference of both means with a chance
-    below 2 %: it is compared with how rods scatter around their mean, and valleys around theirs (Student's t test of two
+    below 0.1 %: it is compared with how rods scatter around their mean, and valleys around theirs (Student's t test of two
     samples). Pairs by themselves prove nothing: in noise without any rods a third of the sectors may meet the first
-    condition, but at most 2.1 % met both. Contrast recovery is the mean peak minus the mean valley, by the same of the
+    condition, but less than 0.1 % met both. Contrast recovery is the mean peak minus the mean valley, by the same of the
     phantom: it is 1 only where the volume's values are right, too.
 
     Parameters

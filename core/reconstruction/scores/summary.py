@@ -52,7 +52,8 @@ class VolumeScore:
         similarity = "" if self.ssim is None else f", SSIM {self.ssim:.3f}"
         lines = [f"All voxels: NRMSE {self.nrmse:.3f}, PSNR {_number(self.psnr, '.1f')} dB{similarity}"]
         if self.derenzo is not None:
-            lines += [f"{sector.rod_diameter:g} mm  {sector.words}" for sector in self.derenzo if sector.rod_diameter]
+            said = ((s.rod_diameter, ": ".join(filter(None, (s.light, s.words)))) for s in self.derenzo)
+            lines += [f"{diameter:g} mm  {words}" for diameter, words in said if diameter]
         if self.nema is not None:
             lines += _table(("Spheres", "contrast recovery", "background variability"), map(_sphere_row, self.nema))
             if not math.isnan(self.nema.lung_residual):
@@ -67,6 +68,7 @@ class VolumeScore:
             names = ("rod_diameter", "valley_to_peak", "contrast_recovery", "chance", "pairs_resolved")
             record["derenzo"] = [
                 {**{name: _finite(getattr(s, name)) for name in names}, "pairs": len(s.profiles), "note": s.note,
+                 "light": s.light or None,
                  "resolved": None if math.isnan(s.resolved) else bool(s.resolved)}
                 for s in self.derenzo
             ]  # fmt: skip

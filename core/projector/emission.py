@@ -24,6 +24,7 @@ from ..physics.optics import Edge, Optics
 from ..validation import instance, positive, real_array, strict_whole
 from ..volumes.volume import Volume, require_quantity
 from .bundles import Beam
+from .hole_nodes import Passage
 from .hole_response import WholeHoles
 from .models import Model, checked_background
 from .pixel_points import TOLERANCE, expected_error, lattices, offsets, points_needed, require_points, shadow_edges
@@ -157,6 +158,7 @@ class Emission(Model):
     tolerance: float = TOLERANCE
     background: float | Floats = 0.0  # type: ignore[assignment]  # no class of mutable values: checked, and frozen
     hole: Hole = "auto"
+    plate_thickness: float | None = None
 
     name = "emission"
     takes = ("activity",)
@@ -187,18 +189,15 @@ class Emission(Model):
         if self.hole not in ("auto", "depth", "rays", "point"):
             raise InputError(f"emission: hole: expected 'auto', 'depth', 'rays' or 'point', got {self.hole!r}")
         has_points = (self.aperture_points, self.aperture_tolerance) != (None, None)
-        given = {"edge 'path'": self.edge == "path", "depth_layers": self.depth_layers > 1, "points of it": has_points}
-        for what in {"depth": list(given), "point": ["points of it"]}.get(self.hole, []):
-            if given[what]:
-                raise InputError(f"emission: hole {self.hole!r} takes no {what}; use hole 'rays', or leave that out")
+        if has_points and self.hole in ("depth", "point"):
+            raise InputError(f"emission: hole {self.hole!r} takes no points of it; use hole 'rays', or leave that out")
 
     @property
     def _is_by_depth(self) -> bool:
         """Whether the hole's blur is computed without rays."""
         if self.hole != "auto":
             return self.hole == "depth"
-        numbers = {self.aperture_points, self.aperture_tolerance, self.pixel_points}
-        return self.edge == "paix" and self.depth_layers == 1 and numbers == {None}
+        return {self.aperture_points, self.aperture_tolerance, self.pixel_points} == {None}
 
     def by_rays(self) -> Self:
         """The model for what can only be done with rays; `InputError` with hole "depth"."""
@@ -384,14 +383,18 @@ class Emission(Model):
             return None
         within = self.within_crystal or self.within_walls
         sides = self.system.detector_side if within else np.full(len(self.system), np.inf)
-        everywhere = replace(self, within_crystal=False, within_walls=False)
+        everywhere = replace(self, within_crystal=False, within_walls=False, depth_layers=1)
+        sizes = zip(self.system.pinhole_diameter.tolist(), self.system.detector_thickness.tolist(), strict=True)
+        passages = [Passage.of(self._optics_of(m), *size) for m, size in enumerate(sizes)]
+        lengths = self.system.collimator_length + [each.mean_depth for each in passages]
 
         def weigh(m: int, u: Floats, v: Floats) -> Floats:
             (opening,) = everywhere.openings(m, 1)
-            return everywhere.pixel_weights(m, u, v, (1.0, 1.0), float(self.system.collimator_length[m]), opening)
+            return everywhere.pixel_weights(m, u, v, (1.0, 1.0), float(lengths[m]), opening)
 
-        of_modules = self._frames, self.system.collimator_length, self.effective_diameter, sides, weigh
-        return WholeHoles(views, grid, *of_modules, self.mu, self.hole == "depth")
+        of_modules = self._frames, lengths, self.effective_diameter, sides, weigh
+        slants = None if passages[0].is_plain else passages
+        return WholeHoles(views, grid, *of_modules, self.mu, self.hole == "depth", slants)
 
     def caution(self, views: Views, grid: Grid) -> str | None:
         """A warning where there are too few rays for the tolerance."""

@@ -157,17 +157,17 @@ class KnifeEdge:
             return 0.0
         return library.exp(-self.mu * self.plate * (1 + slope_u**2 + slope_v**2) ** 0.5)
 
-    def ellipse(self, depth: Any, slope: Any) -> tuple[Any, Any]:
-        """Half axes, mm, along the slope and across it, of where lines of a `slope` pass at most `depth` of the edge.
+    def reach(self, depth: Any, along: Any, across: Any) -> Any:
+        """How far from the hole's middle, mm, lines pass a `depth` of the edge, mm along the axis.
 
-        `depth` is along the hole's axis, mm. Without faces these places fill an ellipse exactly.
+        Their slopes are `along` the way from the middle to where they cross the hole's plane, and `across` it. Between faces
+        this is exact where either is 0: parallel lines that pass up to some depth fill an ellipse.
         """
-        tangent, steep = self.tangent, self.tangent + slope
-        longer = depth * steep / (2 * tangent)  # on the side where the edge recedes from the line
+        steep = self.tangent + abs(along)
+        longer = depth * steep / (2 * self.tangent)  # on the side where the edge recedes from the line
         if self.plate is not None:
             longer = np.minimum(longer, self.plate / 2)
-        across = (self.radius + depth / 2 * tangent) ** 2 - (depth / 2 * slope) ** 2
-        return self.radius + (depth - longer) * steep, across**0.5
+        return ((self.radius + (depth - longer) * steep) ** 2 - (depth / 2 * across) ** 2) ** 0.5
 
     def points(self, n: int) -> list[tuple[ArrayOrTensor, ArrayOrTensor, ArrayOrTensor]]:
         """Sample points beyond the rim: (x, y) in mm, and the area, mm^2, that each represents.

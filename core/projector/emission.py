@@ -383,7 +383,11 @@ class Emission(Model):
             return None
         within = self.within_crystal or self.within_walls
         sides = self.system.detector_side if within else np.full(len(self.system), np.inf)
-        everywhere = replace(self, within_crystal=False, within_walls=False, depth_layers=1)
+        # The edge's path, and depths in the crystal, are in the kernels.
+        everywhere = replace(
+            self, within_crystal=False, within_walls=False, depth_layers=1, edge="paix", plate_thickness=None,
+            within_cone=self.within_cone or self.edge == "path",
+        )  # fmt: skip
         sizes = zip(self.system.pinhole_diameter.tolist(), self.system.detector_thickness.tolist(), strict=True)
         passages = [Passage.of(self._optics_of(m), *size) for m, size in enumerate(sizes)]
         lengths = self.system.collimator_length + [each.mean_depth for each in passages]
@@ -392,7 +396,7 @@ class Emission(Model):
             (opening,) = everywhere.openings(m, 1)
             return everywhere.pixel_weights(m, u, v, (1.0, 1.0), float(lengths[m]), opening)
 
-        of_modules = self._frames, lengths, self.effective_diameter, sides, weigh
+        of_modules = self._frames, lengths, everywhere.effective_diameter, sides, weigh
         slants = None if passages[0].is_plain else passages
         return WholeHoles(views, grid, *of_modules, self.mu, self.hole == "depth", slants)
 

@@ -1,9 +1,10 @@
 """Kernels that depend on the photons' direction: through the knife edge, and into the depth of the crystal.
 
-What lines of a slope s pass of the edge, up to some depth of it, is an ellipse in the hole's plane. So what the hole lets
-through is a sum of ellipses, each with the Fourier transform of a disc. A photon that passes the hole at c is recorded at depth
-z in the crystal, at s (l + z) - c: the image is that of a crystal at the mean depth, smeared along s. Kernels are made for
-pixels at nodes, a lattice on the image, and those of a pixel are mixed from the four nodes around it.
+Where the lines to a pixel pass up to some depth of the edge is an ellipse in the hole's plane. So what the hole lets
+through is a sum of ellipses, each with the Fourier transform of a disc. A photon that is recorded at depth z in the crystal
+would have met the plane at the mean depth elsewhere along its line: the deeper, the nearer to the axis, and the smaller is the
+hole's shadow seen from there. Kernels are made for pixels at nodes, a lattice on the image, and those of a pixel are mixed
+from the four nodes around it.
 """
 
 import functools
@@ -19,8 +20,8 @@ from ..physics.crystal import recorded_depths
 from ..physics.optics import Optics
 from .hole_kernel import KernelNumbers, Spectra, disc_transform, half_taps, of_pixels
 
-# Attenuation in the edge beyond which what passes is not counted, and nodes of Gauss up to there; nodes in the crystal.
-_MOST_PASSED, _LAYERS, _DEPTHS = 6.5, 5, 32
+# Attenuation in the edge beyond which what passes is not counted; nodes of Gauss in the crystal.
+_MOST_PASSED, _DEPTHS = 7.5, 32
 
 
 @dataclass(frozen=True)
@@ -58,10 +59,14 @@ class Slanted(NamedTuple):
 
     forms: Array
     """(n, 3): squared diameters of ellipses as forms f_v^2, f_u^2, f_v f_u,"""
+    centers: Array
+    """(n, 2): their middles,"""
     shares: Array
-    """(n,): and their shares of the photons."""
+    """(n,): and their shares of what a disc of the hole's diameter would let pass."""
     shifts: Array
     """(k, 2): from the pixel to where photons would have been recorded at the mean depth,"""
+    nearer: Array
+    """(k,): how much smaller the hole is, times the part of its shadow that does not grow with l / h,"""
     weights: Array
     """(k,): and what of them is,"""
     mixed: Array
@@ -74,24 +79,25 @@ def node_places(n: int, apart: int) -> Array:
 
 
 def slanted(
-    passage: Passage, diameter: float, length: float, sizes: Array, place: Array, share: float, apart: Array
+    passage: Passage, diameter: float, length: float, sizes: Array, place: Array, share: float, steps: Array, apart: int
 ) -> Slanted:
-    """That of a pixel at a place on the crystal, mm along v and u; cells' `sizes` are in mm.
+    """That of a pixel at a place on the crystal, mm along v and u; cells' `sizes` are in mm, `steps` those of a pixel.
 
-    `length` is that to the plane of the image. `share` is the power of the pixels' factors, as in `Zone`; `apart` are cells
-    from node to node.
+    `length` is that to the plane of the image. `share` is the power of the pixels' factors, as in `Zone`; `apart` are
+    pixels from node to node.
     """
     slope = place / length
     steep = float(np.hypot(*slope))
     axis = slope / steep if steep > 0 else np.array([1.0, 0.0])
-    parts, across, along = np.ones(1), np.full(1, diameter / 2), np.full(1, diameter / 2)
+    parts, across, along, off = np.ones(1), np.full(1, diameter / 2), np.full(1, diameter / 2), np.zeros(1)
     if passage.knife is not None:
-        parts, depths = _layers(passage.knife, steep)
-        along, across = passage.knife.ellipse(depths, steep)
-    shares = parts * along * across
+        decay = float(passage.knife.tangent / (2 * passage.knife.mu)) / np.abs(sizes * steps).min()
+        parts, depths = _layers(passage.knife, steep, min(round(6 + 10 * decay), 32))
+        along, off, across = _ellipses(passage.knife, depths, steep, length)
+    shares = parts * along * across / (diameter / 2) ** 2
     forms = 4 * (across**2)[:, None, None] * np.eye(2) + 4 * (along**2 - across**2)[:, None, None] * np.outer(axis, axis)
     forms = forms / np.outer(sizes, sizes)
-    shifts, weights, mixed = np.zeros((1, 2)), np.ones(1), np.zeros(2)
+    shifts, nearer, weights, mixed = np.zeros((1, 2)), np.zeros(1), np.ones(1), np.zeros(2)
     if passage.crystal_mu:
         nodes, weights = _gauss(_DEPTHS)
         z = nodes * passage.thickness
@@ -101,23 +107,39 @@ def slanted(
         recorded = rate * np.exp(-rate * z) / -np.expm1(-rate * passage.thickness)
         weights = weights * passage.thickness * recorded / stretch**2
         weights = weights * ((1 + steep**2) / squared) ** (1.5 * share)  # of the pixel's direction, that of the photon
-        shifts = (1 / stretch - 1)[:, None] * place / sizes
-        mean = np.average(1 / stretch, 0, weights)
-        mixed = np.average((1 / stretch - mean) ** 2, 0, weights) * apart**2 / 8
+        nearer = 1 / stretch - 1
+        shifts = nearer[:, None] * place / sizes
+        mixed = np.average((nearer - np.average(nearer, 0, weights)) ** 2, 0, weights) * (apart * steps) ** 2 / 8
     each = np.stack([forms[:, 0, 0], forms[:, 1, 1], 2 * forms[:, 0, 1]], -1)
-    return Slanted(each, shares / shares.sum(), shifts, weights, mixed)
+    return Slanted(each, np.outer(off, axis) / sizes, shares, shifts, nearer, weights, mixed)
 
 
-def _layers(knife: KnifeEdge, slope: float) -> tuple[Array, Array]:
+def _layers(knife: KnifeEdge, slope: float, n: int) -> tuple[Array, Array]:
     """Shares of the photons that pass up to some depths of the edge, and these, mm along the axis."""
     rate = knife.mu * math.sqrt(1 + slope**2)
     solid = np.inf if knife.plate is None else rate * knife.plate
-    nodes, weights = _gauss(_LAYERS)
-    least = math.exp(-min(_MOST_PASSED, solid) / 3)
-    root = least + (1 - least) * nodes  # of what passes
-    through = 0.0 if knife.plate is None else math.exp(-solid)
-    parts = 3 * root**2 * weights * (1 - least)
-    return np.append(parts, through), np.append(-3 * np.log(root), 0.0) / rate
+    nodes, weights = _gauss(n)
+    most = min(_MOST_PASSED, solid)
+    parts = most * weights * np.exp(-most * nodes)
+    # The rest: what would pass the solid plate is counted inside the hole alone.
+    return np.append(parts, math.exp(-most)), np.append(most * nodes, most + 0.5 if most < solid else 0.0) / rate
+
+
+def _ellipses(knife: KnifeEdge, depths: Array, slope: float, length: float) -> tuple[Array, Array, Array]:
+    """Of ellipses half the axis along the slope, by how much they are off the hole's middle there, and the other half axis.
+
+    The lines meet in a point `length` behind the hole: their slopes differ from place to place.
+    """
+    found = []
+    for towards, across in ((slope, 0.0), (-slope, 0.0), (0.0, slope)):
+        reach = knife.radius + 0 * depths
+        for _ in range(6):
+            along = towards + reach / length
+            secant = np.sqrt((1 + along**2 + across**2) / (1 + slope**2))
+            reach = knife.reach(depths / secant, along, across)
+        found.append(reach)
+    far, near, side = found
+    return (far + near) / 2, (far - near) / 2, side
 
 
 @functools.lru_cache(maxsize=8)
@@ -131,13 +153,13 @@ def node_kernels(numbers: KernelNumbers, steps: tuple[int, int], each: list[Slan
     """The kernels (planes, nodes along v, along u, taps, taps) of a lattice of nodes of a `shape`, row by row."""
     half = _half(numbers, steps, each)
     spectra = SlantedSpectra(numbers, steps, half, each, shape)
-    found = [of_pixels(spectra.image(i), numbers, steps, half)[0] * own.weights.sum() for i, own in enumerate(each)]
+    found = [of_pixels(spectra.image(i), numbers, steps, half)[0] * spectra.totals[i] for i in range(len(each))]
     return np.stack(found, axis=1).reshape(len(found[0]), *shape, *found[0].shape[1:])
 
 
 def _half(numbers: KernelNumbers, steps: tuple[int, int], each: list[Slanted]) -> tuple[int, int]:
     """Taps on each side of the middle one that all nodes need."""
-    widest = np.sqrt(np.max([own.forms[:, :2].max(axis=0) for own in each], axis=0))
+    widest = np.max([(np.sqrt(own.forms[:, :2]) + 2 * np.abs(own.centers)).max(axis=0) for own in each], axis=0)
     return half_taps(numbers._replace(hole=widest), steps, np.max([np.abs(own.shifts).max(axis=0) for own in each], axis=0))
 
 
@@ -150,34 +172,57 @@ class SlantedSpectra(Spectra):
         super().__init__(numbers, steps, half)
         self.each, self.common = each, self.pixel * self.sincs[0] * self.sincs[1] * self.sincs[2]
         chosen, bases = zip(*(_quadratic(n) for n in shape), strict=True)
-        self.holes = np.array([[self._hole(each[i * shape[1] + j]) for j in chosen[1]] for i in chosen[0]])
+        self.holes = np.array([self._hole(each[i * shape[1] + j]) for i in chosen[0] for j in chosen[1]])
         self.bases = np.einsum("ik,jl->ijkl", *bases).reshape(len(each), -1)
+        passed = np.array([[each[i * shape[1] + j].shares.sum() for j in chosen[1]] for i in chosen[0]])
+        self.passed = self.bases @ passed.ravel()
+        self.totals = self.passed * [own.weights.sum() for own in each]
 
     def _hole(self, own: Slanted) -> Array:
+        """What passes the hole; and with depths, how that grows with the shadow's part that is not l / h."""
         f_v, f_u = self.f
         total: Array = 0.0  # type: ignore[assignment]
-        for form, share in zip(own.forms, own.shares, strict=True):
+        for form, center, share in zip(own.forms, own.centers, own.shares, strict=True):
             radius = np.sqrt(np.maximum(form[0] * f_v**2 + form[1] * f_u**2 + form[2] * f_v * f_u, 0))
-            total = total + share * disc_transform((1 + self.slopes) * radius)[0]
+            disc, rise = disc_transform((1 + self.slopes) * radius)
+            disc = share * (np.stack([disc, radius * rise]) if own.nearer.any() else disc[None])
+            if center.any():
+                v, u = (np.exp(-2j * np.pi * (1 + self.slopes) * at * f) for at, f in zip(center, self.f, strict=True))
+                disc = disc * v * u
+            total = total + disc
         return total
 
-    def smear(self, own: Slanted) -> Array:
-        """The spectrum of what the depth in the crystal does."""
+    def _smear(self, own: Slanted) -> Array:
+        """The spectrum of what the depth in the crystal does: to images, and as far as the hole's size is concerned."""
         waves = [np.exp(-2j * np.pi * np.outer(own.shifts[:, i], f.ravel())) for i, f in enumerate(self.f)]
-        total: Array = (waves[0] * (own.weights / own.weights.sum())[:, None]).T @ waves[1]
+        shares = np.stack([own.weights, own.weights * own.nearer]) / own.weights.sum()
+        total: Array = (waves[0] * shares[:, :, None]).swapaxes(1, 2) @ waves[1]
         return total * (1 + 2 * np.pi**2 * (own.mixed[0] * self.f[0] ** 2 + own.mixed[1] * self.f[1] ** 2))
 
     def image(self, i: int) -> Array:
         """A node's, (planes + 2, taps, taps)."""
-        hole = np.tensordot(self.bases[i], self.holes.reshape(-1, *self.common.shape), 1)
-        return self.spatial(self.common * hole * self.smear(self.each[i]))
+        smear = self._smear(self.each[i]) / self.passed[i]
+        hole = np.tensordot(self.bases[i], self.holes, 1)
+        total = hole[0] * smear[0]
+        if len(hole) > 1:
+            total += hole[1] * smear[1]
+        return self.spatial(self.common * total)
 
 
 def _quadratic(n: int) -> tuple[list[int], Array]:
-    """Up to three of n nodes, and what each has to do with those between, (n, 3)."""
-    if n < 4:
+    """Up to three of n nodes, and what each has to do with those between, (n, 3).
+
+    Less what linear mixing between nodes adds on the mean.
+    """
+    if n < 3:
         return list(range(n)), np.eye(n)
     chosen = [0, (n - 1) // 2, n - 1]
     others = [[b for b in chosen if b != a] for a in chosen]
-    return chosen, np.stack([np.prod([(np.arange(n) - b) / (a - b) for b in own], axis=0)
-                             for a, own in zip(chosen, others, strict=True)], -1)  # fmt: skip
+    bases = np.stack(
+        [
+            np.prod([(np.arange(n) - b) / (a - b) for b in own], axis=0)
+            for a, own in zip(chosen, others, strict=True)
+        ],
+        axis=-1,
+    )
+    return chosen, bases - np.diff(bases[:3], 2, axis=0) / 12

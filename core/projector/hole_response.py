@@ -55,7 +55,7 @@ _LARGE_VOXELS = 0.6
 _PAIR_SMEAR = 0.366 * math.sqrt(12)
 # Where kernels depend on the direction, differences of slopes from node to node: for penetration, by the cone's; and for depths
 # in the crystal, times their standard deviation, in units of that of the hole's image.
-_NODE_SLOPES, _NODE_SMEAR = 0.4, 0.3
+_NODE_SLOPES, _NODE_SMEAR = 0.2, 0.3
 # Larger voxels, mm, are cut into parts of this size at most: kernels as wide as their shadows would take longer.
 _LARGEST = 6.0
 # Voxels that a thread adds to, in whole layers, before it takes others, and bytes of the views' cells that are in memory.

@@ -183,8 +183,8 @@ class Zone:
         n = self.numbers
         v, u = (n.first[i] + n.pitch[i] * node_places(self.pixels[i], self.apart) for i in range(2))
         common = self.passage, n.diameter, n.length, self._sizes
-        apart = self.apart * np.array(self.steps)
-        return [slanted(*common, np.array([a, b]), self.share, apart) for a in v for b in u], (len(v), len(u))
+        more = self.share, np.array(self.steps), self.apart
+        return [slanted(*common, np.array([a, b]), *more) for a in v for b in u], (len(v), len(u))
 
     @staticmethod
     def _margin(kernel: Array) -> tuple[int, int]:

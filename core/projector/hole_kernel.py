@@ -80,12 +80,15 @@ def _means(image: Array) -> Array:
 
 
 def of_pixels(
-    image: Array, numbers: KernelNumbers, steps: tuple[int, int], half: tuple[int, int]
+    image: Array, numbers: KernelNumbers, steps: tuple[int, int], half: tuple[int, int], least: Array | None = None
 ) -> tuple[Array, Array, Array]:
-    """The kernels of images, with the sums that taps of one place were divided by, and which taps are used."""
+    """The kernels of images, with the sums that taps of one place were divided by, and which taps are used.
+
+    Taps up to `least`, (planes,), are left out, and it is taken from the others.
+    """
     away = _away(half)
     kernel = _means(image) * (1 + numbers.bend[0] * away[0][:, None] + numbers.bend[1] * away[1])
-    kernel -= _LEAST / kernel[0].size
+    kernel -= _LEAST / kernel[0].size if least is None else least[:, None, None]
     is_used = kernel > 0
     kernel *= is_used
     shares = np.empty_like(kernel)

@@ -22,6 +22,8 @@ from .hole_kernel import KernelNumbers, Spectra, disc_transform, half_taps, of_p
 
 # Attenuation in the edge beyond which what passes is not counted; nodes of Gauss in the crystal.
 _MOST_PASSED, _DEPTHS = 7.5, 32
+# Taps that are this small, by those inside the shadow, are left out: tails are wide.
+_LEAST = 1.5e-3
 
 
 @dataclass(frozen=True)
@@ -153,8 +155,17 @@ def node_kernels(numbers: KernelNumbers, steps: tuple[int, int], each: list[Slan
     """The kernels (planes, nodes along v, along u, taps, taps) of a lattice of nodes of a `shape`, row by row."""
     half = _half(numbers, steps, each)
     spectra = SlantedSpectra(numbers, steps, half, each, shape)
-    found = [of_pixels(spectra.image(i), numbers, steps, half)[0] * spectra.totals[i] for i in range(len(each))]
-    return np.stack(found, axis=1).reshape(len(found[0]), *shape, *found[0].shape[1:])
+    # By what a tap would be if those in the shadow of the hole and a pixel were alike.
+    least = _LEAST / (np.pi / 4 * numbers.hole.prod() * (1 + numbers.slopes) ** 2 + math.prod(steps))
+    found = np.stack([of_pixels(spectra.image(i), numbers, steps, half, least)[0] for i in range(len(each))], axis=1)
+    found *= spectra.totals[:, None, None]
+    inside = []
+    for axis, h in ((-1, half[0]), (-2, half[1])):
+        used = np.flatnonzero(found.any(axis=(0, 1, axis)))
+        reach = min(max(h - used[0], used[-1] - h), h)
+        inside.append(slice(h - reach, h + reach + 1))
+    found = found[:, :, inside[0], inside[1]]
+    return found.reshape(len(found), *shape, *found.shape[2:])
 
 
 def _half(numbers: KernelNumbers, steps: tuple[int, int], each: list[Slanted]) -> tuple[int, int]:

@@ -28,6 +28,7 @@ _NAMES = {"win32": "siddon.dll", "darwin": "libsiddon.dylib"}
 _MOST_VOXELS = 2**31 - 1  # their indices are of 32 bits
 _PRODUCT = 2  # in kernels.h
 _MOST_PLACES_ALONG = 2**16  # where float32 knows a place to 1/256 of an element; beyond 2^24 it would miss whole ones
+_NODE_ROWS = 4  # in kernels.h
 _READ_ON = 16  # numbers that kernels read beyond the last of what they use
 _MOST_ALONG = 2**12  # where float32 knows the length of a segment to 0.1 %
 
@@ -404,8 +405,9 @@ def _run_pixels(
     nodes: dict[str, Any] = {}
     if of.places is not None:
         rows, columns = (np.ascontiguousarray(each) for each in of.places)
-        room = np.zeros(2 * math.prod(taps.shape[-2:]) + 2 * _padded_row(of) + _READ_ON, image.dtype)
-        bounds = np.empty(4 * taps.shape[-2], np.int64)
+        tall = of.kernel.shape[-2] + (_NODE_ROWS - 1) * of.steps[0]
+        room = np.zeros(_NODE_ROWS * (tall * taps.shape[-1] + _padded_row(of)) + _READ_ON, image.dtype)
+        bounds = np.empty((tall, 2), np.int64)
         nodes = {"nodes": taps.shape[1:3], "node_rows": rows.ctypes.data, "node_columns": columns.ctypes.data,
                  "room": room.ctypes.data, "room_bounds": bounds.ctypes.data}  # fmt: skip
     job = _DepthJob(

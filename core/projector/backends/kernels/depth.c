@@ -246,50 +246,14 @@ typedef struct {
     const int64_t (*bounds)[2]; // of its rows
     REAL *cells;               // of the plane
     int64_t together;
-    int64_t to_next;           // rows from a kernel's row to that of the next row of pixels for the same cells
-    int64_t node;              // the column of nodes whose share of the pixels this is; -1: all of them
 } Plane;
 
 INLINE Plane plane_of(const DepthJob *job, int64_t number) {
     const int64_t row = number * (job->taps[0] + 2 * job->step[0]) + job->step[0];
     return (Plane){
         job, (const REAL *)job->kernel + row * job->taps[1], (const int64_t (*)[2])job->bounds + row,
-        (REAL *)job->cells + number * job->rows * job->columns, job->columns / job->step[1], -job->step[0], -1,
+        (REAL *)job->cells + number * job->rows * job->columns, job->columns / job->step[1],
     };
-}
-
-// A node's weight in a pixel along one axis.
-INLINE REAL of_node(double place, int64_t node) { return (REAL)MAX(1 - __builtin_fabs(place - node), 0.0); }
-
-// The kernels of rows of pixels from i on for a column of nodes, mixed in the job's room, one after the other.
-INLINE Plane mix(const DepthJob *job, int64_t number, int64_t i, int64_t node) {
-    Plane plane = plane_of(job, number);
-    const int64_t rows = job->taps[0] + 2 * job->step[0], size = rows * job->taps[1];
-    REAL *const room = (REAL *)job->room;
-    for (int r = 0; r < TALL; r++) {
-        const double place = job->node_rows[MIN(i + r, job->pixels[0] - 1)];
-        const int64_t before = MIN((int64_t)place, job->nodes[0] - 2), first = (number * job->nodes[0] + before) * job->nodes[1] + node;
-        const REAL *const kernel = (const REAL *)job->kernel + first * size, share = (REAL)(place - before);
-        const int64_t(*const bounds)[2] = (const int64_t(*)[2])job->bounds + first * rows;
-        for (int64_t a = 0; a < rows; a++) {
-            const int64_t low = bounds[a][0], high = bounds[a][1];
-            job->room_bounds[2 * (r * rows + a)] = low, job->room_bounds[2 * (r * rows + a) + 1] = high;
-            const REAL *const one = kernel + a * job->taps[1], *const other = one + job->nodes[1] * size;
-            for (int64_t b = 0; b < job->taps[1]; b++) room[r * size + a * job->taps[1] + b] = one[b] + share * (other[b] - one[b]);
-        }
-    }
-    plane.kernel = room + job->step[0] * job->taps[1], plane.bounds = (const int64_t(*)[2])job->room_bounds + job->step[0];
-    plane.to_next += rows, plane.node = node;
-    return plane;
-}
-
-// The columns of pixels in which a column of nodes has a share.
-INLINE void find_columns(const DepthJob *job, int64_t node, int64_t *first, int64_t *last) {
-    int64_t j = 0;
-    while (j < job->pixels[1] && job->node_columns[j] <= node - 1) j++;
-    *first = j;
-    while (j < job->pixels[1] && job->node_columns[j] < node + 1) j++;
-    *last = j;
 }
 
 // The taps at `place` in a pixel that are not 0 in rows of the kernel, `apart`: from *first on, to before *last.
@@ -310,17 +274,15 @@ INLINE void sum_cells(const Plane *of, int64_t i, int64_t j, const int wide) {
     F sums[TALL][WIDE] = {0};
     for (int64_t a = 0; a < rows; a++) for (int64_t place = 0; place < step[1]; place++) {
         int64_t b, last;
-        find_taps(of, a, of->to_next, place, &b, &last);
+        find_taps(of, a, -step[0], place, &b, &last);
         const REAL *cells = of->cells + (first + a) * job->columns + place * of->together + j + b / step[1];
         const REAL *const row = of->kernel + a * taps[1];
-        for (; b < last; b += step[1], cells++) add_tapped(sums, wide, cells, row + b, of->to_next * taps[1]);
+        for (; b < last; b += step[1], cells++) add_tapped(sums, wide, cells, row + b, -step[0] * taps[1]);
     }
     for (int64_t r = 0; r < MIN((int64_t)TALL, job->pixels[0] - i); r++) {
         REAL *const pixels = (REAL *)job->image + (i + r) * job->row + j;
         const int64_t n = MIN(wide * (int64_t)LANES, job->pixels[1] - j);
-        for (int64_t p = 0; p < n; p++) {
-            pixels[p] += of->node < 0 ? ((const REAL *)sums[r])[p] : ((const REAL *)sums[r])[p] * of_node(job->node_columns[j + p], of->node);
-        }
+        for (int64_t p = 0; p < n; p++) pixels[p] += ((const REAL *)sums[r])[p];
     }
 }
 
@@ -344,24 +306,6 @@ INLINE void sum_pixels(const Plane *of, int64_t r, int64_t place, int64_t j, con
     }
 }
 
-// What rows of pixels from i on give to cells from j on, in row a from the first of row i's, at one place; `pixels` are those rows,
-// `apart`, by the node's share. Taps of row i + r are in row a - r step of its kernel.
-INLINE void give_cells(const Plane *of, const REAL *pixels, int64_t apart, int64_t a, int64_t i, int64_t place, int64_t j, const int wide) {
-    const DepthJob *job = of->job;
-    const int64_t *taps = job->taps, *step = job->step;
-    F sums[WIDE] = {0};
-    for (int r = 0; r < TALL; r++) {
-        const int64_t row = a + r * of->to_next, low = of->bounds[row][0], high = of->bounds[row][1];
-        int64_t b = place + MAX(low - place + step[1] - 1, (int64_t)0) / step[1] * step[1];
-        const REAL *some = pixels + r * apart + j - b / step[1];
-        const REAL *const tap = of->kernel + row * taps[1];
-        for (; b < high; b += step[1], some--) UNROLLED for (int w = 0; w < wide; w++) sums[w] += tap[b] * *(const Run *)(some + w * LANES);
-    }
-    REAL *const cells = of->cells + (i * step[0] + a) * job->columns + place * of->together + j;
-    const int64_t n = MIN(wide * (int64_t)LANES, of->together - j);
-    for (int64_t k = 0; k < n; k++) cells[k] += ((const REAL *)sums)[k];
-}
-
 // DO(wide) for every `wide` vectors from j on, until n numbers of a row are done.
 #define EACH_RUN(j, from, n, DO)                                 \
     for (int64_t j = from, wide; j < n; j += wide * LANES) {     \
@@ -375,40 +319,155 @@ INLINE void give_cells(const Plane *of, const REAL *pixels, int64_t apart, int64
         }                                                        \
     }
 
-void KERNEL(cells_to_pixels)(const DepthJob *job) {
-    for (int64_t number = 0; number < job->planes; number++) {
-        for (int64_t i = 0; i < job->pixels[0]; i += TALL) for (int64_t node = 0; node < MAX(job->nodes[1], (int64_t)1); node++) {
-            const Plane plane = job->nodes[1] ? mix(job, number, i, node) : plane_of(job, number);
-            int64_t first = 0, last = job->pixels[1];
-            if (job->nodes[1]) find_columns(job, node, &first, &last);
-#define SUM(wide) sum_cells(&plane, i, j, wide)
+// Where pixels have kernels of their own, NODE_ROWS rows of them from row i on are done together, for one column of nodes and its shares
+// of the pixels. In the job's room are, for each row of cells from row i's first on, the taps of each of these rows.
+
+// A node's weight in a pixel along one axis.
+INLINE REAL of_node(double place, int64_t node) { return (REAL)MAX(1 - __builtin_fabs(place - node), 0.0); }
+
+// Rows of cells that NODE_ROWS rows of pixels from row i on reach.
+INLINE int64_t tall_of(const DepthJob *job, int64_t i) {
+    return MIN(job->taps[0] + (NODE_ROWS - 1) * job->step[0], job->rows - i * job->step[0]);
+}
+
+// Mix the taps, and find where in each row of cells any of the rows of pixels has some.
+INLINE void mix(const DepthJob *job, int64_t number, int64_t i, int64_t node) {
+    const int64_t step = job->step[0], rows = job->taps[0] + 2 * step, *taps = job->taps;
+    const REAL *kernels[NODE_ROWS];
+    REAL shares[NODE_ROWS];
+    const int64_t *bounds[NODE_ROWS];
+    for (int r = 0; r < NODE_ROWS; r++) {
+        const double place = job->node_rows[MIN(i + r, job->pixels[0] - 1)];
+        const int64_t before = MIN((int64_t)place, job->nodes[0] - 2), first = ((number * job->nodes[0] + before) * job->nodes[1] + node) * rows + step;
+        kernels[r] = (const REAL *)job->kernel + first * taps[1], shares[r] = (REAL)(place - before);
+        bounds[r] = (const int64_t *)job->bounds + 2 * first;
+    }
+    for (int64_t a = 0; a < tall_of(job, i); a++) {
+        int64_t low = taps[1], high = 0;
+        for (int r = 0; r < NODE_ROWS; r++) {
+            const int64_t row = a - r * step;
+            if (row < 0 || row >= taps[0] || !bounds[r][2 * row + 1]) continue;
+            low = MIN(low, bounds[r][2 * row]), high = MAX(high, bounds[r][2 * row + 1]);
+        }
+        job->room_bounds[2 * a] = low, job->room_bounds[2 * a + 1] = high;
+        for (int r = 0; r < NODE_ROWS; r++) {
+            const int64_t row = a - r * step;
+            REAL *const mixed = (REAL *)job->room + (a * NODE_ROWS + r) * taps[1];
+            const REAL *const one = kernels[r] + row * taps[1], *const next = one + job->nodes[1] * rows * taps[1], share = shares[r];
+            if (row < 0 || row >= taps[0]) for (int64_t b = low; b < high; b++) mixed[b] = 0;
+            else for (int64_t b = low; b < high; b++) mixed[b] = one[b] + share * (next[b] - one[b]);
+        }
+    }
+}
+
+// The columns of pixels in which a column of nodes has a share.
+INLINE void find_columns(const DepthJob *job, int64_t node, int64_t *first, int64_t *last) {
+    int64_t j = 0;
+    while (j < job->pixels[1] && job->node_columns[j] <= node - 1) j++;
+    *first = j;
+    while (j < job->pixels[1] && job->node_columns[j] < node + 1) j++;
+    *last = j;
+}
+
+INLINE void sum_for_node(const DepthJob *job, const Plane *of, int64_t i, int64_t j, int64_t node, const int wide) {
+    const int64_t *taps = job->taps, *step = job->step, tall = tall_of(job, i);
+    F sums[2][NODE_ROWS][WIDE] = {0};
+    for (int64_t a = 0; a < tall; a++) {
+        const int64_t low = job->room_bounds[2 * a], high = job->room_bounds[2 * a + 1];
+        const int64_t pixel = (uint32_t)low / (uint32_t)step[1], rest = low - pixel * step[1]; // a division is dear
+        for (int64_t place = 0; place < step[1]; place++) {
+            const int64_t from = pixel + (place < rest);
+            const REAL *cells = of->cells + (i * step[0] + a) * job->columns + place * of->together + j + from;
+            const REAL *tap = (const REAL *)job->room + a * NODE_ROWS * taps[1], *const end = tap + high;
+            tap += place + from * step[1];
+#define ADD(chain, k)                                                                       \
+    UNROLLED for (int w = 0; w < wide; w++) {                                               \
+        const F some = *(const Run *)(cells + k + w * LANES);                               \
+        UNROLLED for (int r = 0; r < NODE_ROWS; r++) sums[chain][r][w] += tap[k * step[1] + r * taps[1]] * some; \
+    }
+            for (; tap + step[1] < end; tap += 2 * step[1], cells += 2) {
+                ADD(0, 0)
+                ADD(1, 1)
+            }
+            if (tap < end) ADD(0, 0)
+#undef ADD
+        }
+    }
+    for (int64_t r = 0; r < MIN((int64_t)NODE_ROWS, job->pixels[0] - i); r++) {
+        UNROLLED for (int w = 0; w < wide; w++) sums[0][r][w] += sums[1][r][w];
+        REAL *const pixels = (REAL *)job->image + (i + r) * job->row + j;
+        const int64_t n = MIN(wide * (int64_t)LANES, job->pixels[1] - j);
+        for (int64_t p = 0; p < n; p++) pixels[p] += ((const REAL *)sums[0][r])[p] * of_node(job->node_columns[j + p], node);
+    }
+}
+
+// The adjoint: `pixels` are those rows, `apart`, by the node's share.
+INLINE void give_for_node(const DepthJob *job, const Plane *of, const REAL *pixels, int64_t apart, int64_t i, int64_t j, const int wide) {
+    const int64_t *taps = job->taps, *step = job->step, tall = tall_of(job, i), n = MIN(wide * (int64_t)LANES, of->together - j);
+    for (int64_t a = 0; a < tall; a++) {
+        const int64_t low = job->room_bounds[2 * a], high = job->room_bounds[2 * a + 1];
+        const int64_t pixel = (uint32_t)low / (uint32_t)step[1], rest = low - pixel * step[1];
+        for (int64_t place = 0; place < step[1]; place++) {
+            const int64_t from = pixel + (place < rest);
+            const REAL *some = pixels + j - from, *tap = (const REAL *)job->room + a * NODE_ROWS * taps[1], *const end = tap + high;
+            F sums[NODE_ROWS][WIDE] = {0};
+            for (tap += place + from * step[1]; tap < end; tap += step[1], some--) {
+                UNROLLED for (int r = 0; r < NODE_ROWS; r++) UNROLLED for (int w = 0; w < wide; w++) {
+                    sums[r][w] += tap[r * taps[1]] * *(const Run *)(some + r * apart + w * LANES);
+                }
+            }
+            UNROLLED for (int r = 1; r < NODE_ROWS; r++) UNROLLED for (int w = 0; w < wide; w++) sums[0][w] += sums[r][w];
+            REAL *const cells = of->cells + (i * step[0] + a) * job->columns + place * of->together + j;
+            for (int64_t k = 0; k < n; k++) cells[k] += ((const REAL *)sums[0])[k];
+        }
+    }
+}
+
+INLINE void sum_for_nodes(const DepthJob *job) {
+    for (int64_t number = 0; number < job->planes; number++) for (int64_t i = 0; i < job->pixels[0]; i += NODE_ROWS) {
+        const Plane plane = plane_of(job, number);
+        for (int64_t node = 0, first, last; node < job->nodes[1]; node++) {
+            mix(job, number, i, node);
+            find_columns(job, node, &first, &last);
+#define SUM(wide) sum_for_node(job, &plane, i, j, node, wide)
             EACH_RUN(j, first, last, SUM);
 #undef SUM
         }
     }
 }
 
-// The adjoint where pixels have kernels of their own: the cells are 0 before.
-INLINE void give_from_nodes(const DepthJob *job) {
+// The cells are 0 before.
+INLINE void give_for_nodes(const DepthJob *job) {
     const int64_t reach = (job->taps[1] - 1) / job->step[1], apart = reach + (job->columns / job->step[1] + 15) / 16 * 16;
-    const int64_t tall = job->taps[0] + (TALL - 1) * job->step[0];
-    REAL *const some = (REAL *)job->room + 2 * (job->taps[0] + 2 * job->step[0]) * job->taps[1] + reach;
-    for (int64_t number = 0; number < job->planes; number++) for (int64_t i = 0; i < job->pixels[0]; i += TALL) {
-        for (int64_t node = 0; node < job->nodes[1]; node++) {
-            const Plane plane = mix(job, number, i, node);
-            int64_t first, last;
+    REAL *const some = (REAL *)job->room + NODE_ROWS * (job->taps[0] + (NODE_ROWS - 1) * job->step[0]) * job->taps[1] + reach;
+    for (int64_t number = 0; number < job->planes; number++) for (int64_t i = 0; i < job->pixels[0]; i += NODE_ROWS) {
+        const Plane plane = plane_of(job, number);
+        for (int64_t node = 0, first, last; node < job->nodes[1]; node++) {
+            mix(job, number, i, node);
             find_columns(job, node, &first, &last);
-            for (int r = 0; r < TALL; r++) for (int64_t j = first; j < last; j++) {
-                const REAL *const row = (const REAL *)job->image + (i + r) * job->row;
-                some[r * apart + j] = i + r < job->pixels[0] ? row[j] * of_node(job->node_columns[j], node) : 0;
+            for (int64_t r = 0; r < MIN((int64_t)NODE_ROWS, job->pixels[0] - i); r++) for (int64_t j = first; j < last; j++) {
+                some[r * apart + j] = ((const REAL *)job->image)[(i + r) * job->row + j] * of_node(job->node_columns[j], node);
             }
             const int64_t end = MIN(last + reach, plane.together);
-            for (int64_t a = 0; a < tall && i * job->step[0] + a < job->rows; a++) for (int64_t place = 0; place < job->step[1]; place++) {
-#define GIVE(wide) give_cells(&plane, some, apart, a, i, place, j, wide)
-                EACH_RUN(j, first, end, GIVE);
+#define GIVE(wide) give_for_node(job, &plane, some, apart, i, j, wide)
+            EACH_RUN(j, first, end, GIVE);
 #undef GIVE
-            }
-            for (int r = 0; r < TALL; r++) for (int64_t j = first; j < last; j++) some[r * apart + j] = 0;
+            for (int r = 0; r < NODE_ROWS; r++) for (int64_t j = first; j < last; j++) some[r * apart + j] = 0;
+        }
+    }
+}
+
+void KERNEL(cells_to_pixels)(const DepthJob *job) {
+    if (job->nodes[1]) {
+        sum_for_nodes(job);
+        return;
+    }
+    for (int64_t number = 0; number < job->planes; number++) {
+        const Plane plane = plane_of(job, number);
+        for (int64_t i = 0; i < job->pixels[0]; i += TALL) {
+#define SUM(wide) sum_cells(&plane, i, j, wide)
+            EACH_RUN(j, 0, job->pixels[1], SUM);
+#undef SUM
         }
     }
 }
@@ -432,7 +491,7 @@ void KERNEL(differentiate_taps)(const DepthJob *job) {
 
 void KERNEL(pixels_to_cells)(const DepthJob *job) {
     if (job->nodes[1]) {
-        give_from_nodes(job);
+        give_for_nodes(job);
         return;
     }
     for (int64_t number = 0; number < job->planes; number++) {

@@ -13,6 +13,7 @@
 #pragma once
 #include <stdint.h>
 
+#define NODE_ROWS 4
 #define CONTRACT 9 // counted up with every change of this file: cpu.py takes no other
 
 // Voxels (n[0], n[1], n[2]) in C order, of a job's kind of number.
@@ -90,8 +91,9 @@ typedef struct {
     // of the nodes; the bounds of a node are also those of the next node's taps along the first axis.
     int64_t nodes[2];              // at least 2 along either axis
     const double *node_rows, *node_columns;
-    void *room;                    // for 2 kernels of a plane, and 2 rows of zeros as `image` has them, with the zeros before and after
-    int64_t *room_bounds;          // for 2 planes of bounds
+    void *room;                    // (taps[0] + (NODE_ROWS - 1) step[0], NODE_ROWS, taps[1]) numbers; and zeros, as many as NODE_ROWS rows of
+                                   // `image` with those before and after, and 16 more
+    int64_t *room_bounds;          // (taps[0] + (NODE_ROWS - 1) step[0], 2)
     double *gradient;              // what derivatives are added to: (planes, taps[0], taps[1]), or by `line` (3), and for each piece (4, 3): by
                                    // its `shifts`, and the same times x, y and z of the voxels
 } DepthJob;

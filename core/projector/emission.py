@@ -199,6 +199,11 @@ class Emission(Model):
             return self.hole == "depth"
         return {self.aperture_points, self.aperture_tolerance, self.pixel_points} == {None}
 
+    @property
+    def has_one_kernel(self) -> bool:
+        """Whether the hole's blur is the same for all directions: no path through the edge, no depth in the crystal."""
+        return self.edge == "paix" and self.depth_layers == 1
+
     def by_rays(self) -> Self:
         """The model for what can only be done with rays; `InputError` with hole "depth"."""
         if self.hole == "depth":
@@ -397,7 +402,7 @@ class Emission(Model):
             return everywhere.pixel_weights(m, u, v, (1.0, 1.0), float(lengths[m]), opening)
 
         of_modules = self._frames, lengths, everywhere.effective_diameter, sides, weigh
-        slants = None if passages[0].is_plain else passages
+        slants = None if self.has_one_kernel else passages
         return WholeHoles(views, grid, *of_modules, self.mu, self.hole == "depth", slants)
 
     def caution(self, views: Views, grid: Grid) -> str | None:

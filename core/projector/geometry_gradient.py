@@ -78,6 +78,11 @@ def geometry_gradient(A: Projector, volume: Volume | Floats | Floats32, images: 
             f"geometry gradient: voxels before pinhole {model.system.numbers[A._close_parts[0][0]]} are too close to it; "
             "take a smaller grid"
         )
+    if not model.has_one_kernel:
+        raise InputError(
+            "geometry gradient: edge 'path' and depth_layers have none yet with hole 'depth': use edge 'paix' and one layer, or "
+            "`emission_images` with rays"
+        )
     array = A._check(volume)
     array = array.reshape(-1, *A.shape_in)
     given = checked(images, "images", A.shape_out, A._float64, batch=True).reshape(-1, *A.shape_out)

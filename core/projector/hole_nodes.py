@@ -23,7 +23,7 @@ from .hole_kernel import KernelNumbers, Spectra, disc_transform, half_taps, of_p
 # Attenuation in the edge beyond which what passes is not counted; nodes of Gauss in the crystal.
 _MOST_PASSED, _DEPTHS = 7.5, 32
 # Taps that are this small, by those inside the shadow, are left out: tails are wide.
-_LEAST = 1.5e-3
+_LEAST = 5e-3
 
 
 @dataclass(frozen=True)
@@ -44,16 +44,19 @@ class Passage:
     @classmethod
     def of(cls, optics: Optics, diameter: float, thickness: float) -> Self:
         """That of a module with a hole of a diameter and a crystal of a thickness, mm."""
-        knife = optics.knife(diameter) if optics.edge == "path" else None
+        knife = None
+        if optics.edge == "path":
+            plate = optics.plate_thickness
+            knife = KnifeEdge(diameter / 2, float(optics.aperture_mu), float(optics.tangent), plate and float(plate))
         if optics.depth_layers == 1:
             return cls(knife, 0.0, thickness, 0.0, 0.0)
         mu = float(optics.crystal_mu)
         return cls(knife, mu, thickness, *recorded_depths(mu, thickness))
 
     @property
-    def is_plain(self) -> bool:
-        """Whether the image depends on the hole's diameter and the collimator's length alone."""
-        return self.knife is None and not self.crystal_mu
+    def decay(self) -> float:
+        """mm beyond the rim in which what passes along the axis falls by e."""
+        return 0.0 if self.knife is None else self.knife.tangent / (2 * self.knife.mu)
 
 
 class Slanted(NamedTuple):
@@ -93,8 +96,8 @@ def slanted(
     axis = slope / steep if steep > 0 else np.array([1.0, 0.0])
     parts, across, along, off = np.ones(1), np.full(1, diameter / 2), np.full(1, diameter / 2), np.zeros(1)
     if passage.knife is not None:
-        decay = float(passage.knife.tangent / (2 * passage.knife.mu)) / np.abs(sizes * steps).min()
-        parts, depths = _layers(passage.knife, steep, min(round(6 + 10 * decay), 32))
+        soft = passage.decay / float(np.abs(sizes * steps).min())
+        parts, depths = _layers(passage.knife, steep, min(round(6 + 10 * soft), 32))
         along, off, across = _ellipses(passage.knife, depths, steep, length)
     shares = parts * along * across / (diameter / 2) ** 2
     forms = 4 * (across**2)[:, None, None] * np.eye(2) + 4 * (along**2 - across**2)[:, None, None] * np.outer(axis, axis)
@@ -155,8 +158,8 @@ def node_kernels(numbers: KernelNumbers, steps: tuple[int, int], each: list[Slan
     """The kernels (planes, nodes along v, along u, taps, taps) of a lattice of nodes of a `shape`, row by row."""
     half = _half(numbers, steps, each)
     spectra = SlantedSpectra(numbers, steps, half, each, shape)
-    # By what a tap would be if those in the shadow of the hole and a pixel were alike.
-    least = _LEAST / (np.pi / 4 * numbers.hole.prod() * (1 + numbers.slopes) ** 2 + math.prod(steps))
+    # By what a tap would be if those in the widest shadow and a pixel were alike.
+    least = _LEAST / (np.pi / 4 * _widest(each).prod() * (1 + numbers.slopes) ** 2 + math.prod(steps))
     found = np.stack([of_pixels(spectra.image(i), numbers, steps, half, least)[0] for i in range(len(each))], axis=1)
     found *= spectra.totals[:, None, None]
     inside = []
@@ -170,8 +173,14 @@ def node_kernels(numbers: KernelNumbers, steps: tuple[int, int], each: list[Slan
 
 def _half(numbers: KernelNumbers, steps: tuple[int, int], each: list[Slanted]) -> tuple[int, int]:
     """Taps on each side of the middle one that all nodes need."""
-    widest = np.max([(np.sqrt(own.forms[:, :2]) + 2 * np.abs(own.centers)).max(axis=0) for own in each], axis=0)
-    return half_taps(numbers._replace(hole=widest), steps, np.max([np.abs(own.shifts).max(axis=0) for own in each], axis=0))
+    shifts = np.max([np.abs(own.shifts).max(axis=0) for own in each], axis=0)
+    return half_taps(numbers._replace(hole=_widest(each)), steps, shifts)
+
+
+def _widest(each: list[Slanted]) -> Array:
+    """The largest diameters of all ellipses, (2,)."""
+    widest: Array = np.max([(np.sqrt(own.forms[:, :2]) + 2 * np.abs(own.centers)).max(axis=0) for own in each], axis=0)
+    return widest
 
 
 class SlantedSpectra(Spectra):

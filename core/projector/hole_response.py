@@ -56,6 +56,8 @@ _PAIR_SMEAR = 0.366 * math.sqrt(12)
 # Where kernels depend on the direction, differences of slopes from node to node: for penetration, by the cone's; and for depths
 # in the crystal, times their standard deviation, in units of that of the hole's image.
 _NODE_SLOPES, _NODE_SMEAR = 0.2, 0.3
+# Width of a penetrated edge's shadow, in lengths in which what passes falls by e.
+_SOFT_EDGE = 3.0
 # Larger voxels, mm, are cut into parts of this size at most: kernels as wide as their shadows would take longer.
 _LARGEST = 6.0
 # Voxels that a thread adds to, in whole layers, before it takes others, and bytes of the views' cells that are in memory.
@@ -346,7 +348,8 @@ class WholeHoles:
         # Of the farthest voxel's image the widths, mm: of the hole's shadow and of the voxel's, where that is narrowest.
         across = np.linalg.svd(to_camera[:2, :3], compute_uv=False)
         widths = d * (1 + l / far), l / far * across[-1]
-        steps = _cells_of_pixel(abs(pitch[0]), *widths), _cells_of_pixel(abs(pitch[1]), *widths)
+        soft = _SOFT_EDGE * passage.decay * (1 + l / far) if passage is not None else 0.0
+        steps = _cells_of_pixel(abs(pitch[0]), *widths, soft), _cells_of_pixel(abs(pitch[1]), *widths, soft)
         _, middle, largest = sorted((*widths, np.abs(pitch).min()))
         sharpness = math.sqrt(middle * largest)
         half = float(np.linalg.norm(grid.spacing)) / 2
@@ -392,16 +395,16 @@ def _pixels_apart(passage: Passage, shadow: float, pitch: float, length: float) 
     """Pixels from node to node where kernels depend on the photons' direction."""
     slopes = []
     if passage.knife is not None:
-        slopes.append(_NODE_SLOPES * float(passage.knife.tangent))
+        slopes.append(_NODE_SLOPES * passage.knife.tangent)
     if passage.crystal_mu:
         slopes.append(_NODE_SMEAR * math.hypot(shadow / 4, pitch / math.sqrt(12)) / passage.spread)
     apart = max(1, int(min(slopes) * length / pitch))
     return apart // 8 * 8 or apart  # whole vectors of the backend cpu
 
 
-def _cells_of_pixel(pitch: float, shadow: float, voxel: float) -> int:
-    """Cells along a pixel's side."""
+def _cells_of_pixel(pitch: float, shadow: float, voxel: float, soft: float) -> int:
+    """Cells along a pixel's side; `soft` is how wide the shadow's edge is, mm."""
     small, middle, largest = sorted((pitch, shadow, voxel))
     sharpness = math.sqrt(middle * largest)
-    size = sharpness * (0.046 + 0.34 * min(small / sharpness, 0.35)) * (1 if shadow == largest else _LARGE_VOXELS)
+    size = sharpness * (0.046 + 0.34 * min(math.hypot(small, soft) / sharpness, 0.35)) * (1 if shadow == largest else _LARGE_VOXELS)
     return max(2, round(pitch / size + 0.2))

@@ -406,7 +406,7 @@ def _run_pixels(
     if of.places is not None:
         rows, columns = (np.ascontiguousarray(each) for each in of.places)
         tall = of.kernel.shape[-2] + (_NODE_ROWS - 1) * of.steps[0]
-        room = np.zeros(_NODE_ROWS * (tall * taps.shape[-1] + _padded_row(of)) + _READ_ON, image.dtype)
+        room = np.zeros(_NODE_ROWS * (tall * taps.shape[-1] + of.after.shape[1] + 2 * _READ_ON), image.dtype)
         bounds = np.empty((tall, 2), np.int64)
         nodes = {"nodes": taps.shape[1:3], "node_rows": rows.ctypes.data, "node_columns": columns.ctypes.data,
                  "room": room.ctypes.data, "room_bounds": bounds.ctypes.data}  # fmt: skip

@@ -401,24 +401,24 @@ INLINE void sum_for_node(const DepthJob *job, const Plane *of, int64_t i, int64_
     }
 }
 
-// The adjoint: `pixels` are those rows, `apart`, by the node's share.
+// The adjoint: `pixels` are those rows, `apart`, by the node's share. Neighbouring rows of cells follow each other: what was just
+// stored, a processor cannot read again a column farther on.
 INLINE void give_for_node(const DepthJob *job, const Plane *of, const REAL *pixels, int64_t apart, int64_t i, int64_t j, const int wide) {
-    const int64_t *taps = job->taps, *step = job->step, tall = tall_of(job, i), n = MIN(wide * (int64_t)LANES, of->together - j);
-    for (int64_t a = 0; a < tall; a++) {
-        const int64_t low = job->room_bounds[2 * a], high = job->room_bounds[2 * a + 1];
-        const int64_t pixel = (uint32_t)low / (uint32_t)step[1], rest = low - pixel * step[1];
-        for (int64_t place = 0; place < step[1]; place++) {
-            const int64_t from = pixel + (place < rest);
-            const REAL *some = pixels + j - from, *tap = (const REAL *)job->room + a * NODE_ROWS * taps[1], *const end = tap + high;
-            F sums[NODE_ROWS][WIDE] = {0};
-            for (tap += place + from * step[1]; tap < end; tap += step[1], some--) {
-                UNROLLED for (int r = 0; r < NODE_ROWS; r++) UNROLLED for (int w = 0; w < wide; w++) {
-                    sums[r][w] += tap[r * taps[1]] * *(const Run *)(some + r * apart + w * LANES);
-                }
+    const int64_t *taps = job->taps, *step = job->step, tall = tall_of(job, i);
+    F some[NODE_ROWS][WIDE];
+    UNROLLED for (int r = 0; r < NODE_ROWS; r++) UNROLLED for (int w = 0; w < wide; w++) some[r][w] = *(const Run *)(pixels + r * apart + j + w * LANES);
+    for (int64_t place = 0; place < step[1]; place++) for (int64_t b = place, at = j; b < taps[1]; b += step[1], at++) {
+        REAL *cells = of->cells + i * step[0] * job->columns + place * of->together + at;
+        const int64_t room = of->together - at; // a row of cells ends there
+        for (int64_t a = 0; a < tall; a++, cells += job->columns) {
+            if (b < job->room_bounds[2 * a] || b >= job->room_bounds[2 * a + 1]) continue;
+            const REAL *tap = (const REAL *)job->room + a * NODE_ROWS * taps[1] + b;
+            UNROLLED for (int w = 0; w < wide; w++) {
+                F sum = tap[0] * some[0][w];
+                UNROLLED for (int r = 1; r < NODE_ROWS; r++) sum += tap[r * taps[1]] * some[r][w];
+                if ((w + 1) * (int64_t)LANES <= room) *(Run *)(cells + w * LANES) += sum;
+                else for (int64_t k = w * LANES; k < room; k++) cells[k] += sum[k - w * LANES];
             }
-            UNROLLED for (int r = 1; r < NODE_ROWS; r++) UNROLLED for (int w = 0; w < wide; w++) sums[0][w] += sums[r][w];
-            REAL *const cells = of->cells + (i * step[0] + a) * job->columns + place * of->together + j;
-            for (int64_t k = 0; k < n; k++) cells[k] += ((const REAL *)sums[0])[k];
         }
     }
 }
@@ -438,8 +438,8 @@ INLINE void sum_for_nodes(const DepthJob *job) {
 
 // The cells are 0 before.
 INLINE void give_for_nodes(const DepthJob *job) {
-    const int64_t reach = (job->taps[1] - 1) / job->step[1], apart = reach + (job->columns / job->step[1] + 15) / 16 * 16;
-    REAL *const some = (REAL *)job->room + NODE_ROWS * (job->taps[0] + (NODE_ROWS - 1) * job->step[0]) * job->taps[1] + reach;
+    const int64_t apart = (job->pixels[1] + 31) / 16 * 16;
+    REAL *const some = (REAL *)job->room + NODE_ROWS * (job->taps[0] + (NODE_ROWS - 1) * job->step[0]) * job->taps[1];
     for (int64_t number = 0; number < job->planes; number++) for (int64_t i = 0; i < job->pixels[0]; i += NODE_ROWS) {
         const Plane plane = plane_of(job, number);
         for (int64_t node = 0, first, last; node < job->nodes[1]; node++) {
@@ -448,9 +448,8 @@ INLINE void give_for_nodes(const DepthJob *job) {
             for (int64_t r = 0; r < MIN((int64_t)NODE_ROWS, job->pixels[0] - i); r++) for (int64_t j = first; j < last; j++) {
                 some[r * apart + j] = ((const REAL *)job->image)[(i + r) * job->row + j] * of_node(job->node_columns[j], node);
             }
-            const int64_t end = MIN(last + reach, plane.together);
 #define GIVE(wide) give_for_node(job, &plane, some, apart, i, j, wide)
-            EACH_RUN(j, first, end, GIVE);
+            EACH_RUN(j, first, last, GIVE);
 #undef GIVE
             for (int r = 0; r < NODE_ROWS; r++) for (int64_t j = first; j < last; j++) some[r * apart + j] = 0;
         }

@@ -92,7 +92,7 @@ typedef struct {
     int64_t nodes[2];              // at least 2 along either axis
     const double *node_rows, *node_columns;
     void *room;                    // (taps[0] + (NODE_ROWS - 1) step[0], NODE_ROWS, taps[1]) numbers; and zeros, as many as NODE_ROWS rows of
-                                   // `image` with those before and after, and 16 more
+                                   // pixels, each with 31 more
     int64_t *room_bounds;          // (taps[0] + (NODE_ROWS - 1) step[0], 2)
     double *gradient;              // what derivatives are added to: (planes, taps[0], taps[1]), or by `line` (3), and for each piece (4, 3): by
                                    // its `shifts`, and the same times x, y and z of the voxels

@@ -33,8 +33,8 @@ _MOST_ATTENUATION = 12.0
 
 
 def _rings_of_plate() -> list[tuple[float, float]]:
-    """Nodes and weights beyond the rim in a plate, by its thickness: lines aslant are in it up to twice as far as straight ones."""
-    (x, w), (y, v) = np.polynomial.legendre.leggauss(6), np.polynomial.legendre.leggauss(4)
+    """Nodes and weights beyond the rim in a plate, by its attenuation: aslant, its edge is up to twice as wide."""
+    (x, w), (y, v) = (np.polynomial.legendre.leggauss(n) for n in (6, 4))  # type: ignore[no-untyped-call]
     x, y = (x + 1) / 2, (y + 1) / 2  # denser at the rim
     return [*zip((x**2).tolist(), (w * x).tolist(), strict=True), *zip((1 + y).tolist(), (v / 2).tolist(), strict=True)]
 

@@ -21,7 +21,7 @@ import numpy as np
 
 from ..arrays import ArrayOrTensor, is_tensor, namespace, promote, require_numbers
 from ..errors import InputError
-from ..geometry.collimator import OPENING_ANGLE, edge_slope
+from ..geometry.collimator import OPENING_ANGLE, Collimator, edge_slope
 from ..geometry.system import PinholeSystem
 from ..validation import freeze, real_array, shape_text, strict_whole
 from .aperture import KnifeEdge, Opening, openings, within_cone
@@ -179,6 +179,15 @@ class Optics:
         if self.edge == "paix":
             return openings(n, self.effective_diameter(diameter))
         return openings(n, diameter, self.knife(diameter))
+
+    def through_plate(self, built: Collimator) -> float:
+        """Photons that pass the solid plate beside a module's hole, by those through the hole, along the axis; at most."""
+        if self.plate_thickness is None:
+            return 0.0
+        widest = max(radius for _, radius in built.hole_profile)
+        beside = (2 * built.front_half_width) ** 2 - math.pi * widest**2
+        hole = math.pi / 4 * self.effective_diameter(built.diameter) ** 2
+        return float(math.exp(-self.aperture_mu * self.plate_thickness) * beside / hole)
 
     def knife(self, diameter: ArrayOrTensor) -> KnifeEdge:
         """The knife edge of a hole of a diameter, mm."""

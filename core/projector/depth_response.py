@@ -51,8 +51,10 @@ class DepthResponse:
     after: Array
     """(n_v, n_u): factors of the pixels."""
     places: tuple[Array, Array] | None = None
-    """Where the pixels' rows (n_v,) and columns (n_u,) lie on a lattice of nodes, in steps of it. Then `padded` has two axes
-    more after the planes', those of the nodes, and a pixel's kernel is mixed linearly from those of the four nodes around it."""
+    """Where the pixels' rows (n_v,) and columns (n_u,) lie on a lattice of nodes, in steps of it.
+
+    Then `padded` has two axes more after the planes', those of the nodes, and a pixel's kernel is mixed linearly from those
+    of the four nodes around it."""
 
     @property
     def shape(self) -> tuple[int, int, int]:

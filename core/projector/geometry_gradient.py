@@ -80,8 +80,8 @@ def geometry_gradient(A: Projector, volume: Volume | Floats | Floats32, images: 
         )
     if not model.has_one_kernel:
         raise InputError(
-            "geometry gradient: edge 'path' and depth_layers have none yet with hole 'depth': use edge 'paix' and one layer, or "
-            "`emission_images` with rays"
+            "geometry gradient: expected edge 'paix' and depth_layers 1; with edge 'path' or more layers take "
+            "`emission_images`, by rays"
         )
     array = A._check(volume)
     array = array.reshape(-1, *A.shape_in)

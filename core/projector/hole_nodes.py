@@ -2,9 +2,9 @@
 
 Where the lines to a pixel pass up to some depth of the edge is an ellipse in the hole's plane. So what the hole lets
 through is a sum of ellipses, each with the Fourier transform of a disc. A photon that is recorded at depth z in the crystal
-would have met the plane at the mean depth elsewhere along its line: the deeper, the nearer to the axis, and the smaller is the
-hole's shadow seen from there. Kernels are made for pixels at nodes, a lattice on the image, and those of a pixel are mixed
-from the four nodes around it.
+would have met the plane at the mean depth elsewhere along its line: the deeper, the nearer to the axis, and the smaller is
+the hole's shadow seen from there. Kernels are made for pixels at nodes, a lattice on the image, and those of a pixel are
+mixed from the four nodes around it.
 """
 
 import functools
@@ -100,7 +100,9 @@ def slanted(
         parts, depths = _layers(passage.knife, steep, min(round(6 + 10 * soft), 32))
         along, off, across = _ellipses(passage.knife, depths, steep, length)
     shares = parts * along * across / (diameter / 2) ** 2
-    forms = 4 * (across**2)[:, None, None] * np.eye(2) + 4 * (along**2 - across**2)[:, None, None] * np.outer(axis, axis)
+    forms = 4 * (across**2)[:, None, None] * np.eye(2) + 4 * (along**2 - across**2)[:, None, None] * np.outer(
+        axis, axis
+    )
     forms = forms / np.outer(sizes, sizes)
     shifts, nearer, weights, mixed = np.zeros((1, 2)), np.zeros(1), np.ones(1), np.zeros(2)
     if passage.crystal_mu:
@@ -150,7 +152,7 @@ def _ellipses(knife: KnifeEdge, depths: Array, slope: float, length: float) -> t
 @functools.lru_cache(maxsize=8)
 def _gauss(n: int) -> tuple[Array, Array]:
     """Nodes and weights from 0 to 1."""
-    x, w = np.polynomial.legendre.leggauss(n)
+    x, w = np.polynomial.legendre.leggauss(n)  # type: ignore[no-untyped-call]
     return (x + 1) / 2, w / 2
 
 
@@ -187,7 +189,12 @@ class SlantedSpectra(Spectra):
     """The spectra of nodes' images. What passes the hole is made for 3 x 3 of them, and is quadratic between these."""
 
     def __init__(
-        self, numbers: KernelNumbers, steps: tuple[int, int], half: tuple[int, int], each: list[Slanted], shape: tuple[int, int]
+        self,
+        numbers: KernelNumbers,
+        steps: tuple[int, int],
+        half: tuple[int, int],
+        each: list[Slanted],
+        shape: tuple[int, int],
     ) -> None:
         super().__init__(numbers, steps, half)
         self.each, self.common = each, self.pixel * self.sincs[0] * self.sincs[1] * self.sincs[2]
@@ -239,10 +246,7 @@ def _quadratic(n: int) -> tuple[list[int], Array]:
     chosen = [0, (n - 1) // 2, n - 1]
     others = [[b for b in chosen if b != a] for a in chosen]
     bases = np.stack(
-        [
-            np.prod([(np.arange(n) - b) / (a - b) for b in own], axis=0)
-            for a, own in zip(chosen, others, strict=True)
-        ],
+        [np.prod([(np.arange(n) - b) / (a - b) for b in own], axis=0) for a, own in zip(chosen, others, strict=True)],
         axis=-1,
     )
     return chosen, bases - np.diff(bases[:3], 2, axis=0) / 12

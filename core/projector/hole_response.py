@@ -53,8 +53,8 @@ _PLANE_APART, _POINT_SMEAR, _PART_SMEAR, _SKEW = 0.2, 0.17, 0.6, 0.16
 _LARGE_VOXELS = 0.6
 # Cells by which two points that share them may be smeared; by more, some of the cells' shares would be negative.
 _PAIR_SMEAR = 0.366 * math.sqrt(12)
-# Where kernels depend on the direction, differences of slopes from node to node: for penetration, by the cone's; and for depths
-# in the crystal, times their standard deviation, in units of that of the hole's image.
+# Where kernels depend on the direction, differences of slopes from node to node: for penetration, by the cone's; and for
+# depths in the crystal, times their standard deviation, in units of that of the hole's image.
 _NODE_SLOPES, _NODE_SMEAR = 0.2, 0.3
 # Width of a penetrated edge's shadow, in lengths in which what passes falls by e.
 _SOFT_EDGE = 3.0
@@ -406,5 +406,6 @@ def _cells_of_pixel(pitch: float, shadow: float, voxel: float, soft: float) -> i
     """Cells along a pixel's side; `soft` is how wide the shadow's edge is, mm."""
     small, middle, largest = sorted((pitch, shadow, voxel))
     sharpness = math.sqrt(middle * largest)
-    size = sharpness * (0.046 + 0.34 * min(math.hypot(small, soft) / sharpness, 0.35)) * (1 if shadow == largest else _LARGE_VOXELS)
+    size = sharpness * (0.046 + 0.34 * min(math.hypot(small, soft) / sharpness, 0.35))
+    size *= 1 if shadow == largest else _LARGE_VOXELS
     return max(2, round(pitch / size + 0.2))

@@ -175,14 +175,14 @@ class Zone:
         """Those of the pixels, or of the nodes."""
         if self.passage is None:
             return kernels(self.kernel_numbers, self.steps)
-        each, shape = self._nodes()
+        each, shape = self._nodes(self.passage)
         return node_kernels(self.kernel_numbers, self.steps, each, shape)
 
-    def _nodes(self) -> tuple[list[Slanted], tuple[int, int]]:
+    def _nodes(self, passage: Passage) -> tuple[list[Slanted], tuple[int, int]]:
         """What the kernels of nodes are made of, row by row, and how many there are along v and u."""
         n = self.numbers
         v, u = (n.first[i] + n.pitch[i] * node_places(self.pixels[i], self.apart) for i in range(2))
-        common = self.passage, n.diameter, n.length, self._sizes
+        common = passage, n.diameter, n.length, self._sizes
         more = self.share, np.array(self.steps), self.apart
         return [slanted(*common, np.array([a, b]), *more) for a in v for b in u], (len(v), len(u))
 

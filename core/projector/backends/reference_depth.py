@@ -61,7 +61,7 @@ def _nodes(of: DepthResponse) -> Iterator[tuple[Array, Array]]:
     for number in np.ndindex(of.kernel.shape[1:3]):
         by_row, by_column = (np.maximum(1 - np.abs(at - k), 0) for at, k in zip(of.places, number, strict=True))
         if by_row.any() and by_column.any():
-            yield of.kernel[:, *number], np.outer(by_row, by_column)
+            yield of.kernel[:, number[0], number[1]], np.outer(by_row, by_column)
 
 
 def _pixels(of: DepthResponse) -> tuple[slice, ...]:

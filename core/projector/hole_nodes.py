@@ -23,7 +23,7 @@ from .hole_kernel import KernelNumbers, Spectra, disc_transform, half_taps, of_p
 # Attenuation in the edge beyond which what passes is not counted; nodes of Gauss in the crystal.
 _MOST_PASSED, _DEPTHS = 7.5, 32
 # Taps that are this small, by those inside the shadow, are left out: tails are wide.
-_LEAST = 5e-3
+_LEAST = 3e-3
 
 
 @dataclass(frozen=True)
@@ -162,7 +162,11 @@ def node_kernels(numbers: KernelNumbers, steps: tuple[int, int], each: list[Slan
     spectra = SlantedSpectra(numbers, steps, half, each, shape)
     # By what a tap would be if those in the widest shadow and a pixel were alike.
     least = _LEAST / (np.pi / 4 * _widest(each).prod() * (1 + numbers.slopes) ** 2 + math.prod(steps))
-    found = np.stack([of_pixels(spectra.image(i), numbers, steps, half, least)[0] for i in range(len(each))], axis=1)
+    kernels = []
+    for i in range(len(each)):
+        image = spectra.image(i)
+        kernels.append(_moved(of_pixels(image, numbers, steps, half, least)[0], image[1:-1]))
+    found = np.stack(kernels, axis=1)
     found *= spectra.totals[:, None, None]
     inside = []
     for axis, h in ((-1, half[0]), (-2, half[1])):
@@ -177,6 +181,20 @@ def _half(numbers: KernelNumbers, steps: tuple[int, int], each: list[Slanted]) -
     """Taps on each side of the middle one that all nodes need."""
     shifts = np.max([np.abs(own.shifts).max(axis=0) for own in each], axis=0)
     return half_taps(numbers._replace(hole=_widest(each)), steps, shifts)
+
+
+def _moved(kernel: Array, image: Array) -> Array:
+    """A kernel (planes, taps, taps) with the mean place of the image, from which the faint end of a tail was taken."""
+    tilt = np.ones_like(kernel)
+    for axis, other in ((1, 2), (2, 1)):
+        along, wanted = (each.sum(axis=other) / each.sum(axis=(1, 2))[:, None] for each in (kernel, image))
+        taps = np.arange(along.shape[1]) - along.shape[1] // 2
+        mean = (along * taps).sum(axis=1, keepdims=True)
+        off = taps - mean
+        missing = (wanted * taps).sum(axis=1, keepdims=True) - mean
+        tilt += np.expand_dims(missing * off / (along * off**2).sum(axis=1, keepdims=True), other)
+    moved: Array = kernel * tilt.clip(min=0)
+    return moved
 
 
 def _widest(each: list[Slanted]) -> Array:

@@ -219,9 +219,10 @@ class SlantedSpectra(Spectra):
         chosen, bases = zip(*(_quadratic(n) for n in shape), strict=True)
         self.holes = np.array([self._hole(each[i * shape[1] + j]) for i in chosen[0] for j in chosen[1]])
         self.bases = np.einsum("ik,jl->ijkl", *bases).reshape(len(each), -1)
-        passed = np.array([[each[i * shape[1] + j].shares.sum() for j in chosen[1]] for i in chosen[0]])
-        self.passed = self.bases @ passed.ravel()
-        self.totals = self.passed * [own.weights.sum() for own in each]
+        passed = np.reshape([own.shares.sum() for own in each], shape)
+        self.passed = self.bases @ passed[np.ix_(*chosen)].ravel()
+        exact = passed - sum(_second_difference(passed, axis) / 12 for axis in (0, 1))
+        self.totals = exact.ravel() * [own.weights.sum() for own in each]
 
     def _hole(self, own: Slanted) -> Array:
         """What passes the hole; and with depths, how that grows with the shadow's part that is not l / h."""
@@ -252,6 +253,13 @@ class SlantedSpectra(Spectra):
         if len(hole) > 1:
             total += hole[1] * smear[1]
         return self.spatial(self.common * total)
+
+
+def _second_difference(values: Array, axis: int) -> Array:
+    if values.shape[axis] < 3:
+        return np.zeros_like(values)
+    ends = [(1, 1) if i == axis else (0, 0) for i in range(values.ndim)]
+    return np.pad(np.diff(values, 2, axis=axis), ends, "edge")
 
 
 def _quadratic(n: int) -> tuple[list[int], Array]:

@@ -72,7 +72,9 @@ def test_a_point_has_the_image_of_photons_one_by_one(place):
 
 @pytest.mark.long
 @pytest.mark.parametrize("pixels", [32, 64, 96])
-@pytest.mark.parametrize(("mu", "plate", "within"), [(TUNGSTEN, None, 1.0), (TUNGSTEN, 2.0, 1.0), (0.9, None, 1.5), (0.6, 4.0, 2.5)])
+@pytest.mark.parametrize(
+    ("mu", "plate", "within"), [(TUNGSTEN, None, 1.0), (TUNGSTEN, 2.0, 1.0), (0.9, None, 1.5), (0.6, 4.0, 2.5)]
+)
 def test_so_it_has_for_any_pixels_edges_and_plates(pixels, mu, plate, within):
     system = module()
     for place in PLACES[:3]:
@@ -120,5 +122,9 @@ def test_a_thin_plate_is_warned_of_and_paix_has_none():
 
 def test_derivatives_by_the_geometry_are_refused():
     system = module()
-    A = mph.Projector(mph.Grid.centered((4, 4, 4), 5.0), system.views((8, 8)), mph.Emission(system, edge="path", aperture_mu=3.0))
-    refused(lambda: mph.geometry_gradient(A, np.ones(A.shape_in), np.ones(A.shape_out)), "edge 'paix'", "depth_layers 1")
+    A = mph.Projector(
+        mph.Grid.centered((4, 4, 4), 5.0), system.views((8, 8)), mph.Emission(system, edge="path", aperture_mu=3.0)
+    )
+    refused(
+        lambda: mph.geometry_gradient(A, np.ones(A.shape_in), np.ones(A.shape_out)), "edge 'paix'", "depth_layers 1"
+    )

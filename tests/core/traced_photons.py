@@ -1,4 +1,4 @@
-"""Photons one by one from a small cube through a knife-edged plate into a crystal, to hold the projector's images against."""
+"""Photons one by one from a small cube through a knife-edged plate into a crystal: what images are compared with."""
 
 from __future__ import annotations
 
@@ -39,7 +39,6 @@ def image_of_voxel(system, place, pixels, size=0.3, backend="auto", **model):
 
 def traced_image(system, place, pixels, size=0.3, n=2**18, edge_mu=None, plate=20.0, crystal_mu=None):
     """The same by n photons, spread as evenly as random ones can be. The cone's half angle is 45 degrees."""
-    u, v, _ = system.frames()[0]
     d, l, side, thickness = (
         float(each[0])
         for each in (system.pinhole_diameter, system.collimator_length, system.detector_side, system.detector_thickness)

@@ -186,7 +186,7 @@ def _half(numbers: KernelNumbers, steps: tuple[int, int], each: list[Slanted]) -
 def _moved(kernel: Array, image: Array) -> Array:
     """A kernel (planes, taps, taps) with the mean place of the image, from which the faint end of a tail was taken."""
     tilt = np.ones_like(kernel)
-    for axis, other in ((1, 2), (2, 1)):
+    for other in (2, 1):
         along, wanted = (each.sum(axis=other) / each.sum(axis=(1, 2))[:, None] for each in (kernel, image))
         taps = np.arange(along.shape[1]) - along.shape[1] // 2
         mean = (along * taps).sum(axis=1, keepdims=True)

@@ -9,6 +9,7 @@ mixed from the four nodes around it.
 
 import functools
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import NamedTuple, Self
 
@@ -163,8 +164,7 @@ def node_kernels(numbers: KernelNumbers, steps: tuple[int, int], each: list[Slan
     # By what a tap would be if those in the widest shadow and a pixel were alike.
     least = _LEAST / (np.pi / 4 * _widest(each).prod() * (1 + numbers.slopes) ** 2 + math.prod(steps))
     kernels = []
-    for i in range(len(each)):
-        image = spectra.image(i)
+    for image in spectra.node_images():
         kernels.append(_moved(of_pixels(image, numbers, steps, half, least)[0], image[1:-1]))
     found = np.stack(kernels, axis=1)
     found *= spectra.totals[:, None, None]
@@ -216,11 +216,10 @@ class SlantedSpectra(Spectra):
     ) -> None:
         super().__init__(numbers, steps, half)
         self.each, self.common = each, self.pixel * self.sincs[0] * self.sincs[1] * self.sincs[2]
-        chosen, bases = zip(*(_quadratic(n) for n in shape), strict=True)
-        self.holes = np.array([self._hole(each[i * shape[1] + j]) for i in chosen[0] for j in chosen[1]])
-        self.bases = np.einsum("ik,jl->ijkl", *bases).reshape(len(each), -1)
+        chosen, self.bases = zip(*(_quadratic(n) for n in shape), strict=True)
+        self.holes = np.array([[self._hole(each[i * shape[1] + j]) for j in chosen[1]] for i in chosen[0]])
         passed = np.reshape([own.shares.sum() for own in each], shape)
-        self.passed = self.bases @ passed[np.ix_(*chosen)].ravel()
+        self.passed = self.bases[0] @ passed[np.ix_(*chosen)] @ self.bases[1].T
         exact = passed - sum(_second_difference(passed, axis) / 12 for axis in (0, 1))
         self.totals = exact.ravel() * [own.weights.sum() for own in each]
 
@@ -245,14 +244,17 @@ class SlantedSpectra(Spectra):
         total: Array = (waves[0] * shares[:, :, None]).swapaxes(1, 2) @ waves[1]
         return total * (1 + 2 * np.pi**2 * (own.mixed[0] * self.f[0] ** 2 + own.mixed[1] * self.f[1] ** 2))
 
-    def image(self, i: int) -> Array:
-        """A node's, (planes + 2, taps, taps)."""
-        smear = self._smear(self.each[i]) / self.passed[i]
-        hole = np.tensordot(self.bases[i], self.holes, 1)
-        total = hole[0] * smear[0]
-        if len(hole) > 1:
-            total += hole[1] * smear[1]
-        return self.spatial(self.common * total)
+    def node_images(self) -> Iterator[Array]:
+        """The nodes' images one by one, row by row, each (planes + 2, taps, taps)."""
+        each = iter(self.each)
+        for of_row, passed in zip(self.bases[0], self.passed, strict=True):
+            row = np.tensordot(of_row, self.holes, 1) * self.common
+            for of_node, share in zip(self.bases[1], passed, strict=True):
+                hole, smear = np.tensordot(of_node, row, 1), self._smear(next(each)) / share
+                total = hole[0] * smear[0]
+                if len(hole) > 1:
+                    total += hole[1] * smear[1]
+                yield self.spatial(total)
 
 
 def _second_difference(values: Array, axis: int) -> Array:

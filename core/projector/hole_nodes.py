@@ -23,6 +23,8 @@ from .hole_kernel import KernelNumbers, Spectra, disc_transform, half_taps, of_p
 
 # Attenuation in the edge beyond which what passes is not counted; nodes of Gauss in the crystal.
 _MOST_PASSED, _DEPTHS = 7.5, 32
+# Slopes up to which the edge is a cone's, by the cone's own: steeper lines count nothing.
+_STEEPEST = 0.98
 # Taps that are this small, by those inside the shadow, are left out: tails are wide.
 _LEAST = 3e-3
 
@@ -98,7 +100,7 @@ def slanted(
     parts, across, along, off = np.ones(1), np.full(1, diameter / 2), np.full(1, diameter / 2), np.zeros(1)
     if passage.knife is not None:
         soft = passage.decay / float(np.abs(sizes * steps).min())
-        parts, depths = _layers(passage.knife, steep, min(round(6 + 10 * soft), 32))
+        parts, depths = _layers(passage.knife, min(steep, _STEEPEST * passage.knife.tangent), min(round(6 + 10 * soft), 32))
         along, off, across = _ellipses(passage.knife, depths, steep, length)
     shares = parts * along * across / (diameter / 2) ** 2
     forms = 4 * (across**2)[:, None, None] * np.eye(2) + 4 * (along**2 - across**2)[:, None, None] * np.outer(
@@ -138,11 +140,12 @@ def _ellipses(knife: KnifeEdge, depths: Array, slope: float, length: float) -> t
 
     The lines meet in a point `length` behind the hole: their slopes differ from place to place.
     """
-    found = []
+    found, most = [], _STEEPEST * knife.tangent
+    slope = min(slope, most)
     for towards, across in ((slope, 0.0), (-slope, 0.0), (0.0, slope)):
         reach = knife.radius + 0 * depths
         for _ in range(6):
-            along = towards + reach / length
+            along = (towards + reach / length).clip(-most, most)
             secant = np.sqrt((1 + along**2 + across**2) / (1 + slope**2))
             reach = knife.reach(depths / secant, along, across)
         found.append(reach)

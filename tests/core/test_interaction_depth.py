@@ -43,13 +43,13 @@ def test_a_point_has_the_image_of_photons_one_by_one(place):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("pixels", [32, 64, 96])
+@pytest.mark.parametrize("pixels", [32, 96])
 @pytest.mark.parametrize(("edge_mu", "mu"), [(None, IODIDE), (TUNGSTEN, IODIDE), (None, 0.08), (TUNGSTEN, 0.08)])
 def test_so_it_has_for_any_pixels_and_crystals(pixels, edge_mu, mu):
     system = module()
     edge = {} if edge_mu is None else {"edge": "path", "aperture_mu": edge_mu}
-    for place in PLACES:
-        exact = traced_image(system, place, pixels, n=2**22, edge_mu=edge_mu, crystal_mu=mu)
+    for place in PLACES[1:3]:
+        exact = traced_image(system, place, pixels, n=2**20, edge_mu=edge_mu, crystal_mu=mu)
         found = image_of_voxel(system, place, pixels, crystal_mu=mu, depth_layers=2, **edge)
         assert misplaced(found, exact) < 2 * bound(place)
         assert found.sum() == pytest.approx(exact.sum(), rel=6e-3)

@@ -71,14 +71,14 @@ def test_a_point_has_the_image_of_photons_one_by_one(place):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("pixels", [32, 64, 96])
+@pytest.mark.parametrize("pixels", [32, 96])
 @pytest.mark.parametrize(
     ("mu", "plate", "within"), [(TUNGSTEN, None, 1.0), (TUNGSTEN, 2.0, 1.0), (0.9, None, 1.5), (0.6, 4.0, 2.5)]
 )
 def test_so_it_has_for_any_pixels_edges_and_plates(pixels, mu, plate, within):
     system = module()
-    for place in PLACES[:3]:
-        exact = traced_image(system, place, pixels, n=2**22, edge_mu=mu, plate=plate or 20.0)
+    for place in PLACES[1:3]:
+        exact = traced_image(system, place, pixels, n=2**20, edge_mu=mu, plate=plate or 20.0)
         found = image_of_voxel(system, place, pixels, edge="path", aperture_mu=mu, plate_thickness=plate)
         assert misplaced(found, exact) < within * bound(place)
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ..arrays import ArrayOrTensor, Floats, is_tensor
 from ..errors import InputError, naming
-from ..geometry.collimator import OPENING_ANGLE, Construction
+from ..geometry.collimator import OPENING_ANGLE
 from ..geometry.grid import Grid
 from ..geometry.system import PinholeSystem
 from ..geometry.views import Views
@@ -37,9 +37,6 @@ _SAME_DIRECTION = 1e-6
 _FWHM_PER_SIGMA = 2 * math.sqrt(2 * math.log(2))
 # A box of this width has the same variance as a Gaussian of sigma 1.
 _BOX_PER_SIGMA = math.sqrt(12)
-
-# Share of the photons that may pass the solid plate without a word.
-_MOST_THROUGH = 0.005
 
 Hole = Literal["auto", "depth", "rays", "point"]
 
@@ -412,10 +409,8 @@ class Emission(Model):
         return WholeHoles(views, grid, *of_modules, self.mu, self.hole == "depth", slants)
 
     def caution(self, views: Views, grid: Grid) -> str | None:
-        """A warning where too many photons pass the solid plate, or there are too few rays for the tolerance."""
-        if plate := self._plate_caution():
-            return plate
-        if self._is_by_depth:  # has no rays
+        """A warning where there are too few rays for the tolerance."""
+        if self._is_by_depth:  # has none
             return None
         points = [(self._pixel_points(views, m, grid), self.hole_points(views, m, grid)) for m in range(len(views))]
         errors = [expected_error(shadow_edges(views, m, grid), *points[m]) for m in range(len(views))]
@@ -430,20 +425,6 @@ class Emission(Model):
         return (
             f"emission: with {n} point{'s' * (n > 1)} of each pixel the total counts of a single voxel of {voxel} mm may be "
             f"{most} % off (in module {self.system.numbers[module]}), those of larger sources less; {advice}"
-        )
-
-    def _plate_caution(self) -> str | None:
-        """A warning where what passes the solid plate, which no model counts, is a share of the photons that matters."""
-        shares = [0.0]
-        for m in range(len(self.system) if self.plate_thickness is not None else 0):
-            optics = self._optics_of(m)
-            built = Construction(float(optics.plate_thickness), opening_angle=float(optics.opening_angle))
-            shares.append(optics.through_plate(self.system[m : m + 1].collimators(built)[0]))
-        if max(shares) <= _MOST_THROUGH:
-            return None
-        return (
-            f"emission: photons through the solid plate beside the hole are not counted: up to {100 * max(shares):.2g} % of "
-            f"those through the hole (module {self.system.numbers[int(np.argmax(shares)) - 1]})"
         )
 
     def _pixel_points(self, views: Views, m: int, grid: Grid) -> int:

@@ -53,8 +53,8 @@ def _doubts_of_plates(model: Emission) -> Iterator[str]:
     worst = int(np.argmax(shares))
     if shares[worst] > _MOST_THROUGH:
         yield (
-            f"emission: photons through the solid plate beside the hole are not counted: up to {100 * shares[worst]:.2g} % of "
-            f"those through the hole (module {model.system.numbers[worst]})"
+            "emission: photons through the solid plate beside the hole are not counted: "
+            f"up to {100 * shares[worst]:.2g} % of those through the hole (module {model.system.numbers[worst]})"
         )
 
 

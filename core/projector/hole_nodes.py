@@ -100,7 +100,9 @@ def slanted(
     parts, across, along, off = np.ones(1), np.full(1, diameter / 2), np.full(1, diameter / 2), np.zeros(1)
     if passage.knife is not None:
         soft = passage.decay / float(np.abs(sizes * steps).min())
-        parts, depths = _layers(passage.knife, min(steep, _STEEPEST * passage.knife.tangent), min(round(6 + 10 * soft), 32))
+        parts, depths = _layers(
+            passage.knife, min(steep, _STEEPEST * passage.knife.tangent), min(round(6 + 10 * soft), 32)
+        )
         along, off, across = _ellipses(passage.knife, depths, steep, length)
     shares = parts * along * across / (diameter / 2) ** 2
     forms = 4 * (across**2)[:, None, None] * np.eye(2) + 4 * (along**2 - across**2)[:, None, None] * np.outer(

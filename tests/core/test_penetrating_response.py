@@ -57,7 +57,9 @@ def test_anywhere_the_total_is_the_sensitivity(plate):
     for place in PLACES:
         at = system.centers[0] + np.asarray(place) @ system.frames()[0]
         (law,) = sensitivity(system, at[None], optics=mph.Emission(system, **model).optics)[0]
-        assert image_of_voxel(system, place, 64, **model).sum() == pytest.approx(law, rel=1e-3 if plate is None else 2e-3)
+        assert image_of_voxel(system, place, 64, **model).sum() == pytest.approx(
+            law, rel=1e-3 if plate is None else 2e-3
+        )
 
 
 @pytest.mark.parametrize("place", PLACES)

@@ -28,6 +28,18 @@ _PLACES = 32
 _ROOT = math.sqrt(2)
 _EDGE_RINGS = ((2 - _ROOT, (2 + _ROOT) / 4), (2 + _ROOT, (2 - _ROOT) / 4))
 _FEWEST_EDGE_ANGLES = 7
+# Beyond this attenuation nothing passes that counts.
+_MOST_ATTENUATION = 12.0
+
+
+def _rings_of_plate() -> list[tuple[float, float]]:
+    """Nodes and weights beyond the rim in a plate, by its attenuation: aslant, its edge is up to twice as wide."""
+    (x, w), (y, v) = (np.polynomial.legendre.leggauss(n) for n in (6, 4))  # type: ignore[no-untyped-call]
+    x, y = (x + 1) / 2, (y + 1) / 2  # denser at the rim
+    return [*zip((x**2).tolist(), (w * x).tolist(), strict=True), *zip((1 + y).tolist(), (v / 2).tolist(), strict=True)]
+
+
+_RINGS_OF_PLATE = _rings_of_plate()
 
 
 def disk_points(n: int) -> Floats:
@@ -93,11 +105,12 @@ def _point_images(points: Floats, shadow: float, pitch: tuple[float, float], blu
 
 @dataclass(frozen=True)
 class KnifeEdge:
-    """A double-cone hole in an infinitely thick plate: material fills r > radius + |z| tan(alpha / 2)."""
+    """A double-cone hole in the middle of a plate: material fills r > radius + |z| tan(alpha / 2) between its faces."""
 
     radius: ArrayOrTensor  # of the hole, mm
     mu: ArrayOrTensor  # 1/mm
     tangent: ArrayOrTensor  # tan(alpha / 2)
+    plate: ArrayOrTensor = None  # thickness, mm; None: infinite
 
     def transmission(
         self, x: ArrayOrTensor, y: ArrayOrTensor, slope_u: ArrayOrTensor, slope_v: ArrayOrTensor, library: Any = np
@@ -106,7 +119,10 @@ class KnifeEdge:
 
         Such a line is inside the material between the two cones; one that is steeper than the cone never leaves it. It
         crosses at (x, y), mm from the hole's centre, and goes by the slopes, mm along u and v per mm along the axis.
+        Through a plate with faces, lines of any slope pass, inside the hole and outside.
         """
+        if self.plate is not None:
+            return self._through_plate(x, y, slope_u, slope_v, library)
         slope = slope_u**2 + slope_v**2
         along = x * slope_u + y * slope_v
         beyond = x * x + y * y - self.radius**2
@@ -118,6 +134,41 @@ class KnifeEdge:
             depth = depth + beyond / ((closing**2 + opens * beyond) ** 0.5 + closing)
         return library.where(passes, library.exp(-self.mu * depth * (1 + slope) ** 0.5), 0.0)
 
+    def _through_plate(self, x: Any, y: Any, slope_u: Any, slope_v: Any, library: Any) -> ArrayOrTensor:
+        slope, face = slope_u**2 + slope_v**2, self.plate / 2
+        along, beyond = x * slope_u + y * slope_v, x * x + y * y - self.radius**2
+        steeper = slope - self.tangent**2
+        safe = library.where(abs(steeper) < 1e-12, 1e-12 + 0 * steeper, steeper)
+        depth = 0.0
+        for side in (along, -along):  # |(x, y) + z slope| > radius + z tangent, on either side
+            half = side - self.radius * self.tangent
+            root = half * half - safe * beyond
+            crosses = root > 0
+            root = library.where(crosses, root, 1.0) ** 0.5
+            ends = [(-half - sign * root) / safe for sign in (1, -1)]
+            first, last = (library.where(z > 0, library.where(z < face, z, face), 0.0) for z in ends)
+            hole = library.where(crosses, last - first, 0.0)  # less steep, it is what lies beside
+            depth = depth + library.where(safe > 0, face - hole, -hole)
+        return library.exp(-self.mu * depth * (1 + slope) ** 0.5)
+
+    def through(self, slope_u: ArrayOrTensor, slope_v: ArrayOrTensor, library: Any = np) -> ArrayOrTensor:
+        """Fraction of the photons that pass the plate where it is solid."""
+        if self.plate is None:
+            return 0.0
+        return library.exp(-self.mu * self.plate * (1 + slope_u**2 + slope_v**2) ** 0.5)
+
+    def reach(self, depth: Any, along: Any, across: Any) -> Any:
+        """How far from the hole's middle, mm, lines pass a `depth` of the edge, mm along the axis.
+
+        Their slopes are `along` the way from the middle to where they cross the hole's plane, and `across` it. Between faces
+        this is exact where either is 0: parallel lines that pass up to some depth fill an ellipse.
+        """
+        steep = self.tangent + abs(along)
+        longer = depth * steep / (2 * self.tangent)  # on the side where the edge recedes from the line
+        if self.plate is not None:
+            longer = np.minimum(longer, self.plate / 2)
+        return ((self.radius + (depth - longer) * steep) ** 2 - (depth / 2 * across) ** 2) ** 0.5
+
     def points(self, n: int) -> list[tuple[ArrayOrTensor, ArrayOrTensor, ArrayOrTensor]]:
         """Sample points beyond the rim: (x, y) in mm, and the area, mm^2, that each represents.
 
@@ -125,13 +176,17 @@ class KnifeEdge:
         At 0.7 of the cone's slope it is about 0.1 % of the hole's area off, and close to the cone 1 %.
         """
         depth = self.tangent / (2 * self.mu)  # where a fraction exp(-1) of the rays along the axis pass
+        rings: Any = [(node, weight * math.exp(node)) for node, weight in _EDGE_RINGS]
+        if self.plate is not None:
+            most = ((self.mu * self.plate) ** -4 + _MOST_ATTENUATION**-4) ** -0.25  # the smaller one
+            rings = [(most * node, most * weight) for node, weight in _RINGS_OF_PLATE]
         # An odd number, so that no two points are opposite: opposite points transmit the same.
         angles = max(_FEWEST_EDGE_ANGLES, math.ceil(2 * math.sqrt(math.pi * n)) | 1)
         points = []
-        for ring, (node, weight) in enumerate(_EDGE_RINGS):
+        for ring, (node, weight) in enumerate(rings):
             radius = self.radius + depth * node
-            area = 2 * math.pi * radius / angles * depth * weight * math.exp(node)
-            turned = 2 * math.pi * (np.arange(angles) + ring / len(_EDGE_RINGS)) / angles
+            area = 2 * math.pi * radius / angles * depth * weight
+            turned = 2 * math.pi * (np.arange(angles) + ring / 2) / angles
             points += [(radius * math.cos(angle), radius * math.sin(angle), area) for angle in turned]
         return points
 
@@ -147,12 +202,16 @@ class Opening:
     beyond: Sequence[tuple[ArrayOrTensor, ...]] = ()  # represented points of the edge: x, y, area
 
     def area(self, slope_u: ArrayOrTensor, slope_v: ArrayOrTensor, library: Any = np) -> ArrayOrTensor:
-        """Area, mm^2, open to photons with slopes in mm along u and v per mm along the axis."""
+        """Area, mm^2, open to photons with slopes in mm along u and v per mm along the axis.
+
+        What would pass the plate were it solid is not in it.
+        """
         if self.knife is None:
             return self.hole
-        area = self.hole * within_cone(slope_u, slope_v, self.knife.tangent, library)
+        passes = within_cone(slope_u, slope_v, self.knife.tangent, library)
+        area, through = self.hole * passes, self.knife.through(slope_u, slope_v, library) * passes
         for x, y, size in self.beyond:
-            area = area + size * self.knife.transmission(x, y, slope_u, slope_v, library)
+            area = area + size * (self.knife.transmission(x, y, slope_u, slope_v, library) * passes - through)
         return area
 
 

@@ -41,6 +41,13 @@ def absorbed_share(
     return reached(layer - 1) - reached(layer)
 
 
+def recorded_depths(mu: float, thickness: float) -> tuple[float, float]:
+    """Mean, and standard deviation, of the depths, mm, at which a crystal stops photons along its normal."""
+    tau = mu * thickness
+    left = math.exp(-tau) / -math.expm1(-tau)
+    return (1 - tau * left) / mu, math.sqrt(1 - tau**2 * left * (1 + left)) / mu
+
+
 def share_inside(middle: ArrayOrTensor, size: ArrayOrTensor, side: ArrayOrTensor) -> ArrayOrTensor:
     """Fractions of intervals of length `size` around `middle` that lie within `side` / 2 of 0, all in mm."""
     first, last = (middle - size / 2).clip(min=-side / 2), (middle + size / 2).clip(max=side / 2)

@@ -21,7 +21,7 @@ import numpy as np
 
 from ..arrays import ArrayOrTensor, is_tensor, namespace, promote, require_numbers
 from ..errors import InputError
-from ..geometry.collimator import OPENING_ANGLE, edge_slope
+from ..geometry.collimator import OPENING_ANGLE, Collimator, edge_slope
 from ..geometry.system import PinholeSystem
 from ..validation import freeze, real_array, shape_text, strict_whole
 from .aperture import KnifeEdge, Opening, openings, within_cone
@@ -30,7 +30,9 @@ from .materials import module_coefficients
 
 Edge = Literal["paix", "path"]
 
-_UNITS = {"aperture_mu": "1/mm", "opening_angle": "rad", "crystal_mu": "1/mm", "photons_per_decay": ""}
+_UNITS = {
+    "aperture_mu": "1/mm", "opening_angle": "rad", "crystal_mu": "1/mm", "photons_per_decay": "", "plate_thickness": "mm",
+}  # fmt: skip
 """Numbers above 0."""
 _NUMBERS = (*_UNITS, "intrinsic_fwhm")
 
@@ -52,6 +54,8 @@ class Optics:
         ``"paix"`` or ``"path"``.
     depth_layers : int
         Depths in the crystal at which photons are recorded.
+    plate_thickness
+        The aperture plate's, mm, with edge ``"path"``; None: infinite.
     intrinsic_fwhm
         FWHM of the detector's blur, mm on the crystal.
     photons_per_decay
@@ -75,6 +79,7 @@ class Optics:
     within_crystal: bool = False
     within_walls: bool = False
     within_cone: bool = False
+    plate_thickness: ArrayOrTensor = None
 
     library = np  # whose functions take the numbers, and all that is computed with them: set where values enter
 
@@ -85,6 +90,8 @@ class Optics:
             raise InputError(f"edge: expected 'paix' or 'path', got {self.edge!r}")
         if self.edge == "path" and self.aperture_mu is None:
             raise InputError("edge 'path' needs aperture_mu, of the aperture's material")
+        if self.plate_thickness is not None and self.edge != "path":
+            raise InputError("plate_thickness is of edge 'path'")
         object.__setattr__(self, "depth_layers", strict_whole(self.depth_layers, "depth_layers", "1 or more"))
         if self.depth_layers > 1 and self.crystal_mu is None:
             raise InputError("depth_layers needs crystal_mu, of the crystal's material")
@@ -171,7 +178,20 @@ class Optics:
         """Where photons cross the plane of a hole of a diameter, mm: n points of the hole, and those of its edge."""
         if self.edge == "paix":
             return openings(n, self.effective_diameter(diameter))
-        return openings(n, diameter, KnifeEdge(diameter / 2, self.aperture_mu, self.tangent))
+        return openings(n, diameter, self.knife(diameter))
+
+    def through_plate(self, built: Collimator) -> float:
+        """Photons that pass the solid plate beside a module's hole, by those through the hole, along the axis; at most."""
+        if self.plate_thickness is None:
+            return 0.0
+        widest = max(radius for _, radius in built.hole_profile)
+        beside = (2 * built.front_half_width) ** 2 - math.pi * widest**2
+        hole = math.pi / 4 * self.effective_diameter(built.diameter) ** 2
+        return float(math.exp(-self.aperture_mu * self.plate_thickness) * beside / hole)
+
+    def knife(self, diameter: ArrayOrTensor) -> KnifeEdge:
+        """The knife edge of a hole of a diameter, mm."""
+        return KnifeEdge(diameter / 2, self.aperture_mu, self.tangent, self.plate_thickness)
 
     def depths(self, thickness: ArrayOrTensor) -> list[ArrayOrTensor]:
         """Depths in a crystal, mm, at which photons are recorded, from its front to its back."""
@@ -258,7 +278,7 @@ class Optics:
 
 def _checked(value: Any, name: str) -> Any:
     """A number as a float, numbers as an array or tensor, None as it is; `InputError` where they are out of range."""
-    if value is None and name.endswith("_mu"):
+    if value is None and name in ("aperture_mu", "crystal_mu", "plate_thickness"):
         return None
     if is_tensor(value):
         require_numbers(value, name)

@@ -50,6 +50,11 @@ class DepthResponse:
     """Rows and columns of cells from a pixel to the next."""
     after: Array
     """(n_v, n_u): factors of the pixels."""
+    places: tuple[Array, Array] | None = None
+    """Where the pixels' rows (n_v,) and columns (n_u,) lie on a lattice of nodes, in steps of it.
+
+    Then `padded` has two axes more after the planes', those of the nodes, and a pixel's kernel is mixed linearly from those
+    of the four nodes around it."""
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -58,14 +63,19 @@ class DepthResponse:
 
     @property
     def kernel(self) -> Array:
-        """(planes, taps, taps): what a pixel counts of the cells from its first on."""
-        return self.padded[:, self.steps[0] : -self.steps[0]]
+        """(planes, [nodes,] taps, taps): what a pixel counts of the cells from its first on."""
+        return self.padded[..., self.steps[0] : -self.steps[0], :]
 
     @functools.cached_property
     def bounds(self) -> NDArray[np.int64]:
-        """(planes, padded rows, 2): where in each row of the kernel taps begin that are not 0, and where they end."""
+        """(planes, [nodes,] padded rows, 2): where in each row of the kernel taps begin that are not 0, and where they end.
+
+        A node's are those of the next one along v, too.
+        """
         has = self.padded != 0
-        return np.stack([has.argmax(-1), has.shape[2] - has[..., ::-1].argmax(-1)], -1) * has.any(-1, keepdims=True)
+        if self.places is not None:
+            has[:, :-1] |= has[:, 1:]
+        return np.stack([has.argmax(-1), has.shape[-1] - has[..., ::-1].argmax(-1)], -1) * has.any(-1, keepdims=True)
 
     def of_part(self, origin: Index, shape: Index) -> tuple[DepthResponse, tuple[slice, slice]]:
         """The response to a part of the volume alone, and the rows and columns of pixels that may see it."""
@@ -77,7 +87,7 @@ class DepthResponse:
             return replace(self, matrix=matrix), (slice(None), slice(None))
         pixels, cells = [], []
         for at, taps, step, n, size in zip(
-            (row, column), self.kernel.shape[1:], self.steps, self.after.shape, self.before.shape, strict=True
+            (row, column), self.kernel.shape[-2:], self.steps, self.after.shape, self.before.shape, strict=True
         ):
             low, high = float((at / depth).min()) - 2, float((at / depth).max()) + 2
             start = min(max(math.floor((low - taps) / step) + 1, 0), n - 1)
@@ -96,4 +106,5 @@ class DepthResponse:
             before=self.before[tuple(cells)],
             padded=self.padded[farther : nearer + 1],
             after=self.after[tuple(pixels)],
+            places=None if self.places is None else (self.places[0][pixels[0]], self.places[1][pixels[1]]),
         ), (pixels[0], pixels[1])

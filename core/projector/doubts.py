@@ -5,6 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from ..arrays import Floats32
+from ..geometry.collimator import Construction
 from ..geometry.grid import Grid
 from ..geometry.views import Views
 from ..physics.materials import APERTURES, attenuation
@@ -12,6 +13,8 @@ from ..volumes.volume import Volume
 from .emission import Emission
 from .models import Model
 
+_MOST_THROUGH = 0.005
+"""Share of the photons that may pass the solid plate without a word."""
 _NARROW = 1.0
 """mm: a body is wider, and what is so many metres wide hardly fits into a scanner."""
 _UNNAMED = ((140.5, 1.0),)  # Tc-99m's line, where no isotope is named
@@ -40,8 +43,25 @@ def _doubts_of_coefficients(model: Emission) -> Iterator[str]:
         value = np.max(0.0 if getattr(model, name) is None else getattr(model, name))
         if value > _ABOVE_METALS * most:
             yield f"{name} is {value:g} 1/mm, more than any material's at its energy ({most:.3g}): is it in 1/cm?"
+    if model.plate_thickness is not None:
+        yield from _doubts_of_plates(model)
     if isinstance(model.mu, Volume):
         yield from doubts_of_mu(model.mu.array, model)
+
+
+def _doubts_of_plates(model: Emission) -> Iterator[str]:
+    """Of what passes the solid plates, which no model counts."""
+    shares = []
+    for m in range(len(model.system)):
+        optics = model.optics.of_modules(m, len(model.system))
+        built = Construction(float(optics.plate_thickness), opening_angle=float(optics.opening_angle))
+        shares.append(optics.through_plate(model.system[m : m + 1].collimators(built)[0]))
+    worst = int(np.argmax(shares))
+    if shares[worst] > _MOST_THROUGH:
+        yield (
+            "emission: photons through the solid plate beside the hole are not counted: "
+            f"up to {100 * shares[worst]:.2g} % of those through the hole (module {model.system.numbers[worst]})"
+        )
 
 
 def doubts_of_mu(mu: Floats32, model: Emission) -> Iterator[str]:

@@ -82,6 +82,11 @@ def geometry_gradient(A: Projector, volume: Volume | Floats | Floats32, images: 
             f"geometry gradient: voxels before pinhole {model.system.numbers[A._close_parts[0][0]]} are too close to it; "
             "take a smaller grid"
         )
+    if not model.has_one_kernel:
+        raise InputError(
+            "geometry gradient: expected edge 'paix' and depth_layers 1; with edge 'path' or more layers take "
+            "`emission_images`, by rays"
+        )
     array = A._check(volume)
     array = array.reshape(-1, *A.shape_in)
     given = checked(images, "images", A.shape_out, A._float64, batch=True).reshape(-1, *A.shape_out)

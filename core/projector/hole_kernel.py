@@ -5,6 +5,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..arrays import Array
 
@@ -31,15 +32,15 @@ def kernels(numbers: KernelNumbers, steps: tuple[int, int]) -> Array:
     In Fourier space the exact image, by what the spline has blurred; and `bend` more. It may not be negative anywhere, or
     expected counts would be. All counts of a cell go to the pixels.
     """
-    half = _half(numbers, steps)
-    return _of_pixels(_images(numbers, steps, half)[0], numbers, steps, half)[0]
+    half = half_taps(numbers, steps)
+    return of_pixels(_images(numbers, steps, half)[0], numbers, steps, half)[0]
 
 
 def kernels_gradient(numbers: KernelNumbers, steps: tuple[int, int], by_kernels: Array) -> tuple[Array, KernelNumbers]:
     """The kernels, and a function's derivatives by `numbers` from those by the kernels."""
-    half = _half(numbers, steps)
+    half = half_taps(numbers, steps)
     image, images = _images(numbers, steps, half)
-    kernel, shares, is_used = _of_pixels(image, numbers, steps, half)
+    kernel, shares, is_used = of_pixels(image, numbers, steps, half)
     by = np.empty_like(kernel)
     for phase in _phases(steps, half):  # of what is divided by its sum
         mean = (by_kernels[phase] * kernel[phase]).sum(axis=(1, 2), keepdims=True)
@@ -56,10 +57,10 @@ def kernels_gradient(numbers: KernelNumbers, steps: tuple[int, int], by_kernels:
     return kernel, images.gradient(by_image)._replace(bend=by_bend)
 
 
-def _half(numbers: KernelNumbers, steps: tuple[int, int]) -> tuple[int, int]:
-    """Taps on each side of the middle one, along v and u."""
+def half_taps(numbers: KernelNumbers, steps: tuple[int, int], more: ArrayLike = 0.0) -> tuple[int, int]:
+    """Taps on each side of the middle one, along v and u; `more` are those that something else needs."""
     most = 2 * numbers.slopes[-1] - numbers.slopes[-2]
-    reach = numbers.hole * (1 + most) / 2 + np.divide(steps, 2) + np.abs(numbers.edges).sum(axis=1) * most / 2
+    reach = numbers.hole * (1 + most) / 2 + np.divide(steps, 2) + np.abs(numbers.edges).sum(axis=1) * most / 2 + more
     return tuple(math.ceil(each) + 1 for each in reach)  # type: ignore[return-value]
 
 
@@ -78,13 +79,16 @@ def _means(image: Array) -> Array:
     return image[1:-1] - (image[2:] - 2 * image[1:-1] + image[:-2]) / 12
 
 
-def _of_pixels(
-    image: Array, numbers: KernelNumbers, steps: tuple[int, int], half: tuple[int, int]
+def of_pixels(
+    image: Array, numbers: KernelNumbers, steps: tuple[int, int], half: tuple[int, int], least: Array | None = None
 ) -> tuple[Array, Array, Array]:
-    """The kernels of images, with the sums that taps of one place were divided by, and which taps are used."""
+    """The kernels of images, with the sums that taps of one place were divided by, and which taps are used.
+
+    Taps up to `least`, (planes,), are left out, and it is taken from the others.
+    """
     away = _away(half)
     kernel = _means(image) * (1 + numbers.bend[0] * away[0][:, None] + numbers.bend[1] * away[1])
-    kernel -= _LEAST / kernel[0].size
+    kernel -= _LEAST / kernel[0].size if least is None else least[:, None, None]
     is_used = kernel > 0
     kernel *= is_used
     shares = np.empty_like(kernel)
@@ -94,7 +98,7 @@ def _of_pixels(
     return kernel, shares, is_used
 
 
-class _Spectra:
+class Spectra:
     """The spectra of images, factor by factor, for their derivatives."""
 
     def __init__(self, numbers: KernelNumbers, steps: tuple[int, int], half: tuple[int, int]) -> None:
@@ -109,13 +113,19 @@ class _Spectra:
         self.pixel = np.sinc(steps[0] * f_v) * np.sinc(steps[1] * f_u) / spline
         self.radius = np.hypot(numbers.hole[0] * f_v, numbers.hole[1] * f_u)
         self.waves = [edge[0] * f_v + edge[1] * f_u for edge in numbers.edges.T]
-        self.disc, self.disc_rise = _disc((1 + self.slopes) * self.radius)
         self.sincs = [np.sinc(self.slopes * wave) for wave in self.waves]
+
+    @functools.cached_property
+    def _discs(self) -> tuple[Array, Array]:
+        return disc_transform((1 + self.slopes) * self.radius)
 
     def images(self) -> Array:
         """(planes + 2, taps, taps): those of a plane more on either side, too."""
-        exact = self.pixel * self.disc * self.sincs[0] * self.sincs[1] * self.sincs[2]
-        image = np.roll(np.fft.irfft2(exact, self.n), self.half, (1, 2))  # type: ignore[arg-type]
+        return self.spatial(self.pixel * self._discs[0] * self.sincs[0] * self.sincs[1] * self.sincs[2])
+
+    def spatial(self, spectra: Array) -> Array:
+        """What has these spectra, around the middle tap."""
+        image = np.roll(np.fft.irfft2(spectra, self.n), self.half, (1, 2))  # type: ignore[arg-type]
         return image[:, : 2 * self.half[0] + 1, : 2 * self.half[1] + 1]
 
     def gradient(self, by_images: Array) -> KernelNumbers:
@@ -128,11 +138,11 @@ class _Spectra:
         spectrum *= self.pixel
         f_v, f_u = self.f
         s, (a, b, c) = self.slopes, self.sincs
-        by_disc = spectrum * a * b * c * self.disc_rise
+        by_disc = spectrum * a * b * c * self._discs[1]
         by_slopes = (by_disc * self.radius).sum(axis=(1, 2))
         by_radius = np.divide((by_disc * (1 + s)).sum(axis=0), self.radius, out=0 * self.radius, where=self.radius > 0)
         by_hole = np.array([hole * (by_radius * f**2).sum() for hole, f in zip(self.numbers.hole, self.f, strict=True)])
-        by_edges, of_disc = np.empty((2, 3)), spectrum * self.disc
+        by_edges, of_disc = np.empty((2, 3)), spectrum * self._discs[0]
         for i, (others, wave) in enumerate(zip((b * c, a * c, a * b), self.waves, strict=True)):
             by_wave = of_disc * others * _sinc_rise(s * wave)
             by_slopes += (by_wave * wave).sum(axis=(1, 2))
@@ -143,8 +153,8 @@ class _Spectra:
         return KernelNumbers(by_hole, by_slopes[1:-1], by_edges, np.zeros(2))
 
 
-def _images(numbers: KernelNumbers, steps: tuple[int, int], half: tuple[int, int]) -> tuple[Array, _Spectra]:
-    spectra = _Spectra(numbers, steps, half)
+def _images(numbers: KernelNumbers, steps: tuple[int, int], half: tuple[int, int]) -> tuple[Array, Spectra]:
+    spectra = Spectra(numbers, steps, half)
     return spectra.images(), spectra
 
 
@@ -157,7 +167,7 @@ def _sinc_rise(x: Array) -> Array:
     )
 
 
-def _disc(x: Array) -> tuple[Array, Array]:
+def disc_transform(x: Array) -> tuple[Array, Array]:
     """The Fourier transform of a disc of diameter 1 and integral 1, ``2 J1(pi x) / (pi x)``, and its derivative.
 
     Cubic pieces between the values and slopes of a table.

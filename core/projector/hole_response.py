@@ -18,7 +18,7 @@ discs. M. Unser, A. Aldroubi, M. Eden, "B-spline signal processing", IEEE Transa
 
 import itertools
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from types import ModuleType
 from typing import Any
 
@@ -32,6 +32,7 @@ from ..geometry.grid import Grid
 from ..geometry.views import Views
 from ..volumes.volume import Volume
 from .depth_response import DepthResponse, Index
+from .hole_nodes import Passage
 from .hole_zone import Sums, ViewNumbers, Zone
 from .lattices import rounded_up
 from .parallel import in_order, run_all
@@ -52,6 +53,11 @@ _PLANE_APART, _POINT_SMEAR, _PART_SMEAR, _SKEW = 0.2, 0.17, 0.6, 0.16
 _LARGE_VOXELS = 0.6
 # Cells by which two points that share them may be smeared; by more, some of the cells' shares would be negative.
 _PAIR_SMEAR = 0.366 * math.sqrt(12)
+# Where kernels depend on the direction, differences of slopes from node to node: for penetration, by the cone's; and for
+# depths in the crystal, times their standard deviation, in units of that of the hole's image.
+_NODE_SLOPES, _NODE_SMEAR = 0.2, 0.3
+# Width of a penetrated edge's shadow, in lengths in which what passes falls by e.
+_SOFT_EDGE = 3.0
 # Larger voxels, mm, are cut into parts of this size at most: kernels as wide as their shadows would take longer.
 _LARGEST = 6.0
 # Voxels that a thread adds to, in whole layers, before it takes others, and bytes of the views' cells that are in memory.
@@ -86,6 +92,8 @@ class WholeHoles:
         What attenuates, if anything.
     is_strict
         Whether grids that reach too close to a pinhole are refused.
+    passages
+        The modules' edges and crystals where kernels depend on the photons' direction.
     """
 
     def __init__(
@@ -99,6 +107,7 @@ class WholeHoles:
         weigh: Weigh,
         mu: Volume | Field | None,
         is_strict: bool,
+        passages: Sequence[Passage] | None = None,
     ) -> None:
         self.n, self.pixels, self.grid, self.mu = len(views), views.shape, grid, mu
         self._made: dict[tuple[int, float, type], DepthResponse] = {}
@@ -107,7 +116,7 @@ class WholeHoles:
         self._passing: dict[int, tuple[Index, Array]] = {}
         self._room = _KEPT
         self._views, self._frames, self._lengths, self._diameters = views, frames, lengths, diameters
-        self._sides, self._weigh, self._is_strict = sides, weigh, is_strict
+        self._sides, self._weigh, self._is_strict, self._passages = sides, weigh, is_strict, passages
 
     def _module(self, m: int) -> tuple[Array, Array, float, float]:
         """Module m's pinhole, mm, its frame u, v, k, the collimator's length and the hole's diameter, mm."""
@@ -327,7 +336,9 @@ class WholeHoles:
         views, grid, (pinhole, frame, l, d) = self._views, self.grid, self._module(m)
         u, v, k = frame
         rays = view_rays(views, m)
-        scale = l / float((views.detector_centers[m] - pinhole) @ k)
+        passage = None if self._passages is None else self._passages[m]
+        front = l if passage is None else l - passage.mean_depth
+        scale = front / float((views.detector_centers[m] - pinhole) @ k)
         # The pixels' places on the crystal: those of the first, and from pixel to pixel.
         corner = scale * (rays.corner - pinhole)
         first = np.array([corner @ v, corner @ u])
@@ -337,7 +348,8 @@ class WholeHoles:
         # Of the farthest voxel's image the widths, mm: of the hole's shadow and of the voxel's, where that is narrowest.
         across = np.linalg.svd(to_camera[:2, :3], compute_uv=False)
         widths = d * (1 + l / far), l / far * across[-1]
-        steps = _cells_of_pixel(abs(pitch[0]), *widths), _cells_of_pixel(abs(pitch[1]), *widths)
+        soft = _SOFT_EDGE * passage.decay * (1 + l / far) if passage is not None else 0.0
+        steps = _cells_of_pixel(abs(pitch[0]), *widths, soft), _cells_of_pixel(abs(pitch[1]), *widths, soft)
         _, middle, largest = sorted((*widths, np.abs(pitch).min()))
         sharpness = math.sqrt(middle * largest)
         half = float(np.linalg.norm(grid.spacing)) / 2
@@ -369,6 +381,8 @@ class WholeHoles:
             steps,
             (_POINT_SMEAR / cell, _PAIR_SMEAR, cell / _PART_SMEAR),
             round(l / (l + 2 / (1 / near + 1 / far)), 2),
+            passage,
+            1 if passage is None else _pixels_apart(passage, widths[0], float(np.abs(pitch).max()), l),
         )
 
 
@@ -377,9 +391,21 @@ def _line(edges: Array) -> Array:
     return edges @ edges[2] / (edges[2] @ edges[2])
 
 
-def _cells_of_pixel(pitch: float, shadow: float, voxel: float) -> int:
-    """Cells along a pixel's side."""
+def _pixels_apart(passage: Passage, shadow: float, pitch: float, length: float) -> int:
+    """Pixels from node to node where kernels depend on the photons' direction."""
+    slopes = []
+    if passage.knife is not None:
+        slopes.append(_NODE_SLOPES * passage.knife.tangent)
+    if passage.crystal_mu:
+        slopes.append(_NODE_SMEAR * math.hypot(shadow / 4, pitch / math.sqrt(12)) / passage.spread)
+    apart = max(1, int(min(slopes) * length / pitch))
+    return apart // 8 * 8 or apart  # whole vectors of the backend cpu
+
+
+def _cells_of_pixel(pitch: float, shadow: float, voxel: float, soft: float) -> int:
+    """Cells along a pixel's side; `soft` is how wide the shadow's edge is, mm."""
     small, middle, largest = sorted((pitch, shadow, voxel))
     sharpness = math.sqrt(middle * largest)
-    size = sharpness * (0.046 + 0.34 * min(small / sharpness, 0.35)) * (1 if shadow == largest else _LARGE_VOXELS)
+    size = sharpness * (0.046 + 0.34 * min(math.hypot(small, soft) / sharpness, 0.35))
+    size *= 1 if shadow == largest else _LARGE_VOXELS
     return max(2, round(pitch / size + 0.2))

@@ -16,6 +16,7 @@ from ..arrays import Array
 from ..physics.crystal import share_inside
 from .depth_response import DepthResponse, Index
 from .hole_kernel import KernelNumbers, kernels, kernels_gradient
+from .hole_nodes import Passage, Slanted, node_kernels, node_places, slanted
 
 # Steps of central differences, relative: their errors are 1e-9 or less of what is differentiated so.
 _STEP = 1e-5
@@ -27,7 +28,7 @@ class ViewNumbers(NamedTuple):
     to_camera: Array
     """(3, 4): of a voxel's indices (x, y, z, 1), to where it is along the module's u, v and k from the pinhole, mm."""
     length: float
-    """The collimator's, mm."""
+    """From the hole's plane to the image's, mm: the collimator's, and the mean depth in the crystal."""
     diameter: float
     """The hole's, mm, effective."""
     first: Array
@@ -86,6 +87,10 @@ class Zone:
     share: float
     """A photon's direction, on which its counts depend, lies between that of the voxel and that of the pixel as seen from
     the hole's middle, so much of the way: the factors of either are powers that are 1 together."""
+    passage: Passage | None = None
+    """What makes kernels depend on the direction,"""
+    apart: int = 1
+    """and pixels from node to node where they do."""
 
     @property
     def _sizes(self) -> Array:
@@ -139,12 +144,13 @@ class Zone:
     def response(self, kind: type) -> DepthResponse:
         """The response, with numbers of this kind."""
         n, second = self.numbers, self._second(*self._second_numbers())
-        kernel = kernels(self.kernel_numbers, self.steps) * (1 + second - second.mean())[:, None, None]
+        kernel = self._kernels()
+        kernel *= (1 + second - second.mean()).reshape(-1, *[1] * (kernel.ndim - 1))
         margin, sizes = self._margin(kernel), self._sizes
         matrix = n.to_camera.copy()
         for row, i in ((0, 1), (1, 0)):  # columns follow u, rows v
             matrix[row] = n.length / sizes[i] * n.to_camera[row] + (margin[i] - n.first[i] / sizes[i]) * n.to_camera[2]
-        n_cells = [self.steps[i] * (self.pixels[i] - 1 - (-kernel.shape[i + 1] - i) // self.steps[i]) for i in range(2)]
+        n_cells = [self.steps[i] * (self.pixels[i] - 1 - (-kernel.shape[i - 2] - i) // self.steps[i]) for i in range(2)]
         v, u = self._places([-each for each in margin], tuple(n_cells), sizes)
         secant = 1 + (v**2 + u**2) / n.length**2
         before = self.volume / self.counts.prod() * n.length**2 * self.weigh(v, u) ** (1 - self.share)
@@ -155,13 +161,34 @@ class Zone:
         along = depth / self.counts / np.linalg.norm(depth)
         pieces = (np.indices(tuple(self.counts)).reshape(3, -1).T + 0.5) / self.counts - 0.5
         apart = (len(self.inverses) - 1) / (self.inverses[-1] - self.inverses[0])
-        padded: Array = np.pad(kernel.astype(kind), ((0, 0), (self.steps[0],) * 2, (0, 0)))
+        rows = [(0, 0)] * (kernel.ndim - 2) + [(self.steps[0],) * 2, (0, 0)]
+        padded: Array = np.pad(kernel.astype(kind), rows)
         zone = self.near, self.far, float(self.inverses[0]), float(apart)
-        return DepthResponse(matrix, pieces, along, *self.limits, *zone, before.astype(kind), padded, self.steps, after)
+        places = None
+        if self.passage is not None:
+            places = np.arange(self.pixels[0]) / self.apart, np.arange(self.pixels[1]) / self.apart
+        return DepthResponse(
+            matrix, pieces, along, *self.limits, *zone, before.astype(kind), padded, self.steps, after, places
+        )
+
+    def _kernels(self) -> Array:
+        """Those of the pixels, or of the nodes."""
+        if self.passage is None:
+            return kernels(self.kernel_numbers, self.steps)
+        each, shape = self._nodes(self.passage)
+        return node_kernels(self.kernel_numbers, self.steps, each, shape)
+
+    def _nodes(self, passage: Passage) -> tuple[list[Slanted], tuple[int, int]]:
+        """What the kernels of nodes are made of, row by row, and how many there are along v and u."""
+        n = self.numbers
+        v, u = (n.first[i] + n.pitch[i] * node_places(self.pixels[i], self.apart) for i in range(2))
+        common = passage, n.diameter, n.length, self._sizes
+        more = self.share, np.array(self.steps), self.apart
+        return [slanted(*common, np.array([a, b]), *more) for a in v for b in u], (len(v), len(u))
 
     @staticmethod
     def _margin(kernel: Array) -> tuple[int, int]:
-        return kernel.shape[1] // 2, kernel.shape[2] // 2
+        return kernel.shape[-2] // 2, kernel.shape[-1] // 2
 
     def _inside(self, first: float = 0.0, pitch: float = 0.0) -> list[Array]:
         """Shares of the rows and columns that are within `side`, all moved and made larger, mm."""

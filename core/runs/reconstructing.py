@@ -285,16 +285,12 @@ def model_of(run: ProjectionRun, recipe: Recipe) -> Recipe:
 
 def _by_depth(recipe: Recipe) -> bool:
     """Whether the whole hole's blur is possible without rays, and fast; a warning says why not."""
-    why, backend = None, choose(recipe["compute.backend"]).name
-    if recipe["model.edge"] == "path":
-        why = "the run's edge is 'path'"
-    elif recipe["model.depth_layers"] > 1:
-        why = "the run has depth_layers"
-    elif backend in ("cuda", "numpy"):  # the one refuses it, the other takes minutes for an iteration
+    backend = choose(recipe["compute.backend"]).name
+    is_slow = backend in ("cuda", "numpy")  # the one refuses it, the other takes minutes for an iteration
+    if is_slow:
         why = f"the backend is {backend}"
-    if why is not None:
         warn(f"the hole's blur is that of rays through {_POINTS} points, not of the whole hole by depth: {why}", 4)
-    return why is None
+    return not is_slow
 
 
 def line_integrals(run: ProjectionRun, recipe: Recipe) -> Floats32:

@@ -167,7 +167,6 @@ def _alternatives(key: str, words: Iterable[str]) -> str:
 
 
 _COUNTS = "model.kind=emission"
-_BY_RAYS = (_COUNTS, "no model.hole=depth")
 _METHOD_OF_COUNTS = _alternatives("reconstruction.method", [name for name, m in METHODS.items() if m.of_counts])
 _RAYS = "model.kind=transmission or model.hole=rays or model.hole=point"
 _FILE = "volume.file or volume.states"
@@ -323,13 +322,15 @@ _DECLARED = (
             most=179.9, needs=(_COUNTS, "model.aperture_mu or model.within_cone")),
     Setting("model.edge", str, "paix", "How photons penetrate the aperture's edge", label="Knife Edge", words={
         "paix": ("Effective Diameter", "As if the hole were wider (Paix 1967)"),
-        "path": ("Path Length", "Each by its path through the edge: more rays"),
-    }, needs=(*_BY_RAYS, "model.aperture_mu")),
+        "path": ("Path Length", "Each by its path through the edge"),
+    }, needs=(_COUNTS, "model.aperture_mu")),
+    Setting("model.plate_thickness", float, None, "Thickness of the aperture's plate, in whose middle the edge is",
+            "infinite", unit="mm", above=0, slider=20, needs=(_COUNTS, "model.edge=path"), label="Plate (mm)"),
     Setting("model.crystal_mu", float, None, "Material of the crystal that stops the photons, or its attenuation "
             "coefficient at their energy", "all photons are counted", unit="1/mm", words=named(CRYSTALS, _BY_NAME),
             above=0, slider=5, needs=(_COUNTS,), label="Crystal", unset="None"),
     Setting("model.depth_layers", int, 1, "Depths in the crystal at which photons are recorded (parallax); 1: where they "
-            "enter", least=1, slider=8, needs=(*_BY_RAYS, "model.crystal_mu")),
+            "enter; without rays, more mean all depths", least=1, slider=8, needs=(_COUNTS, "model.crystal_mu")),
     Setting("model.intrinsic_fwhm", float, 0.0, "Full width at half maximum of the detector's own blur, on the crystal",
             unit="mm", least=0, slider=10, needs=(_COUNTS,), label="Blur (mm)"),
     Setting("model.within_cone", bool, False, "Nothing passes steeper than the knife edge's cone", needs=(_COUNTS,),

@@ -23,11 +23,12 @@ from ..rays import Attenuation, IndexFans, IndexRays, Rays
 LEVEL_VARIABLE = "MPHDRR_CPU_LEVEL"
 """Environment variable that names a lower level of processor, `levels`, than this one's."""
 
-_CONTRACT = 8
+_CONTRACT = 9
 _NAMES = {"win32": "siddon.dll", "darwin": "libsiddon.dylib"}
 _MOST_VOXELS = 2**31 - 1  # their indices are of 32 bits
 _PRODUCT = 2  # in kernels.h
 _MOST_PLACES_ALONG = 2**16  # where float32 knows a place to 1/256 of an element; beyond 2^24 it would miss whole ones
+_NODE_ROWS = 4  # in kernels.h
 _READ_ON = 16  # numbers that kernels read beyond the last of what they use
 _MOST_ALONG = 2**12  # where float32 knows the length of a segment to 0.1 %
 
@@ -68,7 +69,8 @@ class _DepthJob(Structure):
         ("planes_per_inverse", c_double), ("passes", c_void_p), ("cells", c_void_p), ("planes", c_int64),
         ("rows", c_int64), ("columns", c_int64), ("kernel", c_void_p), ("bounds", c_void_p),
         ("taps", c_int64 * 2), ("step", c_int64 * 2), ("image", c_void_p), ("row", c_int64), ("pixels", c_int64 * 2),
-        ("gradient", c_void_p),
+        ("nodes", c_int64 * 2), ("node_rows", c_void_p), ("node_columns", c_void_p), ("room", c_void_p),
+        ("room_bounds", c_void_p), ("gradient", c_void_p),
     ]  # fmt: skip
 
 
@@ -311,6 +313,8 @@ def cells_to_pixels(cells: Array, of: DepthResponse) -> Array:
 def pixels_to_cells(image: Array, of: DepthResponse) -> Array:
     """The adjoint of `cells_to_pixels`."""
     sorted_cells = _sorted_cells(of, image.dtype)
+    if of.places is not None:
+        sorted_cells[...] = 0
     _run_pixels(_library.pixels_to_cells, of, sorted_cells, _padded(image, of))
     cells = np.empty(of.shape, image.dtype)
     np.multiply(sorted_cells, _by_place(of.before, of), out=_by_place(cells, of), casting="same_kind")
@@ -341,10 +345,16 @@ def differentiate_taps(image: Array, cells: Array, of: DepthResponse) -> Floats:
 def _padded(image: Array, of: DepthResponse) -> Array:
     """`image` times `of.after`, with the zeros around it that kernels read."""
     n_v, n_u = image.shape
-    before, together = (of.kernel.shape[2] - 1) // of.steps[1], of.shape[2] // of.steps[1]
-    padded = np.zeros((n_v, before + -(-together // _READ_ON) * _READ_ON), image.dtype)
+    before = (of.kernel.shape[-1] - 1) // of.steps[1]
+    padded = np.zeros((n_v, _padded_row(of)), image.dtype)
     padded[:, before : before + n_u] = image * of.after
     return padded[:, before:]
+
+
+def _padded_row(of: DepthResponse) -> int:
+    """Numbers in a row of a padded image."""
+    before, together = (of.kernel.shape[-1] - 1) // of.steps[1], of.shape[2] // of.steps[1]
+    return before + -(-together // _READ_ON) * _READ_ON
 
 
 def _by_place(cells: Array, of: DepthResponse) -> Array:
@@ -391,12 +401,20 @@ def _run_pixels(
     kernel: Any, of: DepthResponse, sorted_cells: Array, image: Array, gradient: Floats | None = None
 ) -> None:
     """Run a kernel between the sorted cells and the pixels of one view."""
-    taps = of.padded.astype(image.dtype, copy=False)
+    taps = np.ascontiguousarray(of.padded, image.dtype)
+    nodes: dict[str, Any] = {}
+    if of.places is not None:
+        rows, columns = (np.ascontiguousarray(each) for each in of.places)
+        tall = of.kernel.shape[-2] + (_NODE_ROWS - 1) * of.steps[0]
+        room = np.zeros(_NODE_ROWS * (tall * taps.shape[-1] + of.after.shape[1] + 2 * _READ_ON), image.dtype)
+        bounds = np.empty((tall, 2), np.int64)
+        nodes = {"nodes": taps.shape[1:3], "node_rows": rows.ctypes.data, "node_columns": columns.ctypes.data,
+                 "room": room.ctypes.data, "room_bounds": bounds.ctypes.data}  # fmt: skip
     job = _DepthJob(
         is_double=image.dtype == np.float64,
         cells=sorted_cells.ctypes.data, planes=of.shape[0], rows=of.shape[1], columns=of.shape[2],
-        kernel=taps.ctypes.data, bounds=of.bounds.ctypes.data, taps=of.kernel.shape[1:], step=of.steps,
+        kernel=taps.ctypes.data, bounds=of.bounds.ctypes.data, taps=of.kernel.shape[-2:], step=of.steps,
         image=image.ctypes.data, row=image.strides[0] // image.itemsize, pixels=of.after.shape,
-        gradient=None if gradient is None else gradient.ctypes.data,
+        gradient=None if gradient is None else gradient.ctypes.data, **nodes,
     )  # fmt: skip
     kernel(level, job)

@@ -36,15 +36,32 @@ def cells_to_voxels(volume: Array, cells: Array, of: DepthResponse, passes: Arra
 
 def cells_to_pixels(cells: Array, of: DepthResponse) -> Array:
     """The image (n_v, n_u) of a view's cells."""
-    spectrum = np.fft.rfft2(cells * of.before) * np.fft.rfft2(of.kernel, of.shape[1:]).conj()
-    return _inverse(spectrum.sum(axis=0), of)[_pixels(of)] * of.after
+    spectrum, image = np.fft.rfft2(cells * of.before), np.zeros(of.after.shape)
+    for kernel, weights in _nodes(of):
+        own = spectrum * np.fft.rfft2(kernel, of.shape[1:]).conj()
+        image += weights * _inverse(own.sum(axis=0), of)[_pixels(of)]
+    return image * of.after
 
 
 def pixels_to_cells(image: Array, of: DepthResponse) -> Array:
     """The adjoint of `cells_to_pixels`."""
-    fine = np.zeros(of.shape[1:])
-    fine[_pixels(of)] = image * of.after
-    return _inverse(np.fft.rfft2(fine) * np.fft.rfft2(of.kernel, of.shape[1:]), of) * of.before
+    cells = np.zeros(of.shape)
+    for kernel, weights in _nodes(of):
+        fine = np.zeros(of.shape[1:])
+        fine[_pixels(of)] = image * of.after * weights
+        cells += _inverse(np.fft.rfft2(fine) * np.fft.rfft2(kernel, of.shape[1:]), of)
+    return cells * of.before
+
+
+def _nodes(of: DepthResponse) -> Iterator[tuple[Array, Array]]:
+    """Kernels (planes, taps, taps), and their weights in each pixel."""
+    if of.places is None:
+        yield of.kernel, np.ones(of.after.shape)
+        return
+    for number in np.ndindex(of.kernel.shape[1:3]):
+        by_row, by_column = (np.maximum(1 - np.abs(at - k), 0) for at, k in zip(of.places, number, strict=True))
+        if by_row.any() and by_column.any():
+            yield of.kernel[:, number[0], number[1]], np.outer(by_row, by_column)
 
 
 def _pixels(of: DepthResponse) -> tuple[slice, ...]:

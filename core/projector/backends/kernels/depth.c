@@ -307,8 +307,8 @@ INLINE void sum_pixels(const Plane *of, int64_t r, int64_t place, int64_t j, con
 }
 
 // DO(wide) for every `wide` vectors from j on, until n numbers of a row are done.
-#define EACH_RUN(j, n, DO)                                       \
-    for (int64_t j = 0, wide; j < n; j += wide * LANES) {        \
+#define EACH_RUN(j, from, n, DO)                                 \
+    for (int64_t j = from, wide; j < n; j += wide * LANES) {     \
         wide = MIN((n - j - 1) / (int64_t)LANES + 1, WIDE);      \
         switch (wide) {                                          \
         case 1: DO(1); break;                                    \
@@ -319,12 +319,153 @@ INLINE void sum_pixels(const Plane *of, int64_t r, int64_t place, int64_t j, con
         }                                                        \
     }
 
+// Where pixels have kernels of their own, NODE_ROWS rows of them from row i on are done together, for one column of nodes and its shares
+// of the pixels. In the job's room are, for each row of cells from row i's first on, the taps of each of these rows.
+
+// A node's weight in a pixel along one axis.
+INLINE REAL of_node(double place, int64_t node) { return (REAL)MAX(1 - __builtin_fabs(place - node), 0.0); }
+
+// Rows of cells that NODE_ROWS rows of pixels from row i on reach.
+INLINE int64_t tall_of(const DepthJob *job, int64_t i) {
+    return MIN(job->taps[0] + (NODE_ROWS - 1) * job->step[0], job->rows - i * job->step[0]);
+}
+
+// Mix the taps, and find where in each row of cells any of the rows of pixels has some.
+INLINE void mix(const DepthJob *job, int64_t number, int64_t i, int64_t node) {
+    const int64_t step = job->step[0], rows = job->taps[0] + 2 * step, *taps = job->taps;
+    const REAL *kernels[NODE_ROWS];
+    REAL shares[NODE_ROWS];
+    const int64_t *bounds[NODE_ROWS];
+    for (int r = 0; r < NODE_ROWS; r++) {
+        const double place = job->node_rows[MIN(i + r, job->pixels[0] - 1)];
+        const int64_t before = MIN((int64_t)place, job->nodes[0] - 2), first = ((number * job->nodes[0] + before) * job->nodes[1] + node) * rows + step;
+        kernels[r] = (const REAL *)job->kernel + first * taps[1], shares[r] = (REAL)(place - before);
+        bounds[r] = (const int64_t *)job->bounds + 2 * first;
+    }
+    for (int64_t a = 0; a < tall_of(job, i); a++) {
+        int64_t low = taps[1], high = 0;
+        for (int r = 0; r < NODE_ROWS; r++) {
+            const int64_t row = a - r * step;
+            if (row < 0 || row >= taps[0] || !bounds[r][2 * row + 1]) continue;
+            low = MIN(low, bounds[r][2 * row]), high = MAX(high, bounds[r][2 * row + 1]);
+        }
+        job->room_bounds[2 * a] = low, job->room_bounds[2 * a + 1] = high;
+        for (int r = 0; r < NODE_ROWS; r++) {
+            const int64_t row = a - r * step;
+            REAL *const mixed = (REAL *)job->room + (a * NODE_ROWS + r) * taps[1];
+            const REAL *const one = kernels[r] + row * taps[1], *const next = one + job->nodes[1] * rows * taps[1], share = shares[r];
+            if (row < 0 || row >= taps[0]) for (int64_t b = low; b < high; b++) mixed[b] = 0;
+            else for (int64_t b = low; b < high; b++) mixed[b] = one[b] + share * (next[b] - one[b]);
+        }
+    }
+}
+
+// The columns of pixels in which a column of nodes has a share.
+INLINE void find_columns(const DepthJob *job, int64_t node, int64_t *first, int64_t *last) {
+    int64_t j = 0;
+    while (j < job->pixels[1] && job->node_columns[j] <= node - 1) j++;
+    *first = j;
+    while (j < job->pixels[1] && job->node_columns[j] < node + 1) j++;
+    *last = j;
+}
+
+INLINE void sum_for_node(const DepthJob *job, const Plane *of, int64_t i, int64_t j, int64_t node, const int wide) {
+    const int64_t *taps = job->taps, *step = job->step, tall = tall_of(job, i);
+    F sums[2][NODE_ROWS][WIDE] = {0};
+    for (int64_t a = 0; a < tall; a++) {
+        const int64_t low = job->room_bounds[2 * a], high = job->room_bounds[2 * a + 1];
+        const int64_t pixel = (uint32_t)low / (uint32_t)step[1], rest = low - pixel * step[1]; // a division is dear
+        for (int64_t place = 0; place < step[1]; place++) {
+            const int64_t from = pixel + (place < rest);
+            const REAL *cells = of->cells + (i * step[0] + a) * job->columns + place * of->together + j + from;
+            const REAL *tap = (const REAL *)job->room + a * NODE_ROWS * taps[1], *const end = tap + high;
+            tap += place + from * step[1];
+#define ADD(chain, k)                                                                       \
+    UNROLLED for (int w = 0; w < wide; w++) {                                               \
+        const F some = *(const Run *)(cells + k + w * LANES);                               \
+        UNROLLED for (int r = 0; r < NODE_ROWS; r++) sums[chain][r][w] += tap[k * step[1] + r * taps[1]] * some; \
+    }
+            for (; tap + step[1] < end; tap += 2 * step[1], cells += 2) {
+                ADD(0, 0)
+                ADD(1, 1)
+            }
+            if (tap < end) ADD(0, 0)
+#undef ADD
+        }
+    }
+    for (int64_t r = 0; r < MIN((int64_t)NODE_ROWS, job->pixels[0] - i); r++) {
+        UNROLLED for (int w = 0; w < wide; w++) sums[0][r][w] += sums[1][r][w];
+        REAL *const pixels = (REAL *)job->image + (i + r) * job->row + j;
+        const int64_t n = MIN(wide * (int64_t)LANES, job->pixels[1] - j);
+        for (int64_t p = 0; p < n; p++) pixels[p] += ((const REAL *)sums[0][r])[p] * of_node(job->node_columns[j + p], node);
+    }
+}
+
+// The adjoint: `pixels` are those rows, `apart`, by the node's share. Neighbouring rows of cells follow each other: what was just
+// stored, a processor cannot read again a column farther on.
+INLINE void give_for_node(const DepthJob *job, const Plane *of, const REAL *pixels, int64_t apart, int64_t i, int64_t j, const int wide) {
+    const int64_t *taps = job->taps, *step = job->step, tall = tall_of(job, i);
+    F some[NODE_ROWS][WIDE];
+    UNROLLED for (int r = 0; r < NODE_ROWS; r++) UNROLLED for (int w = 0; w < wide; w++) some[r][w] = *(const Run *)(pixels + r * apart + j + w * LANES);
+    for (int64_t place = 0; place < step[1]; place++) for (int64_t b = place, at = j; b < taps[1]; b += step[1], at++) {
+        REAL *cells = of->cells + i * step[0] * job->columns + place * of->together + at;
+        const int64_t room = of->together - at; // a row of cells ends there
+        for (int64_t a = 0; a < tall; a++, cells += job->columns) {
+            if (b < job->room_bounds[2 * a] || b >= job->room_bounds[2 * a + 1]) continue;
+            const REAL *tap = (const REAL *)job->room + a * NODE_ROWS * taps[1] + b;
+            UNROLLED for (int w = 0; w < wide; w++) {
+                F sum = tap[0] * some[0][w];
+                UNROLLED for (int r = 1; r < NODE_ROWS; r++) sum += tap[r * taps[1]] * some[r][w];
+                if ((w + 1) * (int64_t)LANES <= room) *(Run *)(cells + w * LANES) += sum;
+                else for (int64_t k = w * LANES; k < room; k++) cells[k] += sum[k - w * LANES];
+            }
+        }
+    }
+}
+
+INLINE void sum_for_nodes(const DepthJob *job) {
+    for (int64_t number = 0; number < job->planes; number++) for (int64_t i = 0; i < job->pixels[0]; i += NODE_ROWS) {
+        const Plane plane = plane_of(job, number);
+        for (int64_t node = 0, first, last; node < job->nodes[1]; node++) {
+            mix(job, number, i, node);
+            find_columns(job, node, &first, &last);
+#define SUM(wide) sum_for_node(job, &plane, i, j, node, wide)
+            EACH_RUN(j, first, last, SUM);
+#undef SUM
+        }
+    }
+}
+
+// The cells are 0 before.
+INLINE void give_for_nodes(const DepthJob *job) {
+    const int64_t apart = (job->pixels[1] + 31) / 16 * 16;
+    REAL *const some = (REAL *)job->room + NODE_ROWS * (job->taps[0] + (NODE_ROWS - 1) * job->step[0]) * job->taps[1];
+    for (int64_t number = 0; number < job->planes; number++) for (int64_t i = 0; i < job->pixels[0]; i += NODE_ROWS) {
+        const Plane plane = plane_of(job, number);
+        for (int64_t node = 0, first, last; node < job->nodes[1]; node++) {
+            mix(job, number, i, node);
+            find_columns(job, node, &first, &last);
+            for (int64_t r = 0; r < MIN((int64_t)NODE_ROWS, job->pixels[0] - i); r++) for (int64_t j = first; j < last; j++) {
+                some[r * apart + j] = ((const REAL *)job->image)[(i + r) * job->row + j] * of_node(job->node_columns[j], node);
+            }
+#define GIVE(wide) give_for_node(job, &plane, some, apart, i, j, wide)
+            EACH_RUN(j, first, last, GIVE);
+#undef GIVE
+            for (int r = 0; r < NODE_ROWS; r++) for (int64_t j = first; j < last; j++) some[r * apart + j] = 0;
+        }
+    }
+}
+
 void KERNEL(cells_to_pixels)(const DepthJob *job) {
+    if (job->nodes[1]) {
+        sum_for_nodes(job);
+        return;
+    }
     for (int64_t number = 0; number < job->planes; number++) {
         const Plane plane = plane_of(job, number);
         for (int64_t i = 0; i < job->pixels[0]; i += TALL) {
 #define SUM(wide) sum_cells(&plane, i, j, wide)
-            EACH_RUN(j, job->pixels[1], SUM);
+            EACH_RUN(j, 0, job->pixels[1], SUM);
 #undef SUM
         }
     }
@@ -348,13 +489,17 @@ void KERNEL(differentiate_taps)(const DepthJob *job) {
 }
 
 void KERNEL(pixels_to_cells)(const DepthJob *job) {
+    if (job->nodes[1]) {
+        give_for_nodes(job);
+        return;
+    }
     for (int64_t number = 0; number < job->planes; number++) {
         const Plane plane = plane_of(job, number);
         for (int64_t r = 0; r < job->rows; r++) {
             if (r / job->step[0] % TALL) continue; // done with the row above
             for (int64_t place = 0; place < job->step[1]; place++) {
 #define SUM(wide) sum_pixels(&plane, r, place, j, wide)
-                EACH_RUN(j, plane.together, SUM);
+                EACH_RUN(j, 0, plane.together, SUM);
 #undef SUM
             }
         }

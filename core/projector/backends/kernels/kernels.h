@@ -13,7 +13,8 @@
 #pragma once
 #include <stdint.h>
 
-#define CONTRACT 8 // counted up with every change of this file: cpu.py takes no other
+#define NODE_ROWS 4
+#define CONTRACT 9 // counted up with every change of this file: cpu.py takes no other
 
 // Voxels (n[0], n[1], n[2]) in C order, of a job's kind of number.
 typedef struct {
@@ -85,6 +86,14 @@ typedef struct {
                                    // zeros after it until there are columns / step[1] numbers, rounded up to a multiple of 16
     int64_t row;                   // from a row of the image to the next
     int64_t pixels[2];
+    // Where nodes[0] > 0, pixel (i, j) has a kernel of its own: mixed linearly from those of the four nodes around its place,
+    // (node_rows[i], node_columns[j]), both ascending, from 0 to nodes - 1. `kernel` and `bounds` have two axes more after that of the planes, those
+    // of the nodes; the bounds of a node are also those of the next node's taps along the first axis.
+    int64_t nodes[2];              // at least 2 along either axis
+    const double *node_rows, *node_columns;
+    void *room;                    // (taps[0] + (NODE_ROWS - 1) step[0], NODE_ROWS, taps[1]) numbers; and zeros, as many as NODE_ROWS rows of
+                                   // pixels, each with 31 more
+    int64_t *room_bounds;          // (taps[0] + (NODE_ROWS - 1) step[0], 2)
     double *gradient;              // what derivatives are added to: (planes, taps[0], taps[1]), or by `line` (3), and for each piece (4, 3): by
                                    // its `shifts`, and the same times x, y and z of the voxels
 } DepthJob;

@@ -10,7 +10,7 @@ mixed from the four nodes around it.
 import functools
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple, Self
 
 import numpy as np
@@ -55,6 +55,13 @@ class Passage:
             return cls(knife, 0.0, thickness, 0.0, 0.0)
         mu = float(optics.crystal_mu)
         return cls(knife, mu, thickness, *recorded_depths(mu, thickness))
+
+    def of_hole(self, effective: float) -> Self:
+        """The same of a hole of another effective diameter by Paix, mm."""
+        if self.knife is None:
+            return self
+        depth = self.knife.tangent / self.knife.mu
+        return replace(self, knife=replace(self.knife, radius=(math.hypot(effective, depth) - depth) / 2))
 
     @property
     def decay(self) -> float:
@@ -164,15 +171,8 @@ def _gauss(n: int) -> tuple[Array, Array]:
 
 def node_kernels(numbers: KernelNumbers, steps: tuple[int, int], each: list[Slanted], shape: tuple[int, int]) -> Array:
     """The kernels (planes, nodes along v, along u, taps, taps) of a lattice of nodes of a `shape`, row by row."""
-    half = _half(numbers, steps, each)
-    spectra = SlantedSpectra(numbers, steps, half, each, shape)
-    # By what a tap would be if those in the widest shadow and a pixel were alike.
-    least = _LEAST / (np.pi / 4 * _widest(each).prod() * (1 + numbers.slopes) ** 2 + math.prod(steps))
-    kernels = []
-    for image in spectra.node_images():
-        kernels.append(_moved(of_pixels(image, numbers, steps, half, least)[0], image[1:-1]))
-    found = np.stack(kernels, axis=1)
-    found *= spectra.totals[:, None, None]
+    half = half_of_nodes(numbers, steps, each)
+    found = _of_nodes(numbers, steps, each, shape, half)
     inside = []
     for axis, h in ((-1, half[0]), (-2, half[1])):
         used = np.flatnonzero(found.any(axis=(0, 1, axis)))
@@ -182,7 +182,31 @@ def node_kernels(numbers: KernelNumbers, steps: tuple[int, int], each: list[Slan
     return found.reshape(len(found), *shape, *found.shape[2:])
 
 
-def _half(numbers: KernelNumbers, steps: tuple[int, int], each: list[Slanted]) -> tuple[int, int]:
+def node_kernels_of(
+    numbers: KernelNumbers, steps: tuple[int, int], each: list[Slanted], like: Array, half: tuple[int, int]
+) -> Array:
+    """Those of numbers a little different from those that made `like`, with the same taps; `half` is `half_of_nodes`."""
+    found = _of_nodes(numbers, steps, each, like.shape[1:3], half)
+    v, u = ((n - m) // 2 for n, m in zip(found.shape[2:], like.shape[3:], strict=True))
+    return found[:, :, v : v + like.shape[3], u : u + like.shape[4]].reshape(like.shape)
+
+
+def _of_nodes(
+    numbers: KernelNumbers, steps: tuple[int, int], each: list[Slanted], shape: tuple[int, ...], half: tuple[int, int]
+) -> Array:
+    """Kernels with all taps, (planes, nodes, taps, taps)."""
+    spectra = SlantedSpectra(numbers, steps, half, each, shape)
+    # By what a tap would be if those in the widest shadow and a pixel were alike.
+    least = _LEAST / (np.pi / 4 * _widest(each).prod() * (1 + numbers.slopes) ** 2 + math.prod(steps))
+    kernels = []
+    for image in spectra.node_images():
+        kernels.append(_moved(of_pixels(image, numbers, steps, half, least)[0], image[1:-1]))
+    found = np.stack(kernels, axis=1)
+    found *= spectra.totals[:, None, None]
+    return found
+
+
+def half_of_nodes(numbers: KernelNumbers, steps: tuple[int, int], each: list[Slanted]) -> tuple[int, int]:
     """Taps on each side of the middle one that all nodes need."""
     shifts = np.max([np.abs(own.shifts).max(axis=0) for own in each], axis=0)
     return half_taps(numbers._replace(hole=_widest(each)), steps, shifts)
@@ -217,7 +241,7 @@ class SlantedSpectra(Spectra):
         steps: tuple[int, int],
         half: tuple[int, int],
         each: list[Slanted],
-        shape: tuple[int, int],
+        shape: tuple[int, ...],
     ) -> None:
         super().__init__(numbers, steps, half)
         self.each, self.common = each, self.pixel * self.sincs[0] * self.sincs[1] * self.sincs[2]

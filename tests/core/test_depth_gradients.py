@@ -32,6 +32,7 @@ def difference(sums, step):
 
 @pytest.mark.parametrize("settings", [
     {}, {"detector": "virtual"}, {"intrinsic_fwhm": 3.0}, {"within_crystal": True},
+    {"edge": "path"}, {"depth_layers": 2}, {"edge": "path", "depth_layers": 2, "plate_thickness": 3.0, "within_crystal": True},
 ])  # fmt: skip
 def test_derivatives_are_central_differences(settings, rng):
     """By places, tilts, collimators, holes, pixels and the image's middle, each within 1e-6 of the largest of its kind."""

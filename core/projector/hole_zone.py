@@ -16,12 +16,10 @@ from ..arrays import Array
 from ..physics.crystal import share_inside
 from .depth_response import DepthResponse, Index
 from .hole_kernel import KernelNumbers, kernels, kernels_gradient
-from .hole_nodes import Passage, Slanted, half_of_nodes, node_kernels, node_kernels_of, node_places, slanted
+from .hole_nodes import NodesGradient, Passage, Slanted, node_kernels, node_places, slanted
 
 # Steps of central differences, relative: their errors are 1e-9 or less of what is differentiated so.
 _STEP = 1e-5
-# Those of kernels that depend on the direction: at more places, a faint tap is left out or not.
-_NODE_STEP = 1e-6
 
 
 class ViewNumbers(NamedTuple):
@@ -234,30 +232,28 @@ class Zone:
     def _by_nodes(self, passage: Passage, by: Array) -> ViewNumbers:
         """Derivatives through the nodes' kernels by the view's numbers, from those by the kernels."""
         n = self.numbers
-        half = half_of_nodes(self.kernel_numbers, self.steps, self._nodes(passage)[0])
+        form = NodesGradient(self.kernel_numbers, self.steps, *self._nodes(passage), by)
 
-        def total(change: ViewNumbers) -> float:
-            numbers = n.plus(change)
-            own = passage.of_hole(numbers.diameter)
-            zone = replace(self, numbers=numbers)
-            kernel = node_kernels_of(zone.kernel_numbers, self.steps, zone._nodes(own)[0], by, half)
-            return float(np.vdot(by, kernel))
+        def difference(name: str, at: Index, scale: float) -> float:
+            values = []
+            for sign in (1, -1):
+                step = np.zeros_like(getattr(n, name))
+                step[at] = sign * _STEP * scale
+                zone = replace(self, numbers=n.plus(ViewNumbers.zero()._replace(**{name: step})))
+                if name == "to_camera":
+                    values.append(form.of_edges(zone.kernel_numbers))
+                else:
+                    each = zone._nodes(passage.of_hole(zone.numbers.diameter))
+                    values.append(form(zone.kernel_numbers, *each))
+            return (values[0] - values[1]) / (2 * _STEP * scale)
 
-        def difference(name: str, at: Index | None, scale: float) -> float:
-            own, zero = _NODE_STEP * scale, ViewNumbers.zero()
-            step = np.zeros_like(getattr(zero, name))
-            step[at or ()] = own
-            back = zero._replace(**{name: -step})
-            return (total(zero._replace(**{name: step})) - total(back)) / (2 * own)
-
-        edge = float(np.abs(n.to_camera[:, :3]).max())
-        result = ViewNumbers.zero()
+        edge, result = float(np.abs(n.to_camera[:, :3]).max()), ViewNumbers.zero()
         for at in np.ndindex(3, 3):
             result.to_camera[at] = difference("to_camera", at, edge)
         for i in range(2):
             result.first[i] = difference("first", (i,), n.length)
             result.pitch[i] = difference("pitch", (i,), abs(n.pitch[i]))
-        length, diameter = (difference(name, None, getattr(n, name)) for name in ("length", "diameter"))
+        length, diameter = (difference(name, (), getattr(n, name)) for name in ("length", "diameter"))
         return result._replace(length=length, diameter=diameter)
 
     def _by_matrix(self, of: DepthResponse, origin: Index, starts: list[int], sums: Sums) -> tuple[ViewNumbers, Array]:

@@ -33,7 +33,7 @@ def difference(sums, step):
 @pytest.mark.parametrize("settings", [
     {}, {"detector": "virtual"}, {"intrinsic_fwhm": 3.0}, {"within_crystal": True},
     pytest.param({"edge": "path"}, marks=pytest.mark.long), {"depth_layers": 2},
-    pytest.param({"edge": "path", "plate_thickness": 3.0, "within_crystal": True, "depth_layers": 2}, marks=pytest.mark.long),
+    pytest.param({"edge": "path", "plate_thickness": 3.5, "depth_layers": 2, "within_walls": True}, marks=pytest.mark.long),
 ])  # fmt: skip
 def test_derivatives_are_central_differences(settings, rng):
     """By places, tilts, collimators, holes, pixels and the image's middle, each within 1e-6 of the largest of its kind.
@@ -58,7 +58,9 @@ def test_derivatives_are_central_differences(settings, rng):
         expected[f"center {i}"] = difference(
             lambda e, a=axis: sums(SYSTEM.replace(centers=SYSTEM.centers + e * a)), 1e-4 * small
         )
-        expected[f"tilt {i}"] = difference(lambda e, a=axis: sums(SYSTEM.replace(tilt=SYSTEM.tilt + e * a)), 1e-6 * small)
+        expected[f"tilt {i}"] = difference(
+            lambda e, a=axis: sums(SYSTEM.replace(tilt=SYSTEM.tilt + e * a)), 1e-6 * small
+        )
     for i, axis in enumerate(np.eye(2)):
         found |= {f"pitch {i}": gradient.pitch[:, i], f"offset {i}": gradient.offset[:, i]}
         expected[f"pitch {i}"] = difference(lambda e, a=axis: sums(pitch=PITCH + e * a), 1e-5 * small)
@@ -119,12 +121,12 @@ def test_a_part_of_the_volume_has_its_part_of_them(settings, rng):
         np.testing.assert_allclose(parts[0] + parts[1], parts[2], atol=1e-6 * np.abs(parts[2]).max())
 
 
-@pytest.mark.parametrize("settings", [{}, {"edge": "path", "crystal_mu": 0.3, "depth_layers": 2, "crystal_thickness": 9.0}])
-def test_in_torch_all_numbers_have_gradients(settings, rng):
-    """Gradcheck of the images by activity, mu, place, turn, l, d, pixels, the image's middle, time and penetration.
+BY_DIRECTION = {"edge": "path", "crystal_mu": 0.3, "depth_layers": 2, "crystal_thickness": 9.0}
 
-    By path, penetration has none.
-    """
+
+@pytest.mark.parametrize("settings", [{}, pytest.param(BY_DIRECTION, marks=pytest.mark.long)])
+def test_in_torch_all_numbers_have_gradients(settings, rng):
+    """Gradcheck of the images by activity, mu, place, turn, l, d, pixels, the image's middle, time and penetration."""
     torch = pytest.importorskip("torch")
     from mphdrr.core.projector.poses import emission_images
 
@@ -135,7 +137,7 @@ def test_in_torch_all_numbers_have_gradients(settings, rng):
         [[0.1, 0.2], [0.3, -0.4]], [2.0, 3.0], 3.0,
     ]  # fmt: skip
     given = [torch.tensor(np.array(each), requires_grad=True) for each in given]
-    if settings:
+    if settings:  # by path, penetration has none
         given[-1].requires_grad_(False)
 
     def images(x, mu, place, turn, l, d, pitch, offset, time, aperture_mu):
@@ -154,7 +156,7 @@ def test_in_torch_all_numbers_have_gradients(settings, rng):
     )
 
 
-@pytest.mark.parametrize("settings", [{}, {"edge": "path", "plate_thickness": 2.0, "depth_layers": 2}])
+@pytest.mark.parametrize("settings", [{}, {"edge": "path", "plate_thickness": 4.0, "depth_layers": 2}])
 def test_in_torch_it_is_the_projector(settings, rng):
     torch = pytest.importorskip("torch")
     from mphdrr.core.projector.poses import emission_images
@@ -167,6 +169,22 @@ def test_in_torch_it_is_the_projector(settings, rng):
         hole="depth", **PHYSICS, **settings,
     )  # fmt: skip
     np.testing.assert_allclose(images, projector(detector="virtual", **settings)(x), rtol=1e-9)
+
+
+def test_in_torch_penetration_by_path_has_none():
+    torch = pytest.importorskip("torch")
+    from mphdrr.core.projector.poses import emission_images
+
+    volume = mph.Volume(np.ones((2, 2, 2)), mph.Grid.centered(2, 12.0), "activity")
+    place = torch.tensor([0.7, 0.3, -80.0])
+    for name, value in (("aperture_mu", 3.0), ("opening_angle", 1.2)):
+        given = {"aperture_mu": 3.0, name: torch.tensor(value, requires_grad=True)}
+        refused(
+            lambda given=given: emission_images(
+                volume, place, torch.eye(3), 60.0, 5.0, (5, 4), diameter=3.0, hole="depth", edge="path", **given
+            ),
+            "no derivatives by", name,
+        )  # fmt: skip
 
 
 def test_what_cannot_be_is_refused(rng):

@@ -32,7 +32,7 @@ def difference(sums, step):
 
 @pytest.mark.parametrize("settings", [
     {}, {"detector": "virtual"}, {"intrinsic_fwhm": 3.0}, {"within_crystal": True},
-    pytest.param({"edge": "path"}, marks=pytest.mark.long), {"depth_layers": 2},
+    pytest.param({"edge": "path"}, marks=pytest.mark.long), pytest.param({"depth_layers": 2}, marks=pytest.mark.long),
     pytest.param({"edge": "path", "plate_thickness": 3.5, "depth_layers": 2, "within_walls": True}, marks=pytest.mark.long),
 ])  # fmt: skip
 def test_derivatives_are_central_differences(settings, rng):
@@ -67,6 +67,33 @@ def test_derivatives_are_central_differences(settings, rng):
         expected[f"offset {i}"] = difference(lambda e, a=axis: sums(offset=OFFSET + e * a), 1e-4 * small)
     for name, own in found.items():
         np.testing.assert_allclose(own, expected[name], rtol=0, atol=1e-6 * np.abs(expected[name]).max(), err_msg=name)
+
+
+@pytest.mark.parametrize("settings", [
+    pytest.param({"edge": "path"}, marks=pytest.mark.long), {"depth_layers": 2}, {"edge": "path", "depth_layers": 2},
+])  # fmt: skip
+def test_all_numbers_at_once_where_kernels_depend_on_the_direction(settings, rng):
+    x, weights = numbers(rng)
+    by_l, by_d, by_center, by_tilt, by_pitch, by_offset = (
+        rng.normal(size=shape) for shape in (3, 3, (3, 3), (3, 3), 2, 2)
+    )
+
+    def sums(e):
+        system = SYSTEM.replace(
+            collimator_length=SYSTEM.collimator_length + e * by_l,
+            pinhole_diameter=SYSTEM.pinhole_diameter + 0.1 * e * by_d,
+            centers=SYSTEM.centers + e * by_center,
+            tilt=SYSTEM.tilt + 0.01 * e * by_tilt,
+        )
+        A = projector(system, pitch=PITCH + 0.1 * e * by_pitch, offset=OFFSET + e * by_offset, **settings)
+        return (A(x) * weights).sum(axis=(1, 2))
+
+    found = mph.geometry_gradient(projector(**settings), x, weights)
+    centers, tilt = found.by_columns(SYSTEM)
+    along = found.collimator_length * by_l + 0.1 * found.pinhole_diameter * by_d
+    along += (centers * by_center + 0.01 * tilt * by_tilt).sum(axis=1)
+    along += 0.1 * found.pitch @ by_pitch + found.offset @ by_offset
+    np.testing.assert_allclose(along, difference(sums, 1e-6), rtol=0, atol=1e-6 * np.abs(along).max())
 
 
 @pytest.mark.parametrize("settings", [{}, pytest.param({"edge": "path", "depth_layers": 2}, marks=pytest.mark.long)])

@@ -1,5 +1,6 @@
 """Pinhole images by the depth-dependent response in torch, part of its graph. Needs torch."""
 
+import copy
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -14,6 +15,7 @@ from ..geometry.views import Views
 from ..physics.optics import Optics
 from ..volumes.volume import Volume
 from . import autograd, backends
+from .hole_nodes import Passage
 from .hole_response import WholeHoles
 from .lattices import require_no_negative
 from .parallel import thread_count
@@ -45,16 +47,15 @@ def depth_images(
     """`emission_images` by hole "depth", of numbers that it has checked; `optics` has those of the cameras (...)."""
     positions, rotations = poses
     cameras = positions.shape[:-1]
+    by_diameter = () if optics.edge == "path" else ("aperture_mu", "opening_angle")
     for name, number in {"crystal_thickness": holes.thickness, "crystal_side": holes.side, **optics.numbers}.items():
-        if name not in ("aperture_mu", "opening_angle", "photons_per_decay") and getattr(
-            number, "requires_grad", False
-        ):
+        if name not in ("photons_per_decay", *by_diameter) and getattr(number, "requires_grad", False):
             raise InputError(
                 f"emission images: hole 'depth' has no derivatives by {name}: take hole 'rays', or detach it"
             )
     factors = time * optics.photons_per_decay
     plain = optics.with_numbers({"photons_per_decay": 1.0})
-    effective = plain.effective_diameter(holes.diameter)
+    effective = _one_kernel(plain).effective_diameter(holes.diameter)
     array: Any = volume.array if isinstance(volume, Volume) else volume
     attenuation: Any = mu.array if isinstance(mu, Volume) else mu
     mu_grid = mu.grid if isinstance(mu, Volume) else mu_grid or grid
@@ -97,6 +98,14 @@ def _numpy(tensor: Tensor) -> Any:
     return tensor.numpy(force=True)
 
 
+def _one_kernel(optics: Optics) -> Optics:
+    """Without what is in kernels that depend on the direction."""
+    within_cone = optics.within_cone or optics.edge == "path"
+    changed = copy.copy(optics)
+    changed.__dict__.update(edge="paix", depth_layers=1, plate_thickness=None, within_cone=within_cone)
+    return changed
+
+
 def _whole_holes(
     grid: Grid,
     poses: tuple[Tensor, Tensor],
@@ -120,14 +129,18 @@ def _whole_holes(
     sides = np.full(n, np.inf) if holes.side is None else each(holes.side)
     thickness, hole = each(holes.thickness), each(holes.diameter)
     numbers = {name: each(x) if is_tensor(x) else x for name, x in optics.numbers.items()}
-    plain = replace(optics.with_numbers(numbers), within_crystal=False, within_walls=False)
+    optics = replace(optics.with_numbers(numbers), within_crystal=False, within_walls=False)
+    passages = [Passage.of(optics.of_modules(m, n), float(hole[m]), float(thickness[m])) for m in range(n)]
+    lengths, plain = length + [each.mean_depth for each in passages], _one_kernel(optics)
 
     def weigh(m: int, along_v: Any, along_u: Any) -> Any:
         own = plain.of_modules(m, n)
         (opening,) = own.openings(hole[m])
-        return own.pixel_weights((along_u, along_v), (1.0, 1.0), length[m], np.inf, thickness[m], opening)
+        return own.pixel_weights((along_u, along_v), (1.0, 1.0), lengths[m], np.inf, thickness[m], opening)
 
-    return WholeHoles(views, grid, frames.transpose(1, 0, 2), length, each(effective), sides, weigh, mu, True)
+    slants = None if optics.edge == "paix" and optics.depth_layers == 1 else passages
+    of_modules = frames.transpose(1, 0, 2), lengths, each(effective), sides, weigh
+    return WholeHoles(views, grid, *of_modules, mu, True, slants)
 
 
 def _by_cameras(model: WholeHoles, volume: Any, weights: Any, functions: Any, threads: int) -> list[Any]:

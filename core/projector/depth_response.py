@@ -8,6 +8,7 @@ from __future__ import annotations
 import functools
 import itertools
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -77,6 +78,32 @@ class DepthResponse:
             has[:, :-1] |= has[:, 1:]
         return np.stack([has.argmax(-1), has.shape[-1] - has[..., ::-1].argmax(-1)], -1) * has.any(-1, keepdims=True)
 
+    def of_nodes(self) -> Iterator[tuple[Index, DepthResponse, tuple[slice, slice], tuple[slice, slice]]]:
+        """Node by node the response of pixels around it by its kernel alone, times its weights; and their part of all.
+
+        Given are the node's number along v and u, and the pixels' and the cells' rows and columns.
+        """
+        assert self.places is not None
+        for node in np.ndindex(self.padded.shape[1:3]):
+            shares = [np.maximum(1 - np.abs(at - k), 0) for at, k in zip(self.places, node, strict=True)]
+            if not (shares[0].any() and shares[1].any()):
+                continue
+            pixels, cells = [], []
+            for own, step, size in zip(shares, self.steps, self.before.shape, strict=True):
+                used = np.flatnonzero(own)
+                pixels.append(slice(int(used[0]), int(used[-1]) + 1))
+                cells.append(self._cells(pixels[-1], step, len(own), size))
+            rows, columns = pixels
+            after = self.after[rows, columns] * np.outer(shares[0][rows], shares[1][columns])
+            before, padded = np.ascontiguousarray(self.before[tuple(cells)]), self.padded[:, node[0], node[1]]
+            of = replace(self, before=before, padded=np.ascontiguousarray(padded), after=after, places=None)
+            yield node, of, (rows, columns), (cells[0], cells[1])
+
+    @staticmethod
+    def _cells(pixels: slice, step: int, n: int, size: int) -> slice:
+        """Cells, of `size` along an axis, that some of n pixels sum."""
+        return slice(step * pixels.start, step * pixels.stop + size - step * n)
+
     def of_part(self, origin: Index, shape: Index) -> tuple[DepthResponse, tuple[slice, slice]]:
         """The response to a part of the volume alone, and the rows and columns of pixels that may see it."""
         matrix = self.matrix.copy()
@@ -93,7 +120,7 @@ class DepthResponse:
             start = min(max(math.floor((low - taps) / step) + 1, 0), n - 1)
             stop = max(start, min(math.floor(high / step), n - 1)) + 1
             pixels.append(slice(start, stop))
-            cells.append(slice(step * start, step * stop + size - step * n))
+            cells.append(self._cells(pixels[-1], step, n, size))
         planes = (1 / depth - self.first_plane) * self.planes_per_inverse
         nearer = min(max(math.ceil(planes.max()), 1), len(self.padded) - 1)
         farther = min(max(math.floor(planes.min()), 0), nearer - 1)

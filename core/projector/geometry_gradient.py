@@ -82,11 +82,6 @@ def geometry_gradient(A: Projector, volume: Volume | Floats | Floats32, images: 
             f"geometry gradient: voxels before pinhole {model.system.numbers[A._close_parts[0][0]]} are too close to it; "
             "take a smaller grid"
         )
-    if not model.has_one_kernel:
-        raise InputError(
-            "geometry gradient: expected edge 'paix' and depth_layers 1; with edge 'path' or more layers take "
-            "`emission_images`, by rays"
-        )
     array = A._check(volume)
     array = array.reshape(-1, *A.shape_in)
     given = checked(images, "images", A.shape_out, A._float64, batch=True).reshape(-1, *A.shape_out)
@@ -112,9 +107,10 @@ def geometry_gradient(A: Projector, volume: Volume | Floats | Floats32, images: 
 
 
 def _effective_rise(model: Emission) -> Floats:
-    """The derivative of the effective diameter by the diameter (M,)."""
+    """The derivative of the effective diameter by Paix, which the response is made of, by the diameter (M,)."""
     d = model.system.pinhole_diameter
-    more, less = (model.optics.effective_diameter(d * scale) for scale in (1 + _STEP, 1 - _STEP))
+    optics = replace(model.optics, edge="paix", plate_thickness=None)
+    more, less = (optics.effective_diameter(d * scale) for scale in (1 + _STEP, 1 - _STEP))
     rise: Floats = (more - less) / (2 * _STEP * d)
     return rise
 

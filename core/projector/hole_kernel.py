@@ -40,12 +40,27 @@ def kernels_gradient(numbers: KernelNumbers, steps: tuple[int, int], by_kernels:
     """The kernels, and a function's derivatives by `numbers` from those by the kernels."""
     half = half_taps(numbers, steps)
     image, images = _images(numbers, steps, half)
-    kernel, shares, is_used = of_pixels(image, numbers, steps, half)
+    found = of_pixels(image, numbers, steps, half)
+    by_image, by_bend, _ = of_pixels_gradient(by_kernels, image, found, numbers, steps, half)
+    return found[0], images.gradient(by_image)._replace(bend=by_bend)
+
+
+def of_pixels_gradient(
+    by_kernels: Array,
+    image: Array,
+    found: tuple[Array, Array, Array],
+    numbers: KernelNumbers,
+    steps: tuple[int, int],
+    half: tuple[int, int],
+) -> tuple[Array, Array, Array]:
+    """Derivatives by what `of_pixels` has found its kernels from: the image, `bend`, and (planes,) `least`."""
+    kernel, shares, is_used = found
     by = np.empty_like(kernel)
     for phase in _phases(steps, half):  # of what is divided by its sum
         mean = (by_kernels[phase] * kernel[phase]).sum(axis=(1, 2), keepdims=True)
         by[phase] = by_kernels[phase] - mean
     by *= is_used / shares
+    by_least = -by.sum(axis=(1, 2))
     away = _away(half)
     plain = by * _means(image)
     by_bend = np.array([(plain * away[0][:, None]).sum(), (plain * away[1]).sum()])
@@ -54,7 +69,7 @@ def kernels_gradient(numbers: KernelNumbers, steps: tuple[int, int], by_kernels:
     by_image[1:-1] += by * (7 / 6)
     by_image[2:] -= by / 12
     by_image[:-2] -= by / 12
-    return kernel, images.gradient(by_image)._replace(bend=by_bend)
+    return by_image, by_bend, by_least
 
 
 def half_taps(numbers: KernelNumbers, steps: tuple[int, int], more: ArrayLike = 0.0) -> tuple[int, int]:
@@ -116,6 +131,12 @@ class Spectra:
         self.sincs = [np.sinc(self.slopes * wave) for wave in self.waves]
 
     @functools.cached_property
+    def common(self) -> Array:
+        """The factors of the pixel and the voxel."""
+        factors: Array = self.pixel * self.sincs[0] * self.sincs[1] * self.sincs[2]
+        return factors
+
+    @functools.cached_property
     def _discs(self) -> tuple[Array, Array]:
         return disc_transform((1 + self.slopes) * self.radius)
 
@@ -128,14 +149,18 @@ class Spectra:
         image = np.roll(np.fft.irfft2(spectra, self.n), self.half, (1, 2))  # type: ignore[arg-type]
         return image[:, : 2 * self.half[0] + 1, : 2 * self.half[1] + 1]
 
-    def gradient(self, by_images: Array) -> KernelNumbers:
-        """Derivatives by the numbers, without `bend`, from those by the images."""
+    def by_spectra(self, by_images: Array) -> Array:
+        """The adjoint of `spatial`: its conjugate times changes of spectra, summed, has the images' change as real part."""
         n_v, n_u = self.n
         room = np.zeros((len(by_images), n_v, n_u))
         room[:, : by_images.shape[1], : by_images.shape[2]] = by_images
-        spectrum = np.fft.rfft2(np.roll(room, (-self.half[0], -self.half[1]), (1, 2))).real / (n_v * n_u)
+        spectrum: Array = np.fft.rfft2(np.roll(room, (-self.half[0], -self.half[1]), (1, 2))) / (n_v * n_u)
         spectrum[..., 1:-1] *= 2  # of a real image's spectrum, half is kept
-        spectrum *= self.pixel
+        return spectrum
+
+    def gradient(self, by_images: Array) -> KernelNumbers:
+        """Derivatives by the numbers, without `bend`, from those by the images."""
+        spectrum = self.by_spectra(by_images).real * self.pixel
         f_v, f_u = self.f
         s, (a, b, c) = self.slopes, self.sincs
         by_disc = spectrum * a * b * c * self._discs[1]

@@ -10,7 +10,7 @@ mixed from the four nodes around it.
 import functools
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple, Self
 
 import numpy as np
@@ -19,7 +19,7 @@ from ..arrays import Array
 from ..physics.aperture import KnifeEdge
 from ..physics.crystal import recorded_depths
 from ..physics.optics import Optics
-from .hole_kernel import KernelNumbers, Spectra, disc_transform, half_taps, of_pixels
+from .hole_kernel import KernelNumbers, Spectra, disc_transform, half_taps, of_pixels, of_pixels_gradient
 
 # Attenuation in the edge beyond which what passes is not counted; nodes of Gauss in the crystal.
 _MOST_PASSED, _DEPTHS = 7.5, 32
@@ -55,6 +55,13 @@ class Passage:
             return cls(knife, 0.0, thickness, 0.0, 0.0)
         mu = float(optics.crystal_mu)
         return cls(knife, mu, thickness, *recorded_depths(mu, thickness))
+
+    def of_hole(self, effective: float) -> Self:
+        """The same of a hole of another effective diameter by Paix, mm."""
+        if self.knife is None:
+            return self
+        depth = self.knife.tangent / self.knife.mu
+        return replace(self, knife=replace(self.knife, radius=(math.hypot(effective, depth) - depth) / 2))
 
     @property
     def decay(self) -> float:
@@ -165,11 +172,10 @@ def _gauss(n: int) -> tuple[Array, Array]:
 def node_kernels(numbers: KernelNumbers, steps: tuple[int, int], each: list[Slanted], shape: tuple[int, int]) -> Array:
     """The kernels (planes, nodes along v, along u, taps, taps) of a lattice of nodes of a `shape`, row by row."""
     half = _half(numbers, steps, each)
-    spectra = SlantedSpectra(numbers, steps, half, each, shape)
-    # By what a tap would be if those in the widest shadow and a pixel were alike.
-    least = _LEAST / (np.pi / 4 * _widest(each).prod() * (1 + numbers.slopes) ** 2 + math.prod(steps))
+    spectra, least = SlantedSpectra(numbers, steps, half, each, shape), _least(numbers, steps, each)
     kernels = []
-    for image in spectra.node_images():
+    for spectrum in spectra.of_nodes():
+        image = spectra.spatial(spectrum * spectra.common)
         kernels.append(_moved(of_pixels(image, numbers, steps, half, least)[0], image[1:-1]))
     found = np.stack(kernels, axis=1)
     found *= spectra.totals[:, None, None]
@@ -180,6 +186,57 @@ def node_kernels(numbers: KernelNumbers, steps: tuple[int, int], each: list[Slan
         inside.append(slice(h - reach, h + reach + 1))
     found = found[:, :, inside[0], inside[1]]
     return found.reshape(len(found), *shape, *found.shape[2:])
+
+
+def _least(numbers: KernelNumbers, steps: tuple[int, int], each: list[Slanted]) -> Array:
+    """By what a tap would be if those in the widest shadow and a pixel were alike."""
+    least: Array = _LEAST / (np.pi / 4 * _widest(each).prod() * (1 + numbers.slopes) ** 2 + math.prod(steps))
+    return least
+
+
+class NodesGradient:
+    """A sum over nodes' kernels as a linear form of what these are made of: near some numbers, it changes as the sum does.
+
+    `by` are the sum's derivatives by the kernels of `node_kernels`.
+    """
+
+    def __init__(
+        self, numbers: KernelNumbers, steps: tuple[int, int], each: list[Slanted], shape: tuple[int, int], by: Array
+    ) -> None:
+        half = _half(numbers, steps, each)
+        self._given = steps, half
+        spectra, least = SlantedSpectra(numbers, steps, half, each, shape), _least(numbers, steps, each)
+        self._common = spectra.common
+        more = [(0, 0), *((h - n // 2,) * 2 for h, n in zip(half, by.shape[-2:], strict=True))]
+        self._waves, totals = [], []
+        self._by_common, self._by_bend, self._by_least = np.zeros(spectra.common.shape), np.zeros(2), np.zeros(len(by))
+        of_each = by.reshape(len(by), len(each), *by.shape[-2:]).swapaxes(0, 1)
+        for given, spectrum, total in zip(of_each, spectra.of_nodes(), spectra.totals, strict=True):
+            own, image = np.pad(given, more), spectra.spatial(spectrum * spectra.common)
+            found = of_pixels(image, numbers, steps, half, least)
+            totals.append(np.vdot(own, _moved(found[0], image[1:-1])))
+            by_kernel, by_inner = _moved_gradient(own * total, found[0], image[1:-1])
+            by_image, by_bend, by_least = of_pixels_gradient(by_kernel, image, found, numbers, steps, half)
+            by_image[1:-1] += by_inner
+            wave = spectra.by_spectra(by_image)
+            self._by_common += (wave.conj() * spectrum).real
+            self._by_bend += by_bend
+            self._by_least += by_least
+            self._waves.append(wave)
+        self._by_totals = np.array(totals)
+
+    def of_edges(self, numbers: KernelNumbers) -> float:
+        """The form, but for a constant, where only `edges` are others."""
+        return float(np.vdot(self._by_common, Spectra(numbers, *self._given).common))
+
+    def __call__(self, numbers: KernelNumbers, each: list[Slanted], shape: tuple[int, int]) -> float:
+        """The form."""
+        spectra = SlantedSpectra(numbers, *self._given, each, shape)
+        total = self._by_totals @ spectra.totals + self._by_bend @ numbers.bend
+        total += self._by_least @ _least(numbers, self._given[0], each)
+        for wave, spectrum in zip(self._waves, spectra.of_nodes(), strict=True):
+            total += np.vdot(wave, spectrum * spectra.common).real
+        return float(total)
 
 
 def _half(numbers: KernelNumbers, steps: tuple[int, int], each: list[Slanted]) -> tuple[int, int]:
@@ -202,6 +259,32 @@ def _moved(kernel: Array, image: Array) -> Array:
     return moved
 
 
+def _mean(of: Array, values: Array) -> Array:
+    found: Array = (of * values).sum(axis=(1, 2), keepdims=True) / of.sum(axis=(1, 2), keepdims=True)
+    return found
+
+
+def _moved_gradient(by: Array, kernel: Array, image: Array) -> tuple[Array, Array]:
+    """Derivatives by the kernel and the image of `_moved`, from those by what it gives."""
+    tilt, by_kernel, by_image = np.ones_like(kernel), np.zeros_like(kernel), np.zeros_like(image)
+    places = []
+    for axis in (1, 2):
+        taps = np.expand_dims(np.arange(kernel.shape[axis]) - kernel.shape[axis] // 2, 2 - axis)
+        off, off_image = taps - _mean(kernel, taps), taps - _mean(image, taps)
+        spread, missing = _mean(kernel, off**2), _mean(image, off)
+        tilt += missing * off / spread
+        places.append((off, off_image, spread, missing))
+    by_tilt = by * kernel * (tilt > 0)
+    for off, off_image, spread, missing in places:
+        first = (by_tilt * off).sum(axis=(1, 2), keepdims=True) / spread
+        by_mean = -first - missing / spread * by_tilt.sum(axis=(1, 2), keepdims=True)
+        by_kernel += by_mean * off - missing / spread * first * (off**2 - spread)
+        by_image += first * off_image
+    by_kernel /= kernel.sum(axis=(1, 2), keepdims=True)
+    by_image /= image.sum(axis=(1, 2), keepdims=True)
+    return by_kernel + by * tilt.clip(min=0), by_image
+
+
 def _widest(each: list[Slanted]) -> Array:
     """The largest diameters of all ellipses, (2,)."""
     widest: Array = np.max([(np.sqrt(own.forms[:, :2]) + 2 * np.abs(own.centers)).max(axis=0) for own in each], axis=0)
@@ -220,7 +303,7 @@ class SlantedSpectra(Spectra):
         shape: tuple[int, int],
     ) -> None:
         super().__init__(numbers, steps, half)
-        self.each, self.common = each, self.pixel * self.sincs[0] * self.sincs[1] * self.sincs[2]
+        self.each = each
         chosen, self.bases = zip(*(_quadratic(n) for n in shape), strict=True)
         self.holes = np.array([[self._hole(each[i * shape[1] + j]) for j in chosen[1]] for i in chosen[0]])
         passed = np.reshape([own.shares.sum() for own in each], shape)
@@ -249,17 +332,17 @@ class SlantedSpectra(Spectra):
         total: Array = (waves[0] * shares[:, :, None]).swapaxes(1, 2) @ waves[1]
         return total * (1 + 2 * np.pi**2 * (own.mixed[0] * self.f[0] ** 2 + own.mixed[1] * self.f[1] ** 2))
 
-    def node_images(self) -> Iterator[Array]:
-        """The nodes' images one by one, row by row, each (planes + 2, taps, taps)."""
+    def of_nodes(self) -> Iterator[Array]:
+        """The spectra of the nodes' images, without `common`, one by one, row by row."""
         each = iter(self.each)
         for of_row, passed in zip(self.bases[0], self.passed, strict=True):
-            row = np.tensordot(of_row, self.holes, 1) * self.common
+            row = np.tensordot(of_row, self.holes, 1)
             for of_node, share in zip(self.bases[1], passed, strict=True):
                 hole, smear = np.tensordot(of_node, row, 1), self._smear(next(each)) / share
                 total = hole[0] * smear[0]
                 if len(hole) > 1:
                     total += hole[1] * smear[1]
-                yield self.spatial(total)
+                yield total
 
 
 def _second_difference(values: Array, axis: int) -> Array:

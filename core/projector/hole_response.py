@@ -197,7 +197,7 @@ class WholeHoles:
                     matrix, line = functions.differentiate_places(volume, taken, of, passes)
                     matrix[:, :3] += np.outer(line, of.line)
                     after = image * functions.cells_to_pixels(cells, of)
-                    taps = functions.differentiate_taps(image, cells, of)
+                    taps = _by_taps(image, cells, of, functions)
                     found = Sums(matrix, line, (cells * taken).sum(axis=0), after, taps)
                     sums = found if sums is None else Sums(*(a + b for a, b in zip(sums, found, strict=True)))
                     if passes is not None:
@@ -384,6 +384,18 @@ class WholeHoles:
             passage,
             1 if passage is None else _pixels_apart(passage, widths[0], float(np.abs(pitch).max()), l),
         )
+
+
+def _by_taps(image: Array, cells: Array, of: DepthResponse, functions: ModuleType) -> Array:
+    """Of the sum of `image` times what pixels count of `cells`, the derivatives by `of.kernel`."""
+    if of.places is None:
+        alone: Array = functions.differentiate_taps(image, cells, of)
+        return alone
+    by = np.zeros(of.kernel.shape)
+    for (a, b), own, pixels, (rows, columns) in of.of_nodes():
+        some, part = np.ascontiguousarray(image[pixels]), np.ascontiguousarray(cells[:, rows, columns])
+        by[:, a, b] = functions.differentiate_taps(some, part, own)
+    return by
 
 
 def _line(edges: Array) -> Array:

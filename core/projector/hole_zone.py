@@ -6,7 +6,7 @@ small changes of the view leave as it is: the response is a smooth function of t
 
 import functools
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple, Self
 
 import numpy as np
@@ -16,7 +16,7 @@ from ..arrays import Array
 from ..physics.crystal import share_inside
 from .depth_response import DepthResponse, Index
 from .hole_kernel import KernelNumbers, kernels, kernels_gradient
-from .hole_nodes import Passage, Slanted, node_kernels, node_places, slanted
+from .hole_nodes import NodesGradient, Passage, Slanted, node_kernels, node_places, slanted
 
 # Steps of central differences, relative: their errors are 1e-9 or less of what is differentiated so.
 _STEP = 1e-5
@@ -58,7 +58,7 @@ class Sums(NamedTuple):
     after: Array
     """(n_v, n_u): and of `after`."""
     kernel: Array
-    """(planes, taps, taps): by `DepthResponse.kernel`."""
+    """(planes, [nodes,] taps, taps): by `DepthResponse.kernel`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -203,7 +203,7 @@ class Zone:
 
         `of`, `pixels` and `origin` are those of the part, as `DepthResponse.of_part` gives and takes them.
         """
-        kernel, by_kernel, by_second = self._kernel_sums(of, sums.kernel)
+        kernel, by_kernel, by_second, by_nodes = self._kernel_sums(of, sums.kernel)
         margin = self._margin(kernel)
         firsts = [each.start or 0 for each in pixels]
         starts = [self.steps[i] * firsts[i] - margin[i] for i in range(2)]
@@ -213,17 +213,48 @@ class Zone:
         by = by.plus(self._by_after(pixels, firsts, sums.after))
         by_second += by_mean / len(by_second) - by_second.mean()
         by_shape, sizes = self._by_shape(by_kernel, by_second)
+        by = by.plus(by_nodes)
         return by.plus(by_shape)._replace(pitch=by.pitch + by_shape.pitch + (by_sizes + sizes) / self.steps)
 
-    def _kernel_sums(self, of: DepthResponse, by_part: Array) -> tuple[Array, KernelNumbers, Array]:
-        """The kernels; derivatives by their numbers; and by `_second` less its mean."""
+    def _kernel_sums(self, of: DepthResponse, by_part: Array) -> tuple[Array, KernelNumbers, Array, ViewNumbers]:
+        """The kernels; derivatives by their numbers; by `_second` less its mean; and by the view's numbers, of nodes."""
         first = round((of.first_plane - self.inverses[0]) * of.planes_per_inverse)
         by = np.zeros((len(self.inverses), *by_part.shape[1:]))
         by[first : first + len(by_part)] = by_part
         second = self._second(*self._second_numbers())
-        factors = (1 + second - second.mean())[:, None, None]
-        kernel, by_numbers = kernels_gradient(self.kernel_numbers, self.steps, by * factors)
-        return kernel, by_numbers, (by * kernel).sum(axis=(1, 2))
+        factors = (1 + second - second.mean()).reshape(-1, *[1] * (by.ndim - 1))
+        if self.passage is None:
+            kernel, by_numbers = kernels_gradient(self.kernel_numbers, self.steps, by * factors)
+            return kernel, by_numbers, (by * kernel).sum(axis=(1, 2)), ViewNumbers.zero()
+        kernel, none = self._kernels(), KernelNumbers(*(0 * each for each in self.kernel_numbers))
+        return kernel, none, (by * kernel).sum(axis=(1, 2, 3, 4)), self._by_nodes(self.passage, by * factors)
+
+    def _by_nodes(self, passage: Passage, by: Array) -> ViewNumbers:
+        """Derivatives through the nodes' kernels by the view's numbers, from those by the kernels."""
+        n = self.numbers
+        form = NodesGradient(self.kernel_numbers, self.steps, *self._nodes(passage), by)
+
+        def difference(name: str, at: Index, scale: float) -> float:
+            values = []
+            for sign in (1, -1):
+                step = np.zeros_like(getattr(n, name))
+                step[at] = sign * _STEP * scale
+                zone = replace(self, numbers=n.plus(ViewNumbers.zero()._replace(**{name: step})))
+                if name == "to_camera":
+                    values.append(form.of_edges(zone.kernel_numbers))
+                else:
+                    each = zone._nodes(passage.of_hole(zone.numbers.diameter))
+                    values.append(form(zone.kernel_numbers, *each))
+            return (values[0] - values[1]) / (2 * _STEP * scale)
+
+        edge, result = float(np.abs(n.to_camera[:, :3]).max()), ViewNumbers.zero()
+        for at in np.ndindex(3, 3):
+            result.to_camera[at] = difference("to_camera", at, edge)
+        for i in range(2):
+            result.first[i] = difference("first", (i,), n.length)
+            result.pitch[i] = difference("pitch", (i,), abs(n.pitch[i]))
+        length, diameter = (difference(name, (), getattr(n, name)) for name in ("length", "diameter"))
+        return result._replace(length=length, diameter=diameter)
 
     def _by_matrix(self, of: DepthResponse, origin: Index, starts: list[int], sums: Sums) -> tuple[ViewNumbers, Array]:
         """Derivatives through the voxels' places, and by the cells' sizes."""

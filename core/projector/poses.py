@@ -194,7 +194,8 @@ def emission_images(
         What attenuates, as in `trace_rays`.
     hole
         "rays": through its points. "depth": the depth-dependent response, with the blur of the whole hole and the limits
-        that it has in `Emission`; on the processor. It has no derivatives by what the crystal stops and where it ends.
+        that it has in `Emission`; on the processor. It has no derivatives by what the crystal stops and where it ends, nor
+        with edge "path" by what the edge lets pass.
     backend, grid
         The same as in `trace_rays`.
     optics, settings
@@ -235,10 +236,8 @@ def emission_images(
     if hole not in ("rays", "depth"):
         raise InputError(f"emission images: hole: expected 'rays' or 'depth', got {hole!r}")
     if hole == "depth":
-        if aperture_points != 1 or pixel_points is not None or optics.edge == "path" or optics.depth_layers > 1:
-            raise InputError(
-                "emission images: hole 'depth' takes no aperture_points, pixel_points, edge 'path' and depth_layers"
-            )
+        if aperture_points != 1 or pixel_points is not None:
+            raise InputError("emission images: hole 'depth' takes no aperture_points and pixel_points")
         sided = side if optics.within_crystal or optics.within_walls else None
         optics = optics.with_numbers(dict(zip(given, own, strict=True)))
         holes = Holes(l, diameter, sided, thickness, pitch, offset)

@@ -120,13 +120,3 @@ def test_a_thin_plate_is_warned_of_and_paix_has_none():
     with pytest.warns(UserWarning, match="through the solid plate"):
         mph.Projector(grid, views, mph.Emission(system, edge="path", aperture_mu=0.6, plate_thickness=2.0))
     refused(lambda: mph.Emission(system, aperture_mu=3.0, plate_thickness=2.0), "plate_thickness", "edge 'path'")
-
-
-def test_derivatives_by_the_geometry_are_refused():
-    system = module()
-    A = mph.Projector(
-        mph.Grid.centered((4, 4, 4), 5.0), system.views((8, 8)), mph.Emission(system, edge="path", aperture_mu=3.0)
-    )
-    refused(
-        lambda: mph.geometry_gradient(A, np.ones(A.shape_in), np.ones(A.shape_out)), "edge 'paix'", "depth_layers 1"
-    )

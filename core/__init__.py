@@ -129,7 +129,7 @@ if TYPE_CHECKING:
     from .xray.dose import absorbed_dose, absorbed_dose_rate, isocentre_kerma
     from .xray.motion import Motion, MotionFinder, find_change, find_motion
     from .xray.spectra import Spectrum, tube_spectrum
-    from .xray.spectral import SpectralTransmission, water_and_bone
+    from .xray.spectral import SpectralTransmission, panel_blur, water_and_bone
     from .xray.system import XraySystem
 
 (_BLOCK,) = (each for each in ast.parse(Path(__file__).read_text("utf-8")).body if isinstance(each, ast.If))

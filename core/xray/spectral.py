@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Protocol
 
@@ -11,13 +12,16 @@ from numpy.typing import ArrayLike
 from ..arrays import Array, Floats
 from ..errors import InputError
 from ..geometry.views import Views
+from ..physics.crystal import gaussian_blur
 from ..physics.ct_numbers import CT_ENERGY
+from ..physics.energy_window import FWHM_PER_SIGMA
 from ..projector import Projector
-from ..validation import freeze, instance, real_array
+from ..validation import at_least_0, freeze, instance, real_array
 from ..volumes.volume import Volume, require_quantity
 from .coefficients import attenuations
 from .detectors import Bins, Detector, PhotonCounter
 from .spectra import Spectrum
+from .system import XraySystem
 
 _BINS = ((20.0, 60.0), (60.0, 120.0))
 _RAYS = 8192  # computed at once
@@ -47,6 +51,12 @@ class SpectralTransmission:
         Lower and upper energies, keV; None for an `EnergyIntegrator`, whose one signal then stands for counts.
     detector
         A `PhotonCounter` or `EnergyIntegrator`. By default every photon is counted in the bin of its energy.
+    blur
+        FWHM on the panel, mm, one number or one of each view (M,), of the Gaussian blur of images by panel and focal spot,
+        as `panel_blur` gives it. Counts blurred over an image's edge are lost.
+    background
+        Counts besides those of the spectrum, such as scatter: one number, or what broadcasts to (bins, M, n_v, n_u). Blur
+        and background are of `project` and its derivative alone: single rays have none.
 
     Attributes
     ----------
@@ -68,6 +78,8 @@ class SpectralTransmission:
         materials: Sequence[str] = ("water", "bone"),
         bins: Bins | None = _BINS,
         detector: Detector | None = None,
+        blur: ArrayLike = 0.0,
+        background: ArrayLike = 0.0,
     ) -> None:
         instance(spectrum, Spectrum, "spectrum")
         self.views = views if views is None or isinstance(views, Views) else _views_of(views)
@@ -84,6 +96,8 @@ class SpectralTransmission:
         self.weights = freeze(weights)
         self.mu = freeze(np.array([attenuations(name, spectrum.energies) for name in self.materials]))
         self._pixels = None if self.views is None else _pixels(self.views)
+        self._blurs = _blurs(self.views, _none_below_0(blur, "blur")) if np.any(blur) else []
+        self.background = freeze(_none_below_0(background, "background"))
 
     def expected(self, paths: ArrayLike, mAs: ArrayLike) -> Floats:
         """Expected counts (bins, ...) of rays with `paths` (materials, ...), mm of each material at its own density.
@@ -118,12 +132,18 @@ class SpectralTransmission:
 
         `A` is the `Projector` of the volumes' grid into these views; its line integrals of the volumes are the paths.
         """
-        return self.expected(self._paths(volumes, A), mAs)
+        counts = self.expected(self._paths(volumes, A), mAs)
+        for m, (along_v, along_u) in enumerate(self._blurs):
+            counts[:, m] = along_v @ counts[:, m] @ along_u.T
+        return counts + self.background
 
     def volume_gradient(
         self, volumes: Sequence[Volume | Array] | Array, values: ArrayLike, A: Projector, mAs: ArrayLike
     ) -> Array:
         """The adjoint of the derivative of `project` by the volumes, of `values` (bins, M, n_v, n_u): one per material."""
+        values = np.array(values, np.float64)
+        for m, (along_v, along_u) in enumerate(self._blurs):
+            values[:, m] = along_v.T @ values[:, m] @ along_u
         paths = self.gradient(self._paths(volumes, A), values, mAs)
         return np.stack([A.T(path) for path in paths])
 
@@ -182,6 +202,39 @@ def _views_of(scanner: HasViews) -> Views:
     if not callable(getattr(scanner, "views", None)):
         raise InputError(f"views: expected Views, a scanner or None, got {type(scanner).__name__}")
     return scanner.views()
+
+
+def panel_blur(system: XraySystem, fwhm: float = 0.0) -> Floats:
+    """The blur of images of what is at the isocentre, FWHM on the panel (N,), mm: of a panel's own FWHM and the focal spots.
+
+    A focal spot's shadow is its size times the panel's distance behind the isocentre, by that of the source before it; an
+    even one blurs as the Gaussian of the same variance.
+    """
+    instance(system, XraySystem, "panel_blur")
+    before = np.linalg.norm(system.sources, axis=1)
+    shadow = system.focal_spot * (np.linalg.norm(system.panel_centers - system.sources, axis=1) / before - 1)
+    blur: Floats = np.hypot(at_least_0(fwhm, "fwhm"), np.maximum(shadow, 0) * FWHM_PER_SIGMA / math.sqrt(12))
+    return blur
+
+
+def _none_below_0(values: ArrayLike, name: str) -> Floats:
+    array = real_array(values, name, None)
+    if array.min(initial=0.0) < 0:
+        raise InputError(f"{name}: expected 0 or more, got {array.min():g}")
+    return array
+
+
+def _blurs(views: Views | None, blur: Floats) -> list[tuple[Floats, Floats]]:
+    """Of each view the matrices that blur its images along v and u."""
+    if views is None or blur.shape not in ((), (len(views),)):
+        raise InputError("blur: expected one number, or one of each view, and views")
+    sigmas = np.broadcast_to(blur / FWHM_PER_SIGMA, len(views))
+    steps = np.linalg.norm([views.v_steps, views.u_steps], axis=2)
+    along_v, along_u = (
+        [gaussian_blur(n, sigma / step) for sigma, step in zip(sigmas, own, strict=True)]
+        for n, own in zip(views.shape, steps, strict=True)
+    )
+    return list(zip(along_v, along_u, strict=True))
 
 
 def _pixels(views: Views) -> Floats:

@@ -206,3 +206,30 @@ def test_water_has_no_cupping_after_correction():
             edge, middle = volume[(r > 70) & (r < 88)].mean(), volume[r < 20].mean()
             cupping.append((edge - middle) / edge)
         assert cupping[0] > 0.02 and abs(cupping[1]) < 0.01
+
+
+def test_blur_keeps_counts_widens_edges_and_has_its_adjoint(rng):
+    views, grid = arc(2, (40, 41)), mph.Grid.centered(8, 20.0)
+    A = mph.Projector(grid, views, backend="numpy")
+    plain = mph.SpectralTransmission(views, TUBE, ("water",), ((20, 120),))
+    steps = np.linalg.norm(views.u_steps, axis=1)
+    m = mph.SpectralTransmission(views, TUBE, ("water",), ((20, 120),), blur=4 * steps, background=3.0)
+    volume = np.zeros((1, *grid.shape))
+    volume[0, 3:5, 3:5, 3:5] = 1.0
+    sharp, soft = (each.project(volume, A, 1.0) for each in (plain, m))
+    air = plain.project(0 * volume, A, 1.0)
+    # A uniform field stays as it is away from the edges, and so does what an object takes from it in all.
+    blurred_air = m.project(0 * volume, A, 1.0) - 3.0
+    np.testing.assert_allclose(blurred_air[..., 12:-12, 12:-12], air[..., 12:-12, 12:-12], rtol=1e-3)
+    np.testing.assert_allclose((blurred_air - soft + 3.0).sum(axis=(2, 3)), (air - sharp).sum(axis=(2, 3)), rtol=2e-3)
+    values, step, h = rng.random(soft.shape), rng.random(volume.shape), 1e-4
+    slope = (m.project(volume + h * step, A, 1.0) - m.project(volume - h * step, A, 1.0)) / (2 * h)
+    assert np.vdot(slope, values) == pytest.approx(np.vdot(step, m.volume_gradient(volume, values, A, 1.0)), rel=1e-6)
+    with pytest.raises(mph.InputError, match="blur: expected one number"):
+        mph.SpectralTransmission(None, TUBE, ("water",), ((20, 120),), blur=1.0)
+
+
+def test_a_focal_spot_blurs_by_its_shadow():
+    ring = mph.xray_ring(3, source_radius=400, panel_radius=400, z=0.0, focal_spot=1.2)
+    width = mph.panel_blur(ring, 0.5)
+    np.testing.assert_allclose(width, np.hypot(0.5, 1.2 * 2.3548 / 12**0.5), rtol=1e-3)

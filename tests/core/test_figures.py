@@ -78,7 +78,7 @@ def test_sums_print_translation_and_rotation(subject, tmp_path):
     assert "T = (10, 0, −5.5) mm    R = (φ, θ, ψ) = (30, 55, −10)°" in said
     assert "40 × 40 × 40 voxels of 2.6 × 2.6 × 2.6 mm" in said
     largest = max(float(orthogonal_sum(subject.volume, axis)[0].max()) for axis in range(3))
-    assert f"{largest:.4g}" in said and "kBq/mL mm" in said
+    assert f"{largest:.4g}" in said and "kBq/mL · mm" in said
     for axis in "xyz":
         assert f"Sum along {axis}" in said
 

@@ -69,6 +69,7 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ball = mph.Volume((np.hypot(*np.indices(small.shape)[:2] - 9.5) < 6).astype(np.float32), small, "mu")
         mph.write_mesh(mph.volume_to_mesh(ball, 0.5), folder / f"{name}.stl")
     np.save(folder / "counts.npy", np.ones((80, 16, 16)))
+    np.save(folder / "flood.npy", np.random.default_rng(1).poisson(400.0, (80, 16, 16)))
     (folder / "study.toml").write_text('[reconstruction]\nmethod = "osem"\niterations = 2\n')
     model = TEXT[TEXT.index("[models.emission]") : TEXT.index("[radon]")]
     text = TEXT.replace(str(SMALL_WORKBOOK), str(WORKBOOK))
@@ -87,6 +88,10 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     heart = "mphdrr project scanner.xlsx --volume heart.nii.gz --emission --time 600 --set model.intrinsic_fwhm=2"
     run(folder, f"{heart} --size 24 24 --write-recipe heart.toml")
     run(folder, "mphdrr project heart.toml -o run.h5")
+    run(
+        folder,
+        "mphdrr project scanner.xlsx --counts flood.npy --frames 1-80 --orientation front+v --time 60 -o flood.h5",
+    )
     run(folder, "mphdrr events make set --recipe derenzo.toml -n 13")
     system = mph.read_system(WORKBOOK)
     views, model = system.views((32, 32)), mph.Emission(system, time=60.0)

@@ -32,7 +32,6 @@ def difference(sums, step):
 
 @pytest.mark.parametrize("settings", [
     {}, {"detector": "virtual"}, {"intrinsic_fwhm": 3.0}, {"within_crystal": True},
-    pytest.param({"edge": "path"}, marks=pytest.mark.long), pytest.param({"depth_layers": 2}, marks=pytest.mark.long),
     pytest.param({"edge": "path", "plate_thickness": 3.5, "depth_layers": 2, "within_walls": True}, marks=pytest.mark.long),
 ])  # fmt: skip
 def test_derivatives_are_central_differences(settings, rng):
@@ -70,7 +69,8 @@ def test_derivatives_are_central_differences(settings, rng):
 
 
 @pytest.mark.parametrize("settings", [
-    pytest.param({"edge": "path"}, marks=pytest.mark.long), {"depth_layers": 2}, {"edge": "path", "depth_layers": 2},
+    pytest.param({"edge": "path"}, marks=pytest.mark.long), {"depth_layers": 2},
+    pytest.param({"edge": "path", "depth_layers": 2}, marks=pytest.mark.long),
 ])  # fmt: skip
 def test_all_numbers_at_once_where_kernels_depend_on_the_direction(settings, rng):
     x, weights = numbers(rng)

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -70,6 +71,7 @@ def next_step(context: bpy.types.Context) -> Step:
     return Step("mphdrr.export_dataset", "Export Dataset", "EXPORT")
 
 
+@cache
 def tutorial() -> str:
     """The address of the tutorial: on the website, or beside this file, or of the README that the zip has."""
     if website():

@@ -94,6 +94,8 @@ def set_panel(settings: ProjectionProperties, recipe: Recipe) -> None:
     """Set the panel as a recipe says, and the rest to its defaults; raises InputError for what the panel cannot show."""
     if recipe["model.pixel_points"] == "auto" and recipe["model.kind"] != "emission":
         raise InputError("model.pixel_points: the panel has no automatic number for radiographs")
+    if recipe["frames.times"] is not None:
+        raise InputError("frames.times: the panel has one frame; mphdrr project makes a run of each")
     text = recipe["system.modules"] or "-"
     first, dash, last = text.partition("-")
     try:

@@ -284,10 +284,10 @@ _DECLARED = (
         "inverse-square": ("Inverse Square Sum", "Line integrals with each segment times a point source's sensitivity, "
                            "as 1/h^2: no counts, for comparison"),
     }),
-    Setting("model.time", float, 1.0, f"Acquisition time{_OF_MODULES}", unit="s", above=0, needs=(_COUNTS,),
-            label="Time (s)", of_modules=True),
+    Setting("model.time", float, 1.0, f"Acquisition time{_OF_MODULES}", unit="s", above=0, needs=(_COUNTS,
+            "no frames.times"), label="Time (s)", of_modules=True),
     Setting("model.start", float, 0.0, f"Start of the acquisition after the reference time of the activity{_OF_MODULES}",
-            unit="s", needs=(_COUNTS,), label="Start (s)", option="--start-time", of_modules=True),
+            unit="s", needs=(_COUNTS, "no frames.starts"), label="Start (s)", option="--start-time", of_modules=True),
     Setting("model.photons", float, None, "X-ray photons per pixel: a radiograph of attenuation coefficients then holds "
             "those that pass", "line integrals", above=0, slider=1e6, needs=("model.kind=transmission",), unset="None"),
     Setting("model.isotope", str, None, "What decays: its photons are counted, and its activity falls during the "

@@ -99,6 +99,13 @@ def test_a_recipe_makes_a_run_of_each_frame(system, tmp_path):
     np.testing.assert_allclose(mph.read_run(tmp_path / "frame-2.h5").projections, runs[1].projections, rtol=1e-6)
 
 
+def test_times_beside_those_of_frames_are_refused():
+    counts = {"system.file": str(WORKBOOK), "model.kind": "emission", "frames.times": [1.0, 2.0]}
+    for key, more in (("model.time", {}), ("model.start", {"frames.starts": [0.0, 1.0]})):
+        with pytest.raises(mph.InputError, match=rf"{key}.*frames"):
+            mph.Recipe({**counts, key: 60.0, **more})
+
+
 def test_what_frames_do_not_fit_is_refused(system):
     A = projector(system)
     for times, starts, words in (

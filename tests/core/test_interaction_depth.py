@@ -9,9 +9,8 @@ import pytest
 
 import mphdrr.core as mph
 
-from .conftest import BACKENDS, WORKBOOK, general_grid
-from .test_emission import assert_adjoint
-from .test_penetrating_response import PLACES, TUNGSTEN, bound
+from .conftest import BACKENDS, WORKBOOK
+from .test_penetrating_response import PLACES, TUNGSTEN, assert_exact, bound
 from .traced_photons import image_of_voxel, misplaced, module, traced_image
 
 SYSTEM = mph.read_system(WORKBOOK)[[0, 47]]
@@ -68,14 +67,8 @@ def test_beyond_the_crystals_side_nothing_is_recorded():
 @pytest.mark.parametrize("backend", [b for b in BACKENDS if b in ("cpu", "numpy")])
 @pytest.mark.parametrize("edge", [{}, {"edge": "path", "aperture_mu": 2.0}])
 def test_adjoint_is_exact_and_backends_agree(backend, edge, rng):
-    grid, views = general_grid(rng, (9, 8, 21)), SYSTEM.views((22, 19))
     model = mph.Emission(SYSTEM, hole="depth", within_crystal=True, intrinsic_fwhm=2.0, **DEEP, **edge)
-    A, reference = (mph.Projector(grid, views, model, name, double=True) for name in (backend, "numpy"))
-    assert_adjoint(A, rng)
-    x, y = rng.random(A.shape_in), rng.random(A.shape_out)
-    assert (A(x) * y).sum() == pytest.approx((A.T(y) * x).sum(), rel=1e-12)
-    for found, expected in ((A(x), reference(x)), (A.T(y), reference.T(y))):
-        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12 * expected.max())
+    assert_exact(model, backend, rng)
 
 
 def test_it_agrees_with_rays(rng):

@@ -1,4 +1,4 @@
-"""Draw the pictures of docs/conventions.md and docs/perspective.md: ``python tools/draw_conventions.py``."""
+"""Draw the pictures of docs/conventions.md, perspective.md and architecture.md: ``python tools/draw_conventions.py``."""
 
 # ruff: noqa: RUF005 (arrays plus lists are sums here)
 
@@ -251,8 +251,49 @@ def draw_perspective() -> None:
     picture.write("perspective.svg")
 
 
+def draw_architecture() -> None:
+    """What becomes of what, and the room of core that does it."""
+    picture = Picture("What becomes of what in mphDRR, and the folder that does it", 1000, 560)
+
+    def box(x: float, y: float, name: str, room: str, look: str = "area") -> None:
+        picture.path([(x, y), (x + 180, y), (x + 180, y + 56), (x, y + 56)], look, closed=True)
+        picture.text((x + 90, y + 24), name)
+        picture.text((x + 90, y + 44), room, "soft mono")
+
+    surfaces = ("panels, operators, addon", "the command line: core/cli", "import mphdrr.core as mph")
+    for x, name in zip((30, 350, 670), surfaces, strict=True):
+        picture.path([(x, 24), (x + 300, 24), (x + 300, 62), (x, 62)], "thick", closed=True)
+        picture.text((x + 150, 49), name)
+    picture.text((500, 92), "all three give the same settings to the same functions of core", "soft")
+    box(30, 130, "workbook .xlsx", "workbook")
+    box(30, 240, "phantom .toml, CT", "phantoms, volumes")
+    box(30, 350, "isotope, materials", "physics")
+    box(280, 130, "Scanner, its Views", "geometry, xray")
+    box(280, 240, "Volume on a Grid", "volumes")
+    box(280, 350, "model of photons", "projector, xray")
+    box(530, 240, "Projector", "projector", "area thick")
+    box(780, 130, "run .h5: images", "runs")
+    box(780, 240, "Volume, scores", "reconstruction")
+    box(780, 350, "event set", "events")
+    box(530, 460, "four backends", "projector/backends")
+    box(530, 130, "other programs", "exchange")
+    box(780, 460, "networks, designs", "learning, design")
+    for y in (158, 268, 378):
+        picture.arrow((210, y), (280, y))
+    for y, end in ((172, 252), (268, 268), (378, 284)):
+        picture.arrow((460, y), (530, end))
+    for start, y in ((252, 158), (284, 378)):
+        picture.arrow((710, start), (780, y))
+    picture.arrow((870, 186), (870, 240))
+    picture.arrow((620, 460), (620, 296), "soft")
+    picture.arrow((870, 406), (870, 460))
+    picture.arrow((460, 150), (530, 150))
+    picture.write("architecture.svg")
+
+
 if __name__ == "__main__":
     draw_frames()
     draw_detectors()
     draw_arrays()
     draw_perspective()
+    draw_architecture()

@@ -18,8 +18,8 @@ from mphdrr.core.geometry.grid import Grid
 from mphdrr.core.runs.presets import PRESETS
 from mphdrr.core.runs.recipe import Recipe, write_recipe
 from mphdrr.core.runs.run_recipe import recipe_model
-from mphdrr.core.xray.arrangements import xray_arc
 from mphdrr.core.volumes.volume import Volume
+from mphdrr.core.xray.arrangements import xray_arc
 
 
 @pytest.fixture

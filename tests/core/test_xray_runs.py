@@ -50,7 +50,6 @@ def test_counts_of_a_recipe_are_those_of_the_spectra(given, detector, bins):
 def test_one_energy_is_transmission():
     system = SYSTEM.replace(focal_spot=np.zeros(5))
     at_70 = mph.Volume(CYLINDER.array * 0.9, GRID, "mu")
-    tube = mph.Spectrum([70.0], [1e7])
     model = mph.SpectralScan(system, spectrum=mph.Spectrum([70.0], [1e7]))
     nothing = mph.Volume(0 * at_70.array, GRID, "mu")
     behind, air = (

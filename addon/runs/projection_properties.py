@@ -119,7 +119,7 @@ def use_preset(settings: ProjectionProperties, preset: str) -> None:
     for name, setting in PROPERTIES.items():
         if setting.key in changes:
             set_property(settings, PROPERTIES, name, changes[setting.key])
-    _set_time(settings)
+    set_time(settings)
 
 
 def fit_model(settings: ProjectionProperties, quantity: str) -> None:
@@ -129,10 +129,10 @@ def fit_model(settings: ProjectionProperties, quantity: str) -> None:
         return
     settings.model = settings.fitted = model
     if model == "EMISSION":
-        _set_time(settings)
+        set_time(settings)
 
 
-def _set_time(settings: ProjectionProperties) -> None:
+def set_time(settings: ProjectionProperties) -> None:
     """Nobody acquires for the default time, 1 s, which only makes counts the sensitivity's rates."""
     if not settings.is_property_set("time"):
         settings.time = USUAL_TIME

@@ -10,6 +10,7 @@ from ..core import Recipe, euler_pose, read_system, run_recipe, xray_ring
 from ..core.example import EULER_DEGREES, EXAMPLE
 from ..core.geometry.scanner import Scanner
 from ..core.progress import Progress, stages_of
+from ..core.runs.display import Display
 from .blender import jobs
 from .figures import studio
 from .phantoms import phantom_properties, phantoms
@@ -44,7 +45,8 @@ def example_job(context: bpy.types.Context, of_xrays: bool = False) -> jobs.Job:
     if of_xrays:
         given = {"model.kind": "spectral", "volume.energy": settings.phantom().mu_energy, "noise.seed": 1}
     recipe = rendering.of_phantom(Recipe(given), settings, pose)
-    scene_uid, path, display = scene.session_uid, rendering.run_path(scene), scene.mphdrr_display.display()
+    scene_uid, path = scene.session_uid, rendering.run_path(scene)
+    display = Display("grey", "log") if of_xrays else scene.mphdrr_display.display()
 
     def work(progress: Progress) -> Any:
         stages = stages_of(progress)
@@ -55,6 +57,8 @@ def example_job(context: bpy.types.Context, of_xrays: bool = False) -> jobs.Job:
     def finish(result: Any) -> jobs.Finishing:
         stored, run, made = result
         scene = jobs.scene_again(scene_uid, "the projections are")
+        if of_xrays:
+            scene.mphdrr_display.colors, scene.mphdrr_display.scale = "GREY", "LOG"
         mosaic = yield from images.storing(run, made)
         collection = scanner.build_scanner(scene, pinholes)
         yield None

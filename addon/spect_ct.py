@@ -51,6 +51,8 @@ def using_ct(context: bpy.types.Context) -> jobs.Job:
             settings.mu, settings.model = body, "EMISSION"
             settings.isotope = "Tc-99m" if settings.isotope == "NONE" else settings.isotope
             projection_properties.set_time(settings)
+            for name in ("colors", "scale"):  # those of radiographs
+                scene.mphdrr_display.property_unset(name)
         return text
 
     job.finish = finish

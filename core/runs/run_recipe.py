@@ -40,6 +40,7 @@ _MODELS: dict[str, Any] = {
     "transmission": Transmission, "emission": Emission, "spectral": SpectralScan, "inverse-square": InverseSquareSum,
 }  # fmt: skip
 _MODULES, _EFFICIENCY = "system.modules", "model.efficiency"
+_MU_ADVICE = "; of mu, give the energy at which it holds (--energy)"
 _MOST_MU = 500.0
 """1/mm: more than any material of the tables attenuates photons of 10 keV or more."""
 
@@ -299,7 +300,8 @@ def _read(path: str, recipe: Recipe, progress: Progress | None) -> Volume:
             raise InputError(f"{path}: {values}; --quantity activity takes them as such")
         return volume
     if recipe["model.kind"] == "spectral":
-        return read_volume(path, series=series, progress=progress)
+        held, advice = ("mu", "; CT numbers need no energy") if recipe["volume.energy"] else ("hu", _MU_ADVICE)
+        return read_volume_of(path, held, advice, series=series, progress=progress)
     if recipe["model.photons"] is not None or recipe["volume.energy"] is not None:
         return read_mu(path, recipe["volume.energy"], series, progress)
     volume = read_volume(path, series=series, progress=progress)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import mphdrr.core as mph
+from mphdrr.core.cli import main
 
 TUBES = {"shape": (12, 16), "panel_size": (300, 240), "mas": 0.5}
 SYSTEM = mph.xray_ring(5, kvp=[120, 80, 120, 80, 120], filters="Al 3", **TUBES)
@@ -135,3 +136,29 @@ def test_pinholes_have_no_tubes(system):
         mph.InputError, match="spectral: expected a scanner of X-ray tubes and panels, got one of the kind pinhole"
     ):
         list(mph.run_recipe(mph.Recipe(SPECTRAL), system, CYLINDER))
+
+
+def test_the_command_makes_the_same_counts_and_lines(tmp_path, capsys):
+    book, volume, run = (str(tmp_path / name) for name in ("both.xlsx", "mu.npz", "run.npz"))
+    mph.write_system(SYSTEM, book)
+    mph.write_volume(CYLINDER, volume)
+    project = ["project", book, "--scanner-kind", "x-ray", "--volume", volume, "--spectral", "--noise", "4", "-o", run]
+    assert main([*project, "--energy", "60", "--bins", "20", "60", "60", "130"]) == 0
+    lines = capsys.readouterr().out
+    script = mph.Recipe({**SPECTRAL, "frames.bins": [20, 60, 60, 130], "noise.seed": 4})
+    for number, expected in enumerate(mph.run_recipe(script, SYSTEM, CYLINDER), 1):
+        found = mph.read_run(tmp_path / f"run-{number}.npz")
+        assert f"run-{number}.npz" in lines and found.seed == 3 + number
+        np.testing.assert_array_equal(found.projections, expected.projections)
+    assert main(project) == 1
+    assert capsys.readouterr().err.rstrip().endswith("of mu, give the energy at which it holds (--energy)")
+
+
+def test_event_sets_have_one_energy(tmp_path):
+    mph.write_system(SYSTEM, tmp_path / "x.xlsx")
+    (tmp_path / "events.toml").write_text(
+        'version = 1\n[system]\nfile = "x.xlsx"\nkind = "x-ray"\n[truth]\nquantity = "mu"\nspacing = 8\nvoxels = 16\n[[phantoms]]\nkind = "torso"\n'
+        '[models.ct]\nkind = "spectral"\n'
+    )
+    with pytest.raises(mph.InputError, match="event sets have X rays of one energy"):
+        mph.events.read_recipe(tmp_path / "events.toml")

@@ -156,9 +156,12 @@ def test_the_command_makes_the_same_counts_and_lines(tmp_path, capsys):
 
 def test_event_sets_have_one_energy(tmp_path):
     mph.write_system(SYSTEM, tmp_path / "x.xlsx")
-    (tmp_path / "events.toml").write_text(
-        'version = 1\n[system]\nfile = "x.xlsx"\nkind = "x-ray"\n[truth]\nquantity = "mu"\nspacing = 8\nvoxels = 16\n[[phantoms]]\nkind = "torso"\n'
-        '[models.ct]\nkind = "spectral"\n'
-    )
+    (tmp_path / "events.toml").write_text("""
+        version = 1
+        system = {file = "x.xlsx", kind = "x-ray"}
+        truth = {quantity = "mu", spacing = 8, voxels = 16}
+        phantoms = [{kind = "torso"}]
+        models = {ct = {kind = "spectral"}}
+    """)
     with pytest.raises(mph.InputError, match="event sets have X rays of one energy"):
         mph.events.read_recipe(tmp_path / "events.toml")

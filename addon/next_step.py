@@ -46,8 +46,8 @@ _RENDER = Step("mphdrr.render_projections", "Render Projections", "RENDER_STILL"
 def stages(context: bpy.types.Context) -> list[Stage]:
     """The stages in their order."""
     scene = context.scene
-    collection, run, known = scanner.active_scanner(scene), runs.shown(scene), _phantoms(scene)
-    stale, found = _stale(scene), spect_ct.shown_reconstruction(scene)
+    collection, run, known = scanner.active_scanner(scene), _run(scene), _phantoms(scene)
+    stale, found = (_stale(scene), spect_ct.shown_reconstruction(scene)) if run else ([], {})
     scores = found.get("scores", ())
     made = event_notes.of_set(scene.mphdrr_events.folder)
     return [
@@ -61,14 +61,13 @@ def stages(context: bpy.types.Context) -> list[Stage]:
 
 def next_step(context: bpy.types.Context) -> Step:
     """The step that comes next."""
-    scene, run = context.scene, runs.shown(context.scene)
+    scene, run = context.scene, _run(context.scene)
     if run is None and scanner.active_scanner(scene) is None:
         return Step("mphdrr.load_example", "Load Example", "PLAY")
     if run is None or _stale(scene):
         if not _phantoms(scene):
             return Step("mphdrr.add_derenzo", "Add Phantom", "OUTLINER_DATA_VOLUME", {"confirmed": True})
-        is_other = run is None or run.scanner != scanner.active_scanner(scene)
-        return _RENDER if is_other else Step(_RENDER.operator, "Render Again", "FILE_REFRESH")
+        return _RENDER if run is None else Step(_RENDER.operator, "Render Again", "FILE_REFRESH")
     if not spect_ct.shown_reconstruction(scene):
         return Step("mphdrr.reconstruct", "Reconstruct", "OUTLINER_OB_VOLUME")
     if spect_ct.chain(scene):
@@ -95,6 +94,13 @@ def _phantoms(scene: bpy.types.Scene) -> list[bpy.types.Object]:
     """The volumes that may be projected: no maps, and not what was reconstructed."""
     found = scene.mphdrr_reconstruction.volume
     return [item for item in volumes.volume_objects(scene) if item != found and volumes.quantity_of(item) not in MAPS]
+
+
+def _run(scene: bpy.types.Scene) -> bpy.types.PropertyGroup | None:
+    """The shown run, unless it is of another scanner than the panels work on."""
+    run = runs.shown(scene)
+    is_other = run is not None and run.scanner not in (None, scanner.active_scanner(scene))
+    return None if is_other else run
 
 
 def _is_without_dose(scene: bpy.types.Scene) -> bool:

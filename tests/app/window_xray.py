@@ -1,7 +1,7 @@
 """From a clean home to CT, SPECT with it, and dose, by clicks on the buttons that the tab proposes."""
 
 import bpy
-from driving import ARGUMENTS, editor, idle, open_tab, ours, picture, run, seen, sidebar, xdotool
+from driving import editor, idle, open_tab, ours, picture, run, seen, sidebar, xdotool
 
 _FIRST, _LATER = 78, 160  # pixels from the sidebar's top to the button, before there is anything, and later
 
@@ -24,9 +24,7 @@ def steps():
         yield from idle()
         yield 2
         picture(f"click-{number}")
-        if number == 1 and not ARGUMENTS:  # for speed; with any argument as it is, for the pictures of docs/xray.md
-            settings = scene.mphdrr_reconstruction
-            settings.voxels, settings.spacing, settings.iterations = 28, 16.0, 10
+        scene.mphdrr_reconstruction.iterations = 30 if number < 3 else 0  # of the CT, for speed
     volumes = ours("addon.volumes.volumes")
     found = [(item.name, volumes.quantity_of(item)) for item in volumes.volume_objects(scene)]
     seen["volumes"] = found

@@ -1,20 +1,25 @@
 """The example in one click, and its workbook in the file browser."""
 
 import bpy
+from bpy.props import EnumProperty
 
 from ..addon import example
-from ..addon.blender import jobs
+from ..addon.blender import choices, jobs
 from ..addon.blender.reports import Reported, needs
 from ..core.example import EXAMPLE
 
 
 class MPHDRR_OT_load_example(jobs.JobOperator, bpy.types.Operator):
-    """Load the bundled scanner of 80 modules with a Derenzo phantom, and show what every module sees of it"""
+    """Load the bundled scanner of 80 modules with a phantom, and show what every module, or every X-ray tube, sees of it"""
+
+    example: EnumProperty(
+        name="Example", description="What is loaded", items=choices.items({}, example.EXAMPLES), options={"SKIP_SAVE"}
+    )
 
     poll = needs((lambda context: not jobs.is_running(), "Another job is running: wait for it or cancel it"))
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        return example.example_job(context)
+        return example.example_job(context, of_xrays=self.example == "XRAY")
 
 
 class MPHDRR_OT_browse_example(Reported, bpy.types.Operator):

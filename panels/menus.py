@@ -39,6 +39,7 @@ class MPHDRR_MT_commands(bpy.types.Menu):
         layout.menu("MPHDRR_MT_projections", icon="RENDER_STILL")
         layout.separator()
         layout.operator("mphdrr.load_example", icon="PLAY")
+        layout.operator("mphdrr.load_example", text="Load Example: X-ray Inside SPECT", icon="PLAY").example = "XRAY"
 
 
 class MPHDRR_MT_modules(bpy.types.Menu):
@@ -118,6 +119,7 @@ class MPHDRR_MT_projections(bpy.types.Menu):
         layout.operator("mphdrr.reconstruct", icon="OUTLINER_OB_VOLUME")
         layout.operator("mphdrr.continue_reconstruction", icon="FORWARD")
         layout.operator("mphdrr.show_reconstruction", icon="IMAGE_DATA")
+        layout.operator("mphdrr.use_ct", icon="MOD_FLUIDSIM")
         layout.operator_menu_enum("mphdrr.backproject", "how", icon="OUTLINER_DATA_VOLUME")
         layout.separator()
         layout.operator_menu_enum("mphdrr.new_event_recipe", "like", icon="FILE_NEW")

@@ -13,7 +13,8 @@ from .sidebar import Folded, draw_text
 _MAIN = ("model", "time", "hole", "height", "width")
 """A beginner's settings, which the panel itself shows."""
 _PHYSICS = (
-    "photons", "isotope", "window", "aperture_material", "aperture_mu", "crystal_material", "crystal_mu",
+    "photons", "isotope", "panel", "window", "sensor", "sensor_thickness", "materials",
+    "aperture_material", "aperture_mu", "crystal_material", "crystal_mu",
     "intrinsic_fwhm", "background",
 )  # fmt: skip
 """Settings under Physics; all others stand under Advanced."""

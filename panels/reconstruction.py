@@ -73,7 +73,10 @@ class MPHDRR_PT_reconstruction_model(Folded, bpy.types.Panel):
     def draw(self, context: bpy.types.Context) -> None:
         settings = context.scene.mphdrr_reconstruction
         others = (each for each in drawn(settings) if each[0] not in _MAIN)
-        layouts.draw_settings(layouts.labelled(self.layout).column(), settings, others)
+        column = layouts.labelled(self.layout).column()
+        if runs.holds_counts(context.scene):
+            column.prop(settings, "mu", placeholder="The run's")
+        layouts.draw_settings(column, settings, others)
 
 
 class MPHDRR_PT_backprojection(Folded, bpy.types.Panel):

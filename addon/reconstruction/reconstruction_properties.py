@@ -107,6 +107,11 @@ class ReconstructionProperties(ReconstructionSettings, bpy.types.PropertyGroup):
         name="Reconstruction", description="The last reconstructed volume", type=bpy.types.Object,
         poll=lambda self, item: volumes.is_volume(item), options={"HIDDEN"},
     )  # fmt: skip
+    mu: PointerProperty(
+        name="Attenuation", description="Volume of attenuation coefficients (1/mm) or CT numbers for counts, in place of "
+        "that which the run was made with; empty: the run's", type=bpy.types.Object,
+        poll=lambda self, item: volumes.is_volume(item) and volumes.quantity_of(item) in ("mu", "hu"),
+    )  # fmt: skip
     fitted: StringProperty(
         name="Fitted Method", description="The method that what a run holds has chosen", options={"HIDDEN"}
     )

@@ -103,7 +103,9 @@ def request(context: bpy.types.Context) -> Request:
     distance = float(recipe_views(recipe, system).fields(system.poses())[0, 2])
     share = None if shown.planes == "NONE" else planes.share_of_way(shown, module, distance)
     mu = None if mu_item is None else volumes.source(mu_item)
-    return Request(recipe, system, volumes.source(item), mu, shown.display(), share, tuple(lines))
+    return Request(
+        rendering.with_energy(recipe, item), system, volumes.source(item), mu, shown.display(), share, tuple(lines)
+    )
 
 
 def make(asked: Request, quick: bool, voxels: dict[Path, Volume]) -> Preview:

@@ -94,8 +94,9 @@ def set_panel(settings: ProjectionProperties, recipe: Recipe) -> None:
     """Set the panel as a recipe says, and the rest to its defaults; raises InputError for what the panel cannot show."""
     if recipe["model.pixel_points"] == "auto" and recipe["model.kind"] != "emission":
         raise InputError("model.pixel_points: the panel has no automatic number for radiographs")
-    if recipe["frames.times"] is not None:
-        raise InputError("frames.times: the panel has one frame; mphdrr project makes a run of each")
+    for several in ("frames.times", "frames.bins"):
+        if recipe[several] is not None:
+            raise InputError(f"{several}: the panel has one frame; mphdrr project makes a run of each")
     text = recipe["system.modules"] or "-"
     first, dash, last = text.partition("-")
     try:
@@ -118,7 +119,7 @@ def use_preset(settings: ProjectionProperties, preset: str) -> None:
     for name, setting in PROPERTIES.items():
         if setting.key in changes:
             set_property(settings, PROPERTIES, name, changes[setting.key])
-    _set_time(settings)
+    set_time(settings)
 
 
 def fit_model(settings: ProjectionProperties, quantity: str) -> None:
@@ -128,10 +129,10 @@ def fit_model(settings: ProjectionProperties, quantity: str) -> None:
         return
     settings.model = settings.fitted = model
     if model == "EMISSION":
-        _set_time(settings)
+        set_time(settings)
 
 
-def _set_time(settings: ProjectionProperties) -> None:
+def set_time(settings: ProjectionProperties) -> None:
     """Nobody acquires for the default time, 1 s, which only makes counts the sensitivity's rates."""
     if not settings.is_property_set("time"):
         settings.time = USUAL_TIME
@@ -139,14 +140,17 @@ def _set_time(settings: ProjectionProperties) -> None:
 
 def drawn(settings: ProjectionProperties, table: str) -> Iterator[tuple[str, bool]]:
     """The properties of a table that the chosen model and hole have, each with whether it has an effect."""
-    of_others = drawn_of(PROPERTIES, settings, lambda need: "model.kind=" in need or "model.hole=rays" in need, table)
+    of_others = drawn_of(
+        PROPERTIES, settings, lambda need: need.startswith("model.kind=") or "model.hole=rays" in need, table
+    )
     for name, is_active in of_others:
         yield name, is_active and (name != "magnification" or settings.detector == "VIRTUAL")
 
 
 def makes_counts(settings: ProjectionProperties) -> bool:
     """Whether images hold numbers of photons, which may have noise."""
-    return settings.model == "EMISSION" or (settings.model == "TRANSMISSION" and settings.photons > 0)
+    of_xrays = settings.model == "SPECTRAL" and settings.panel == "COUNTING"
+    return settings.model == "EMISSION" or of_xrays or (settings.model == "TRANSMISSION" and settings.photons > 0)
 
 
 def _is_ours(self: ProjectionProperties, item: bpy.types.Object) -> bool:

@@ -50,7 +50,7 @@ def render_job(context: bpy.types.Context, recipe: Recipe, volume: str = "", mu:
     # The array, means and colours of it, and the packed images, in our memory and in Blender's beside those of the last run.
     memory.require(16.0 * len(system) * rows * columns, f"{len(system)} images of {columns} x {rows} pixels")
     recipe = recipe.updated({"volume.object": item.name, "attenuation.object": mu_item and mu_item.name})
-    recipe = _with_volume(recipe, item)
+    recipe = _with_volume(with_energy(recipe, item), item)
     read_volume, read_mu = volumes.reader(item), mu_item and volumes.reader(mu_item)
     energy = mu_item and phantoms.mu_energy(mu_item)
     path, display = run_path(scene), scene.mphdrr_display.display()
@@ -91,6 +91,11 @@ def sources(
     taken = tuple(each for each in taken if each in (("mu",) if recipe["model.photons"] else model.takes))
     item = _chosen_volume(context, volume, taken, model.name)
     return item, attenuating(context, recipe, mu)
+
+
+def with_energy(recipe: Recipe, item: bpy.types.Object) -> Recipe:
+    """The recipe with the energy at which an object's mu holds, if spectra need it."""
+    return recipe.updated({"volume.energy": phantoms.mu_energy(item)}) if recipe["model.kind"] == "spectral" else recipe
 
 
 def attenuating(context: bpy.types.Context, recipe: Recipe, mu: str = "") -> bpy.types.Object | None:

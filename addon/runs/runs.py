@@ -115,11 +115,17 @@ def shown(scene: bpy.types.Scene) -> bpy.types.PropertyGroup | None:
     return next((item for item in settings.runs if item.file == settings.run_file), None)
 
 
-def holds_counts(scene: bpy.types.Scene) -> bool | None:
-    """Whether the `shown` run is of SPECT counts; None where that is not known."""
+def settings_of(scene: bpy.types.Scene) -> Mapping[str, Any]:
+    """The settings that the `shown` run was made with, all that its numbers depend on; empty where they are not known."""
     item = shown(scene)
     settings = json.loads(item.state).get("settings") if item is not None and item.state else None
-    return None if settings is None else settings.get("model.kind", _DEFAULTS["model.kind"]) == "emission"
+    return {} if settings is None else {**_DEFAULTS, **settings}
+
+
+def holds_counts(scene: bpy.types.Scene) -> bool | None:
+    """Whether the `shown` run is of SPECT counts; None where that is not known."""
+    settings = settings_of(scene)
+    return settings["model.kind"] == "emission" if settings else None
 
 
 def required(scene: bpy.types.Scene, to_do: str) -> bpy.types.PropertyGroup:

@@ -44,6 +44,14 @@ def test_clicks_on_what_is_proposed_lead_to_a_score(window, work_folder):
     assert found == ["EMISSION", "OSEM", "NRMSE", "Export Dataset"], "what suits a phantom of activity"
 
 
+def test_six_clicks_lead_from_an_empty_scene_over_a_ct_to_a_dose_map(window, work_folder):
+    seen = window("xray")
+    clicks = ["Load Example", "Reconstruct", "Use CT for SPECT", "Render Projections", "Reconstruct", "Dose Map"]
+    assert seen["clicks"] == clicks
+    assert [quantity for _, quantity in seen["volumes"]].count("dose_rate") == 1
+    assert seen["tubes"].endswith("CT") and seen["next"] == "Export Dataset"
+
+
 def close(one: dict, other: dict) -> None:
     assert one.keys() == other.keys()
     for name, value in one.items():

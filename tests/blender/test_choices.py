@@ -101,6 +101,7 @@ DEFAULTS = {
     "detector": "VIRTUAL", "backend": "AUTO", "rows": "BY_NUMBER", "unit": "NONE",
     "colors": "INFERNO", "scale": "LINEAR", "planes": "ALL", "look": "DENSITY", "figure": "SCANNER",
     "method": "OSEM", "prior": "NONE", "hole": "AUTO", "lines": "TOGETHER", "dead_time_kind": "NON_PARALYSABLE",
+    "panel": "COUNTING", "sensor": "NONE", "materials": "WATER_BONE",
     "how": "SUM", "uniform": "K", "MixturePhantomProperties.look": "solids",
 }  # fmt: skip
 """What files mean that do not hold a choice, because nobody has made it."""

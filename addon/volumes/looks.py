@@ -81,7 +81,7 @@ def _shift(item: bpy.types.Object) -> Vector:
 def _new_surface(item: bpy.types.Object) -> bpy.types.Object:
     name = f"{item.name} surface"
     mesh = bpy.data.meshes.new(name)
-    mesh.materials.append(_material(name, item.mphdrr_volume.quantity))
+    mesh.materials.append(new_material(name, item.mphdrr_volume.quantity))
     surface = bpy.data.objects.new(name, mesh)
     surface[_KEY] = True
     surface.parent, surface.hide_select = item, True
@@ -106,7 +106,7 @@ def _cutting(name: str) -> bpy.types.NodeTree:
     return tree
 
 
-def _material(name: str, quantity: str) -> bpy.types.Material:
+def new_material(name: str, quantity: str) -> bpy.types.Material:
     """A dull surface in the brighter colours of a quantity."""
     material, shader = compat.surface_material(name, "ShaderNodeBsdfPrincipled")
     color = (*volume_materials.ramp(quantity)[-2][1], 1.0)

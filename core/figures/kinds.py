@@ -5,12 +5,17 @@ into the studio (`addon.figures.figures`).
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 from ..validation import one_of
 from . import mosaics, sums, virtual_c_arm
-from .page import Page
+from .page import DARK, Page
 from .subject import Subject
+
+
+Motion = Literal["turn", "light"]
+PAPERS = {"dark": DARK, "light": "#ffffff"}
+"""What rendered figures lie on, by their style."""
 
 
 class Studio(NamedTuple):
@@ -19,7 +24,10 @@ class Studio(NamedTuple):
     volume: bool = False
     rays: bool = False  # the modules' principal rays
     cut: bool = False  # the modules between the isocentre and the viewer are left out
-    near: bool = False  # the ROI fills the picture's height
+    near: float = 0.0  # ROI radii from the isocentre to the picture's edge; 0: the whole scanner fits
+    lens: float = 50.0  # mm, of a camera whose film is 36 mm wide: a short one shows what is near large
+    lit: bool = False  # the chosen modules alone are lit and have rays; others stay, and fade where they stand in the way
+    motion: Motion | None = None  # of an animation
 
 
 class FigureKind(NamedTuple):
@@ -48,7 +56,19 @@ KINDS = {
         ),
         FigureKind(
             "inside", "Volume in the Scanner", "a volume seen from near by, between the modules", ("scanner", "volume"),
-            (1600, 1000), studio=Studio(volume=True, near=True),
+            (1600, 1000), studio=Studio(volume=True, near=1.7),
+        ),
+        FigureKind(
+            "picture", "Picture", "a volume with its scale and colour bar, and the rays of chosen modules or of a ring",
+            ("scanner", "volume"), (2400, 1500), studio=Studio(volume=True, rays=True, near=1.4, lens=30.0, lit=True),
+        ),
+        FigureKind(
+            "turntable", "Turntable", "the picture, once around: an animation", ("scanner", "volume"), (1280, 800),
+            studio=Studio(volume=True, rays=True, near=1.4, lens=30.0, lit=True, motion="turn"),
+        ),
+        FigureKind(
+            "light-up", "Modules Light Up", "the picture, one module after the other with its ray: an animation",
+            ("scanner", "volume"), (1280, 800), studio=Studio(volume=True, rays=True, near=1.4, lens=30.0, lit=True, motion="light"),
         ),
         FigureKind(
             "sums", "Orthogonal Sums", "a volume's sums along x, y and z, value x mm, with its translation T and rotation R",

@@ -56,3 +56,10 @@ def surface_material(name: str, kind: str) -> tuple[bpy.types.Material, bpy.type
     shader = add_node(material.node_tree, kind, (0.0, 0.0))
     add_node(material.node_tree, "ShaderNodeOutputMaterial", (300.0, 0.0), {"Surface": shader.outputs[0]})
     return material, shader
+
+
+def write_films(settings: bpy.types.ImageFormatSettings) -> None:
+    """Have renders written as films."""
+    if bpy.app.version >= (5, 0, 0):
+        settings.media_type = "VIDEO"
+    settings.file_format = "FFMPEG"

@@ -22,7 +22,7 @@ from bpy_extras.io_utils import ExportHelper
 
 from ...core.cli.options import progress_bar
 from ...core.errors import InputError
-from ...core.progress import Cancelled, Progress, StagedProgress
+from ...core.progress import Cancelled, Progress, StagedProgress, stages_of, tell
 from ...core.recording import recorded_warnings
 from . import reports, storage, windows
 
@@ -69,11 +69,16 @@ def run(job: Job, progress: Progress = lambda done, total: None) -> str:
     """Do a job now; returns the line to report, raises what the work raises."""
     try:
         steps = _finishing(job, job.work(progress))
+        stage, show = "", None
         while True:
             try:
-                next(steps)
+                step = next(steps)
             except StopIteration as end:
                 return str(end.value)
+            if step is not None:
+                if step[0] != stage:
+                    stage, show = step[0], stages_of(progress)(step[0])
+                tell(show, *step[1:])
     except BaseException:
         job.discard()
         raise

@@ -3,9 +3,10 @@
 It needs no window and no graphics card.
 """
 
+import glob
 import sys
 import tempfile
-import time
+import threading
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -17,11 +18,11 @@ import numpy as np
 from mathutils import Vector
 from numpy.typing import ArrayLike, NDArray
 
-from ...core import Cancelled, PinholeSystem, Progress, read_run, recording, volume_to_mesh
+from ...core import PinholeSystem, Progress, files, read_run, recording, volume_to_mesh
 from ...core.cli.options import output_path
 from ...core.errors import InputError, warn
-from ...core.figures.kinds import KINDS, PAPERS, FigureKind, Studio, figure_kind
-from ...core.figures.page import DARK, SUFFIXES, Page, box
+from ...core.figures.kinds import FILM, KINDS, PAPERS, FigureKind, Film, Studio, figure_kind
+from ...core.figures.page import DARK, Page, box
 from ...core.figures.parts import bar_width, color_bar, heading, heading_height
 from ...core.figures.subject import Subject, require
 from ...core.runs.display import Display
@@ -32,9 +33,20 @@ from ..blender.choices import items
 from ..phantoms import phantoms
 from ..scanner import pinholes, scanner, selection
 from ..volumes import slices, volume_materials, volumes
+from . import engine
 from .stage import DIRECTION, Stage
 
-KIND_ITEMS = items({}, ((name.upper().replace("-", "_"), kind.label, kind.summary) for name, kind in KINDS.items()))
+KIND_ITEMS, FILM_ITEMS = (
+    items(
+        {},
+        (
+            (name.upper().replace("-", "_"), kind.label, kind.summary)
+            for name, kind in KINDS.items()
+            if kind.is_film == film
+        ),
+    )
+    for film in (False, True)
+)
 _MISSING = {
     "scanner": "no scanner in the scene: import a workbook first",
     "volume": "no volume in the scene: add a phantom first",
@@ -43,15 +55,17 @@ _MISSING = {
 SAMPLES = 16
 """Rays per pixel; what noise they leave is smoothed."""
 _MOST_RUNS = 6  # of module numbers that a title lists
-_PAUSE = 0.02  # s between two looks at Blender's render job
 _REST = 0.5  # s between two looks at Blender's render job where nothing waits for it
 _SMALL, _TRACE = 240, 8  # pixels across, and of 255: what a volume that can be seen changes in a small picture
 _drawn: set[tuple[str, str, float, float]] = set()  # volumes and looks that Cycles is known to draw
-_CLEAR = 64  # surfaces of faded modules behind one another that are seen through
 _UNSEEN = ": Low and High draw none of its values, its file is missing, or this Blender's Cycles draws no volumes"
 _AXES = {"dark": ("#ff8a80", "#8ee59a", "#8cb8ff"), "light": ("#c62828", "#2e7d32", "#1f57c3")}  # x, y and z
 _STEPS = (1.0, 2.0, 5.0)  # round numbers of scale bars
 _SCALE = 0.2  # of the picture's width that a scale bar takes at most
+
+
+Step = tuple[str, int, int] | None
+"""As a job's finishing yields it (`jobs.Finishing`)."""
 
 
 @dataclass(frozen=True)
@@ -74,20 +88,24 @@ def figure_job(
     labels: bool = True,
     samples: int = SAMPLES,
     style: str = "dark",
+    film: Film = FILM,
 ) -> jobs.Job:
-    """The job that writes a figure of the context's scene to files (.png, .svg), `size` pixels wide and high.
+    """The job that writes a figure of the context's scene to files (.png, .svg; .mp4), `size` pixels wide and high.
 
     `modules` are all by default; of figures of one module, the active one. Raises InputError where the scene has not what
     the figure needs.
     """
     kind, scene = figure_kind(name), context.scene
     page = new_page(kind, size, style)
-    paths = [output_path(str(path), SUFFIXES) for path in paths]
+    paths = [output_path(str(path), kind.suffixes) for path in paths]
     collection = scanner.active_scanner(scene)
     item = _volume_item(context) if "volume" in kind.needs else None
     active = selection.active_module(context)
     if kind.one_module and modules is None and active is not None:
         modules = str(active.mphdrr_module.number)
+    selected = [camera.mphdrr_module.number for camera in selection.selected_modules(context)]
+    if kind.studio is not None and kind.studio.lit and modules is None and len(selected) > 1:
+        modules = ",".join(map(str, selected))
     known: dict[str, Any] = {"modules": modules, "display": scene.mphdrr_display.display()}
     if collection is not None:
         known["scanner"] = scanner.read_scanner(collection)
@@ -110,21 +128,47 @@ def figure_job(
             known["name"] = found["run"].settings.get("volume", "")
         return Subject(**known, **found)
 
-    def finish(subject: Subject) -> Generator[None, None, str]:
-        if kind.draw is not None:
-            kind.draw(page, subject)
-        if kind.studio is not None:
-            yield from rendering(page, subject, kind.studio, item, labels, samples)
-        for path in paths:
-            page.write(path)
+    enough = threading.Event()
+    made: list[Path] = []
+
+    def finish(subject: Subject) -> Generator[Step, None, str]:
+        yield from drawing(page, subject, kind, item, paths, labels, samples, film, made, enough)
         return f"Wrote {', '.join(map(str, paths))}"
 
-    return jobs.Job("Drawing the figure", work, finish)
+    def left() -> str:
+        return f"{len(made)} pictures are in {made[0].parent}" if made else "nothing was changed"
+
+    return jobs.Job("Drawing the figure", work, finish, enough=enough if kind.is_film else None, left=left)
 
 
 def new_page(kind: FigureKind, size: tuple[int, int] | None, style: str) -> Page:
     """The page of a kind of figure; only rendered ones have a style."""
-    return Page(*(size or kind.size), *([PAPERS[style]] if kind.studio is not None else []))
+    return Page(*(size or kind.size), PAPERS[style] if kind.studio is not None else PAPERS["light"])
+
+
+def drawing(
+    page: Page,
+    subject: Subject,
+    kind: FigureKind,
+    item: bpy.types.Object | None,
+    paths: Sequence[Path],
+    labels: bool = True,
+    samples: int = SAMPLES,
+    film: Film = FILM,
+    made: list[Path] | None = None,
+    enough: threading.Event | None = None,
+) -> Generator[Step, None, None]:
+    """Draw a figure of a kind on its page and write it to `paths`; the other arguments are those of `filming`."""
+    if kind.draw is not None:
+        kind.draw(page, subject)
+    elif kind.is_film:
+        for path in paths:
+            yield from filming(page, subject, kind, item, path, labels, samples, film, made, enough)
+        return
+    elif kind.studio is not None:
+        yield from rendering(page, subject, kind.studio, item, labels, samples)
+    for path in paths:
+        page.write(path)
 
 
 def rendering(
@@ -144,9 +188,53 @@ def rendering(
         stage.remove()
 
 
+def filming(
+    page: Page,
+    subject: Subject,
+    kind: FigureKind,
+    item: bpy.types.Object | None,
+    path: Path,
+    labels: bool = True,
+    samples: int = SAMPLES,
+    film: Film = FILM,
+    made: list[Path] | None = None,
+    enough: threading.Event | None = None,
+) -> Generator[Step, None, None]:
+    """Render an animation: pictures in the folder NAME-frames beside `path`, and of them the MP4 `path`, NAME.mp4.
+
+    Yields how many of the pictures there are. They are added to `made` and stay if the work is ended; where `enough` is
+    set, the film ends with those. Raises InputError where a side of the page is odd, which MP4 cannot hold.
+    """
+    assert kind.studio is not None
+    if page.width % 2 or page.height % 2:
+        raise InputError(f"size {page.width}x{page.height}: of an animation both must be even")
+    made = [] if made is None else made
+    folder = files.ensure_folder(path.with_name(f"{path.stem}-frames"))
+    for old in folder.glob(f"{glob.escape(path.stem)}-[0-9][0-9][0-9][0-9].png"):
+        old.unlink()  # of an animation that may have been longer
+    stage = Stage(subject, kind.studio, item, page, heading_height(page, 1) if labels else 0)
+    try:
+        yield from prepared(stage, subject, samples)
+        shown, frame = None, page
+        for k in range(film.frames):
+            if enough is not None and enough.is_set() and made:
+                break
+            moment = stage.moment(k / film.frames)
+            if moment != shown:
+                shown, frame = moment, Page(page.width, page.height, page.paper)
+                stage.show(*moment)
+                yield from picture(stage, subject, frame, labels)
+            made.append(folder / f"{path.stem}-{k + 1:04d}.png")
+            frame.write(made[-1])
+            yield "rendering pictures", k + 1, film.frames
+        yield from engine.write_film(made, path, film.fps, page)
+    finally:
+        stage.remove()
+
+
 def prepared(stage: Stage, subject: Subject, samples: int) -> Generator[None, None, None]:
     """Set up Cycles for a stage; a volume that it does not draw becomes a surface, which is said."""
-    _set_up(stage.scene, stage.page, samples)
+    engine.set_up(stage.scene, stage.page, samples)
     item = stage.item
     if item is None or not stage.drawn or (yield from _leave_a_trace(stage.scene, stage.drawn)):
         return
@@ -210,25 +298,11 @@ def _titles(stage: Stage, subject: Subject) -> tuple[str, str]:
     modules = f"{'Module' if len(numbers) == 1 else 'Modules'} {listed}"
     within = f"ROI of radius {stage.radius:g} mm"
     name = subject.name if stage.shown.volume else ""
-    return (name or modules, f"{modules}, {within}") if stage.shown.lit else (modules, ", ".join(filter(None, (name, within))))
-
-
-def _set_up(scene: bpy.types.Scene, page: Page, samples: int) -> None:
-    """Have a scene rendered as 8-bit colours by Cycles, the same on every machine."""
-    render = scene.render
-    try:
-        render.engine = "CYCLES"
-    except TypeError:
-        raise InputError("Cycles is disabled: enable Cycles Render Engine in Edit > Preferences > Add-ons") from None
-    cycles = scene.cycles
-    cycles.device, cycles.samples, cycles.max_bounces, cycles.seed = "CPU", samples, 4, 0
-    cycles.use_adaptive_sampling, cycles.adaptive_threshold, cycles.adaptive_min_samples = True, 0.05, 4
-    cycles.use_denoising, cycles.denoising_prefilter = True, "ACCURATE"
-    render.resolution_x, render.resolution_y, render.resolution_percentage = page.width, page.height, 100
-    cycles.transparent_max_bounces = _CLEAR
-    render.image_settings.file_format, render.image_settings.color_mode = "PNG", "RGB"
-    render.dither_intensity = 0.0
-    scene.view_settings.view_transform = "Standard"
+    return (
+        (name or modules, f"{modules}, {within}")
+        if stage.shown.lit
+        else (modules, ", ".join(filter(None, (name, within))))
+    )
 
 
 def _leave_a_trace(scene: bpy.types.Scene, drawn: list[bpy.types.Object]) -> Generator[None, None, bool]:
@@ -287,41 +361,8 @@ def _render(scene: bpy.types.Scene) -> Generator[None, None, NDArray[np.uint8]]:
     """Colours (height, width, 3) of a scene."""
     with tempfile.TemporaryDirectory(prefix="mphdrr-") as folder:
         path = Path(folder) / "figure.png"
-        yield from written(scene, path)
-        return _pixels(path)
-
-
-def written(scene: bpy.types.Scene, path: Path, animation: bool = False) -> Generator[None, None, None]:
-    """Render a scene to a file; in the window as Blender's own job, which its status bar shows and Esc ends."""
-    how = {"animation" if animation else "write_still": True, "scene": scene.name}
-    scene.render.filepath = str(path)
-    try:
-        if not jobs.is_running():
-            bpy.ops.render.render(**how)
-            return
-        view = bpy.context.preferences.view
-        before, view.render_display_type = view.render_display_type, "NONE"
-        try:
-            bpy.ops.render.render("INVOKE_DEFAULT", **how)
-        finally:
-            view.render_display_type = before
-    except RuntimeError as error:
-        raise InputError(f"Blender cannot render the figure: {str(error).strip().splitlines()[0]}") from error
-    while bpy.app.is_job_running("RENDER"):
-        time.sleep(_PAUSE)
-        yield
-    if not path.is_file():  # the user has pressed Esc
-        raise Cancelled
-
-
-def _pixels(path: Path) -> NDArray[np.uint8]:
-    """Colours (height, width, 3) of a PNG, row 0 at the top."""
-    image = bpy.data.images.load(str(path))
-    width, height = image.size
-    values = np.empty(4 * width * height, np.float32)
-    image.pixels.foreach_get(values)
-    bpy.data.images.remove(image)
-    return np.rint(values.reshape(height, width, 4)[::-1, :, :3] * 255).astype(np.uint8)
+        yield from engine.written(scene, path)
+        return engine.pixels(path)
 
 
 def _draw_axes(page: Page, camera: bpy.types.Object) -> None:

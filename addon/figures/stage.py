@@ -21,6 +21,8 @@ from ..scanner import collimators
 from ..volumes import looks, meshes
 from . import studio
 
+Moment = tuple[float, list[int], list[int]]
+"""The camera's turn about the z axis, radians; the modules that are lit, and those whose rays are seen."""
 Points = NDArray[np.float64]
 DIRECTION = np.array(Vector((0.45, -1.0, 0.75)).normalized())
 """From the scanner to the camera."""
@@ -31,8 +33,9 @@ _SOLID, _GONE = 0.1, 0.5  # the same share: modules fade from one to the other
 _GHOST = 0.3  # how much of a module that is lit is there at least
 _RAY_RADIUS = 0.006  # of the ROI's radius
 _ACCENT = (1.0, 0.40, 0.03, 1.0)  # linear RGBA: rays, and modules that are lit
-_SHINE, _TINT = 0.1, 0.6  # of lit modules: how much they glow, and how far they are of the accent's colour
-_WORLD = 0.75  # how bright the surroundings are, which metal reflects
+_DULL = 0.3  # how much of the metal's gloss is left
+_SHINE, _TINT = 0.3, 0.8  # of lit modules: how much they glow, and how far they are of the accent's colour
+_WORLD = 0.9  # how bright the surroundings are, which metal reflects
 
 _TURNS = np.linspace(0.0, 2 * np.pi, 64, endpoint=False)
 _BALL = np.stack(  # points (N, 3) of a sphere of radius 1
@@ -52,7 +55,9 @@ class Stage:
         assert subject.scanner is not None
         self.whole, self.shown, self.item, self.page, self.top = subject.scanner, shown, item, page, top
         chosen = subject.chosen(self.whole)
-        if shown.lit and subject.modules is None:  # of all rays none could be told from the others
+        if (
+            shown.lit and subject.modules is None and shown.motion != "light"
+        ):  # of all rays none could be told from the others
             chosen = chosen[chosen.rings() == chosen.rings().max() // 2]
         self.numbers: list[int] = chosen.numbers.tolist()
         """Of the chosen modules."""
@@ -107,20 +112,22 @@ class Stage:
         for number, ray in self.rays.items():
             ray.hide_render = number not in rays
 
-    def on_page(self, point: Points) -> tuple[float, float]:
-        """Where on the page a point (3,), mm, is seen."""
-        x, y, z = np.array(self.camera.matrix_basis.inverted() @ Vector(point))
-        scale = self._per_tangent / -z
-        return self.page.width / 2 + scale * x, self.page.height / 2 - scale * y
+    def moment(self, share: float) -> Moment:
+        """What an animation shows after a share of its time."""
+        if self.shown.motion == "turn":
+            return 2 * np.pi * share, self.numbers, self.numbers
+        now = int(share * len(self.numbers))
+        return 0.0, self.numbers[: now + 1], [self.numbers[now]]
 
-    @property
-    def _per_tangent(self) -> float:
-        return max(self.page.width, self.page.height) * self.shown.lens / _FILM
+    def show(self, turn: float, lit: list[int], rays: list[int]) -> None:
+        """Show a moment of an animation."""
+        self.look(turn)
+        self.light(lit, rays)
 
     def pixels_per_mm(self) -> float:
         """How large the page shows what is at the isocentre."""
         distance = float(np.array(self.camera.location) @ self.direction)
-        return self._per_tangent / distance
+        return max(self.page.width, self.page.height) * self.shown.lens / _FILM / distance
 
     @property
     def is_smoke(self) -> bool:
@@ -253,6 +260,8 @@ def _material(part: str) -> bpy.types.Material:
     )
     shine = {"Base Color": _ACCENT, "Roughness": 0.5, "Emission Color": _ACCENT, "Emission Strength": _SHINE}
     bright = add_node("ShaderNodeBsdfPrincipled", (600, -200), shine).outputs[0]
+    if plain := next((node for node in tree.nodes if node.type == "BSDF_PRINCIPLED"), None):
+        plain.inputs["Metallic"].default_value *= _DULL  # of metal one would see what it reflects
     either = add_node("ShaderNodeMixShader", (800, 0), {0: lit, 1: surface.links[0].from_socket, 2: bright}).outputs[0]
     clear = add_node("ShaderNodeBsdfTransparent", (800, 200)).outputs[0]
     tree.links.new(add_node("ShaderNodeMixShader", (1000, 0), {0: there, 1: clear, 2: either}).outputs[0], surface)

@@ -9,13 +9,27 @@ from typing import Literal, NamedTuple
 
 from ..validation import one_of
 from . import mosaics, sums, virtual_c_arm
-from .page import DARK, Page
+from .page import DARK, SUFFIXES, Page
 from .subject import Subject
-
 
 Motion = Literal["turn", "light"]
 PAPERS = {"dark": DARK, "light": "#ffffff"}
 """What rendered figures lie on, by their style."""
+
+
+class Film(NamedTuple):
+    """How long an animation is, and how many pictures it shows in a second."""
+
+    seconds: float = 8.0
+    fps: int = 24
+
+    @property
+    def frames(self) -> int:
+        """The number of its pictures."""
+        return max(1, round(self.seconds * self.fps))
+
+
+FILM, FILMS = Film(), (".mp4",)
 
 
 class Studio(NamedTuple):
@@ -26,7 +40,9 @@ class Studio(NamedTuple):
     cut: bool = False  # the modules between the isocentre and the viewer are left out
     near: float = 0.0  # ROI radii from the isocentre to the picture's edge; 0: the whole scanner fits
     lens: float = 50.0  # mm, of a camera whose film is 36 mm wide: a short one shows what is near large
-    lit: bool = False  # the chosen modules alone are lit and have rays; others stay, and fade where they stand in the way
+    lit: bool = (
+        False  # the chosen modules alone are lit and have rays; others stay, and fade where they stand in the way
+    )
     motion: Motion | None = None  # of an animation
 
 
@@ -42,7 +58,18 @@ class FigureKind(NamedTuple):
     studio: Studio | None = None  # of a figure that Blender renders
     one_module: bool = False  # it shows the first of the chosen modules
 
+    @property
+    def is_film(self) -> bool:
+        """Whether it is an animation."""
+        return self.studio is not None and self.studio.motion is not None
 
+    @property
+    def suffixes(self) -> tuple[str, ...]:
+        """How the names of its files end."""
+        return FILMS if self.is_film else SUFFIXES
+
+
+_PICTURE = Studio(volume=True, rays=True, near=1.4, lens=30.0, lit=True)
 KINDS = {
     kind.name: kind
     for kind in (
@@ -60,15 +87,15 @@ KINDS = {
         ),
         FigureKind(
             "picture", "Picture", "a volume with its scale and colour bar, and the rays of chosen modules or of a ring",
-            ("scanner", "volume"), (2400, 1500), studio=Studio(volume=True, rays=True, near=1.4, lens=30.0, lit=True),
+            ("scanner", "volume"), (2400, 1500), studio=_PICTURE,
         ),
         FigureKind(
             "turntable", "Turntable", "the picture, once around: an animation", ("scanner", "volume"), (1280, 800),
-            studio=Studio(volume=True, rays=True, near=1.4, lens=30.0, lit=True, motion="turn"),
+            studio=_PICTURE._replace(motion="turn"),
         ),
         FigureKind(
             "light-up", "Modules Light Up", "the picture, one module after the other with its ray: an animation",
-            ("scanner", "volume"), (1280, 800), studio=Studio(volume=True, rays=True, near=1.4, lens=30.0, lit=True, motion="light"),
+            ("scanner", "volume"), (1280, 800), studio=_PICTURE._replace(motion="light"),
         ),
         FigureKind(
             "sums", "Orthogonal Sums", "a volume's sums along x, y and z, value x mm, with its translation T and rotation R",

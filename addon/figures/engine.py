@@ -69,7 +69,7 @@ def pixels(path: Path) -> NDArray[np.uint8]:
 
 
 def write_film(pictures: Sequence[Path], path: Path, fps: int, page: Page) -> Generator[None, None, None]:
-    """Put pictures of a page's size, files of one folder, together to an MP4, which replaces what is there when it is whole."""
+    """Put pictures of a page's size, files of one folder, together to an MP4, whole or not at all."""
     scene = bpy.data.scenes.new(ids.STUDIO)
     try:
         strip = scene.sequence_editor_create().strips.new_image("Film", str(pictures[0]), 1, 1)

@@ -61,6 +61,7 @@ _drawn: set[tuple[str, str, float, float]] = set()  # volumes and looks that Cyc
 _UNSEEN = ": Low and High draw none of its values, its file is missing, or this Blender's Cycles draws no volumes"
 _AXES = {"dark": ("#ff8a80", "#8ee59a", "#8cb8ff"), "light": ("#c62828", "#2e7d32", "#1f57c3")}  # x, y and z
 _STEPS = (1.0, 2.0, 5.0)  # round numbers of scale bars
+_VEIL = 0.7  # how much of the paper covers what is under labels
 _SCALE = 0.2  # of the picture's width that a scale bar takes at most
 
 
@@ -75,7 +76,7 @@ class _Ramp(Display):
     quantity: str = "activity"
 
     def colored(self, values: ArrayLike, window: tuple[float, float] | None = None) -> NDArray[np.uint8]:
-        table = np.rint(255 * slices.colors(self.quantity)[:, :3]).astype(np.uint8)
+        table = np.rint(255 * slices.colors(self.quantity, smoke=True)[:, :3]).astype(np.uint8)
         return table[np.rint(255 * self.shares(values, window or self.window(values))).astype(int)]
 
 
@@ -261,7 +262,7 @@ def _label(stage: Stage, subject: Subject, page: Page) -> None:
     """Write on a picture what it shows, and how large."""
     em, title, line = page.em, *_titles(stage, subject)
     if stage.shown.near:  # what is shown reaches under the title
-        page.area(box(0, 0, page.width, stage.top), page.paper, 0.7)
+        page.area(box(0, 0, page.width, stage.top), page.paper, _VEIL)
     heading(page, title, [line], page.ink, page.faint)
     _draw_axes(page, stage.camera)
     if not stage.shown.volume:
@@ -269,12 +270,14 @@ def _label(stage: Stage, subject: Subject, page: Page) -> None:
     longest = _SCALE * page.width / stage.pixels_per_mm()
     length = max(n * 10.0**k for n in _STEPS for k in range(-3, 5) if n * 10.0**k <= longest)
     end, row = 1.2 * em + length * stage.pixels_per_mm(), page.height - 1.4 * em
+    page.area(box(0.6 * em, row - 2.2 * em, end, 3.0 * em), page.paper, _VEIL)
     page.line([(1.2 * em, row), (end, row)], page.ink, 0.25 * em)
     page.text(f"{length:g} mm", (1.2 * em + end) / 2, row - 0.6 * em, em, page.ink, "middle")
     if stage.item is not None and stage.is_smoke:
         settings = stage.item.mphdrr_volume
         window, ramp = (settings.display_low, settings.display_high), _Ramp(quantity=settings.quantity)
         left, tall = page.width - round(em) - bar_width(page, ramp, window, settings.unit), round(11 * em)
+        page.area(box(left - em, page.height - tall - 4.2 * em, page.width, tall + 4.2 * em), page.paper, _VEIL)
         color_bar(page, ramp, window, settings.unit, left, page.height - tall - round(1.4 * em), tall)
 
 
@@ -291,11 +294,12 @@ def _volume_item(context: bpy.types.Context) -> bpy.types.Object | None:
 
 def _titles(stage: Stage, subject: Subject) -> tuple[str, str]:
     """What is written on a rendered figure: a title and a line below it."""
-    numbers = np.array(stage.lit if stage.shown.lit else stage.system.numbers)
+    numbers = np.array(stage.shining if stage.shown.lit else stage.system.numbers)
     runs = np.split(numbers, np.flatnonzero(np.diff(numbers) != 1) + 1)
     listed = ", ".join(f"{run[0]}–{run[-1]}" if len(run) > 1 else str(run[0]) for run in runs[:_MOST_RUNS])
     listed += " …" if len(runs) > _MOST_RUNS else ""
     modules = f"{'Module' if len(numbers) == 1 else 'Modules'} {listed}"
+    modules += f" of {len(stage.system)}" if stage.shown.lit else ""
     within = f"ROI of radius {stage.radius:g} mm"
     name = subject.name if stage.shown.volume else ""
     return (

@@ -1,7 +1,7 @@
-"""The studio that figures are rendered in: a scene of its own with copies of what is shown, so that the user's stays as it is.
+"""What figures are rendered of: a scene of its own with copies of what is shown, so that the user's stays as it is.
 
-The camera sees the figure's paper behind it. Each module can be lit, and fades where it would stand
-between the viewer and the isocentre.
+The camera sees the figure's paper behind it. Each module can be lit, and fades where it would stand between the viewer and
+the isocentre.
 """
 
 from functools import partial
@@ -100,13 +100,13 @@ class Stage:
 
     def light(self, lit: list[int], rays: list[int]) -> None:
         """Light modules by their numbers, show the rays of some, and let those fade that stand in the way."""
-        numbers, self.lit = self.system.numbers, lit
-        shining = np.isin(numbers, lit) & self.shown.lit
+        numbers, self.shining = self.system.numbers, rays
+        bright = _TINT * np.isin(numbers, lit) * self.shown.lit
         front = -self.system.frames()[:, 2] @ self.direction
         there = np.clip((_GONE - front) / (_GONE - _SOLID), 0.0, 1.0) if self.shown.lit else np.ones(len(numbers))
         there = np.maximum(there, _GHOST * np.isin(numbers, rays) * (len(rays) == 1))
         for mesh, module in self._modules:
-            for name, values in (("lit", _TINT * shining), ("there", there)):
+            for name, values in (("lit", bright), ("there", there)):
                 mesh.attributes[name].data.foreach_set("value", values[module].astype(np.float32))
             mesh.update()
         for number, ray in self.rays.items():
@@ -250,7 +250,7 @@ def _backdrop(world: bpy.types.World, paper: str) -> None:
 
 
 def _material(part: str) -> bpy.types.Material:
-    """A copy of the material of parts, in another colour where the faces' attribute "lit" is 1, and clear where "there" is 0."""
+    """A copy of the material of parts: in the accent's colour by the faces' attribute "lit", and clear without "there"."""
     material = collimators.part_material(part).copy()
     material.name, tree = ids.STUDIO, material.node_tree
     add_node, surface = partial(compat.add_node, tree), tree.get_output_node("CYCLES").inputs["Surface"]

@@ -91,11 +91,11 @@ KINDS = {
         ),
         FigureKind(
             "turntable", "Turntable", "the picture, once around: an animation", ("scanner", "volume"), (1280, 800),
-            studio=_PICTURE._replace(motion="turn"),
+            studio=_PICTURE._replace(motion="turn", near=1.7),
         ),
         FigureKind(
             "light-up", "Modules Light Up", "the picture, one module after the other with its ray: an animation",
-            ("scanner", "volume"), (1280, 800), studio=_PICTURE._replace(motion="light"),
+            ("scanner", "volume"), (1280, 800), studio=_PICTURE._replace(motion="light", near=2.2),
         ),
         FigureKind(
             "sums", "Orthogonal Sums", "a volume's sums along x, y and z, value x mm, with its translation T and rotation R",

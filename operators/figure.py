@@ -5,17 +5,18 @@ from typing import Any
 import bpy
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, StringProperty
 
-from ..addon.blender import file_properties, jobs, reports
+from ..addon.blender import file_properties, ids, jobs, reports
 from ..addon.blender.choices import items
 from ..addon.figures import figures
 from ..addon.scanner import scanner
 from ..addon.volumes import volumes
 from ..core.errors import InputError
-from ..core.figures.kinds import FILM, FILMS, Film
+from ..core.figures.kinds import FILMS, PAPERS, SAMPLES, How
 from ..core.figures.page import LARGEST, SUFFIXES
 
 _PIXELS = {"description": "Pixels; 0: what suits the figure", "min": 0, "max": LARGEST, "subtype": "PIXEL"}
-_STYLES = (("DARK", "Dark", "As screens show it"), ("LIGHT", "Light", "As paper shows it"))
+_STYLES = ((name.upper(), name.title(), f"On {name} paper") for name in PAPERS)
+_HOW = ("labels", "samples", "style", "seconds", "fps")
 _SHOWN: reports.Need = (
     lambda context: scanner.active_scanner(context.scene) or volumes.volume_objects(context.scene),
     "Nothing to show: import a workbook or add a phantom first",
@@ -26,21 +27,19 @@ class _Drawing(jobs.ExportJob):
     """What operators that draw a figure share."""
 
     endings: tuple[str, ...] = SUFFIXES
-    stem = "figure"
     filepath: file_properties.file_property("File to write")
     filter_glob: file_properties.shown_files((*SUFFIXES, *FILMS))
     width: IntProperty(name="Width", **_PIXELS)
     height: IntProperty(name="Height", **_PIXELS)
     modules: StringProperty(
         name="Modules",
-        description="Such as 1-40 or 1-20,41; empty: all; of a picture those selected, or a ring; of figures of one module "
-        "the active one",
+        description="Such as 1-40 or 1-20,41; empty: all, of a picture those selected or a ring, of one module the active",
     )
     labels: BoolProperty(name="Labels", description="Write titles, axes and scales on rendered figures", default=True)
     style: EnumProperty(name="Style", description="Of rendered figures", items=items({}, _STYLES), default="DARK")
     samples: IntProperty(
         name="Samples", description="Rays per pixel of rendered figures: the more, the smoother and slower",
-        default=figures.SAMPLES, min=1, soft_max=256,
+        default=SAMPLES, min=1, soft_max=256,
     )  # fmt: skip
 
     poll = reports.needs(_SHOWN)
@@ -48,7 +47,7 @@ class _Drawing(jobs.ExportJob):
     def ask(self, context: bpy.types.Context) -> set[str] | None:
         if self.filepath:
             return None
-        self.filepath = self.stem + self.endings[0]
+        self.filepath = ids.label(type(self).__name__).split()[-1].lower() + self.endings[0]
         return super().ask(context)
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
@@ -57,31 +56,31 @@ class _Drawing(jobs.ExportJob):
         if bool(own.width) != bool(own.height):
             raise InputError("size: give both width and height, or neither")
         size = (own.width, own.height) if own.width else None
-        film = Film(own.seconds, own.fps) if hasattr(self, "seconds") else FILM
-        return figures.figure_job(
-            context, own.figure.lower().replace("_", "-"), [path], size, own.modules or None, own.labels, own.samples,
-            own.style.lower(), film,
-        )  # fmt: skip
+        how = {name: getattr(self, name) for name in _HOW if hasattr(self, name)} | {"style": own.style.lower()}
+        name = own.figure.lower().replace("_", "-")
+        return figures.figure_job(context, name, [path], size, own.modules or None, **how)
 
 
 class MPHDRR_OT_export_figure(_Drawing, bpy.types.Operator):
     """Draw a figure of the scanner, the volume or the last projections as PNG, or as SVG whose labels are text"""
 
-    figure: EnumProperty(name="Figure", description="What is shown", items=figures.KIND_ITEMS, default="SCANNER")
+    figure: EnumProperty(name="Figure", description="What is shown", items=figures.kind_items(), default="SCANNER")
 
 
 class MPHDRR_OT_render_picture(_Drawing, bpy.types.Operator):
     """Render the volume in the scanner for a paper, with scale, colour bar and rays of the selected modules or a ring"""
 
-    stem, figure = "picture", "PICTURE"
+    figure = "PICTURE"
 
 
 class MPHDRR_OT_render_animation(_Drawing, bpy.types.Operator):
     """Render pictures and an MP4 of the volume in the scanner: once around it, or one module lit after the other"""
 
-    endings, stem = FILMS, "animation"
-    figure: EnumProperty(name="Animation", description="What happens", items=figures.FILM_ITEMS, default="TURNTABLE")
-    seconds: FloatProperty(
-        name="Seconds", description="How long it takes", default=FILM.seconds, min=0.01, soft_max=60.0, max=400.0
+    endings = FILMS
+    figure: EnumProperty(
+        name="Animation", description="What happens", items=figures.kind_items(True), default="TURNTABLE"
     )
-    fps: IntProperty(name="Frames per Second", default=FILM.fps, description="Pictures", min=1, max=60)
+    seconds: FloatProperty(
+        name="Seconds", description="How long it takes", default=How().seconds, min=0.01, soft_max=60.0
+    )
+    fps: IntProperty(name="Frames per Second", default=How().fps, description="Pictures", min=1, max=60)

@@ -69,16 +69,13 @@ def run(job: Job, progress: Progress = lambda done, total: None) -> str:
     """Do a job now; returns the line to report, raises what the work raises."""
     try:
         steps = _finishing(job, job.work(progress))
-        stage, show = "", None
         while True:
             try:
                 step = next(steps)
             except StopIteration as end:
                 return str(end.value)
             if step is not None:
-                if step[0] != stage:
-                    stage, show = step[0], stages_of(progress)(step[0])
-                tell(show, *step[1:])
+                tell(stages_of(progress)(step[0]), *step[1:])
     except BaseException:
         job.discard()
         raise

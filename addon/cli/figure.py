@@ -2,7 +2,7 @@
 
 import argparse
 import contextlib
-import math
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ from ...core import (
     read_volume,
 )
 from ...core.cli.options import add_command, output_path, progress_bar, refuse
-from ...core.figures.kinds import FILM, FILMS, KINDS, PAPERS, FigureKind, Film, figure_kind
+from ...core.figures.kinds import FILMS, KINDS, PAPERS, SAMPLES, FigureKind, How, figure_kind
 from ...core.figures.page import SUFFIXES, Page
 from ...core.figures.subject import NEEDS, Subject, require
 from ...core.phantoms.kinds import KINDS as PHANTOMS
@@ -59,11 +59,8 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     add("-o", "--output", action="append", default=[], metavar="FILE", help=text)
     add("--list", action="store_true", help="list the kinds of figures")
     add("--size", type=_size, metavar="WIDTHxHEIGHT", help="pixels; the kind's own by default")
-    add(
-        "--modules",
-        metavar="RANGE",
-        help="such as 1-40 or 1-20,41; default: all, of pictures a ring; c-arm shows the first",
-    )
+    text = "such as 1-40 or 1-20,41; default: all, but a picture's rays are of a ring, and c-arm shows the first"
+    add("--modules", metavar="RANGE", help=text)
     add(
         "--position", type=float, nargs=3, default=[0.0, 0.0, 0.0], metavar="MM", help="of a phantom: its middle, x y z"
     )
@@ -71,10 +68,10 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     add("--euler-degrees", type=float, nargs=3, default=[0.0, 0.0, 0.0], metavar="DEG", help=text)
     add("--voxels", type=int, default=200, metavar="N", help="of a phantom, along each side")
     add("--no-labels", action="store_true", help="without title and axes, where the figure is rendered")
-    add("--samples", type=int, default=16, metavar="N", help="rays per pixel, where the figure is rendered")
+    add("--samples", type=int, default=SAMPLES, metavar="N", help="rays per pixel, where the figure is rendered")
     add("--style", choices=list(PAPERS), default="dark", help="of figures that are rendered")
-    add("--seconds", type=float, default=FILM.seconds, metavar="S", help="how long an animation is")
-    add("--fps", type=int, default=FILM.fps, metavar="N", help="pictures of an animation per second")
+    add("--seconds", type=float, default=How().seconds, metavar="S", help="how long an animation is")
+    add("--fps", type=int, default=How().fps, metavar="N", help="pictures of an animation per second")
     parser.set_defaults(run=_run)
 
 
@@ -99,23 +96,21 @@ def _run(arguments: argparse.Namespace) -> None:
     if not arguments.output:
         raise InputError("nothing to write: give --output FILE")
     paths = [output_path(name, kind.suffixes) for name in arguments.output]
-    film = Film(arguments.seconds, arguments.fps)
-    if not (0 < film.seconds < math.inf and film.fps > 0):
-        raise InputError(f"{film.seconds:g} s of {film.fps} pictures per second: expected more than 0 of both")
+    how = How(*(not arguments.no_labels, *(getattr(arguments, name) for name in How._fields[1:])))
+    page = kind.page(arguments.size, how.style)
     blends = [file for file in arguments.files if file.lower().endswith(".blend")]
     if blends:
         if len(arguments.files) > 1:
             raise InputError(f"{blends[0]}: a .blend holds all that is shown; give no other file")
         refuse(arguments, _POSED, "is for phantoms that are named on the command line, not for a .blend")
-        _of_scene(arguments, kind, Path(blends[0]), paths, film)
+        _of_scene(arguments, kind, Path(blends[0]), paths, how)
     else:
         subject = _subject(arguments)
         have = [need for need in NEEDS if getattr(subject, need) is not None]
         require(kind.needs, have, kind.name, _MISSING)
         if kind.draw is None:
-            _render(arguments, kind, subject, paths, film)
+            _render(kind, page, subject, paths, how)
         else:
-            page = Page(*(arguments.size or kind.size))
             kind.draw(page, subject)
             for path in paths:
                 page.write(path)
@@ -123,7 +118,7 @@ def _run(arguments: argparse.Namespace) -> None:
         print(path)
 
 
-def _of_scene(arguments: argparse.Namespace, kind: FigureKind, blend: Path, paths: list[Path], film: Film) -> None:
+def _of_scene(arguments: argparse.Namespace, kind: FigureKind, blend: Path, paths: list[Path], how: How) -> None:
     """A figure of the scene in a .blend, as the window makes it."""
     new_scene()
     import bpy
@@ -136,12 +131,11 @@ def _of_scene(arguments: argparse.Namespace, kind: FigureKind, blend: Path, path
             bpy.ops.wm.open_mainfile(filepath=str(blend.absolute()))
         except RuntimeError as error:
             raise InputError(f"{blend}: cannot be opened ({str(error).strip().splitlines()[0]})") from None
-        labels = not arguments.no_labels
-        given = arguments.size, arguments.modules, labels, arguments.samples, arguments.style, film
-        jobs.run(figures.figure_job(bpy.context, kind.name, paths, *given), StagedProgress(progress_bar, "figure"))
+        job = figures.figure_job(bpy.context, kind.name, paths, arguments.size, arguments.modules, **how._asdict())
+        jobs.run(job, StagedProgress(progress_bar, "figure"))
 
 
-def _render(arguments: argparse.Namespace, kind: FigureKind, subject: Subject, paths: list[Path], film: Film) -> None:
+def _render(kind: FigureKind, page: Page, subject: Subject, paths: list[Path], how: How) -> None:
     """A figure that Blender renders."""
     new_scene()
     from ..figures import figures
@@ -151,10 +145,9 @@ def _render(arguments: argparse.Namespace, kind: FigureKind, subject: Subject, p
     item = None
     if kind.studio.volume and subject.volume is not None:
         item = volumes.add_volume(subject.volume, subject.name or "Volume")
-    page = figures.new_page(kind, arguments.size, arguments.style)
     show = progress_bar("rendering")
     with quiet():
-        for step in figures.drawing(page, subject, kind, item, paths, not arguments.no_labels, arguments.samples, film):
+        for step in figures.drawing(page, subject, kind, item, paths, how, [], threading.Event()):
             if step is not None:
                 show(*step[1:])
 

@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 from ...core import PinholeSystem, Progress, files, read_run, recording, volume_to_mesh
 from ...core.cli.options import output_path
 from ...core.errors import InputError, warn
-from ...core.figures.kinds import FILM, KINDS, PAPERS, FigureKind, Film, Studio, figure_kind
+from ...core.figures.kinds import KINDS, SAMPLES, FigureKind, How, figure_kind
 from ...core.figures.page import DARK, Page, box
 from ...core.figures.parts import bar_width, color_bar, heading, heading_height
 from ...core.figures.subject import Subject, require
@@ -36,24 +36,13 @@ from ..volumes import slices, volume_materials, volumes
 from . import engine
 from .stage import DIRECTION, Stage
 
-KIND_ITEMS, FILM_ITEMS = (
-    items(
-        {},
-        (
-            (name.upper().replace("-", "_"), kind.label, kind.summary)
-            for name, kind in KINDS.items()
-            if kind.is_film == film
-        ),
-    )
-    for film in (False, True)
-)
+Step = tuple[str, int, int] | None
+"""As a job's finishing yields it (`jobs.Finishing`)."""
 _MISSING = {
     "scanner": "no scanner in the scene: import a workbook first",
     "volume": "no volume in the scene: add a phantom first",
     "run": "no projections: render them first",
 }
-SAMPLES = 16
-"""Rays per pixel; what noise they leave is smoothed."""
 _MOST_RUNS = 6  # of module numbers that a title lists
 _REST = 0.5  # s between two looks at Blender's render job where nothing waits for it
 _SMALL, _TRACE = 240, 8  # pixels across, and of 255: what a volume that can be seen changes in a small picture
@@ -63,10 +52,6 @@ _AXES = {"dark": ("#ff8a80", "#8ee59a", "#8cb8ff"), "light": ("#c62828", "#2e7d3
 _STEPS = (1.0, 2.0, 5.0)  # round numbers of scale bars
 _VEIL = 0.7  # how much of the paper covers what is under labels
 _SCALE = 0.2  # of the picture's width that a scale bar takes at most
-
-
-Step = tuple[str, int, int] | None
-"""As a job's finishing yields it (`jobs.Finishing`)."""
 
 
 @dataclass(frozen=True)
@@ -80,24 +65,28 @@ class _Ramp(Display):
         return table[np.rint(255 * self.shares(values, window or self.window(values))).astype(int)]
 
 
+def kind_items(films: bool = False) -> tuple[tuple[Any, ...], ...]:
+    """Choices of an EnumProperty: the kinds of figures, animations or others."""
+    kinds = (kind for kind in KINDS.values() if bool(kind.motion) == films)
+    return items({}, ((kind.name.upper().replace("-", "_"), kind.label, kind.summary) for kind in kinds))
+
+
 def figure_job(
     context: bpy.types.Context,
     name: str,
     paths: Sequence[Path],
     size: tuple[int, int] | None = None,
     modules: str | None = None,
-    labels: bool = True,
-    samples: int = SAMPLES,
-    style: str = "dark",
-    film: Film = FILM,
+    **how: Any,
 ) -> jobs.Job:
     """The job that writes a figure of the context's scene to files (.png, .svg; .mp4), `size` pixels wide and high.
 
-    `modules` are all by default; of figures of one module, the active one. Raises InputError where the scene has not what
-    the figure needs.
+    `modules` are all by default; of figures of one module, the active one; of a picture those selected, if more than one
+    is. `how` are the fields of `core.figures.kinds.How`. Raises InputError where the scene has not what the figure needs.
     """
+    given = How(**how)
     kind, scene = figure_kind(name), context.scene
-    page = new_page(kind, size, style)
+    page = kind.page(size, given.style)
     paths = [output_path(str(path), kind.suffixes) for path in paths]
     collection = scanner.active_scanner(scene)
     item = _volume_item(context) if "volume" in kind.needs else None
@@ -133,18 +122,13 @@ def figure_job(
     made: list[Path] = []
 
     def finish(subject: Subject) -> Generator[Step, None, str]:
-        yield from drawing(page, subject, kind, item, paths, labels, samples, film, made, enough)
+        yield from drawing(page, subject, kind, item, paths, given, made, enough)
         return f"Wrote {', '.join(map(str, paths))}"
 
     def left() -> str:
         return f"{len(made)} pictures are in {made[0].parent}" if made else "nothing was changed"
 
-    return jobs.Job("Drawing the figure", work, finish, enough=enough if kind.is_film else None, left=left)
-
-
-def new_page(kind: FigureKind, size: tuple[int, int] | None, style: str) -> Page:
-    """The page of a kind of figure; only rendered ones have a style."""
-    return Page(*(size or kind.size), PAPERS[style] if kind.studio is not None else PAPERS["light"])
+    return jobs.Job("Drawing the figure", work, finish, enough=enough if kind.motion else None, left=left)
 
 
 def drawing(
@@ -153,114 +137,83 @@ def drawing(
     kind: FigureKind,
     item: bpy.types.Object | None,
     paths: Sequence[Path],
-    labels: bool = True,
-    samples: int = SAMPLES,
-    film: Film = FILM,
-    made: list[Path] | None = None,
-    enough: threading.Event | None = None,
+    how: How,
+    made: list[Path],
+    enough: threading.Event,
 ) -> Generator[Step, None, None]:
-    """Draw a figure of a kind on its page and write it to `paths`; the other arguments are those of `filming`."""
+    """Draw a figure on its page and write it to `paths`; yields while Blender's own job renders, and pictures of a film.
+
+    The volume that is rendered is that of an object. A film's pictures, in the folder NAME-frames beside NAME.mp4, are
+    added to `made`, and stay if the work is ended; where `enough` is set, the film ends with those.
+    """
     if kind.draw is not None:
         kind.draw(page, subject)
-    elif kind.is_film:
-        for path in paths:
-            yield from filming(page, subject, kind, item, path, labels, samples, film, made, enough)
-        return
-    elif kind.studio is not None:
-        yield from rendering(page, subject, kind.studio, item, labels, samples)
-    for path in paths:
+    if kind.studio is not None:
+        if kind.motion and (page.width % 2 or page.height % 2):
+            raise InputError(f"size {page.width}x{page.height}: of an animation both must be even")
+        stage = Stage(subject, kind, item, page, heading_height(page, 1) if how.labels else 0)
+        try:
+            yield from _prepared(stage, how)
+            for path in paths if kind.motion else ():
+                yield from _filmed(stage, how, path, made, enough)
+            if not kind.motion:
+                yield from _picture(stage, how, page)
+        finally:
+            stage.remove()
+    for path in () if kind.motion else paths:
         page.write(path)
 
 
-def rendering(
-    page: Page,
-    subject: Subject,
-    shown: Studio,
-    item: bpy.types.Object | None = None,
-    labels: bool = True,
-    samples: int = SAMPLES,
-) -> Generator[None, None, None]:
-    """Render a subject's scanner, and the volume of an object, onto a page; yields while Blender's own job renders."""
-    stage = Stage(subject, shown, item, page, heading_height(page, 1) if labels else 0)
-    try:
-        yield from prepared(stage, subject, samples)
-        yield from picture(stage, subject, page, labels)
-    finally:
-        stage.remove()
-
-
-def filming(
-    page: Page,
-    subject: Subject,
-    kind: FigureKind,
-    item: bpy.types.Object | None,
-    path: Path,
-    labels: bool = True,
-    samples: int = SAMPLES,
-    film: Film = FILM,
-    made: list[Path] | None = None,
-    enough: threading.Event | None = None,
+def _filmed(
+    stage: Stage, how: How, path: Path, made: list[Path], enough: threading.Event
 ) -> Generator[Step, None, None]:
-    """Render an animation: pictures in the folder NAME-frames beside `path`, and of them the MP4 `path`, NAME.mp4.
-
-    Yields how many of the pictures there are. They are added to `made` and stay if the work is ended; where `enough` is
-    set, the film ends with those. Raises InputError where a side of the page is odd, which MP4 cannot hold.
-    """
-    assert kind.studio is not None
-    if page.width % 2 or page.height % 2:
-        raise InputError(f"size {page.width}x{page.height}: of an animation both must be even")
-    made = [] if made is None else made
+    """Render an animation's pictures, and put them together to an MP4."""
+    made.clear()
     folder = files.ensure_folder(path.with_name(f"{path.stem}-frames"))
     for old in folder.glob(f"{glob.escape(path.stem)}-[0-9][0-9][0-9][0-9].png"):
         old.unlink()  # of an animation that may have been longer
-    stage = Stage(subject, kind.studio, item, page, heading_height(page, 1) if labels else 0)
-    try:
-        yield from prepared(stage, subject, samples)
-        shown, frame = None, page
-        for k in range(film.frames):
-            if enough is not None and enough.is_set() and made:
-                break
-            moment = stage.moment(k / film.frames)
-            if moment != shown:
-                shown, frame = moment, Page(page.width, page.height, page.paper)
-                stage.show(*moment)
-                yield from picture(stage, subject, frame, labels)
-            made.append(folder / f"{path.stem}-{k + 1:04d}.png")
-            frame.write(made[-1])
-            yield "rendering pictures", k + 1, film.frames
-        yield from engine.write_film(made, path, film.fps, page)
-    finally:
-        stage.remove()
+    shown, page = None, stage.page
+    for k in range(how.frames):
+        moment = stage.moment(k / how.frames)
+        if moment != shown:
+            stage.show(*moment)
+            shown, page = moment, Page(page.width, page.height, page.paper)
+            yield from _picture(stage, how, page)
+        made.append(folder / f"{path.stem}-{k + 1:04d}.png")
+        page.write(made[-1])
+        yield "rendering pictures", k + 1, how.frames
+        if enough.is_set():
+            break
+    yield from engine.write_film(made, path, how.fps, page)
 
 
-def prepared(stage: Stage, subject: Subject, samples: int) -> Generator[None, None, None]:
+def _prepared(stage: Stage, how: How) -> Generator[None, None, None]:
     """Set up Cycles for a stage; a volume that it does not draw becomes a surface, which is said."""
-    engine.set_up(stage.scene, stage.page, samples)
-    item = stage.item
+    engine.set_up(stage.scene, stage.page, how.samples)
+    item, volume = stage.item, stage.subject.volume
     if item is None or not stage.drawn or (yield from _leave_a_trace(stage.scene, stage.drawn)):
         return
-    if subject.volume is None:
+    if volume is None:
         warn(f"the picture shows nothing of {item.name!r}{_UNSEEN}")
         return
     settings, factor = item.mphdrr_volume, volume_materials.shown_unit(item.mphdrr_volume.quantity)[1]
     level = (settings.display_low + settings.display_high) / 2 / factor
-    if not outside_value(subject.volume) < level <= subject.volume.array.max():
-        level = None
-    stage.draw_surface(volume_to_mesh(subject.volume, level), settings.quantity)
-    at = "half its largest value" if level is None else f"{level * factor:.3g} {settings.unit}"
+    is_usable = outside_value(volume) < level <= volume.array.max()
+    stage.draw_surface(volume_to_mesh(volume, level if is_usable else None), settings.quantity)
+    at = f"{level * factor:.3g} {settings.unit}" if is_usable else "half its largest value"
     warn(f"the picture shows {item.name!r} as the surface at {at}{_UNSEEN}")
 
 
-def picture(stage: Stage, subject: Subject, page: Page, labels: bool) -> Generator[None, None, None]:
+def _picture(stage: Stage, how: How, page: Page) -> Generator[None, None, None]:
     """Render a stage, as it is now, onto a page."""
     page.image((yield from _render(stage.scene)), 0, 0, page.width, page.height)
-    if labels:
-        _label(stage, subject, page)
+    if how.labels:
+        _label(stage, page)
 
 
-def _label(stage: Stage, subject: Subject, page: Page) -> None:
+def _label(stage: Stage, page: Page) -> None:
     """Write on a picture what it shows, and how large."""
-    em, title, line = page.em, *_titles(stage, subject)
+    em, title, line = page.em, *_titles(stage)
     if stage.shown.near:  # what is shown reaches under the title
         page.area(box(0, 0, page.width, stage.top), page.paper, _VEIL)
     heading(page, title, [line], page.ink, page.faint)
@@ -273,7 +226,7 @@ def _label(stage: Stage, subject: Subject, page: Page) -> None:
     page.area(box(0.6 * em, row - 2.2 * em, end, 3.0 * em), page.paper, _VEIL)
     page.line([(1.2 * em, row), (end, row)], page.ink, 0.25 * em)
     page.text(f"{length:g} mm", (1.2 * em + end) / 2, row - 0.6 * em, em, page.ink, "middle")
-    if stage.item is not None and stage.is_smoke:
+    if stage.item is not None and [part.type for part in stage.drawn] == ["VOLUME"]:
         settings = stage.item.mphdrr_volume
         window, ramp = (settings.display_low, settings.display_high), _Ramp(quantity=settings.quantity)
         left, tall = page.width - round(em) - bar_width(page, ramp, window, settings.unit), round(11 * em)
@@ -292,21 +245,17 @@ def _volume_item(context: bpy.types.Context) -> bpy.types.Object | None:
     return known[0] if known else None
 
 
-def _titles(stage: Stage, subject: Subject) -> tuple[str, str]:
+def _titles(stage: Stage) -> tuple[str, str]:
     """What is written on a rendered figure: a title and a line below it."""
     numbers = np.array(stage.shining if stage.shown.lit else stage.system.numbers)
     runs = np.split(numbers, np.flatnonzero(np.diff(numbers) != 1) + 1)
     listed = ", ".join(f"{run[0]}–{run[-1]}" if len(run) > 1 else str(run[0]) for run in runs[:_MOST_RUNS])
     listed += " …" if len(runs) > _MOST_RUNS else ""
     modules = f"{'Module' if len(numbers) == 1 else 'Modules'} {listed}"
-    modules += f" of {len(stage.system)}" if stage.shown.lit else ""
-    within = f"ROI of radius {stage.radius:g} mm"
-    name = subject.name if stage.shown.volume else ""
-    return (
-        (name or modules, f"{modules}, {within}")
-        if stage.shown.lit
-        else (modules, ", ".join(filter(None, (name, within))))
-    )
+    name, within = stage.subject.name if stage.shown.volume else "", f"ROI of radius {stage.radius:g} mm"
+    if stage.shown.lit:
+        return name, f"{modules} of {len(stage.system)}, {within}"
+    return modules, ", ".join(filter(None, (name, within)))
 
 
 def _leave_a_trace(scene: bpy.types.Scene, drawn: list[bpy.types.Object]) -> Generator[None, None, bool]:
@@ -349,7 +298,8 @@ def _say_what_is_unseen() -> float | None:
             sizes = reach / np.array([50, 10, 10, 50, 1])  # of a small module behind it, as seen
             with recording.recorded_warnings() as caught:
                 subject = Subject(PinholeSystem(-2 * reach * DIRECTION[None], *sizes))
-                list(rendering(Page(_SMALL, _SMALL), subject, Studio(volume=True, near=1.7), item, False, 1))
+                page, how = Page(_SMALL, _SMALL), How(labels=False, samples=1)
+                list(drawing(page, subject, figure_kind("inside"), item, [], how, [], threading.Event()))
             why = _UNSEEN if any(_UNSEEN in text for text in caught) else ""
             _drawn.update([] if why else [known])
         if why:

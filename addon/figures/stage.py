@@ -11,10 +11,9 @@ import numpy as np
 from mathutils import Color, Vector
 from numpy.typing import NDArray
 
-from ...core.figures.kinds import Studio
+from ...core.figures.kinds import FigureKind
 from ...core.figures.page import Page
 from ...core.figures.subject import Subject
-from ...core.geometry.scanner import Scanner
 from ...core.volumes.meshes.mesh import Mesh
 from ..blender import compat, ids
 from ..scanner import collimators
@@ -28,8 +27,7 @@ DIRECTION = np.array(Vector((0.45, -1.0, 0.75)).normalized())
 """From the scanner to the camera."""
 _FILM = 36.0  # mm, of the camera
 _MARGIN = 0.04  # of the picture's shorter side, free around what is shown
-_CUT = 0.15  # of b: modules whose pinholes are farther to the front are cut away
-_SOLID, _GONE = 0.1, 0.5  # the same share: modules fade from one to the other
+_SOLID, _GONE = 0.1, 0.5  # how far to the front, of 1, a pinhole's module begins to fade, and is cut away
 _GHOST = 0.3  # how much of a module that is lit is there at least
 _RAY_RADIUS = 0.006  # of the ROI's radius
 _ACCENT = (1.0, 0.40, 0.03, 1.0)  # linear RGBA: rays, and modules that are lit
@@ -51,17 +49,17 @@ _BALL = np.stack(  # points (N, 3) of a sphere of radius 1
 class Stage:
     """A subject's scanner and the volume of an object, in a scene of their own, with a camera that sees them on a page."""
 
-    def __init__(self, subject: Subject, shown: Studio, item: bpy.types.Object | None, page: Page, top: int) -> None:
-        assert subject.scanner is not None
-        self.whole, self.shown, self.item, self.page, self.top = subject.scanner, shown, item, page, top
+    def __init__(self, subject: Subject, kind: FigureKind, item: bpy.types.Object | None, page: Page, top: int) -> None:
+        assert subject.scanner is not None and kind.studio is not None
+        self.subject, self.item, self.page, self.top = subject, item, page, top
+        self.shown, self._motion = shown, motion = kind.studio, kind.motion
+        self.whole = subject.scanner
         chosen = subject.chosen(self.whole)
-        if (
-            shown.lit and subject.modules is None and shown.motion != "light"
-        ):  # of all rays none could be told from the others
+        if shown.lit and subject.modules is None and motion != "light":  # of all rays none could be told apart
             chosen = chosen[chosen.rings() == chosen.rings().max() // 2]
         self.numbers: list[int] = chosen.numbers.tolist()
         """Of the chosen modules."""
-        self.system = self.whole if shown.lit else cut_away(chosen) if shown.cut else chosen
+        self.system = self.whole if shown.lit else chosen
         self.scene = scene = bpy.data.scenes.new(ids.STUDIO)
         self.radius = self.whole.region_radius()
         self.drawn: list[bpy.types.Object] = []
@@ -70,7 +68,7 @@ class Stage:
             studio.furnish(scene)
             scene.frame_set(bpy.context.scene.frame_current)
             _backdrop(scene.world, page.paper)
-            self._put_modules(subject)
+            self._put_modules()
             roi = self.put(collimators.new_sphere(ids.STUDIO, self.radius, collimators.part_material("ROI")))
             roi.visible_shadow = False
             if shown.volume and item is not None:
@@ -94,8 +92,9 @@ class Stage:
         """Place the camera, turned about the world's z axis by so many radians."""
         cos, sin = np.cos(turn), np.sin(turn)
         self.direction = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]]) @ DIRECTION
-        near, shown = self.shown.near, self.system if self.shown.cut else self.whole
-        points = near * self.radius * _BALL if near else corners(shown, self.radius)
+        points = (self.shown.near or 1.0) * self.radius * _BALL
+        if not self.shown.near:
+            points = np.concatenate([points, *(part.vertices for part in self.whole.parts())])
         aim(self.camera, self.direction, self.page, points, self.top)
 
     def light(self, lit: list[int], rays: list[int]) -> None:
@@ -103,18 +102,19 @@ class Stage:
         numbers, self.shining = self.system.numbers, rays
         bright = _TINT * np.isin(numbers, lit) * self.shown.lit
         front = -self.system.frames()[:, 2] @ self.direction
-        there = np.clip((_GONE - front) / (_GONE - _SOLID), 0.0, 1.0) if self.shown.lit else np.ones(len(numbers))
+        there = np.clip((_GONE - front) / (_GONE - _SOLID), 0.0, 1.0) if self.shown.cut else np.ones(len(numbers))
         there = np.maximum(there, _GHOST * np.isin(numbers, rays) * (len(rays) == 1))
         for mesh, module in self._modules:
             for name, values in (("lit", bright), ("there", there)):
                 mesh.attributes[name].data.foreach_set("value", values[module].astype(np.float32))
             mesh.update()
-        for number, ray in self.rays.items():
-            ray.hide_render = number not in rays
+        for number, share in zip(numbers.tolist(), there, strict=True):
+            if number in self.rays:
+                self.rays[number].hide_render = number not in rays or share == 0
 
     def moment(self, share: float) -> Moment:
         """What an animation shows after a share of its time."""
-        if self.shown.motion == "turn":
+        if self._motion == "turn":
             return 2 * np.pi * share, self.numbers, self.numbers
         now = int(share * len(self.numbers))
         return 0.0, self.numbers[: now + 1], [self.numbers[now]]
@@ -128,11 +128,6 @@ class Stage:
         """How large the page shows what is at the isocentre."""
         distance = float(np.array(self.camera.location) @ self.direction)
         return max(self.page.width, self.page.height) * self.shown.lens / _FILM / distance
-
-    @property
-    def is_smoke(self) -> bool:
-        """Whether the volume itself is drawn, in the colours of its values."""
-        return len(self.drawn) == 1 and self.drawn[0].type == "VOLUME"
 
     def draw_surface(self, mesh: Mesh, quantity: str) -> None:
         """Draw a mesh in the place of the volume."""
@@ -152,10 +147,10 @@ class Stage:
         bpy.data.scenes.remove(scene)
         bpy.data.batch_remove([*found, *datas, *materials, *homes, world])
 
-    def _put_modules(self, subject: Subject) -> None:
+    def _put_modules(self) -> None:
         """All collimators as one object, and all crystals."""
         numbered = dict(zip(self.system.numbers.tolist(), range(len(self.system)), strict=True))
-        parts = self.system.parts(subject.construction)
+        parts = self.system.parts(self.subject.construction)
         for kind in dict.fromkeys(part.kind for part in parts):
             chosen = [part for part in parts if part.kind == kind]
             firsts = np.cumsum([0, *(len(part.vertices) for part in chosen)])
@@ -196,17 +191,6 @@ class Stage:
             rays[number] = self.put(curve)
             rays[number].visible_shadow = False
         return rays
-
-
-def cut_away(system: Scanner) -> Scanner:
-    """The modules that do not stand between the isocentre and the viewer."""
-    front = -system.frames()[:, 2] @ DIRECTION
-    return system[front < _CUT] if np.any(front < _CUT) else system
-
-
-def corners(system: Scanner, radius: float) -> Points:
-    """Points (N, 3), mm, around all modules and the ROI."""
-    return np.concatenate([radius * _BALL, *(part.vertices for part in system.parts())])
 
 
 def aim(camera: bpy.types.Object, direction: Points, page: Page, points: Points, top: int) -> None:

@@ -273,11 +273,7 @@ LOOKS = (
     ("CUT", "Cut-Away", "The outer surface, cut open at the slices"),
     ("BONE", "Bone", "Of a CT or mu: the bones' surface, and their window"),
     ("SOFT", "Soft Tissue", "Of a CT or mu: the skin, and the window of soft tissue"),
-    (
-        "LUNG",
-        "Lung",
-        "Of a CT or mu: where air begins, which shows lungs that are cut open at slices, and their window",
-    ),
+    ("LUNG", "Lung", "Of a CT or mu: where air begins, so that a cut shows the lungs, and their window"),
 )
 
 

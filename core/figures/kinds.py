@@ -4,32 +4,40 @@ A new kind is a line here: one that is drawn has a function of a page and a subj
 into the studio (`addon.figures.figures`).
 """
 
+import math
 from collections.abc import Callable
 from typing import Literal, NamedTuple
 
+from ..errors import InputError
 from ..validation import one_of
 from . import mosaics, sums, virtual_c_arm
 from .page import DARK, SUFFIXES, Page
 from .subject import Subject
 
-Motion = Literal["turn", "light"]
 PAPERS = {"dark": DARK, "light": "#ffffff"}
 """What rendered figures lie on, by their style."""
 
 
-class Film(NamedTuple):
-    """How long an animation is, and how many pictures it shows in a second."""
+FILMS = (".mp4",)
+SAMPLES = 16
+"""Rays per pixel; what noise they leave is smoothed."""
 
-    seconds: float = 8.0
-    fps: int = 24
+
+class How(NamedTuple):
+    """How figures are rendered."""
+
+    labels: bool = True
+    samples: int = SAMPLES
+    style: str = "dark"  # of `PAPERS`
+    seconds: float = 8.0  # of an animation
+    fps: int = 24  # its pictures in a second
 
     @property
     def frames(self) -> int:
-        """The number of its pictures."""
+        """The number of an animation's pictures."""
+        if not (0 < self.seconds < math.inf and self.fps > 0):
+            raise InputError(f"{self.seconds:g} s of {self.fps} pictures each: expected more than 0 of both")
         return max(1, round(self.seconds * self.fps))
-
-
-FILM, FILMS = Film(), (".mp4",)
 
 
 class Studio(NamedTuple):
@@ -37,13 +45,10 @@ class Studio(NamedTuple):
 
     volume: bool = False
     rays: bool = False  # the modules' principal rays
-    cut: bool = False  # the modules between the isocentre and the viewer are left out
+    cut: bool = False  # the modules between the isocentre and the viewer fade
     near: float = 0.0  # ROI radii from the isocentre to the picture's edge; 0: the whole scanner fits
     lens: float = 50.0  # mm, of a camera whose film is 36 mm wide: a short one shows what is near large
-    lit: bool = (
-        False  # the chosen modules alone are lit and have rays; others stay, and fade where they stand in the way
-    )
-    motion: Motion | None = None  # of an animation
+    lit: bool = False  # the chosen modules are lit and have rays, and the others stay
 
 
 class FigureKind(NamedTuple):
@@ -57,19 +62,19 @@ class FigureKind(NamedTuple):
     draw: Callable[[Page, Subject], None] | None = None
     studio: Studio | None = None  # of a figure that Blender renders
     one_module: bool = False  # it shows the first of the chosen modules
-
-    @property
-    def is_film(self) -> bool:
-        """Whether it is an animation."""
-        return self.studio is not None and self.studio.motion is not None
+    motion: Literal["turn", "light"] | None = None  # of an animation
 
     @property
     def suffixes(self) -> tuple[str, ...]:
         """How the names of its files end."""
-        return FILMS if self.is_film else SUFFIXES
+        return FILMS if self.motion else SUFFIXES
+
+    def page(self, size: tuple[int, int] | None, style: str) -> Page:
+        """A page for it; only rendered figures have a style."""
+        return Page(*(size or self.size), PAPERS["light" if self.studio is None else style])
 
 
-_PICTURE = Studio(volume=True, rays=True, near=1.4, lens=30.0, lit=True)
+_PICTURE = Studio(volume=True, rays=True, cut=True, near=1.4, lens=30.0, lit=True)
 KINDS = {
     kind.name: kind
     for kind in (
@@ -91,11 +96,11 @@ KINDS = {
         ),
         FigureKind(
             "turntable", "Turntable", "the picture, once around: an animation", ("scanner", "volume"), (1280, 800),
-            studio=_PICTURE._replace(motion="turn", near=1.7),
+            studio=_PICTURE._replace(near=1.7), motion="turn",
         ),
         FigureKind(
             "light-up", "Modules Light Up", "the picture, one module after the other with its ray: an animation",
-            ("scanner", "volume"), (1280, 800), studio=_PICTURE._replace(motion="light", near=2.2),
+            ("scanner", "volume"), (1280, 800), studio=_PICTURE._replace(near=2.2), motion="light",
         ),
         FigureKind(
             "sums", "Orthogonal Sums", "a volume's sums along x, y and z, value x mm, with its translation T and rotation R",

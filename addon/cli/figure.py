@@ -97,7 +97,7 @@ def _run(arguments: argparse.Namespace) -> None:
         raise InputError("nothing to write: give --output FILE")
     paths = [output_path(name, kind.suffixes) for name in arguments.output]
     how = How(*(not arguments.no_labels, *(getattr(arguments, name) for name in How._fields[1:])))
-    page = kind.page(arguments.size, how.style)
+    page = kind.page(arguments.size, how)
     blends = [file for file in arguments.files if file.lower().endswith(".blend")]
     if blends:
         if len(arguments.files) > 1:

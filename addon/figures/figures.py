@@ -47,7 +47,8 @@ _MOST_RUNS = 6  # of module numbers that a title lists
 _REST = 0.5  # s between two looks at Blender's render job where nothing waits for it
 _SMALL, _TRACE = 240, 8  # pixels across, and of 255: what a volume that can be seen changes in a small picture
 _drawn: set[tuple[str, str, float, float]] = set()  # volumes and looks that Cycles is known to draw
-_UNSEEN = ": Low and High draw none of its values, its file is missing, or this Blender's Cycles draws no volumes"
+_UNDRAWN = "Low and High draw none of its values, or this Blender's Cycles draws no volumes"
+_UNSEEN = f": its file is missing, {_UNDRAWN}"
 _AXES = {"dark": ("#ff8a80", "#8ee59a", "#8cb8ff"), "light": ("#c62828", "#2e7d32", "#1f57c3")}  # x, y and z
 _STEPS = (1.0, 2.0, 5.0)  # round numbers of scale bars
 _VEIL = 0.7  # how much of the paper covers what is under labels
@@ -86,7 +87,7 @@ def figure_job(
     """
     given = How(**how)
     kind, scene = figure_kind(name), context.scene
-    page = kind.page(size, given.style)
+    page = kind.page(size, given)
     paths = [output_path(str(path), kind.suffixes) for path in paths]
     collection = scanner.active_scanner(scene)
     item = _volume_item(context) if "volume" in kind.needs else None
@@ -149,8 +150,6 @@ def drawing(
     if kind.draw is not None:
         kind.draw(page, subject)
     if kind.studio is not None:
-        if kind.motion and (page.width % 2 or page.height % 2):
-            raise InputError(f"size {page.width}x{page.height}: of an animation both must be even")
         stage = Stage(subject, kind, item, page, heading_height(page, 1) if how.labels else 0)
         try:
             yield from _prepared(stage, how)
@@ -201,7 +200,7 @@ def _prepared(stage: Stage, how: How) -> Generator[None, None, None]:
     is_usable = outside_value(volume) < level <= volume.array.max()
     stage.draw_surface(volume_to_mesh(volume, level if is_usable else None), settings.quantity)
     at = f"{level * factor:.3g} {settings.unit}" if is_usable else "half its largest value"
-    warn(f"the picture shows {item.name!r} as the surface at {at}{_UNSEEN}")
+    warn(f"the picture shows {item.name!r} as the surface at {at}: {_UNDRAWN}")
 
 
 def _picture(stage: Stage, how: How, page: Page) -> Generator[None, None, None]:

@@ -110,7 +110,7 @@ class Stage:
             mesh.update()
         for number, share in zip(numbers.tolist(), there, strict=True):
             if number in self.rays:
-                self.rays[number].hide_render = number not in rays or share == 0
+                self.rays[number].hide_render = number not in rays or not share
 
     def moment(self, share: float) -> Moment:
         """What an animation shows after a share of its time."""

@@ -35,8 +35,6 @@ class How(NamedTuple):
     @property
     def frames(self) -> int:
         """The number of an animation's pictures."""
-        if not (0 < self.seconds < math.inf and self.fps > 0):
-            raise InputError(f"{self.seconds:g} s of {self.fps} pictures each: expected more than 0 of both")
         return max(1, round(self.seconds * self.fps))
 
 
@@ -69,9 +67,14 @@ class FigureKind(NamedTuple):
         """How the names of its files end."""
         return FILMS if self.motion else SUFFIXES
 
-    def page(self, size: tuple[int, int] | None, style: str) -> Page:
-        """A page for it; only rendered figures have a style."""
-        return Page(*(size or self.size), PAPERS["light" if self.studio is None else style])
+    def page(self, size: tuple[int, int] | None, how: How) -> Page:
+        """A page for it; only rendered figures have a style. Raises InputError of what no animation can be."""
+        page = Page(*(size or self.size), PAPERS["light" if self.studio is None else how.style])
+        if self.motion and (page.width % 2 or page.height % 2):
+            raise InputError(f"size {page.width}x{page.height}: of an animation both must be even")
+        if not (0 < how.seconds < math.inf and how.fps > 0):
+            raise InputError(f"{how.seconds:g} s of {how.fps} pictures each: expected more than 0 of both")
+        return page
 
 
 _PICTURE = Studio(volume=True, rays=True, cut=True, near=1.4, lens=30.0, lit=True)

@@ -15,8 +15,7 @@ from ..core.figures.kinds import FILMS, PAPERS, SAMPLES, How
 from ..core.figures.page import LARGEST, SUFFIXES
 
 _PIXELS = {"description": "Pixels; 0: what suits the figure", "min": 0, "max": LARGEST, "subtype": "PIXEL"}
-_STYLES = ((name.upper(), name.title(), f"On {name} paper") for name in PAPERS)
-_HOW = ("labels", "samples", "style", "seconds", "fps")
+_STYLES = ((name, name.title(), f"On {name} paper") for name in PAPERS)
 _SHOWN: reports.Need = (
     lambda context: scanner.active_scanner(context.scene) or volumes.volume_objects(context.scene),
     "Nothing to show: import a workbook or add a phantom first",
@@ -36,7 +35,7 @@ class _Drawing(jobs.ExportJob):
         description="Such as 1-40 or 1-20,41; empty: all, of a picture those selected or a ring, of one module the active",
     )
     labels: BoolProperty(name="Labels", description="Write titles, axes and scales on rendered figures", default=True)
-    style: EnumProperty(name="Style", description="Of rendered figures", items=items({}, _STYLES), default="DARK")
+    style: EnumProperty(name="Style", description="Of rendered figures", items=items({}, _STYLES), default="dark")
     samples: IntProperty(
         name="Samples", description="Rays per pixel of rendered figures: the more, the smoother and slower",
         default=SAMPLES, min=1, soft_max=256,
@@ -56,7 +55,7 @@ class _Drawing(jobs.ExportJob):
         if bool(own.width) != bool(own.height):
             raise InputError("size: give both width and height, or neither")
         size = (own.width, own.height) if own.width else None
-        how = {name: getattr(self, name) for name in _HOW if hasattr(self, name)} | {"style": own.style.lower()}
+        how = {name: value for name, value in self.as_keywords().items() if name in How._fields}
         name = own.figure.lower().replace("_", "-")
         return figures.figure_job(context, name, [path], size, own.modules or None, **how)
 

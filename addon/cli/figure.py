@@ -2,7 +2,6 @@
 
 import argparse
 import contextlib
-import threading
 from pathlib import Path
 from typing import Any
 
@@ -147,7 +146,7 @@ def _render(kind: FigureKind, page: Page, subject: Subject, paths: list[Path], h
         item = volumes.add_volume(subject.volume, subject.name or "Volume")
     show = progress_bar("rendering")
     with quiet():
-        for step in figures.drawing(page, subject, kind, item, paths, how, [], threading.Event()):
+        for step in figures.drawing(page, subject, kind, item, paths, how, figures.Reel()):
             if step is not None:
                 show(*step[1:])
 

@@ -27,7 +27,6 @@ from ...core.figures.parts import bar_width, color_bar, heading, heading_height
 from ...core.figures.subject import Subject, require
 from ...core.runs.display import Display
 from ...core.runs.resizing import resized
-from ...core.volumes.volume import outside_value
 from ..blender import ids, jobs, storage, timers
 from ..blender.choices import items
 from ..phantoms import phantoms
@@ -53,6 +52,12 @@ _AXES = {"dark": ("#ff8a80", "#8ee59a", "#8cb8ff"), "light": ("#c62828", "#2e7d3
 _STEPS = (1.0, 2.0, 5.0)  # round numbers of scale bars
 _VEIL = 0.7  # how much of the paper covers what is under labels
 _SCALE = 0.2  # of the picture's width that a scale bar takes at most
+
+
+class Reel(threading.Event):
+    """The pictures that an animation has so far; where it is set, they are enough."""
+
+    pictures: Sequence[Path] = ()
 
 
 @dataclass(frozen=True)
@@ -119,17 +124,17 @@ def figure_job(
             known["name"] = found["run"].settings.get("volume", "")
         return Subject(**known, **found)
 
-    enough = threading.Event()
-    made: list[Path] = []
+    reel = Reel()
 
     def finish(subject: Subject) -> Generator[Step, None, str]:
-        yield from drawing(page, subject, kind, item, paths, given, made, enough)
+        yield from drawing(page, subject, kind, item, paths, given, reel)
         return f"Wrote {', '.join(map(str, paths))}"
 
     def left() -> str:
+        made = reel.pictures
         return f"{len(made)} pictures are in {made[0].parent}" if made else "nothing was changed"
 
-    return jobs.Job("Drawing the figure", work, finish, enough=enough if kind.motion else None, left=left)
+    return jobs.Job("Drawing the figure", work, finish, enough=reel if kind.motion else None, left=left)
 
 
 def drawing(
@@ -139,13 +144,12 @@ def drawing(
     item: bpy.types.Object | None,
     paths: Sequence[Path],
     how: How,
-    made: list[Path],
-    enough: threading.Event,
+    reel: Reel,
 ) -> Generator[Step, None, None]:
     """Draw a figure on its page and write it to `paths`; yields while Blender's own job renders, and pictures of a film.
 
-    The volume that is rendered is that of an object. A film's pictures, in the folder NAME-frames beside NAME.mp4, are
-    added to `made`, and stay if the work is ended; where `enough` is set, the film ends with those.
+    The volume that is rendered is that of an object. A film's pictures, in the folder NAME-frames beside NAME.mp4, stay if
+    the work is ended; where `reel` is set, the film ends with those.
     """
     if kind.draw is not None:
         kind.draw(page, subject)
@@ -154,7 +158,7 @@ def drawing(
         try:
             yield from _prepared(stage, how)
             for path in paths if kind.motion else ():
-                yield from _filmed(stage, how, path, made, enough)
+                yield from _filmed(stage, how, path, reel)
             if not kind.motion:
                 yield from _picture(stage, how, page)
         finally:
@@ -163,11 +167,9 @@ def drawing(
         page.write(path)
 
 
-def _filmed(
-    stage: Stage, how: How, path: Path, made: list[Path], enough: threading.Event
-) -> Generator[Step, None, None]:
+def _filmed(stage: Stage, how: How, path: Path, reel: Reel) -> Generator[Step, None, None]:
     """Render an animation's pictures, and put them together to an MP4."""
-    made.clear()
+    made = reel.pictures = []
     folder = files.ensure_folder(path.with_name(f"{path.stem}-frames"))
     for old in folder.glob(f"{glob.escape(path.stem)}-[0-9][0-9][0-9][0-9].png"):
         old.unlink()  # of an animation that may have been longer
@@ -181,7 +183,7 @@ def _filmed(
         made.append(folder / f"{path.stem}-{k + 1:04d}.png")
         page.write(made[-1])
         yield "rendering pictures", k + 1, how.frames
-        if enough.is_set():
+        if reel.is_set():
             break
     yield from engine.write_film(made, path, how.fps, page)
 
@@ -196,11 +198,9 @@ def _prepared(stage: Stage, how: How) -> Generator[None, None, None]:
         warn(f"the picture shows nothing of {item.name!r}{_UNSEEN}")
         return
     settings, factor = item.mphdrr_volume, volume_materials.shown_unit(item.mphdrr_volume.quantity)[1]
-    level = (settings.display_low + settings.display_high) / 2 / factor
-    is_usable = outside_value(volume) < level <= volume.array.max()
-    stage.draw_surface(volume_to_mesh(volume, level if is_usable else None), settings.quantity)
-    at = f"{level * factor:.3g} {settings.unit}" if is_usable else "half its largest value"
-    warn(f"the picture shows {item.name!r} as the surface at {at}: {_UNDRAWN}")
+    level = min((settings.display_low + settings.display_high) / factor, float(volume.array.max())) / 2
+    stage.draw_surface(volume_to_mesh(volume, level), settings.quantity)
+    warn(f"the picture shows {item.name!r} as the surface at {level * factor:.3g} {settings.unit}: {_UNDRAWN}")
 
 
 def _picture(stage: Stage, how: How, page: Page) -> Generator[None, None, None]:
@@ -219,9 +219,9 @@ def _label(stage: Stage, page: Page) -> None:
     _draw_axes(page, stage.camera)
     if not stage.shown.volume:
         return
-    longest = _SCALE * page.width / stage.pixels_per_mm()
+    longest = _SCALE * page.width / stage.pixels_per_mm
     length = max(n * 10.0**k for n in _STEPS for k in range(-3, 5) if n * 10.0**k <= longest)
-    end, row = 1.2 * em + length * stage.pixels_per_mm(), page.height - 1.4 * em
+    end, row = 1.2 * em + length * stage.pixels_per_mm, page.height - 1.4 * em
     page.area(box(0.6 * em, row - 2.2 * em, end, 3.0 * em), page.paper, _VEIL)
     page.line([(1.2 * em, row), (end, row)], page.ink, 0.25 * em)
     page.text(f"{length:g} mm", (1.2 * em + end) / 2, row - 0.6 * em, em, page.ink, "middle")
@@ -298,7 +298,7 @@ def _say_what_is_unseen() -> float | None:
             with recording.recorded_warnings() as caught:
                 subject = Subject(PinholeSystem(-2 * reach * DIRECTION[None], *sizes))
                 page, how = Page(_SMALL, _SMALL), How(labels=False, samples=1)
-                list(drawing(page, subject, figure_kind("inside"), item, [], how, [], threading.Event()))
+                list(drawing(page, subject, figure_kind("inside"), item, [], how, Reel()))
             why = _UNSEEN if any(_UNSEEN in text for text in caught) else ""
             _drawn.update([] if why else [known])
         if why:

@@ -76,8 +76,7 @@ class Stage:
             self.rays = self._put_rays() if shown.rays else {}
             self.camera = scene.camera = self.put(bpy.data.cameras.new(ids.STUDIO))
             self.camera.data.lens, self.camera.data.sensor_width = shown.lens, _FILM
-            self.look()
-            self.light(self.numbers, self.numbers)
+            self.show(0.0, self.numbers, self.numbers)
         except BaseException:
             self.remove()
             raise
@@ -88,25 +87,25 @@ class Stage:
         self.scene.collection.objects.link(item)
         return item
 
-    def look(self, turn: float = 0.0) -> None:
-        """Place the camera, turned about the world's z axis by so many radians."""
+    def show(self, turn: float, lit: list[int], rays: list[int]) -> None:
+        """Show a moment: the camera where it is then, and let those modules fade that stand in its way."""
         cos, sin = np.cos(turn), np.sin(turn)
-        self.direction = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]]) @ DIRECTION
+        direction = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]]) @ DIRECTION
         points = (self.shown.near or 1.0) * self.radius * _BALL
         if not self.shown.near:
             points = np.concatenate([points, *(part.vertices for part in self.whole.parts())])
-        aim(self.camera, self.direction, self.page, points, self.top)
-
-    def light(self, lit: list[int], rays: list[int]) -> None:
-        """Light modules by their numbers, show the rays of some, and let those fade that stand in the way."""
+        aim(self.camera, direction, self.page, points, self.top)
+        # What is at the isocentre is shown as large:
+        longer, distance = max(self.page.width, self.page.height), float(np.array(self.camera.location) @ direction)
+        self.pixels_per_mm = longer * self.shown.lens / _FILM / distance
         numbers, self.shining = self.system.numbers, rays
-        bright = _TINT * np.isin(numbers, lit) * self.shown.lit
-        front = -self.system.frames()[:, 2] @ self.direction
+        front = -self.system.frames()[:, 2] @ direction
         there = np.clip((_GONE - front) / (_GONE - _SOLID), 0.0, 1.0) if self.shown.cut else np.ones(len(numbers))
         there = np.maximum(there, _GHOST * np.isin(numbers, rays) * (len(rays) == 1))
+        values = {"lit": _TINT * np.isin(numbers, lit) * self.shown.lit, "there": there}
         for mesh, module in self._modules:
-            for name, values in (("lit", bright), ("there", there)):
-                mesh.attributes[name].data.foreach_set("value", values[module].astype(np.float32))
+            for name, value in values.items():
+                mesh.attributes[name].data.foreach_set("value", value[module].astype(np.float32))
             mesh.update()
         for number, share in zip(numbers.tolist(), there, strict=True):
             if number in self.rays:
@@ -118,16 +117,6 @@ class Stage:
             return 2 * np.pi * share, self.numbers, self.numbers
         now = int(share * len(self.numbers))
         return 0.0, self.numbers[: now + 1], [self.numbers[now]]
-
-    def show(self, turn: float, lit: list[int], rays: list[int]) -> None:
-        """Show a moment of an animation."""
-        self.look(turn)
-        self.light(lit, rays)
-
-    def pixels_per_mm(self) -> float:
-        """How large the page shows what is at the isocentre."""
-        distance = float(np.array(self.camera.location) @ self.direction)
-        return max(self.page.width, self.page.height) * self.shown.lens / _FILM / distance
 
     def draw_surface(self, mesh: Mesh, quantity: str) -> None:
         """Draw a mesh in the place of the volume."""

@@ -77,7 +77,7 @@ class FigureKind(NamedTuple):
         return page
 
 
-_PICTURE = Studio(volume=True, rays=True, cut=True, near=1.4, lens=30.0, lit=True)
+_PICTURE = Studio(volume=True, rays=True, cut=True, near=1.25, lens=30.0, lit=True)
 KINDS = {
     kind.name: kind
     for kind in (

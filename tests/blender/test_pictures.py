@@ -16,7 +16,7 @@ from mphdrr.addon.volumes import volume_materials, volumes
 from mphdrr.core.recording import recorded_warnings
 
 SIZE = (192, 120)
-PAPERS = {"DARK": (20, 22, 26), "LIGHT": (255, 255, 255)}
+PAPERS = {"dark": (20, 22, 26), "light": (255, 255, 255)}
 
 
 @pytest.fixture
@@ -70,7 +70,7 @@ def test_an_animation_has_the_phantom_on_its_first_and_last_picture(example, tmp
         assert [frame.name for frame in frames] == [f"{kind}-{k:04d}.png" for k in (1, 2)]
         first, last = picture(frames[0]), picture(frames[-1])
         assert min(share_of_phantom(first), share_of_phantom(last)) > 0.008
-        assert min(share_of_paper(first, "DARK"), share_of_paper(last, "DARK")) > 0.1
+        assert min(share_of_paper(first, "dark"), share_of_paper(last, "dark")) > 0.1
         assert np.abs(first - last).max() > 60, "something happens"
         clip = bpy.data.movieclips.load(str(path))
         assert (tuple(clip.size), clip.frame_duration, clip.fps) == (SIZE, 2, 10)

@@ -22,7 +22,7 @@ from bpy_extras.io_utils import ExportHelper
 
 from ...core.cli.options import progress_bar
 from ...core.errors import InputError
-from ...core.progress import Cancelled, Progress, StagedProgress, stages_of, tell
+from ...core.progress import Cancelled, Progress, StagedProgress
 from ...core.recording import recorded_warnings
 from . import reports, storage, windows
 
@@ -71,11 +71,9 @@ def run(job: Job, progress: Progress = lambda done, total: None) -> str:
         steps = _finishing(job, job.work(progress))
         while True:
             try:
-                step = next(steps)
+                next(steps)
             except StopIteration as end:
                 return str(end.value)
-            if step is not None:
-                tell(stages_of(progress)(step[0]), *step[1:])
     except BaseException:
         job.discard()
         raise

@@ -23,7 +23,6 @@ from ...core.figures.kinds import FILMS, KINDS, PAPERS, SAMPLES, FigureKind, How
 from ...core.figures.page import SUFFIXES, Page
 from ...core.figures.subject import NEEDS, Subject, require
 from ...core.phantoms.kinds import KINDS as PHANTOMS
-from ...core.progress import StagedProgress
 from ...core.runs.files import FORMATS, read_run
 from ...core.runs.run_recipe import phantom_pose, run_recipe
 from ...core.toml import read_toml
@@ -122,7 +121,6 @@ def _of_scene(arguments: argparse.Namespace, kind: FigureKind, blend: Path, path
     new_scene()
     import bpy
 
-    from ..blender import jobs
     from ..figures import figures
 
     with quiet():
@@ -131,7 +129,7 @@ def _of_scene(arguments: argparse.Namespace, kind: FigureKind, blend: Path, path
         except RuntimeError as error:
             raise InputError(f"{blend}: cannot be opened ({str(error).strip().splitlines()[0]})") from None
         job = figures.figure_job(bpy.context, kind.name, paths, arguments.size, arguments.modules, **how._asdict())
-        jobs.run(job, StagedProgress(progress_bar, "figure"))
+        _follow(job.finish(job.work(lambda done, total: None)))
 
 
 def _render(kind: FigureKind, page: Page, subject: Subject, paths: list[Path], how: How) -> None:
@@ -144,11 +142,15 @@ def _render(kind: FigureKind, page: Page, subject: Subject, paths: list[Path], h
     item = None
     if kind.studio.volume and subject.volume is not None:
         item = volumes.add_volume(subject.volume, subject.name or "Volume")
-    show = progress_bar("rendering")
     with quiet():
-        for step in figures.drawing(page, subject, kind, item, paths, how, figures.Reel()):
-            if step is not None:
-                show(*step[1:])
+        _follow(figures.drawing(page, subject, kind, item, paths, how, figures.Reel()))
+
+
+def _follow(steps: Any) -> None:
+    """Take the steps of a drawing, and show how far it is."""
+    show = progress_bar("rendering")
+    for step in filter(None, steps):
+        show(*step[1:])
 
 
 def _subject(arguments: argparse.Namespace) -> Subject:

@@ -341,6 +341,7 @@ def test_window_and_command_draw_the_same_figures(blender, blender_script, windo
     seen = window("figure")
     assert seen["scenes"] == 1 and seen["display"] == ["WINDOW", "WINDOW"]
     assert seen["ticks"] > 3, "the window was alive while the figure was rendered"
+    assert seen["film"] == 2 == len(list((work_folder / "film-frames").iterdir()))
     for kind in ("cut-away", "sums"):
         path = work_folder / f"{kind}-command.png"
         blender("--command", "mphdrr", "figure", kind, blend, "--size", SIZE, "--samples", "8", "-o", path)

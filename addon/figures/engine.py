@@ -1,5 +1,6 @@
 """Blender as an engine: scenes rendered by Cycles to pictures, and pictures put together to films."""
 
+import tempfile
 import time
 from collections.abc import Generator, Sequence
 from pathlib import Path
@@ -82,7 +83,9 @@ def write_film(pictures: Sequence[Path], path: Path, fps: int, page: Page) -> Ge
         render.fps, render.use_file_extension = fps, False
         compat.write_films(render.image_settings)
         render.ffmpeg.format, render.ffmpeg.codec, render.ffmpeg.constant_rate_factor = "MPEG4", "H264", "HIGH"
-        with files.replacing(path) as temporary:
-            yield from written(scene, temporary, animation=True)
+        with tempfile.TemporaryDirectory(prefix="mphdrr-") as folder:
+            made = Path(folder) / "film.mp4"
+            yield from written(scene, made, animation=True)
+            files.write_bytes(path, made.read_bytes())
     finally:
         bpy.data.scenes.remove(scene)

@@ -134,7 +134,7 @@ class Stage:
         materials = {m for data in datas for m in getattr(data, "materials", ()) if m.name.startswith(ids.STUDIO)}
         homes, world = list(scene.collection.children), scene.world
         bpy.data.scenes.remove(scene)
-        bpy.data.batch_remove([*found, *datas, *materials, *homes, world])
+        bpy.data.batch_remove([*found, *datas, *materials, *homes, *filter(None, [world])])
 
     def _put_modules(self) -> None:
         """All collimators as one object, and all crystals."""
@@ -226,7 +226,10 @@ def _material(part: str) -> bpy.types.Material:
     """A copy of the material of parts: in the accent's colour by the faces' attribute "lit", and clear without "there"."""
     material = collimators.part_material(part).copy()
     material.name, tree = ids.STUDIO, material.node_tree
-    add_node, surface = partial(compat.add_node, tree), tree.get_output_node("CYCLES").inputs["Surface"]
+    output = tree and tree.get_output_node("CYCLES")
+    if output is None or not output.inputs["Surface"].links:  # the user's own
+        return material
+    add_node, surface = partial(compat.add_node, tree), output.inputs["Surface"]
     lit, there = (
         add_node("ShaderNodeAttribute", (600, y), attribute_name=name).outputs["Fac"]
         for name, y in (("lit", 300), ("there", 500))

@@ -134,3 +134,5 @@ class MPHDRR_MT_projections(bpy.types.Menu):
         layout.operator("mphdrr.load_recipe", icon="FILE_FOLDER")
         layout.operator("mphdrr.export_dataset", icon="EXPORT")
         layout.operator("mphdrr.export_figure", icon="IMAGE_DATA")
+        layout.operator("mphdrr.render_picture", icon="RENDER_STILL")
+        layout.operator("mphdrr.render_animation", icon="RENDER_ANIMATION")

@@ -128,6 +128,8 @@ class MPHDRR_PT_export(Folded, bpy.types.Panel):
         row = layout.row()
         row.enabled = bool(run_file)
         row.operator("mphdrr.export_dataset", text="Export Dataset", icon="EXPORT")
+        layout.operator("mphdrr.render_picture", icon="RENDER_STILL")
+        layout.operator("mphdrr.render_animation", icon="RENDER_ANIMATION")
         layout.operator("mphdrr.export_figure", text="Export Figure", icon="IMAGE_DATA")
         if run_file:
             kept = run_file if run_file.startswith("//") else iface("Kept when the .blend is saved")

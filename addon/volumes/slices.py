@@ -246,9 +246,9 @@ def _material(name: str, image: bpy.types.Image) -> bpy.types.Material:
     return material
 
 
-def colors(quantity: str) -> NDArray[np.float32]:
-    """RGBA (256, 4) of the display range, as an sRGB image holds them; the lowest is transparent."""
-    positions, colors = zip(*volume_materials.ramp(quantity), strict=True)
+def colors(quantity: str, smoke: bool = False) -> NDArray[np.float32]:
+    """RGBA (256, 4) of the display range, as an sRGB image holds them; the lowest is transparent. Of slices, or of smoke."""
+    positions, colors = zip(*volume_materials.ramp(quantity, smoke), strict=True)
     shades = np.linspace(0, 1, _SHADES)
     rgb = np.stack([np.interp(shades, positions, channel) for channel in np.transpose(colors)], axis=1)
     srgb = np.where(rgb <= 0.0031308, 12.92 * rgb, 1.055 * rgb ** (1 / 2.4) - 0.055)

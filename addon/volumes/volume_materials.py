@@ -1,7 +1,8 @@
 """How volumes look: colours, units, the volume material, and the density of the solid viewport's smoke.
 
-Activity glows in purples, maps are green, attenuation and CT numbers look like a radiograph, the higher the brighter. None
-has a hue of the crystals (`core.geometry.part_colors`) or of what Blender marks as selected.
+Activity glows in purples, maps are green; attenuation and CT numbers look like a radiograph on slices and like tissue as
+smoke, the higher the brighter. Neither activity nor maps have a hue of the crystals (`core.geometry.part_colors`) or of what
+Blender marks as selected.
 """
 
 from collections.abc import Sequence
@@ -29,7 +30,14 @@ _GREENS = (
     (1.00, (0.6200, 0.7600, 0.0200)),
 )
 _GREYS = ((0.00, (0.02, 0.02, 0.02)), (1.00, (0.80, 0.80, 0.80)))
-_XRAY = ("mu", "hu")
+_TISSUES = (  # of the smoke of CT numbers and mu: blood, muscle, fat, bone
+    (0.00, (0.0200, 0.0050, 0.0050)),
+    (0.25, (0.2200, 0.0350, 0.0250)),
+    (0.50, (0.5500, 0.1900, 0.1000)),
+    (0.75, (0.8000, 0.5000, 0.2800)),
+    (1.00, (0.9500, 0.8800, 0.7200)),
+)
+XRAY = ("mu", "hu")
 # Not in the voxels' own unit: as every other sensitivity in the window, and in few letters.
 _SHOWN_AS = {"sensitivity": ("cps/MBq", 1e6), "backprojection": ("as images", 1.0)}
 _CT_WINDOW = (-200.0, 1000.0)  # HU: skin to bone
@@ -46,9 +54,11 @@ Cut = Sequence[tuple[Sequence[float], float]]
 """A vector n and a number t for each axis of a grid; points x, mm in the object's space, with n x > t lie in front."""
 
 
-def ramp(quantity: str) -> tuple[tuple[float, tuple[float, float, float]], ...]:
-    """Positions (0 to 1) and colours (linear RGB) that show a quantity's display range."""
-    return _GREYS if quantity in _XRAY else _PURPLES if quantity == "activity" else _GREENS
+def ramp(quantity: str, smoke: bool = False) -> tuple[tuple[float, tuple[float, float, float]], ...]:
+    """Positions (0 to 1) and colours (linear RGB) that show a quantity's display range: on slices, or as smoke."""
+    if quantity in XRAY:
+        return _TISSUES if smoke else _GREYS
+    return _PURPLES if quantity == "activity" else _GREENS
 
 
 def shown_unit(quantity: str) -> tuple[str, float]:
@@ -66,7 +76,7 @@ def usual_range(quantity: str, low: float, high: float) -> tuple[float, float]:
 def new_material(name: str, quantity: str, size: float) -> bpy.types.Material:
     """A material that glows and is opaque where the grid `quantity` is high (`set_range`); for a volume of `size` mm."""
     material = blank_material(name)
-    tree, colors = material.node_tree, ramp(quantity)
+    tree, colors = material.node_tree, ramp(quantity, smoke=True)
     attribute = add_node(tree, "ShaderNodeAttribute", (0.0, 0.0), attribute_name=quantity)
     ranged = {"Value": attribute.outputs["Fac"]}
     relative = add_node(

@@ -349,12 +349,12 @@ def test_window_and_command_draw_the_same_figures(blender, blender_script, windo
     seen = window("figure")
     assert seen["scenes"] == 1 and seen["display"] == ["WINDOW", "WINDOW"]
     assert seen["ticks"] > 3, "the window was alive while the figure was rendered"
+    assert seen["film"] == 2 == len(list((work_folder / "film-frames").iterdir()))
     for kind in ("cut-away", "sums"):
         path = work_folder / f"{kind}-command.png"
-        done = blender("--command", "mphdrr", "figure", kind, blend, "--size", SIZE, "--samples", "8", "-o", path)
-        colors = pixels(path)
-        is_drawn = kind != "cut-away" or np.count_nonzero(colors[..., 0] - colors[..., 1] > 40) > 100  # its purple
-        assert ("the picture shows nothing of" in done.stdout + done.stderr) != is_drawn
+        blender("--command", "mphdrr", "figure", kind, blend, "--size", SIZE, "--samples", "8", "-o", path)
+        colors = pixels(path)  # where Cycles draws no volumes, as in Debian, the phantom is a surface
+        assert kind != "cut-away" or np.count_nonzero(colors[..., 0] - colors[..., 1] > 40) > 100, "its purple"
         own, other = (np.asarray(Image.open(p).convert("L")) for p in (work_folder / f"{kind}.png", path))
         assert own.std() > 15, "something is to be seen"
         assert ssim(own, other) > 0.99

@@ -13,6 +13,8 @@ from mphdrr.addon.perspective import color_bar
 from mphdrr.addon.volumes import looks, slices, volume_materials, volumes
 from mphdrr.core.geometry.grid import Grid
 from mphdrr.core.geometry.part_colors import LOOKS
+from mphdrr.core.physics.ct_numbers import hu_to_mu
+from mphdrr.core.physics.materials import attenuation
 from mphdrr.core.volumes.volume import Volume
 
 
@@ -99,11 +101,17 @@ def test_presets_of_a_ct(scene):
     array[2:7, 2:7, 2:7], array[4, 4, 4] = 40.0, 900.0
     item = volumes.add_volume(Volume(array, Grid.centered(9, 2.0), "hu"), "CT")
     sides = {}
-    for look in ("BONE", "SOFT"):
+    for look in ("BONE", "LUNG", "SOFT"):
         item.mphdrr_volume.look = look
         sides[look] = np.ptp(surface(item)[0], axis=0).max()
     assert sides["BONE"] < 4.0 and 8.0 < sides["SOFT"] < 10.0  # one voxel, and five
     assert (item.mphdrr_volume.display_low, item.mphdrr_volume.display_high) == (-160.0, 240.0)
+    mu = volumes.add_volume(hu_to_mu(volumes.volume_from_object(item)), "mu").mphdrr_volume
+    water, bone = attenuation("water", 140.5), attenuation("bone", 140.5)
+    mu.look = "SOFT"
+    assert mu.display_low < water < mu.display_high < bone and mu.unit == "1/mm"
+    mu.look = "BONE"
+    assert water < mu.surface < bone
 
 
 def test_slices_of_nema_show_six_spheres_also_after_reopening(nema, tmp_path):

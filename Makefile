@@ -30,6 +30,9 @@ ANY_PYTHON = $$(for p in "$(PYTHON)" python3 python3.11 python3.13; do "$$p" -c 
 ENVIRONMENT = @p=$(ANY_PYTHON); [ -n "$$p" ] || { echo "no Python found; name one: make PYTHON=/path/to/python3.11"; exit 1; }; \
 	"$$p" tools/environment.py $(VENV) --python "$(PYTHON)"
 
+# Python keeps what it has compiled: else each process of the tests compiles everything anew.
+unexport PYTHONDONTWRITEBYTECODE
+
 .PHONY: demo gallery test test-long lint test-app test-kernels test-gate test-peers bench bench-events bench-reconstruction docs tutorial dist clean env env-dev env-gate env-peers
 
 demo: env

@@ -83,8 +83,9 @@ test-app: env-dev
 	$(BIN)/python -m pytest tests/app -m alone
 
 test-kernels: env-dev
-	$(BIN)/python -m pytest tests/kernels
-	@for level in $$($(BIN)/python -c "from mphdrr.core.projector.backends import cpu; print(*cpu.levels())"); do \
+	$(BIN)/python -m pytest tests/kernels -n auto --dist worksteal
+	@# make test runs at the highest level
+	@for level in $$($(BIN)/python -c "from mphdrr.core.projector.backends import cpu; print(*cpu.levels()[:-1])"); do \
 		echo "accuracy of $$level"; MPHDRR_CPU_LEVEL=$$level $(BIN)/python -m pytest -k cpu tests/core/test_projector.py \
 		tests/core/test_emission.py tests/core/test_emission_gradients.py tests/core/test_geometry_gradients.py tests/core/test_hole_by_depth.py || exit 1; done
 

@@ -149,14 +149,14 @@ def test_links_within_a_file_are_followed(tmp_path, rng):
 
 
 @pytest.mark.parametrize(
-    ("body", "words"),
-    [("while True: pass", "no end"), ("import os; os.abort()", "crashes")],
+    ("body", "seconds", "words"),
+    [("while True: pass", 0.5, "no end"), ("import os; os.abort()", 60, "crashes")],
 )
-def test_what_hangs_or_crashes_hdf5_is_one_line(tmp_path, monkeypatch, body, words):
+def test_what_hangs_or_crashes_hdf5_is_one_line(tmp_path, monkeypatch, body, seconds, words):
     with h5py.File(tmp_path / "a.h5", "w") as file:
         file["array"] = np.ones((2, 2, 2))
     monkeypatch.setattr(hdf5, "_PROBE", body)
-    monkeypatch.setattr(hdf5, "_PROBE_SECONDS", 0.5)
+    monkeypatch.setattr(hdf5, "_PROBE_SECONDS", seconds)
     refused(lambda: mph.read_counts(tmp_path / "a.h5"), "a.h5", words)
 
 

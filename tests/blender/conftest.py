@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +27,7 @@ def factory_settings() -> None:
 def scene(factory_settings):
     """A fresh factory scene with the extension registered."""
     bpy.ops.wm.read_homefile(use_factory_startup=True)
+    shutil.rmtree(Path(bpy.app.tempdir, "mphdrr"), ignore_errors=True)
     registration.register()
     yield bpy.context.scene
     registration.unregister()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import atexit
+import functools
 import gc
 import os
 from pathlib import Path
@@ -12,6 +13,8 @@ import pytest
 # Each of several processes leaves the other cores to the others; BLAS and torch would wait for theirs, busily.
 if "PYTEST_XDIST_WORKER" in os.environ:
     os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+
+from mphdrr.core.workbook import reader  # noqa: E402
 
 # No test cuts the power: to wait until each small file is on the disk would be most of what some of them take.
 os.fsync = lambda descriptor: None
@@ -33,6 +36,15 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
         _file = item.path
         gc.collect()
         gc.freeze()
+
+
+# The users' workbook is read hundreds of times in a process; what it gives cannot be changed.
+WORKBOOK = Path(__file__).parents[1] / "examples" / "dc-spect-80.xlsx"
+_read = reader._read
+_read_workbook = functools.cache(lambda kind: _read(WORKBOOK, kind, None))
+reader._read = lambda path, kind, columns: (
+    _read_workbook(kind) if columns is None and Path(path) == WORKBOOK else _read(path, kind, columns)
+)
 
 
 @atexit.register

@@ -38,12 +38,14 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
         gc.freeze()
 
 
-# The users' workbook is read hundreds of times in a process; what it gives cannot be changed.
+# The users' workbook is read hundreds of times in a process; what it gives cannot be changed, but a kind's columns can.
 WORKBOOK = Path(__file__).parents[1] / "examples" / "dc-spect-80.xlsx"
 _read = reader._read
-_read_workbook = functools.cache(lambda kind: _read(WORKBOOK, kind, None))
+_read_workbook = functools.cache(lambda kind, columns: _read(WORKBOOK, kind, None))
 reader._read = lambda path, kind, columns: (
-    _read_workbook(kind) if columns is None and Path(path) == WORKBOOK else _read(path, kind, columns)
+    _read_workbook(kind, tuple(kind.columns))
+    if columns is None and Path(path) == WORKBOOK
+    else _read(path, kind, columns)
 )
 
 

@@ -1,10 +1,8 @@
 """The example with a live preview: fifty moves of module and phantom, numbers edited; then the eyedropper."""
 
-import time
-
 import bpy
 import numpy as np
-from driving import editor, idle, on_screen, open_tab, ours, press, run, seen, xdotool
+from driving import editor, idle, on_screen, open_tab, ours, own_time, press, run, seen, xdotool
 
 core, preview, volumes = (ours(name) for name in ("core", "addon.runs.preview", "addon.volumes.volumes"))
 images = ours("addon.pictures.images")
@@ -16,11 +14,11 @@ def timed(function):
     """The function, its time added to that of the move."""
 
     def run(*arguments):
-        started = time.perf_counter()
+        started = own_time()
         try:
             return function(*arguments)
         finally:
-            spent["move"] += time.perf_counter() - started
+            spent["move"] += own_time() - started
 
     return run
 

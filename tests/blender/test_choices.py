@@ -218,7 +218,7 @@ print("READ", json.dumps([expected, read]))
 @pytest.mark.parametrize("items", [pytest.param("as they are", marks=pytest.mark.long), "more"])
 def test_a_file_of_the_first_version_opens_with_the_choices_it_was_saved_with(items):
     done = subprocess.run(
-        [sys.executable, "-c", OPEN, str(SAVED), items], capture_output=True, text=True, timeout=120, check=False
+        [sys.executable, "-c", OPEN, str(SAVED), items], capture_output=True, text=True, timeout=600, check=False
     )
     answer = [line for line in done.stdout.splitlines() if line.startswith("READ ")]
     assert answer, done.stderr

@@ -21,8 +21,8 @@ _VIEW = Euler((1.05, 0.0, 0.95))  # from above, into the opening of the rings
 _STARTUP = ("Cube", "Light", "Camera")
 
 
-def example_job(context: bpy.types.Context) -> jobs.Job:
-    """The job that puts the example into the context's scene and shows it."""
+def example_job(context: bpy.types.Context, replace: bool = False) -> jobs.Job:
+    """The job that puts the example into the context's scene and shows it; `replace`: also in place of a changed one."""
     scene, system = context.scene, read_system(EXAMPLE)
     pose = euler_pose(*np.deg2rad(EULER_DEGREES))
     settings = phantom_properties.plain_settings("derenzo", voxels=_VOXELS)
@@ -41,7 +41,7 @@ def example_job(context: bpy.types.Context) -> jobs.Job:
         stored, run, made = result
         scene = jobs.scene_again(scene_uid, "the projections are")
         mosaic = yield from images.storing(run, made)
-        collection = scanner.build_scanner(scene, system)
+        collection = scanner.build_scanner(scene, system, replace=replace)
         yield None
         adding.finish(stored)
         yield None

@@ -23,7 +23,8 @@ class MPHDRR_OT_load_example(jobs.JobOperator, bpy.types.Operator):
         return ask_to_replace(self, context) if self._losses else None
 
     def draw(self, context: bpy.types.Context) -> None:
-        draw_losses(self.layout, self._losses)
+        if self._losses:  # not in the panel of the last operation
+            draw_losses(self.layout, self._losses)
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
         return example.example_job(context, replace=self.confirmed)

@@ -35,8 +35,8 @@ class MPHDRR_Preferences(bpy.types.AddonPreferences):
         default=0, min=0, soft_max=64, update=_set,
     )  # fmt: skip
     copies: BoolProperty(
-        name="Save As Copies Files", description="Copy the voxels and runs of a scene into the folder beside the new .blend; "
-        "else both .blend files share those of the old one",
+        name="Save As Copies Files", description="Copy the voxels and runs of a scene into the folder beside the new "
+        ".blend; else both .blend files share those of the old one",
         default=True, update=_set,
     )  # fmt: skip
 

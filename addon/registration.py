@@ -101,7 +101,14 @@ _UNDONE = (recoloring.check, runs.after_update, live_scanner.after_undo, slices.
 _UPDATED = (
     live_scanner.after_update, selection.after_update, planes.after_update, frustums.after_update, slices.after_update,
 )  # fmt: skip
-_LOADED = (storage.after_load, volumes.after_load, recovery.after_load, live_scanner.after_load, runs.after_load, recoloring.check)
+_LOADED = (
+    storage.after_load,
+    volumes.after_load,
+    recovery.after_load,
+    live_scanner.after_load,
+    runs.after_load,
+    recoloring.check,
+)
 _FRAME = (runs.after_update, live_scanner.after_frame, preview.after_update, slices.after_frame_change)
 # By lists of bpy.app.handlers; all of them stay when a file is loaded.
 _HANDLERS: dict[str, tuple[Any, ...]] = {

@@ -258,7 +258,11 @@ def collect() -> str:
     for problem in kept.problems:
         warn(problem)
     names = several(sorted(path.name for path in kept.copied), 6)
-    return f"Copied {_amount(kept.copied)} into {kept.target}: {names}. Save the .blend" if names else "All files are there"
+    return (
+        f"Copied {_amount(kept.copied)} into {kept.target}: {names}. Save the .blend"
+        if names
+        else "All files are there"
+    )
 
 
 def before_save(filepath: str, _: Any = None) -> None:
@@ -291,23 +295,23 @@ def after_save(filepath: str, _: Any = None) -> None:
     """Set paths back after "Save Copy", when this session still belongs to another file or to none."""
     if not filepath or bpy.data.filepath != filepath:
         restore_paths()
-    for owner, name, _, path in _before_save:
+    for each in _before_save:
         # `//` may not have led there yet when the path was set, so Blender could not read the voxels: set it again.
-        if owner == owner.id_data:
-            setattr(owner, name, _below(Path(filepath).parent, path))
+        if each.owner == each.owner.id_data:
+            setattr(each.owner, each.name, _below(Path(filepath).parent, each.path))
     _before_save.clear()
 
 
 def restore_paths(*_: Any) -> None:
     """Set paths back as they were before a save, for example when Blender could not write the .blend."""
-    for owner, name, old, _ in _before_save:
-        setattr(owner, name, old)
+    for each in _before_save:
+        setattr(each.owner, each.name, each.old)
     _before_save.clear()
 
 
 def after_load(*_: Any) -> None:
     """Find the files of a .blend that was renamed with its folder: those that are missing where they were, and lie there."""
-    for owner, name in list(references()) if bpy.data.filepath else ():
+    for owner, name in list(references() if bpy.data.filepath else ()):
         old = absolute(getattr(owner, name))
         path = _folder() / PureWindowsPath(old).name  # of any system
         if not old.exists() and path.is_file():

@@ -102,7 +102,7 @@ def set_panel(settings: ProjectionProperties, recipe: Recipe) -> None:
     if recipe["model.pixel_points"] == "auto" and recipe["model.kind"] != "emission":
         raise InputError("model.pixel_points: the panel has no automatic number for radiographs")
     if recipe["frames.times"] is not None:
-        raise InputError("frames.times: the panel has one frame; mphdrr project makes a run of each")
+        raise InputError("frames.times: the panel has one frame")
     text = recipe["system.modules"] or "-"
     first, dash, last = text.partition("-")
     try:

@@ -7,7 +7,6 @@ children are its parts: its collimator and its crystal.
 import json
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict
-from pathlib import Path
 
 import bpy
 import numpy as np

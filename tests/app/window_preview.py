@@ -4,7 +4,7 @@ import time
 
 import bpy
 import numpy as np
-from driving import editor, idle, on_screen, open_tab, ours, picture, press, run, seen, xdotool
+from driving import editor, folder, idle, on_screen, open_tab, ours, picture, press, run, seen, xdotool
 
 core, preview, volumes = (ours(name) for name in ("core", "addon.runs.preview", "addon.volumes.volumes"))
 images = ours("addon.pictures.images")
@@ -125,6 +125,9 @@ def steps():
     box = drawing._boxes[region.as_pointer()][0]
     seen["dragged"] = [box[0] - left, box[1] - bottom, list(camera.location) == place]
     picture("dragged")
+    bpy.ops.wm.save_as_mainfile(filepath=str(folder / "a.blend"))
+    yield 3.0
+    picture("saved")
     pick_high(30)
     yield 4.0
     exact = images.projection_array(bpy.data.images["mphDRR 30"])

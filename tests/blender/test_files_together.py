@@ -58,7 +58,8 @@ def held() -> dict[str, np.ndarray]:
 
 def is_whole(top: Path, expected: dict[str, np.ndarray]) -> None:
     """Whether the scene's files are below a folder, and hold what they did."""
-    assert storage.missing_volumes() == [] and all(item.data.grids.load() for item in volumes.volume_objects(bpy.context.scene))
+    assert storage.missing_volumes() == []
+    assert all(item.data.grids.load() for item in volumes.volume_objects(bpy.context.scene))
     named = [storage.absolute(getattr(owner, name)).resolve() for owner, name in storage.references()]
     assert [path for path in named if not path.is_relative_to(top) and path.suffix != ".xlsx"] == []
     now = held()
@@ -113,7 +114,10 @@ def test_files_can_be_shared_and_are_when_they_are_large(study, tmp_path, monkey
     monkeypatch.setattr(storage, "_is_too_large", lambda path, size, target: path.suffix == ".h5")
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "c.blend"))
     assert "Copied 4 files (" in (said := capfd.readouterr().out) and "shares 1 file (" in said
-    assert storage.absolute(bpy.context.scene.mphdrr_projections.run_file).resolve().parent == study.parent / "study_mphdrr"
+    assert (
+        storage.absolute(bpy.context.scene.mphdrr_projections.run_file).resolve().parent
+        == study.parent / "study_mphdrr"
+    )
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "c.blend"))
     is_whole(tmp_path, expected)
 
@@ -124,6 +128,7 @@ def test_collect_files_brings_workbook_pictures_and_what_is_shared(study, tmp_pa
     picture.filepath_raw, picture.file_format = str(tmp_path / "tables" / "photo.png"), "PNG"
     picture.save()
     photo = bpy.data.images.load(str(tmp_path / "tables" / "photo.png"))
+    scene.camera.data.background_images.new().image = photo
     np.save(tmp_path / "tables" / "flood.npy", np.ones((16, 10, 12)))
     scene.mphdrr_projections.efficiency_of_modules = str(tmp_path / "tables" / "flood.npy")
     scene.mphdrr_reconstruction.method_file = str(tmp_path / "tables" / "net.pt")  # which is not there
@@ -145,10 +150,12 @@ def test_collect_files_brings_workbook_pictures_and_what_is_shared(study, tmp_pa
     home, scene = tmp_path / "c" / "b_mphdrr", bpy.context.scene
     is_whole(home, expected)
     collection = scanner.active_scanner(scene)
-    assert storage.absolute(collection.mphdrr_scanner.workbook) == scanner.source(collection).path == home / "small.xlsx"
+    assert (
+        storage.absolute(collection.mphdrr_scanner.workbook) == scanner.source(collection).path == home / "small.xlsx"
+    )
     assert storage.absolute(scene.mphdrr_projections.efficiency_of_modules).name == "flood-2.npy"
     assert storage.absolute(bpy.data.images["photo.png"].filepath) == home / "photo.png"
-    assert photo is not None and "Copied" not in capfd.readouterr().out
+    assert "Copied" not in capfd.readouterr().out
     assert bpy.ops.mphdrr.export_geometry(filepath=str(tmp_path / "out.xlsx")) == {"FINISHED"}
 
 

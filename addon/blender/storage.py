@@ -11,9 +11,9 @@ import os
 import re
 import shutil
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
-from pathlib import Path, PureWindowsPath
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import bpy
@@ -101,25 +101,38 @@ def missing_volumes() -> list[bpy.types.Volume]:
 
 
 def relocate(directory: str) -> str:
-    """Look for missing volumes' files by name, in a folder and all below it; returns which volumes' were found."""
+    """Look for missing files by name, in a folder and all below it; returns whose were found."""
     top = absolute(directory)
     if not directory or not top.is_dir():
         raise InputError(f"{directory or 'no folder given'}: expected a folder to look in")
-    _size_at.cache_clear()
-    missing = missing_volumes()
-    wanted = {absolute(data.filepath).name for data in missing}
-    there = {path.name: path for path in sorted(top.rglob("*.vdb"), reverse=True) if path.name in wanted}
-    found = []
-    for data in missing:
-        shown = there.get(absolute(data.filepath).name)  # the files of one volume are in one folder
-        if shown is not None and all(shown.with_name(path.name).is_file() for path in _files_of(data)):
-            data.filepath = stored_path(shown)
-            data.grids.load()
-            found.append(data.name)
-    _size_at.cache_clear()
-    if absent := sorted(data.name for data in missing if data.name not in found):
+    found = _find(top.rglob("*"))
+    if absent := sorted(data.name for data in missing_volumes()):
         warn(f"{top}: the files of {', '.join(absent)} are not there either")
     return f"Found the files of {', '.join(sorted(found)) or 'no volume'}"
+
+
+def _find(files: Iterable[Path]) -> set[str]:
+    """Have paths that lead nowhere lead to files of that name; returns the names of volumes and runs whose were found."""
+    lost = []
+    for owner, name in references():
+        wanted = _files_of(owner) if isinstance(owner, bpy.types.Volume) else {absolute(getattr(owner, name))}
+        if not all(path.exists() for path in wanted):
+            lost.append((owner, name, set(map(_name, wanted))))
+    names = {name for _, _, wanted in lost for name in wanted}
+    there = {path.name: path for path in sorted(files, reverse=True) if path.name in names}
+    found = set()
+    for owner, name, wanted in lost:
+        path = there.get(_name(getattr(owner, name)))  # the files of one volume are in one folder
+        if path is not None and all(path.with_name(each).is_file() for each in wanted):
+            setattr(owner, name, stored_path(path))
+            found.add(getattr(owner, "name", ""))
+    _size_at.cache_clear()
+    return found - {""}
+
+
+def _name(path: str | Path) -> str:
+    """The last part of a path of any system."""
+    return re.split(r"[\\/]", str(path))[-1]
 
 
 def unused_volumes() -> list[Path]:
@@ -311,12 +324,7 @@ def restore_paths(*_: Any) -> None:
 
 def after_load(*_: Any) -> None:
     """Find the files of a .blend that was renamed with its folder: those that are missing where they were, and lie there."""
-    for owner, name in list(references() if bpy.data.filepath else ()):
-        old = absolute(getattr(owner, name))
-        path = _folder() / PureWindowsPath(old).name  # of any system
-        if not old.exists() and path.is_file():
-            setattr(owner, name, stored_path(path))
-    _size_at.cache_clear()
+    _find(_folder().glob("*") if bpy.data.filepath else ())
 
 
 def _below(folder: Path, path: Path) -> str:

@@ -22,7 +22,7 @@ class MPHDRR_GT_preview(bpy.types.Gizmo):
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         self._mouse = event.mouse_x, event.mouse_y
-        self._start = tuple(context.scene.mphdrr_projections.preview_place)
+        self._start = tuple(context.scene.mphdrr_display.preview_place)
         return {"RUNNING_MODAL"}
 
     def modal(self, context: bpy.types.Context, event: bpy.types.Event, tweak: set[str]) -> set[str]:

@@ -26,6 +26,7 @@ from . import ids
 _OUR_VOLUME = re.compile(r"[a-z]+-[0-9a-f]{16}(\.preview)?(_\d{4})?\.vdb")
 """Names of the files that `stored_volumes` writes, made from their content."""
 _OUR_RUN = re.compile(r".*-projections-[0-9a-f]{8}\.h5")  # names of the files of runs
+_ENDING = re.compile(r"\.[A-Za-z]\w*$")  # of files, not of folders, nor of numbers in place of a file
 _FRAME = re.compile(r"_\d{4}\.vdb$")  # of a sequence, at the end of the name
 
 _LOOK = 2.0  # s that a file's size, once read, is shown
@@ -118,12 +119,12 @@ def _find(files: Iterable[Path]) -> set[str]:
         wanted = _files_of(owner) if isinstance(owner, bpy.types.Volume) else {absolute(getattr(owner, name))}
         if not all(path.exists() for path in wanted):
             lost.append((owner, name, set(map(_name, wanted))))
-    names = {name for _, _, wanted in lost for name in wanted}
-    there = {path.name: path for path in sorted(files, reverse=True) if path.name in names}
+    names = {name for _, _, all_of_it in lost for name in all_of_it}
+    there = {path.name: path for path in sorted((path for path in files if path.name in names), reverse=True)}
     found = set()
-    for owner, name, wanted in lost:
+    for owner, name, all_of_it in lost:
         path = there.get(_name(getattr(owner, name)))  # the files of one volume are in one folder
-        if path is not None and all(path.with_name(each).is_file() for each in wanted):
+        if path is not None and all(path.with_name(each).is_file() for each in all_of_it):
             setattr(owner, name, stored_path(path))
             found.add(getattr(owner, "name", ""))
     _size_at.cache_clear()
@@ -202,18 +203,21 @@ class _Kept:
     problems: list[str] = field(default_factory=list)
 
     @property
+    def absent(self) -> str:
+        """Which files are missing; "" for none."""
+        return f"missing: {several(dict.fromkeys(self.missing), 6)}" if self.missing else ""
+
+    @property
     def text(self) -> str:
         """What was done, in a line; "" for nothing."""
         homes = ", ".join(sorted({path.parent.name for path in self.shared}))
+        amounts = {
+            f"copied {_amount(self.copied)} into {self.target.name}": self.copied,
+            f"shares {_amount(self.shared)} with {homes}": self.shared,
+            f"{_amount(self.outside)} elsewhere: Collect Files copies them": self.outside,
+        }
         return "; ".join(
-            text
-            for text, files in (
-                (f"copied {_amount(self.copied)} into {self.target.name}", self.copied),
-                (f"shares {_amount(self.shared)} with {homes}", self.shared),
-                (f"{_amount(self.outside)} elsewhere: Collect Files copies them", self.outside),
-                ("; ".join(self.problems), self.problems),
-            )
-            if files
+            filter(None, [*(text for text, files in amounts.items() if files), self.absent, *self.problems])
         )
 
 
@@ -221,7 +225,7 @@ def _amount(files: dict[Path, int]) -> str:
     return f"{len(files)} file{'s' * (len(files) > 1)} ({readable_size(sum(files.values()))})"
 
 
-def _keep_together(target: Path, is_wanted: Callable[[Any, str, Path], bool]) -> _Kept:
+def _keep_together(target: Path, is_wanted: Callable[[str, Path], bool]) -> _Kept:
     """Copy the wanted files into the folder `target` of a .blend, and have all paths lead to where files are, from there."""
     kept, changed = _Kept(target), []
     for owner, name in references():
@@ -229,12 +233,12 @@ def _keep_together(target: Path, is_wanted: Callable[[Any, str, Path], bool]) ->
         path = absolute(old)
         files = _files_of(owner) if isinstance(owner, bpy.types.Volume) else {path}
         sizes = {file: file.stat().st_size for file in files if file.is_file()}
-        if sizes.keys() < files and not path.is_dir():
+        if sizes.keys() < files and _ENDING.search(path.name):
             kept.missing.append(path.name)
         elif sizes and path.parent.resolve() != target.resolve():
             stays = kept.shared if path.parent.name.endswith(_FOLDER) else kept.outside
             try:
-                if is_wanted(owner, name, path) and not _is_too_large(path, sum(sizes.values()), target):
+                if is_wanted(name, path) and not _is_too_large(path, sum(sizes.values()), target):
                     brought = {file: _bring(file, target) for file in files}
                     kept.copied |= {brought[file]: size for file, size in sizes.items()}
                     path, sizes = brought.get(path, target / path.name), {}
@@ -244,13 +248,13 @@ def _keep_together(target: Path, is_wanted: Callable[[Any, str, Path], bool]) ->
         is_near = owner != owner.id_data and path.is_relative_to(target.parent)
         if old.startswith("//") or path != absolute(old) or is_near:
             changed.append(_Changed(owner, name, old, path))
+    _before_save[:] = changed
     for each in changed:
         # Where a Save As leads to another folder, Blender itself rewrites the paths of datablocks from the old one.
         own = each.owner == each.owner.id_data
         new = _below(Path(bpy.data.filepath).parent if own and bpy.data.filepath else target.parent, each.path)
         if new != getattr(each.owner, each.name):
             setattr(each.owner, each.name, new)
-    _before_save[:] = changed
     return kept
 
 
@@ -259,23 +263,16 @@ def collect() -> str:
 
     What is missing, and what stays where it is, is said in a warning.
     """
-    kept = _keep_together(_folder(), lambda owner, name, path: name not in _STAY)
+    kept = _keep_together(_folder(), lambda name, path: name not in _STAY)
     _before_save.clear()
     known = _folder().parent, bpy.utils.system_resource("DATAFILES")  # which has Blender's own brushes
     others = {Path(path) for path in bpy.utils.blend_paths(absolute=True, packed=False)} | kept.outside.keys()
     others = {path for path in others if not any(map(path.is_relative_to, known)) and path.name not in kept.missing}
-    if kept.missing:
-        warn(f"missing: {several(dict.fromkeys(kept.missing), 6)}")
-    if others:
-        warn(f"outside the .blend's folder stay: {several(sorted(others), 6)}")
-    for problem in kept.problems:
-        warn(problem)
+    stay = [f"outside the .blend's folder stay: {several(sorted(others), 6)}"] if others else []
+    for text in (*stay, *filter(None, [kept.absent, *kept.problems])):
+        warn(text)
     names = several(sorted(path.name for path in kept.copied), 6)
-    return (
-        f"Copied {_amount(kept.copied)} into {kept.target}: {names}. Save the .blend"
-        if names
-        else "All files are there"
-    )
+    return f"Copied {_amount(kept.copied)} into {kept.target}: {names}. Save the .blend" if names else "All are there"
 
 
 def before_save(filepath: str, _: Any = None) -> None:
@@ -286,7 +283,7 @@ def before_save(filepath: str, _: Any = None) -> None:
         return
     is_new = filepath != bpy.data.filepath
 
-    def is_wanted(owner: Any, name: str, path: Path) -> bool:
+    def is_wanted(name: str, path: Path) -> bool:
         return _is_temporary(path) or (is_new and copies and path.parent.name.endswith(_FOLDER))
 
     kept = _keep_together(_folder_of(filepath), is_wanted)

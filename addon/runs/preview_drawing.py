@@ -64,7 +64,7 @@ def drag(context: bpy.types.Context, start: _Pair, pixels: _Pair) -> None:
     """Put the box, which was at the `start` of its ways, so many pixels further to the right and up."""
     room = _boxes[context.region.as_pointer()][1]
     place = [min(1.0, max(0.0, a + b / max(c, 1.0))) for a, b, c in zip(start, pixels, room, strict=True)]
-    context.scene.mphdrr_projections.preview_place = place
+    context.scene.mphdrr_display.preview_place = place
     windows.redraw("VIEW_3D")
 
 
@@ -100,7 +100,7 @@ def _draw_box(session: Any) -> None:
         width, height = min(width, aspect * most), min(most, width / aspect)  # as large as fits
     wide, high = max(width, _WIDTH * unit), height + (1.4 * len(lines) + 2) * size
     room = max(0.0, right - wide - margin), max(0.0, context.region.height - 2 * margin - high)
-    x, y = context.scene.mphdrr_projections.preview_place
+    x, y = context.scene.mphdrr_display.preview_place
     left, bottom = margin + x * room[0], margin + y * room[1]
     top = bottom + high
     box = left - size, bottom - size, left + wide + size, top

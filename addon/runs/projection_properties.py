@@ -6,14 +6,7 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import bpy
-from bpy.props import (
-    BoolProperty,
-    CollectionProperty,
-    FloatVectorProperty,
-    IntProperty,
-    PointerProperty,
-    StringProperty,
-)
+from bpy.props import BoolProperty, CollectionProperty, IntProperty, PointerProperty, StringProperty
 
 from ...core.errors import InputError
 from ...core.physics.maps import MAPS
@@ -232,10 +225,6 @@ class ProjectionProperties(ProjectionSettings, bpy.types.PropertyGroup):
         options={"HIDDEN", "PATH_SUPPORTS_BLEND_RELATIVE"},
     )  # fmt: skip
     run_summary: StringProperty(name="Shown Run", description="What the shown run is", options={"HIDDEN"})
-    preview_place: FloatVectorProperty(
-        name="Preview's Place", description="Of the live preview in the 3D views: shares of the way to the right, and up",
-        size=2, default=(1.0, 0.0), min=0.0, max=1.0, options={"HIDDEN"},
-    )  # fmt: skip
 
 
 ProjectionProperties.__annotations__.update(setting_properties.unset_of(PROPERTIES))

@@ -159,8 +159,7 @@ def remove_unused() -> str:
 
 def summary(files: list[Path]) -> str:
     """How many unused files there are, and how large they are."""
-    size = readable_size(sum(path.stat().st_size for path in files))
-    return f"{len(files)} unused file{'s' if len(files) != 1 else ''} of voxels or runs ({size})"
+    return f"{_amount({path: path.stat().st_size for path in files})} of voxels or runs that nothing needs"
 
 
 def files_of_states(data: bpy.types.Volume) -> list[Path]:
@@ -263,7 +262,9 @@ def collect() -> str:
 
     What is missing, and what stays where it is, is said in a warning.
     """
+    global _said
     kept = _keep_together(_folder(), lambda name, path: name not in _STAY)
+    _said = (0.0, "")  # it may have asked for this
     _before_save.clear()
     known = _folder().parent, bpy.utils.system_resource("DATAFILES")  # which has Blender's own brushes
     others = {Path(path) for path in bpy.utils.blend_paths(absolute=True, packed=False)} | kept.outside.keys()

@@ -33,8 +33,11 @@ _MIDDLE = (35.0, -30.0, -30.0)  # of the torso, whose heart is at the isocentre,
 _STARTUP = ("Cube", "Light", "Camera")
 
 
-def example_job(context: bpy.types.Context, of_xrays: bool = False) -> jobs.Job:
-    """The job that puts the example into the context's scene and shows it: `EXAMPLES`' first, or that of X rays."""
+def example_job(context: bpy.types.Context, of_xrays: bool = False, replace: bool = False) -> jobs.Job:
+    """The job that puts the example into the context's scene and shows it: `EXAMPLES`' first, or that of X rays.
+
+    `replace`: also in place of a changed one.
+    """
     scene, pinholes = context.scene, read_system(EXAMPLE)
     system: Scanner = xray_ring(**_RING) if of_xrays else pinholes
     kind, name = ("torso", "Cardiac Torso") if of_xrays else ("derenzo", "Derenzo")
@@ -60,10 +63,10 @@ def example_job(context: bpy.types.Context, of_xrays: bool = False) -> jobs.Job:
         if of_xrays:
             scene.mphdrr_display.colors, scene.mphdrr_display.scale = "GREY", "LOG"
         mosaic = yield from images.storing(run, made)
-        collection = scanner.build_scanner(scene, pinholes)
+        collection = scanner.build_scanner(scene, pinholes, replace=replace)
         yield None
         if of_xrays:
-            collection = scanner.build_scanner(scene, system, "X-ray")
+            collection = scanner.build_scanner(scene, system, "X-ray", replace=replace)
             yield None
         adding.finish(stored)
         yield None

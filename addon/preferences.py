@@ -9,18 +9,20 @@ from pathlib import Path
 
 import bpy
 from bpy.app.translations import pgettext_iface as iface
-from bpy.props import IntProperty
+from bpy.props import BoolProperty, IntProperty
 
 from ..core import cache
 from ..core.memory import readable_size
 from ..core.projector import backends, parallel
+from .blender import storage
 from .blender.layouts import invoking
 
 PACKAGE = __package__.rpartition(".")[0]  # "mphdrr", or "bl_ext.<repo>.mphdrr" when installed as an extension
 
 
-def _threads_set(self: MPHDRR_Preferences, context: bpy.types.Context) -> None:
+def _set(self: MPHDRR_Preferences, context: bpy.types.Context) -> None:
     parallel.set_usual_threads(self.threads or None)
+    storage.copies = self.copies
 
 
 class MPHDRR_Preferences(bpy.types.AddonPreferences):
@@ -30,7 +32,12 @@ class MPHDRR_Preferences(bpy.types.AddonPreferences):
 
     threads: IntProperty(
         name="Threads", description="Processor threads that projections use where the panel does not say; 0: all",
-        default=0, min=0, soft_max=64, update=_threads_set,
+        default=0, min=0, soft_max=64, update=_set,
+    )  # fmt: skip
+    copies: BoolProperty(
+        name="Save As Copies Files", description="Copy the voxels and runs of a scene into the folder beside the new "
+        ".blend; else both .blend files share those of the old one",
+        default=True, update=_set,
     )  # fmt: skip
 
     def draw(self, context: bpy.types.Context) -> None:
@@ -48,6 +55,7 @@ class MPHDRR_Preferences(bpy.types.AddonPreferences):
             states.label(text=state[:1].upper() + state[1:])
         layout.use_property_split = True
         layout.prop(self, "threads", text="Threads" if self.threads else "Threads (0: all)")
+        layout.prop(self, "copies")
         folder = cache_folder()
         if folder is not None:
             row = layout.row()
@@ -90,4 +98,4 @@ def apply() -> None:
     folder, addon = cache_folder(), bpy.context.preferences.addons.get(PACKAGE)
     cache.keep_in(folder)
     if addon is not None and addon.preferences is not None:
-        parallel.set_usual_threads(addon.preferences.threads or None)
+        _set(addon.preferences, bpy.context)

@@ -57,6 +57,7 @@ ENTRIES = {
         "mphdrr.export_dataset": "mphDRR Dataset (.h5/.npz/.pt)",
         "mphdrr.export_figure": "mphDRR Figure (.png/.svg)",
     },
+    bpy.types.TOPBAR_MT_file_external_data: {"mphdrr.collect_files": "Collect mphDRR's Files Beside the .blend"},
     bpy.types.VIEW3D_MT_object_convert: {
         "mphdrr.voxelize_objects": "Voxelize Meshes",
         "mphdrr.mesh_from_volume": "Mesh from Volume",
@@ -92,7 +93,7 @@ def _draw_splash(menu: bpy.types.Menu, context: bpy.types.Context) -> None:
 
 
 MENUS = [(menu, _draw_entries(entries)) for menu, entries in ENTRIES.items()]
-MENUS.append((bpy.types.STATUSBAR_HT_header, jobs.draw_status))
+MENUS += [(bpy.types.STATUSBAR_HT_header, draw) for draw in (storage.draw_said, jobs.draw_status)]
 MENUS += [(menu, _draw_submenu(*submenu)) for menu, submenu in SUBMENUS.items()]
 MENUS.append((bpy.types.WM_MT_splash, _draw_splash))
 
@@ -100,7 +101,14 @@ _UNDONE = (recoloring.check, runs.after_update, live_scanner.after_undo, slices.
 _UPDATED = (
     live_scanner.after_update, selection.after_update, planes.after_update, frustums.after_update, slices.after_update,
 )  # fmt: skip
-_LOADED = (volumes.after_load, recovery.after_load, live_scanner.after_load, runs.after_load, recoloring.check)
+_LOADED = (
+    storage.after_load,
+    volumes.after_load,
+    recovery.after_load,
+    live_scanner.after_load,
+    runs.after_load,
+    recoloring.check,
+)
 _FRAME = (runs.after_update, live_scanner.after_frame, preview.after_update, slices.after_frame_change)
 # By lists of bpy.app.handlers; all of them stay when a file is loaded.
 _HANDLERS: dict[str, tuple[Any, ...]] = {

@@ -85,6 +85,17 @@ class MPHDRR_OT_clean_volume_files(Reported, bpy.types.Operator):
         return storage.remove_unused()
 
 
+class MPHDRR_OT_collect_files(Reported, bpy.types.Operator):
+    """Copy every file outside that the scene uses, such as its workbook, into the folder beside the .blend, so that both can
+    be moved together. Says what is missing
+    """
+
+    poll = needs((lambda context: bpy.data.filepath, "Save the .blend first: its folder is beside it"))
+
+    def act(self, context: bpy.types.Context) -> str:
+        return storage.collect()
+
+
 class MPHDRR_OT_remake_volumes(jobs.JobOperator, bpy.types.Operator):
     """Make the phantoms and maps again whose files of voxels are missing, as after a crash; they stay where they are"""
 

@@ -102,6 +102,7 @@ class MPHDRR_MT_volumes(bpy.types.Menu):
         layout.operator("mphdrr.export_volume", icon="EXPORT")
         layout.operator("mphdrr.remake_volumes", icon="FILE_REFRESH")
         layout.operator("mphdrr.find_volume_files", icon="VIEWZOOM")
+        layout.operator("mphdrr.collect_files", icon="FILE_FOLDER")
         layout.operator("mphdrr.clean_volume_files", icon="TRASH")
 
 

@@ -68,7 +68,9 @@ def properties_of(settings: Settings) -> dict[str, Any]:
             made[name] = make(default=default, **common)
         if each := of_modules(name, setting):
             or_file = f", or a file with an image for each ({', '.join(setting.endings)})" if setting.endings else ""
+            as_file = {"subtype": "FILE_PATH", "options": {"PATH_SUPPORTS_BLEND_RELATIVE"}} if setting.endings else {}
             made[each] = StringProperty(
+                **as_file,
                 name=f"Each {setting.label.partition(' (')[0]}",
                 description=f"A number for each module that is projected, such as 10, 20, 30{or_file}. Empty: one for all",
             )

@@ -46,7 +46,7 @@ _FILES = ", ".join(METHOD_FILES)
 ReconstructionSettings.__annotations__ = properties_of(PROPERTIES)
 ReconstructionSettings.__annotations__["method_file"] = StringProperty(
     name="Method File", description=f"A trained network ({_FILES}) instead of the method; it has voxels of its own",
-    subtype="FILE_PATH",
+    subtype="FILE_PATH", options={"PATH_SUPPORTS_BLEND_RELATIVE"},
 )  # fmt: skip
 _OF_FILES = ("ignore_attenuation", "ignore_blur", "hole", "aperture_points", "pixel_points")
 """Settings that matter to methods in files: of the model alone."""

@@ -22,7 +22,7 @@ from ...core.memory import readable_size
 from ...core.runs.display import Display
 from ...core.runs.mosaic import as_seen, sized, totals
 from ...core.runs.run_recipe import recipe_model, recipe_views, run_recipe
-from ..blender import jobs, timers, windows
+from ..blender import jobs, reports, timers, windows
 from ..phantoms import phantoms
 from ..pictures import planes
 from ..scanner import scanner, selection
@@ -230,7 +230,8 @@ class Session:
         self.worker, self.late = None, ""
         error = worker.error
         if error is None:
-            self.shown, self.problem, self.cautions = worker.result, "", tuple(worker.caught[:_MOST_CAUTIONS])
+            self.shown, self.problem = worker.result, ""
+            self.cautions = tuple(map(reports.in_window, worker.caught[:_MOST_CAUTIONS]))
         elif isinstance(error, InputError):
             self._fail(str(error))
         elif isinstance(error, MemoryError):
@@ -240,7 +241,7 @@ class Session:
         windows.redraw("VIEW_3D")
 
     def _fail(self, problem: str) -> None:
-        self.shown, self.problem, self.asked, self.full_at = None, problem, None, None
+        self.shown, self.problem, self.asked, self.full_at = None, reports.in_window(problem), None, None
         windows.redraw("VIEW_3D")
 
     @property

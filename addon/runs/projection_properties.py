@@ -96,7 +96,7 @@ def set_panel(settings: ProjectionProperties, recipe: Recipe) -> None:
         raise InputError("model.pixel_points: the panel has no automatic number for radiographs")
     for several in ("frames.times", "frames.bins"):
         if recipe[several] is not None:
-            raise InputError(f"{several}: the panel has one frame; mphdrr project makes a run of each")
+            raise InputError(f"{several}: the panel has one frame")
     text = recipe["system.modules"] or "-"
     first, dash, last = text.partition("-")
     try:

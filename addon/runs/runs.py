@@ -19,7 +19,7 @@ from ...core.memory import readable_size
 from ...core.runs.recipe import Recipe, fitting_recipe
 from ...core.runs.run import ProjectionRun
 from ...core.runs.settings import SAMPLING, SETTINGS, Setting
-from ..blender import decimals, ids, objects, storage, timers, windows
+from ..blender import decimals, ids, objects, reports, storage, timers, windows
 from ..phantoms import phantoms
 from ..scanner import following, module_values, scanner, scanner_parts
 from ..volumes import volumes
@@ -150,7 +150,7 @@ def _changes(scene: bpy.types.Scene, item: bpy.types.PropertyGroup | None = None
     try:
         return list(_differences(scene, json.loads(item.state), item.scanner))
     except InputError as error:
-        return [(str(error), None)]
+        return [(reports.in_window(error), None)]
 
 
 def _last_changes(scene: bpy.types.Scene) -> _Changes:

@@ -218,6 +218,7 @@ def test_a_live_preview_follows_module_phantom_and_numbers(window, work_folder):
     assert seen["largest"] > 0 and seen["differs"] < 2e-5 and seen["same place"]
     assert seen["typed"] == 60 and seen["unit"] == "counts" and seen["images"]
     assert "pinhole_diameter" in seen["impossible"] and seen["again"] == ""
+    assert seen["dragged"] == [pytest.approx(-100, abs=3), pytest.approx(50, abs=3), True], "the box follows the mouse"
     assert seen["picked"] == [False, 0.0, True], "the eyedropper's click set the window's high end to an exact number"
 
 
@@ -262,6 +263,7 @@ def test_jobs_leave_the_window_alive_and_are_cancelled_without_a_trace(window, w
     seen = window("jobs")
     assert seen["changed"] == [] and seen["undone"] == 0.0
     assert seen["queue"] == [True, False, False] and seen["added"] == ["C"]
+    assert seen["disabled"] < 0.5, "s, while a job runs that does not look up"
     for words in (r"Voxelizing \d+ of \d+", r"Projecting \d+ of 80", r"Packing \d+ of 160", r".*\d s left"):
         assert any(re.fullmatch(words, text) for text in seen["words"]), words
     late = {name: pauses for name, pauses in seen["gaps"].items() if min(pauses) > 0.1}

@@ -194,7 +194,7 @@ def test_missing_files_are_found_again(tmp_path, ct, monkeypatch, capfd, large):
     assert not volumes.file_of(item).is_file()
     assert bpy.ops.mphdrr.find_volume_files(directory=str(tmp_path)) == {"FINISHED"}
     assert np.array_equal(volumes.volume_from_object(item).array, ct.array)
-    assert item.data.filepath.startswith("//archive/old/") and item.data.grids.is_loaded
+    assert item.data.filepath.startswith("//archive/old/") and item.data.grids.load()
     with pytest.raises(RuntimeError, match="expected a folder"):
         bpy.ops.mphdrr.find_volume_files(directory=str(tmp_path / "nowhere"))
 

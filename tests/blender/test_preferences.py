@@ -8,6 +8,7 @@ import bpy
 import pytest
 
 from mphdrr.addon import preferences
+from mphdrr.addon.blender import storage
 from mphdrr.core.projector import backends, parallel
 
 
@@ -69,6 +70,14 @@ def test_threads_are_those_of_projections_that_do_not_say(user):
     assert parallel.thread_count(None) == every + 3
     user.threads = 0
     assert parallel.thread_count(None) == every
+
+
+def test_save_as_copies_files_unless_the_preferences_share_them(user):
+    assert storage.copies and user.copies
+    user.copies = False
+    assert not storage.copies
+    user.copies = True
+    assert storage.copies
 
 
 def test_the_cache_is_measured_and_cleaned(cache):

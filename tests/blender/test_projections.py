@@ -139,7 +139,7 @@ def test_numbers_of_modules_are_texts_of_the_panel(scanned, scene, tmp_path):
     with pytest.raises(RuntimeError, match="time: expected one number, or"):
         bpy.ops.mphdrr.render_projections()
     settings.time_of_modules = "10, soon"
-    with pytest.raises(RuntimeError, match=r"model.time: expected a number above 0"):
+    with pytest.raises(RuntimeError, match=r"Time: expected a number above 0"):
         bpy.ops.mphdrr.render_projections()
 
 
@@ -241,9 +241,9 @@ def test_numbers_that_the_panel_does_not_show_are_not_used(scanned, scene):
     ("settings", "message"),
     [
         ({"aperture_points": 2}, "3 or more"),
-        ({"edge": "PATH"}, "aperture_mu"),
+        ({"edge": "PATH"}, "Knife Edge needs Aperture"),
         ({"aperture_material": "lead"}, "aperture_mu 'lead': at which energy"),
-        ({"depth_layers": 2}, "crystal_mu"),
+        ({"depth_layers": 2}, "Depth Layers needs Crystal"),
         ({"mu": "Nope"}, "no volume is named 'Nope'"),
         ({"mu": "Derenzo"}, "volume of mu"),
     ],

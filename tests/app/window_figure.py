@@ -23,7 +23,7 @@ def steps():
         while not is_idle() or bpy.app.is_job_running("RENDER"):
             seen["ticks"] += 1
             yield 0.05
-    film = {"width": 240, "height": 160, "samples": 1, "seconds": 0.1, "fps": 20}
+    film = {"width": 120, "height": 120, "samples": 1, "seconds": 0.1, "fps": 20}
     press(bpy.ops.mphdrr.render_animation, filepath=str(folder / "film.mp4"), **film)
     while not is_idle() or bpy.app.is_job_running("RENDER"):
         yield 0.05

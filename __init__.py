@@ -1,5 +1,9 @@
 """mphDRR: multi-pinhole SPECT geometry, phantoms and projections, as a Blender extension and a Python package."""
 
+from .core.version import VERSION
+
+__version__ = VERSION
+
 
 def register() -> None:
     """Blender enables the extension."""

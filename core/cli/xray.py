@@ -5,7 +5,6 @@ import argparse
 import numpy as np
 
 from ... import core as mph
-from ..runs.reconstructing import line_integrals
 from ..volumes.volume_files import VOLUME_FORMATS
 from ..xray.dose import decays
 from . import COMMANDS
@@ -52,6 +51,8 @@ def _motion(arguments: argparse.Namespace) -> None:
 
     mphdrr xray motion radiographs.h5 mu70.nii.gz --change change.nii.gz
     """
+    from ..runs.reconstructing import line_integrals
+
     path = output_path(arguments.change, VOLUME_FORMATS) if arguments.change else None
     run, reference = mph.read_run(arguments.radiographs), mph.read_volume(arguments.reference, "mu")
     images = line_integrals(run, run.recipe)

@@ -30,7 +30,7 @@ from ..volumes.volume import Volume
 from .event_files import Place, read_array, read_truth
 from .folders import SetFolder
 from .index import column
-from .making import radon_views
+from .event_maker import radon_views
 from .planning import PlannedEvent, plan
 from .recipe import EventRecipe
 

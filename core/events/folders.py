@@ -13,7 +13,7 @@ from ..version import build
 from .event_files import Header, Place, header
 from .index import Index
 from .inputs import Input
-from .making import EventMaker
+from .event_maker import EventMaker
 from .recipe import EventRecipe, read_recipe
 from .store import Store
 

@@ -15,7 +15,7 @@ from ..validation import seed_number, whole_number
 from .dask_work import in_cluster
 from .event_set import EventSet
 from .folders import SetFolder
-from .making import EventMaker
+from .event_maker import EventMaker
 from .planning import plan
 from .pool import in_processes
 from .recipe import EventRecipe

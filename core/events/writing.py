@@ -9,7 +9,7 @@ from ..progress import Progress
 from ..recording import recorded_warnings
 from .event_files import Place, packed
 from .folders import SetFolder
-from .making import EventMaker
+from .event_maker import EventMaker
 
 
 class Written(NamedTuple):

@@ -23,6 +23,7 @@ from ..hdf5 import attributes, datasets, numbers, opened, pack
 from ..scanner_kinds import scanner_kind
 from ..volumes.formats import numpy_files
 from ..volumes.volume import Volume
+from .formats import FORMATS
 from .run import ProjectionRun
 
 _FORMAT = "mphDRR run"
@@ -243,4 +244,4 @@ _FORMATS: dict[str, _Format] = {
     ".npz": (_packed_npz, _read_npz),
     ".pt": (_packed_pt, _read_pt),
 }
-FORMATS = tuple(_FORMATS)
+assert tuple(_FORMATS) == FORMATS

@@ -52,7 +52,8 @@ def _optimize(arguments: argparse.Namespace) -> None:
     record = {"parameters": found.parameters, "objectives": found.values, "faults": found.faults}
     *lines, verdict = found.summary()
     if arguments.evaluate:
-        gain = mph.design.evaluate(recipe, found.start, found.system, None if arguments.quiet else progress_bar("evaluating"))
+        bar = None if arguments.quiet else progress_bar("evaluating")
+        gain = mph.design.evaluate(recipe, found.start, found.system, bar)
         record["evaluation"] = gain._asdict()
         lines.append(f"{gain.score}: {gain.start:.4g} at the start, now {gain.found:.4g}; better by {gain.gain:.1%}, "
                      f"95 % interval {gain.low:.1%} to {gain.high:.1%}")  # fmt: skip

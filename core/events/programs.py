@@ -33,7 +33,9 @@ class Program:
 
 
 _PROGRAMS = (
-    Program("legacy", "truth_i.pt, Projections_i.pt by slots, ProjRadonN_i.pt, RunTranslate.npy, RunRotate.npy", "Legacy"),
+    Program(
+        "legacy", "truth_i.pt, Projections_i.pt by slots, ProjRadonN_i.pt, RunTranslate.npy, RunRotate.npy", "Legacy"
+    ),
     Program("3dunet", "pytorch-3dunet: an HDF5 file an event with raw and label, in a folder for each split", "Unet3d"),
     Program("webdataset", "tar archives for WebDataset, of one split each", "WebDataset"),
     Program("npz", "an archive of numpy an event, with all that is known of it", "Npz"),

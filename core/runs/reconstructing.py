@@ -37,7 +37,6 @@ _POINTS = 7
 """Points of the hole: enough for its blur, and few enough for an iteration in a fraction of a second."""
 
 
-
 def reconstruct_run(
     run: ProjectionRun,
     recipe: Recipe | None = None,
@@ -54,9 +53,9 @@ def reconstruct_run(
     run : ProjectionRun
         Simulated or measured.
     recipe : Recipe
-        Its tables `HOW_TABLES` say how; by default the run's own. What is modelled is what made the run, unless the settings of
-        the reconstruction say otherwise: another model of the hole, no attenuation, no blur. For a run without a recipe, as
-        those of version 0.1.0, it needs the whole model, ``model.kind`` and all that this takes.
+        Its tables `HOW_TABLES` say how; by default the run's own. What is modelled is what made the run, unless the settings
+        of the reconstruction say otherwise: another model of the hole, no attenuation, no blur. For a run without a recipe,
+        as those of version 0.1.0, it needs the whole model, ``model.kind`` and all that this takes.
     mu : Volume
         What attenuates, instead of what the recipe says.
     start : Volume or Reconstruction

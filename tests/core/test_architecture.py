@@ -25,7 +25,9 @@ def toml(name: str) -> dict:
 
 
 def test_version_is_the_same_everywhere():
-    texts = {name: (ROOT / name).read_text(encoding="utf-8") for name in ("CITATION.cff", "CHANGELOG.md", "docs/conf.py")}
+    texts = {
+        name: (ROOT / name).read_text(encoding="utf-8") for name in ("CITATION.cff", "CHANGELOG.md", "docs/conf.py")
+    }
     assert toml("pyproject.toml")["tool"]["setuptools"]["dynamic"]["version"] == {"attr": "mphdrr.core.version.VERSION"}
     assert toml("blender_manifest.toml")["version"] == VERSION == mphdrr.__version__
     assert f"\nversion: {VERSION}\n" in texts["CITATION.cff"] and "release = VERSION" in texts["docs/conf.py"]

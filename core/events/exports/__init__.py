@@ -1,7 +1,7 @@
 """Exports of event sets for other programs.
 
-To add a program, write its `Layout` in a module here, and list it in `programs.py`, a folder up; `mphdrr events export` takes
-it from there.
+To add a program, write its `Layout` in a module here, and list it in `events/programs.py`; `mphdrr events export` takes it
+from there.
 """
 
 from collections.abc import Sequence

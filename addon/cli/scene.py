@@ -25,21 +25,15 @@ INSTALL_BLENDER = 'pip install "mphdrr[blender]", or ".[blender]" in its source;
 def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     """Add the command."""
     parser = add_command(
-        subparsers,
-        "scene",
-        COMMANDS[__name__],
-        "mphdrr scene scanner.xlsx --run run.h5 -o scanner.blend",
+        subparsers, "scene", COMMANDS[__name__], "mphdrr scene scanner.xlsx --run run.h5 -o scanner.blend"
     )
     add_workbook(parser)
-    parser.add_argument("--modules", metavar="RANGE", help="such as 1-40 or 1-20,41; default: all")
-    parser.add_argument(
-        "--volume", metavar="FILE", help="also put in this volume, of any format that volume info reads"
-    )
-    parser.add_argument(
-        "--mu", metavar="FILE", help="and this volume of attenuation coefficients (1/mm), for SPECT counts"
-    )
-    parser.add_argument("--run", metavar="FILE", dest="run_file", help="also put in this run's volume and projections")
-    parser.add_argument("-o", "--output", required=True, metavar="FILE", help="the .blend to write")
+    add = parser.add_argument
+    add("--modules", metavar="RANGE", help="such as 1-40 or 1-20,41; default: all")
+    add("--volume", metavar="FILE", help="also put in this volume, of any format that volume info reads")
+    add("--mu", metavar="FILE", help="and this volume of attenuation coefficients (1/mm), for SPECT counts")
+    add("--run", metavar="FILE", dest="run_file", help="also put in this run's volume and projections")
+    add("-o", "--output", required=True, metavar="FILE", help="the .blend to write")
     parser.set_defaults(run=_run)
 
 

@@ -13,6 +13,7 @@ MODULE = "bl_ext.own.mphdrr"
 BEFORE = f"""
 import bpy, pathlib, sys
 root = pathlib.Path(sys.modules["{MODULE}"].__file__).parent
+bpy.ops.wm.read_homefile(use_empty=True)
 bpy.ops.mphdrr.import_geometry(filepath=str(root / "examples" / "dc-spect-80.xlsx"))
 bpy.ops.wm.save_as_mainfile(filepath=sys.argv[-1])
 print("BEFORE", len([x for x in bpy.data.objects if x.type == "CAMERA"]))
@@ -44,9 +45,8 @@ def test_it_updates_from_a_repository(extension_zip: Path, new_blender, work_fol
     repository, scene, script = work_folder / "repository", work_folder / "scene.blend", work_folder / "script.py"
     repository.mkdir()
 
-    def extension(*words: object) -> str:
-        done = new_blender("--command", "extension", *map(str, words))
-        return done.stdout + done.stderr
+    def extension(*words: object) -> None:  # Blender synchronizes in online mode alone, be it with a folder
+        new_blender("--online-mode", "--command", "extension", *map(str, words))
 
     def said(text: str) -> list[str]:
         script.write_text(text, encoding="utf-8")
@@ -64,6 +64,5 @@ def test_it_updates_from_a_repository(extension_zip: Path, new_blender, work_fol
     shutil.copy(extension_zip, repository)
     old.unlink()
     extension("server-generate", "--repo-dir", repository)
-    version = extension_zip.name.split("-")[1]
-    assert version in extension("update", "--sync")
-    assert said(AFTER) == ["AFTER", version, "80", "1"]
+    extension("update", "--sync")
+    assert said(AFTER) == ["AFTER", extension_zip.name.split("-")[1], "80", "1"]

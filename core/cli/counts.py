@@ -8,7 +8,7 @@ import numpy as np
 
 from ... import core as mph
 from ..files import require_ending, write_bytes
-from ..runs.files import FORMATS
+from ..runs.formats import FORMATS
 from . import COMMANDS
 from .options import add_command, add_run, output_path, print_answer
 

@@ -465,5 +465,8 @@ def settings_with(kind: str) -> Mapping[str, Setting]:
 
 TABLES = tuple(dict.fromkeys(key.partition(".")[0] for key in SETTINGS))
 
+HOW_TABLES = ("reconstruction", "model", "attenuation", "compute")
+"""Those that say how a run is reconstructed. The others say how its images were made."""
+
 SAMPLING = tuple(f"model.{name}" for name in ("aperture_points", "aperture_tolerance", "pixel_points", "tolerance"))
 """Numbers of rays and what sets them: counts have them only where the hole is by rays."""

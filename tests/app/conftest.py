@@ -111,6 +111,17 @@ def blender(home: Path) -> Run:
 
 
 @pytest.fixture
+def new_blender(request: pytest.FixtureRequest) -> Run:
+    """Like `blender`, in a clean home of the test's own, without the extension."""
+    folder = _emptied(OUTPUT / f"home-{request.node.name}")
+
+    def run(*arguments: str | Path, **options: float) -> subprocess.CompletedProcess[str]:
+        return run_blender(*arguments, home=folder, **options)
+
+    return run
+
+
+@pytest.fixture
 def blender_script(blender: Run, work_folder: Path) -> Run:
     """`blender_script(text, *arguments)`: run Python in a windowless Blender; an exception in it fails the test."""
 

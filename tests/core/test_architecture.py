@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+import mphdrr
 from mphdrr.core.version import VERSION
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -24,8 +25,13 @@ def toml(name: str) -> dict:
 
 
 def test_version_is_the_same_everywhere():
-    assert toml("pyproject.toml")["project"]["version"] == VERSION
-    assert toml("blender_manifest.toml")["version"] == VERSION
+    texts = {
+        name: (ROOT / name).read_text(encoding="utf-8") for name in ("CITATION.cff", "CHANGELOG.md", "docs/conf.py")
+    }
+    assert toml("pyproject.toml")["tool"]["setuptools"]["dynamic"]["version"] == {"attr": "mphdrr.core.version.VERSION"}
+    assert toml("blender_manifest.toml")["version"] == VERSION == mphdrr.__version__
+    assert f"\nversion: {VERSION}\n" in texts["CITATION.cff"] and "release = VERSION" in texts["docs/conf.py"]
+    assert re.findall(r"^## \[?([0-9.]+)", texts["CHANGELOG.md"], re.MULTILINE)[0] == VERSION
 
 
 def test_one_compiler_builds_the_kernels_everywhere():

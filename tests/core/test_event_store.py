@@ -150,6 +150,21 @@ def test_damage_in_a_shard_is_found_and_mended(whole, made, capsys):
     assert events.check(whole) == []
 
 
+def test_a_set_of_version_0_1_0_opens_is_whole_and_goes_on(tmp_path):
+    shutil.copytree(Path(__file__).parent / "data" / "events-0.1.0", tmp_path / "set")
+    old = events.EventSet(tmp_path / "set")
+    assert events.check(tmp_path / "set") == [] and old.numbers == [0, 1]
+    assert old[0].images("emission").shape == (3, 7, 8) and old[0].row["phantom.radius"] == pytest.approx(32.52799)
+    with pytest.warns(mph.InputWarning, match="another build"):
+        events.make(old.recipe, tmp_path / "set", 3)
+    made = events.EventSet(tmp_path / "set")
+    assert len(made) == 3 and events.check(tmp_path / "set") == []
+    fresh = events.make(old.recipe, tmp_path / "fresh", 1)[0]
+    np.testing.assert_allclose(made[0].images("emission").sum(), fresh.images("emission").sum(), rtol=0.01)
+    np.testing.assert_allclose(made[0].truth.array.sum(), fresh.truth.array.sum(), rtol=1e-3)
+    np.testing.assert_allclose(made[0].pose, fresh.pose, rtol=1e-12)
+
+
 def test_a_set_of_an_earlier_version_opens_and_goes_on(whole, made):
     """Its events have no table of blocks and no build; its index alone says what was asked for, in columns of its own."""
     for path in (whole / "events").glob("*.h5"):

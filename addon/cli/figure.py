@@ -120,7 +120,7 @@ def _of_scene(arguments: argparse.Namespace, kind: FigureKind, blend: Path, path
         except RuntimeError as error:
             raise mph.InputError(f"{blend}: cannot be opened ({str(error).strip().splitlines()[0]})") from None
         job = figures.figure_job(bpy.context, kind.name, paths, arguments.size, arguments.modules, **how._asdict())
-        jobs.run(job)
+        _follow(job.finish(job.work(lambda done, total: None)))
 
 
 def _render(kind: FigureKind, page: Page, subject: Subject, paths: list[Path], how: How) -> None:

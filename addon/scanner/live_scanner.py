@@ -36,12 +36,13 @@ def _follow(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph, aim: bool) -
     # Both when objects were added, deleted, shown or hidden; selecting is an update of the scene alone.
     structure = _overlooked or (depsgraph.id_type_updated("SCENE") and depsgraph.id_type_updated("COLLECTION"))
     updates = [u for u in depsgraph.updates if u.id.id_type == "OBJECT"]
-    objects = [u.id.original for u in updates if u.is_updated_transform]
+    placed = [u.id.original for u in updates if u.is_updated_transform]
     # Blender does not say that an animation or a driver has changed a module's number: the animated are looked at.
     animated = [u.id.original for u in updates if u.id.animation_data is not None]
-    moved = {item for item in (*objects, *animated) if item.mphdrr_module.is_module}
+    moved = {item for item in placed if item.mphdrr_module.is_module and following.has_moved(item)}
+    moved |= {item for item in animated if item.mphdrr_module.is_module}
     off = [
-        item for item in (scene.objects if _overlooked else objects) if grabbing.is_part(item) and grabbing.is_off(item)
+        item for item in (scene.objects if _overlooked else placed) if grabbing.is_part(item) and grabbing.is_off(item)
     ]
     if not (moved or off or structure):
         return

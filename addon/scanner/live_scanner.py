@@ -46,13 +46,15 @@ def _follow(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph, aim: bool) -
     ]
     if not (moved or off or structure):
         return
-    _overlooked = _is_busy()
+    everything, _overlooked = _overlooked, _is_busy()
     if _overlooked:
         return
     moved |= _carry(off)
     for collection in _local(scanner.scanners(scene)):
-        own = (camera for camera in moved if collection.all_objects.get(camera.name) == camera)
-        following.refresh(collection, scanner.modules(collection) if structure else list(own), aim)
+        own = [camera for camera in moved if collection.all_objects.get(camera.name) == camera]
+        if structure:
+            own = [o for o in scanner.modules(collection) if everything or o in moved or following.has_moved(o)]
+        following.refresh(collection, own, aim)
         if structure:
             _look_for_copies(collection)
 

@@ -8,6 +8,7 @@ import tomllib
 from pathlib import Path
 
 import bpy
+import rna_keymap_ui
 from bpy.app.translations import pgettext_iface as iface
 from bpy.props import IntProperty
 
@@ -16,6 +17,7 @@ from ..core.memory import readable_size
 from ..core.projector import backends, parallel
 from .blender.layouts import invoking
 
+PIE, PIE_KEYMAP = "MPHDRR_MT_module", "Object Mode"  # the menu on a key, and Blender's keymap with that
 PACKAGE = __package__.rpartition(".")[0]  # "mphdrr", or "bl_ext.<repo>.mphdrr" when installed as an extension
 
 
@@ -48,6 +50,11 @@ class MPHDRR_Preferences(bpy.types.AddonPreferences):
             states.label(text=state[:1].upper() + state[1:])
         layout.use_property_split = True
         layout.prop(self, "threads", text="Threads" if self.threads else "Threads (0: all)")
+        known = context.window_manager.keyconfigs.user
+        keymap = known.keymaps.get(PIE_KEYMAP)
+        for item in keymap.keymap_items if keymap else ():
+            if getattr(item.properties, "name", "") == PIE:
+                rna_keymap_ui.draw_kmi([], known, keymap, item, layout, 0)
         folder = cache_folder()
         if folder is not None:
             row = layout.row()

@@ -40,6 +40,7 @@ class MPHDRR_Preferences(bpy.types.AddonPreferences):
         layout = self.layout
         row = invoking(layout.row())
         row.operator("mphdrr.load_example", icon="PLAY")
+        row.operator("mphdrr.add_looks", icon="ASSET_MANAGER")
         if website():
             row.operator("wm.url_open", text="Website and Documentation", icon="URL").url = website()
         box = layout.box()
@@ -55,7 +56,7 @@ class MPHDRR_Preferences(bpy.types.AddonPreferences):
         for item in keymap.keymap_items if keymap else ():
             if getattr(item.properties, "name", "") == PIE:
                 rna_keymap_ui.draw_kmi([], known, keymap, item, layout, 0)
-        folder = cache_folder()
+        folder = own_folder()
         if folder is not None:
             row = layout.row()
             text = iface("Compiled code, {size} in {folder}")
@@ -63,23 +64,23 @@ class MPHDRR_Preferences(bpy.types.AddonPreferences):
             row.operator("mphdrr.clean_cache", text="Clean", icon="TRASH")
 
 
-def cache_folder() -> Path | None:
-    """The folder in the extension's own one for what can be made again; None where this is no installed extension."""
+def own_folder(name: str = "cache") -> Path | None:
+    """A folder in the extension's own one for what can be made again; None where this is no installed extension."""
     try:
-        return Path(bpy.utils.extension_path_user(PACKAGE, path="cache"))
+        return Path(bpy.utils.extension_path_user(PACKAGE, path=name))
     except ValueError:
         return None
 
 
 def cache_size() -> int:
-    """Bytes of the files in `cache_folder`."""
-    folder = cache_folder()
+    """Bytes of the files in `own_folder`."""
+    folder = own_folder()
     return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()) if folder else 0
 
 
 def clean_cache() -> str:
-    """Delete what is in `cache_folder`; returns the line to report."""
-    size, folder = cache_size(), cache_folder()
+    """Delete what is in `own_folder`; returns the line to report."""
+    size, folder = cache_size(), own_folder()
     if folder is not None:
         shutil.rmtree(folder, ignore_errors=True)  # a library that is loaded cannot be deleted on Windows
     return f"Deleted {readable_size(size - cache_size())}"
@@ -94,7 +95,7 @@ def website() -> str:
 
 def apply() -> None:
     """Do as the preferences say, when the extension is enabled."""
-    folder, addon = cache_folder(), bpy.context.preferences.addons.get(PACKAGE)
+    folder, addon = own_folder(), bpy.context.preferences.addons.get(PACKAGE)
     cache.keep_in(folder)
     if addon is not None and addon.preferences is not None:
         parallel.set_usual_threads(addon.preferences.threads or None)

@@ -3,10 +3,11 @@
 import bpy
 from bpy.props import EnumProperty, FloatProperty, StringProperty
 
-from ..addon import recovery
+from ..addon import preferences, recovery
 from ..addon.blender import choices, decimals, jobs, storage
 from ..addon.blender.reports import Reported, ask_to_remove, needs
-from ..addon.volumes import slices, volume_import, volumes
+from ..addon.volumes import slices, volume_import, volume_materials, volumes
+from ..core.errors import InputError
 from ..core.xray.dose import decays
 
 
@@ -83,6 +84,29 @@ class MPHDRR_OT_clean_volume_files(Reported, bpy.types.Operator):
 
     def act(self, context: bpy.types.Context) -> str:
         return storage.remove_unused()
+
+
+class MPHDRR_OT_add_looks(Reported, bpy.types.Operator):
+    """Put the looks of volumes into the Asset Browser, as a library of its own: dragged onto a volume, a look replaces its
+    colours, also on its slices, and the display range stays
+    """
+
+    bl_label = "Looks for Asset Browser"
+    bl_options = {"REGISTER"}
+
+    directory: StringProperty(
+        name="Folder", description="Where the library is written; empty: the extension's own folder", subtype="DIR_PATH"
+    )
+
+    def act(self, context: bpy.types.Context) -> str:
+        folder = storage.absolute(self.directory) if self.directory else preferences.own_folder("assets")
+        if folder is None:
+            raise InputError("no folder given: this is no installed extension, so it has none of its own")
+        volume_materials.write_assets(folder)
+        libraries = context.preferences.filepaths.asset_libraries
+        if not any(storage.absolute(each.path) == folder for each in libraries):
+            libraries.new(name="mphDRR", directory=str(folder))
+        return f"Looks are in the Asset Browser's library mphDRR: {folder}"
 
 
 class MPHDRR_OT_remake_volumes(jobs.JobOperator, bpy.types.Operator):

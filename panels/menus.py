@@ -134,6 +134,7 @@ class MPHDRR_MT_volumes(bpy.types.Menu):
         layout.operator("mphdrr.remake_volumes", icon="FILE_REFRESH")
         layout.operator("mphdrr.find_volume_files", icon="VIEWZOOM")
         layout.operator("mphdrr.clean_volume_files", icon="TRASH")
+        layout.operator("mphdrr.add_looks", icon="ASSET_MANAGER")
 
 
 class MPHDRR_MT_projections(bpy.types.Menu):

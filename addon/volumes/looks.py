@@ -38,8 +38,8 @@ def show(item: bpy.types.Object, cut: volume_materials.Cut | None) -> None:
     high = max(settings.display_high / factor, low + max(1e-30, 1e-6 * abs(low)))
     exponent, gain = _SMOKE.get(settings.look, (1.0, 0.0))
     for material in filter(None, item.data.materials):
-        volume_materials.set_range(material, low, high)
-        volume_materials.set_opacity(material, exponent, gain)
+        inputs = {"Low": low, "High": high, "Exponent": exponent, "Gain": gain, "Size": settings.extent}
+        volume_materials.set_look(material, settings.quantity, **inputs)
         if material.node_tree is not None:
             volume_materials.set_cut(material.node_tree, cut)
     volume_materials.set_display(item.data, low, high, settings.extent, gain if cut is None else 0.0)
@@ -81,7 +81,7 @@ def _shift(item: bpy.types.Object) -> Vector:
 def _new_surface(item: bpy.types.Object) -> bpy.types.Object:
     name = f"{item.name} surface"
     mesh = bpy.data.meshes.new(name)
-    mesh.materials.append(_material(name, item.mphdrr_volume.quantity))
+    mesh.materials.append(_material(name, volume_materials.ramp_of(item)))
     surface = bpy.data.objects.new(name, mesh)
     surface[_KEY] = True
     surface.parent, surface.hide_select = item, True
@@ -106,10 +106,10 @@ def _cutting(name: str) -> bpy.types.NodeTree:
     return tree
 
 
-def _material(name: str, quantity: str) -> bpy.types.Material:
-    """A dull surface in the brighter colours of a quantity."""
+def _material(name: str, colors: volume_materials.Ramp) -> bpy.types.Material:
+    """A dull surface in the brighter of some colours."""
     material, shader = compat.surface_material(name, "ShaderNodeBsdfPrincipled")
-    color = (*volume_materials.ramp(quantity)[-2][1], 1.0)
+    color = (*colors[-2][1], 1.0)
     material.diffuse_color = color
     shader.inputs["Base Color"].default_value, shader.inputs["Roughness"].default_value = color, 0.6
     return material

@@ -28,7 +28,7 @@ _FRONT = (0.7, -0.5, 0.5)  # direction from which a scene is looked at first: th
 # The volume that slices were last taken of: reading it takes longer than all the rest.
 _last: tuple[Path, Volume] | None = None
 # By the session's number of a plane's image: the file, index and display range that it was painted of.
-_painted: dict[int, tuple[Path, int, float, float]] = {}
+_painted: dict[int, tuple[Path, int, float, float, volume_materials.Ramp]] = {}
 
 
 def add_slices(item: bpy.types.Object, at: Sequence[int] | None = None) -> list[bpy.types.Object]:
@@ -141,7 +141,8 @@ def _paint(item: bpy.types.Object, plane: bpy.types.Object) -> None:
     """Paint a plane's image, unless it is so; raises InputError where the voxels' file is missing."""
     settings, axis = item.mphdrr_volume, plane[_KEY]
     image = plane.data.materials[0].node_tree.nodes["Slice"].image
-    wanted = volumes.file_of(item), settings.slices[axis], settings.display_low, settings.display_high
+    ramp = volume_materials.ramp_of(item)
+    wanted = volumes.file_of(item), settings.slices[axis], settings.display_low, settings.display_high, ramp
     if image is None or _painted.get(image.session_uid) == wanted:
         return
     array = _stored(item).array
@@ -151,7 +152,7 @@ def _paint(item: bpy.types.Object, plane: bpy.types.Object) -> None:
         high - low, 1e-30
     )
     shades = np.clip(relative * (_SHADES - 1), 0, _SHADES - 1).astype(np.uint8)
-    image.pixels.foreach_set(colors(settings.quantity)[shades].ravel())
+    image.pixels.foreach_set(colors(settings.quantity, ramp)[shades].ravel())
     image.update()
     _painted[image.session_uid] = wanted
 
@@ -186,7 +187,12 @@ def before_save(*_: object) -> None:
 
 def after_update(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
     """Volumes were hidden or shown: their planes, too."""
-    if scene != bpy.context.scene or not depsgraph.id_type_updated("SCENE"):
+    if scene != bpy.context.scene:
+        return
+    if depsgraph.id_type_updated("MATERIAL") or depsgraph.id_type_updated("NODETREE"):  # another look, or an edited one
+        for item in volumes.volume_objects(scene):
+            update(item)
+    if not depsgraph.id_type_updated("SCENE"):
         return
     for item in volumes.volume_objects(scene):
         for plane in planes_of(item):
@@ -246,9 +252,11 @@ def _material(name: str, image: bpy.types.Image) -> bpy.types.Material:
     return material
 
 
-def colors(quantity: str) -> NDArray[np.float32]:
-    """RGBA (256, 4) of the display range, as an sRGB image holds them; the lowest is transparent."""
-    positions, colors = zip(*volume_materials.ramp(quantity), strict=True)
+def colors(quantity: str, ramp: volume_materials.Ramp | None = None) -> NDArray[np.float32]:
+    """RGBA (256, 4) of the display range, as an sRGB image holds them, of a ramp or else the quantity's; the lowest is
+    transparent.
+    """
+    positions, colors = zip(*(ramp or volume_materials.ramp(quantity)), strict=True)
     shades = np.linspace(0, 1, _SHADES)
     rgb = np.stack([np.interp(shades, positions, channel) for channel in np.transpose(colors)], axis=1)
     srgb = np.where(rgb <= 0.0031308, 12.92 * rgb, 1.055 * rgb ** (1 / 2.4) - 0.055)

@@ -96,7 +96,10 @@ MENUS = [(menu, _draw_entries(entries)) for menu, entries in ENTRIES.items()]
 MENUS.append((bpy.types.STATUSBAR_HT_header, jobs.draw_status))
 MENUS += [(menu, _draw_submenu(*submenu)) for menu, submenu in SUBMENUS.items()]
 MENUS.append((bpy.types.WM_MT_splash, _draw_splash))
-MENUS += [(each, menus.draw_in_context_menu) for each in (bpy.types.VIEW3D_MT_object_context_menu, bpy.types.OUTLINER_MT_object)]
+MENUS += [
+    (each, menus.draw_in_context_menu)
+    for each in (bpy.types.VIEW3D_MT_object_context_menu, bpy.types.OUTLINER_MT_object)
+]
 
 _UNDONE = (recoloring.check, runs.after_update, live_scanner.after_undo, slices.after_undo, framing.after_undo)
 _UPDATED = (

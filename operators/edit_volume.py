@@ -1,7 +1,7 @@
 """The active volume: slices through it, a CT's attenuation, its files cleaned up or found again."""
 
 import bpy
-from bpy.props import EnumProperty, FloatProperty, StringProperty
+from bpy.props import EnumProperty, FloatProperty, FloatVectorProperty, StringProperty
 
 from ..addon import preferences, recovery
 from ..addon.blender import choices, decimals, jobs, storage
@@ -14,10 +14,17 @@ from ..core.xray.dose import decays
 class MPHDRR_OT_add_slices(Reported, bpy.types.Operator):
     """Show an axial, a coronal and a sagittal slice of the active volume as planes that go with it"""
 
+    place: FloatVectorProperty(
+        name="Place", description="Where the slices meet: share of the way along each of the grid's axes", size=3, min=0.0,
+        max=1.0, default=(0.5, 0.5, 0.5), options={"SKIP_SAVE"},
+    )  # fmt: skip
+
     poll = needs(volumes.ACTIVE)
 
     def act(self, context: bpy.types.Context) -> str:
-        return f"Added {len(slices.add_slices(context.object))} slices"
+        shape = context.object.mphdrr_volume.shape
+        at = [min(int(share * n), n - 1) for share, n in zip(self.place, shape, strict=True)]
+        return f"Added {len(slices.add_slices(context.object, at))} slices"
 
 
 class MPHDRR_OT_remove_slices(Reported, bpy.types.Operator):

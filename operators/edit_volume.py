@@ -112,7 +112,8 @@ class MPHDRR_OT_add_looks(Reported, bpy.types.Operator):
         volume_materials.write_assets(folder)
         libraries = context.preferences.filepaths.asset_libraries
         if not any(storage.absolute(each.path) == folder for each in libraries):
-            libraries.new(name="mphDRR", directory=str(folder))
+            library = libraries.new(name="mphDRR", directory=str(folder))
+            library.import_method = "APPEND"  # for each volume one of its own, whose display range can be set
         return f"Looks are in the Asset Browser's library mphDRR: {folder}"
 
 

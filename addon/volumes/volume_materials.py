@@ -146,11 +146,16 @@ def set_look(material: bpy.types.Material, quantity: str, **inputs: float) -> No
             objects.change(nodes[earlier].inputs[index], default_value=value)
 
 
+def is_look(material: bpy.types.Material) -> bool:
+    """Whether a material draws volumes in a look."""
+    return material.node_tree is not None and _LOOK in material.node_tree.nodes
+
+
 def ramp_of(item: bpy.types.Object) -> Ramp:
     """Positions and colours of a volume's display range, as the look of its material has them."""
     for material in filter(None, item.data.materials):
-        look = material.node_tree.nodes.get(_LOOK) if material.node_tree else None
-        if look is not None and look.node_tree and (node := look.node_tree.nodes.get(_COLORS)):
+        look = material.node_tree.nodes[_LOOK].node_tree if is_look(material) else None
+        if look is not None and (node := look.nodes.get(_COLORS)):
             return tuple((each.position, tuple(each.color[:3])) for each in node.color_ramp.elements)
     return ramp(item.mphdrr_volume.quantity)
 

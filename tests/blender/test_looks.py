@@ -93,6 +93,11 @@ def test_a_look_from_the_asset_library_restyles_a_volume_and_its_slices(nema, tm
     assert look.inputs["High"].default_value == 3.0 and brightest()[2] < brightest()[0]
     look.node_tree.nodes["Colors"].color_ramp.elements[-1].color = (1.0, 1.0, 1.0, 1.0)
     assert np.allclose(brightest(), 1.0, atol=0.01)
+    own, other = plane.material_slots[0].material, volume_materials.new_material("Other", "mu", 9.0)
+    plane.material_slots[0].material = other  # a drop on a slice is meant for the volume
+    bpy.context.view_layer.update()
+    assert nema.data.materials[0] == other and plane.material_slots[0].material == own
+    assert nema.data.materials[0].node_tree.nodes["Values"].attribute_name == "activity"
 
 
 @pytest.mark.long

@@ -74,9 +74,9 @@ def measured(file: str) -> dict[str, float]:
     """Milliseconds of each, in the order of `_AIMS`."""
     bpy.ops.wm.open_mainfile(filepath=file)
     found = [least(follow, move(count)) for count in (80, 1)]
-    bpy.ops.ed.undo_push(message="start")
     window = bpy.context.window_manager.windows[:1]
     with bpy.context.temp_override(**({"window": window[0]} if window else {})):
+        bpy.ops.ed.undo_push(message="start")
         found += [least(undo, push(change)) for change in (move(80), rename)]
     found.append(least(lambda n: bpy.context.scene.frame_set(n + 2)))
     found.append(least(lambda n: bpy.ops.wm.open_mainfile(filepath=file)))

@@ -8,6 +8,7 @@ import tomllib
 from pathlib import Path
 
 import bpy
+import rna_keymap_ui
 from bpy.app.translations import pgettext_iface as iface
 from bpy.props import BoolProperty, IntProperty
 
@@ -17,6 +18,7 @@ from ..core.projector import backends, parallel
 from .blender import storage
 from .blender.layouts import invoking
 
+PIE, PIE_KEYMAP = "MPHDRR_MT_module", "Object Mode"  # the menu on a key, and Blender's keymap with that
 PACKAGE = __package__.rpartition(".")[0]  # "mphdrr", or "bl_ext.<repo>.mphdrr" when installed as an extension
 
 
@@ -45,6 +47,7 @@ class MPHDRR_Preferences(bpy.types.AddonPreferences):
         layout = self.layout
         row = invoking(layout.row())
         row.operator("mphdrr.load_example", icon="PLAY")
+        row.operator("mphdrr.add_looks", icon="ASSET_MANAGER")
         if website():
             row.operator("wm.url_open", text="Website and Documentation", icon="URL").url = website()
         box = layout.box()
@@ -56,7 +59,12 @@ class MPHDRR_Preferences(bpy.types.AddonPreferences):
         layout.use_property_split = True
         layout.prop(self, "threads", text="Threads" if self.threads else "Threads (0: all)")
         layout.prop(self, "copies")
-        folder = cache_folder()
+        known = context.window_manager.keyconfigs.user
+        keymap = known.keymaps.get(PIE_KEYMAP)
+        for item in keymap.keymap_items if keymap else ():
+            if getattr(item.properties, "name", "") == PIE:
+                rna_keymap_ui.draw_kmi([], known, keymap, item, layout, 0)
+        folder = own_folder()
         if folder is not None:
             row = layout.row()
             text = iface("Compiled code, {size} in {folder}")
@@ -64,23 +72,23 @@ class MPHDRR_Preferences(bpy.types.AddonPreferences):
             row.operator("mphdrr.clean_cache", text="Clean", icon="TRASH")
 
 
-def cache_folder() -> Path | None:
-    """The folder in the extension's own one for what can be made again; None where this is no installed extension."""
+def own_folder(name: str = "cache") -> Path | None:
+    """A folder in the extension's own one for what can be made again; None where this is no installed extension."""
     try:
-        return Path(bpy.utils.extension_path_user(PACKAGE, path="cache"))
+        return Path(bpy.utils.extension_path_user(PACKAGE, path=name))
     except ValueError:
         return None
 
 
 def cache_size() -> int:
-    """Bytes of the files in `cache_folder`."""
-    folder = cache_folder()
+    """Bytes of the files in `own_folder`."""
+    folder = own_folder()
     return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()) if folder else 0
 
 
 def clean_cache() -> str:
-    """Delete what is in `cache_folder`; returns the line to report."""
-    size, folder = cache_size(), cache_folder()
+    """Delete what is in `own_folder`; returns the line to report."""
+    size, folder = cache_size(), own_folder()
     if folder is not None:
         shutil.rmtree(folder, ignore_errors=True)  # a library that is loaded cannot be deleted on Windows
     return f"Deleted {readable_size(size - cache_size())}"
@@ -95,7 +103,7 @@ def website() -> str:
 
 def apply() -> None:
     """Do as the preferences say, when the extension is enabled."""
-    folder, addon = cache_folder(), bpy.context.preferences.addons.get(PACKAGE)
+    folder, addon = own_folder(), bpy.context.preferences.addons.get(PACKAGE)
     cache.keep_in(folder)
     if addon is not None and addon.preferences is not None:
         _set(addon.preferences, bpy.context)

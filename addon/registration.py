@@ -12,6 +12,7 @@ import bpy
 
 from .. import operators, panels
 from ..operators import add_phantom
+from ..panels import menus
 from . import preferences, properties, recovery
 from .blender import ids, jobs, layouts, plots, storage, timers, updates
 from .events import event_notes
@@ -96,6 +97,10 @@ MENUS = [(menu, _draw_entries(entries)) for menu, entries in ENTRIES.items()]
 MENUS += [(bpy.types.STATUSBAR_HT_header, draw) for draw in (storage.draw_said, jobs.draw_status)]
 MENUS += [(menu, _draw_submenu(*submenu)) for menu, submenu in SUBMENUS.items()]
 MENUS.append((bpy.types.WM_MT_splash, _draw_splash))
+MENUS += [
+    (each, menus.draw_in_context_menu)
+    for each in (bpy.types.VIEW3D_MT_object_context_menu, bpy.types.OUTLINER_MT_object)
+]
 
 _UNDONE = (recoloring.check, runs.after_update, live_scanner.after_undo, slices.after_undo, framing.after_undo)
 _UPDATED = (
@@ -195,10 +200,15 @@ def register(command: Callable[..., int] | None = None) -> None:
             for space, draw, when in DRAWINGS:
                 drawing = space.draw_handler_add(draw, (), "WINDOW", when)
                 _registered.callback(space.draw_handler_remove, drawing, "WINDOW")
+            keymaps = bpy.context.window_manager.keyconfigs.addon.keymaps
             for name in ("Image", "Image Editor Tool: Sample"):  # the editor's usual tool takes clicks first
-                keymap = bpy.context.window_manager.keyconfigs.addon.keymaps.new(name, space_type="IMAGE_EDITOR")
+                keymap = keymaps.new(name, space_type="IMAGE_EDITOR")
                 click = keymap.keymap_items.new("mphdrr.pick_module", "LEFTMOUSE", "PRESS")
                 _registered.callback(keymap.keymap_items.remove, click)
+            keymap = keymaps.new(preferences.PIE_KEYMAP)
+            key = keymap.keymap_items.new("wm.call_menu_pie", "Q", "PRESS", shift=True)
+            key.properties.name = preferences.PIE
+            _registered.callback(keymap.keymap_items.remove, key)
         if command is not None:
             _registered.callback(bpy.utils.unregister_cli_command, bpy.utils.register_cli_command(ids.PREFIX, command))
     except Exception:

@@ -65,6 +65,14 @@ def consistent(state: dict) -> None:
     assert sum(x * x for x in state["place"]) ** 0.5 == pytest.approx(state["pinhole_distance"], rel=1e-6)
 
 
+def test_a_look_dragged_from_the_asset_browser_restyles_a_phantom(window):
+    seen = window("looks")
+    assert seen["materials"] == ["Derenzo activity", "mphDRR Fire"]
+    before, after = seen["brightest"]
+    assert before[2] > before[1] and after[2] < after[1], "the slices go along: from pink to yellow"
+    assert seen["slice"] == ["Slice"] and seen["high"] == 100.0
+
+
 def test_modules_follow_in_the_window(window, work_folder):
     seen = window("design")
     before = seen["before"]

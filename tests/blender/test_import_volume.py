@@ -77,8 +77,8 @@ def test_ct_begins_with_a_window_of_its_own_and_keeps_the_users(ct):
     assert (settings.display_low, settings.display_high) == (-200, 1000)
     settings.display_low = 50.0
     _replace(item, Volume(ct.array[:5].copy(), Grid((5, 11, 7), AFFINE), "hu"))
-    node = item.data.materials[0].node_tree.nodes["Display Range"]
-    assert node.inputs["From Min"].default_value == 50.0 and node.inputs["From Max"].default_value == 1000.0
+    node = item.data.materials[0].node_tree.nodes["Look"]
+    assert node.inputs["Low"].default_value == 50.0 and node.inputs["High"].default_value == 1000.0
 
 
 def test_solid_viewport_gets_no_value_below_0(ct):

@@ -90,4 +90,4 @@ def test_the_cache_is_measured_and_cleaned(cache):
 
 
 def test_without_an_extension_there_is_no_cache_to_show():
-    assert preferences.cache_folder() is None and not any("Compiled" in call for call in drawn())
+    assert preferences.own_folder() is None and not any("Compiled" in call for call in drawn())

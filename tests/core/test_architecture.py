@@ -63,6 +63,24 @@ def test_no_modules_import_each_other_in_a_circle():
     assert circles == {}, "what is in a circle, or imports something that is"
 
 
+def test_help_imports_nothing_that_commands_work_with():
+    """Options and help of all commands, so that they and completion are quick."""
+    rooms = (
+        "runs.run_recipe",
+        "runs.files",
+        "workbook",
+        "design",
+        "events.event_files",
+        "learning.data",
+        "figures.scores",
+    )
+    unwanted = {f"mphdrr.core.{name}" for name in rooms} | {"bpy", "h5py", "torch", "trimesh"}
+    parsers = "from mphdrr.addon.cli import COMMANDS; from mphdrr.core.cli import build_parser; build_parser(COMMANDS)"
+    script = f"import sys; {parsers}; print(*(set({sorted(unwanted)!r}) & set(sys.modules)))"
+    loaded = subprocess.run([sys.executable, "-c", script], check=True, capture_output=True, text=True).stdout
+    assert loaded.strip() == ""
+
+
 @functools.cache
 def nodes_of(path: Path) -> list[ast.AST]:
     return list(ast.walk(ast.parse(path.read_text(encoding="utf-8"))))

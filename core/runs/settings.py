@@ -344,6 +344,9 @@ _DECLARED = (
     }, needs=(_COUNTS, "model.aperture_mu")),
     Setting("model.plate_thickness", float, None, "Thickness of the aperture's plate, in whose middle the edge is",
             "infinite", unit="mm", above=0, slider=20, needs=(_COUNTS, "model.edge=path"), label="Plate (mm)"),
+    Setting("model.wall_thickness", float, None, "Thickness of the collimators' walls, of the aperture's material: photons "
+            "that pass them, or a neighbour's hole and walls, are counted", "nothing passes them", unit="mm", above=0,
+            slider=20, needs=(_COUNTS, "model.aperture_mu"), label="Walls (mm)", unset="Opaque"),
     Setting("model.crystal_mu", float, None, "Material of the crystal that stops the photons, or its attenuation "
             "coefficient at their energy", "all photons are counted", unit="1/mm", words=named(CRYSTALS, _BY_NAME),
             above=0, slider=5, needs=(_COUNTS,), label="Crystal", unset="None"),

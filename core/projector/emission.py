@@ -117,8 +117,8 @@ class Emission(Model):
         With edge "path" the thickness of the plate, mm, in whose middle the knife edge is. What passes it where it is solid,
         far from the hole, is not counted without `wall_thickness`; a warning says so from 0.5 % on. None: infinite.
     wall_thickness : float, optional
-        Of the collimators, mm, of the aperture's material. With it photons are counted, too, that pass a module's own walls
-        or plate beside its hole, or a neighbour's hole and then walls: by rays (`wall_penetration`). Neighbours are the other
+        Of the collimators, mm, of the aperture's material. Then photons are counted, too, that pass a module's own walls or
+        plate beside its hole, or a neighbour's hole and then walls: by rays (`wall_penetration`). Neighbours are the other
         modules of `system`. None: nothing passes walls.
     edge : str
         How photons penetrate the knife edge. ``"paix"``: as if the hole had the diameter d_e with

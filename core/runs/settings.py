@@ -280,6 +280,8 @@ _DECLARED = (
             "file says", unit="keV", above=0, sizes=(3,), needs=("counts.files", _SCATTER)),
     Setting("counts.scatter_fwhm", float, None, "FWHM of the Gaussian that smooths the estimate of scatter", "it is not "
             "smoothed", unit="pixels", above=0, needs=("counts.files", _SCATTER)),
+    Setting("counts.scatter_tails", bool, False, "The photopeak's tails in those windows, by the energy resolution, are no "
+            "scatter", needs=("counts.files", _SCATTER, "model.isotope", "model.energy_fwhm")),
     Setting("model.kind", str, "transmission", "What a pixel holds", label="Model", option="--model", words={
         "transmission": ("Radiograph", "Line integrals of the volume"),
         "emission": ("SPECT Counts", "Photons of a volume of activity that the crystal counts"),

@@ -12,12 +12,14 @@ from .files import read_run
 from .formats import FORMATS
 from .frame_files import read_counts
 
+Places = dict[str, list[list[int]]]
+"""Of dead and hot pixels module's number, row and column, from 1; of dead modules their numbers."""
 
-def write_flood(file: AnyPath, path: AnyPath, order: int = 2) -> tuple[FloodEfficiency, dict[str, list[list[int]]], list[str]]:
+
+def write_flood(file: AnyPath, path: AnyPath, order: int = 2) -> tuple[FloodEfficiency, Places, list[str]]:
     """Write the efficiencies that the `file` of a flood, a run or images (.npy), tells; `order` is that of the trend.
 
-    Returns what `flood_efficiency` does; dead and hot pixels (module's number, row, column, from 1) and dead modules; and
-    lines of text that say so.
+    Returns what `flood_efficiency` does, which pixels and modules are dead or hot, and lines of text that say so.
     """
     file = Path(file)
     require_ending(file, (*FORMATS, ".npy"))  # frames of other files may be of any module, and lie in any way

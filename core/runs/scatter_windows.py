@@ -88,7 +88,9 @@ class ScatterWindows:
         """The energies between which the frames of a window are, keV."""
         low, high = found.about[used[0], -2:].tolist()
         if not (np.isfinite(low + high) and (found.about[used, -2:] == found.about[used[0], -2:]).all()):
-            raise InputError(f"{found.name}: the peak's tails need the {word} window's energies, the same of all frames")
+            raise InputError(
+                f"{found.name}: the peak's tails need the {word} window's energies, the same of all frames"
+            )
         return low, high
 
     def _width(self, word: str, used: Sequence[int], found: Counts) -> float:

@@ -392,9 +392,10 @@ _DECLARED = (
             slider=10, label="Pixel Size (mm)"),
     Setting("frames.times", float, None, "Durations of a scan's frames, or of a heart's gates: a run of each, as OUTPUT-1, "
             "OUTPUT-2 …, of the volume, or of each its state", "there is one frame", unit="s", above=0, sizes=(),
-            needs=(_COUNTS, _MADE), option="--frame-times"),
+            needs=(_COUNTS, _MADE), option="--frame-times", label="Frame Times (s)"),
     Setting("frames.starts", float, None, "When they start after the reference time of the activity; of gates, all with the "
-            "scan", "each as the one before ends", unit="s", sizes=(), needs=("frames.times",), option="--frame-starts"),
+            "scan", "each as the one before ends", unit="s", sizes=(), needs=("frames.times",), option="--frame-starts",
+            label="Frame Starts (s)"),
     Setting("frames.bins", float, None, "Energy bins of X rays, from, to, from, to …: a run of each, as OUTPUT-1, "
             "OUTPUT-2 …", "one, the window", unit="keV", least=0, sizes=(), option="--bins",
             needs=(_XRAYS, "no model.panel=energy", "no model.window", "no volume.states")),

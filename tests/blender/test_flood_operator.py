@@ -20,6 +20,7 @@ def test_a_flood_becomes_the_panels_efficiencies(scene, ring_system, tmp_path, c
     np.save(tmp_path / "flood.npy", frames)
     assert not bpy.ops.mphdrr.flood_efficiency.poll()
     settings = scene.mphdrr_projections
+    settings.model = "EMISSION"
     bpy.ops.mphdrr.import_counts(filepath=str(tmp_path / "flood.npy"), frames="1-8", orientation="front+v", time=60.0)
     run = storage.absolute(settings.run_file)
     assert bpy.ops.mphdrr.flood_efficiency(filepath=str(tmp_path / "e.npy"), order=0) == {"FINISHED"}

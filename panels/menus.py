@@ -162,6 +162,7 @@ class MPHDRR_MT_projections(bpy.types.Menu):
         layout.separator()
         settings = context.scene.mphdrr_projections
         layout.operator_menu_enum("mphdrr.compare_runs", "other", icon="SELECT_DIFFERENCE")
+        layout.operator("mphdrr.flood_efficiency", icon="MESH_GRID")
         layout.operator("mphdrr.remove_run", icon="TRASH").index = settings.active_run
         layout.separator()
         layout.operator_menu_enum("mphdrr.use_preset", "preset", icon="PRESET")

@@ -98,7 +98,7 @@ class MPHDRR_PT_advanced(Folded, bpy.types.Panel):
         column = layout.column(align=True)
         if settings.model == "EMISSION" and collection is not None:
             column.prop(collection.mphdrr_scanner, "opening_angle")
-        for table in ("model", "detector", "compute"):
+        for table in ("model", "frames", "detector", "compute"):
             others = (each for each in drawn(settings, table) if each[0] not in (*_MAIN, *_PHYSICS))
             layouts.draw_settings(column, settings, others)
         column.prop(settings, "all_modules")

@@ -121,7 +121,7 @@ def make(asked: Request, quick: bool, voxels: dict[Path, Volume]) -> Preview:
         if path not in voxels:
             voxels[path] = vdb.read_vdb(path)
     volume, *mu = (stored_volumes.moved(voxels[path], pose) for path, pose in sources)
-    (run,) = run_recipe(quick_recipe(recipe) if quick else recipe, system, volume, mu[0] if mu else None)
+    run, *_ = run_recipe(quick_recipe(recipe) if quick else recipe, system, volume, mu[0] if mu else None)
     shown = run.projections
     if run.unit == "counts" and quick:  # shown per pixel of the panel's size, as the full picture and the runs are
         shown = shown * np.float32(_pixel_area(recipe_views(recipe, system)) / _pixel_area(run.views))

@@ -33,13 +33,14 @@ OPENING_ANGLE = "model.opening_angle_degrees"
 USUAL_TIME = 600.0
 """s, of a cardiac acquisition: what the panel has when a preset or a volume makes it count photons."""
 
-_NAMES = {"model.kind": "model", "detector.plane": "detector", "detector.rows": "height", "detector.columns": "width"}
+_NAMES = {"model.kind": "model", "detector.plane": "detector", "detector.rows": "height", "detector.columns": "width",
+          "frames.times": "frame_times", "frames.starts": "frame_starts"}  # fmt: skip
 """Names that .blend files keep, where they are not those of the settings."""
 
 PROPERTIES = {
     _NAMES.get(key, key.partition(".")[2]): setting
     for key, setting in SETTINGS.items()
-    if key.startswith(("model.", "detector.", "compute.")) and key != OPENING_ANGLE
+    if key.startswith(("model.", "detector.", "frames.", "compute.")) and key not in (OPENING_ANGLE, "frames.bins")
 }
 """The settings by the names of their properties. A coefficient has a second property, of its material."""
 
@@ -94,9 +95,8 @@ def set_panel(settings: ProjectionProperties, recipe: Recipe) -> None:
     """Set the panel as a recipe says, and the rest to its defaults; raises InputError for what the panel cannot show."""
     if recipe["model.pixel_points"] == "auto" and recipe["model.kind"] != "emission":
         raise InputError("model.pixel_points: the panel has no automatic number for radiographs")
-    for several in ("frames.times", "frames.bins"):
-        if recipe[several] is not None:
-            raise InputError(f"{several}: the panel has one frame")
+    if recipe["frames.bins"] is not None:
+        raise InputError("frames.bins: the panel has one bin")
     text = recipe["system.modules"] or "-"
     first, dash, last = text.partition("-")
     try:

@@ -280,6 +280,8 @@ _DECLARED = (
             "file says", unit="keV", above=0, sizes=(3,), needs=("counts.files", _SCATTER)),
     Setting("counts.scatter_fwhm", float, None, "FWHM of the Gaussian that smooths the estimate of scatter", "it is not "
             "smoothed", unit="pixels", above=0, needs=("counts.files", _SCATTER)),
+    Setting("counts.scatter_tails", bool, False, "The photopeak's tails in those windows, by the energy resolution, are no "
+            "scatter", needs=("counts.files", _SCATTER, "model.isotope", "model.energy_fwhm")),
     Setting("model.kind", str, "transmission", "What a pixel holds", label="Model", option="--model", words={
         "transmission": ("Radiograph", "Line integrals of the volume"),
         "emission": ("SPECT Counts", "Photons of a volume of activity that the crystal counts"),
@@ -344,6 +346,9 @@ _DECLARED = (
     }, needs=(_COUNTS, "model.aperture_mu")),
     Setting("model.plate_thickness", float, None, "Thickness of the aperture's plate, in whose middle the edge is",
             "infinite", unit="mm", above=0, slider=20, needs=(_COUNTS, "model.edge=path"), label="Plate (mm)"),
+    Setting("model.wall_thickness", float, None, "Thickness of the collimators' walls, of the aperture's material: photons "
+            "that pass them, or a neighbour's hole and walls, are counted", "nothing passes them", unit="mm", above=0,
+            slider=20, needs=(_COUNTS, "model.aperture_mu"), label="Walls (mm)", unset="Opaque"),
     Setting("model.crystal_mu", float, None, "Material of the crystal that stops the photons, or its attenuation "
             "coefficient at their energy", "all photons are counted", unit="1/mm", words=named(CRYSTALS, _BY_NAME),
             above=0, slider=5, needs=(_COUNTS,), label="Crystal", unset="None"),
@@ -387,9 +392,10 @@ _DECLARED = (
             slider=10, label="Pixel Size (mm)"),
     Setting("frames.times", float, None, "Durations of a scan's frames, or of a heart's gates: a run of each, as OUTPUT-1, "
             "OUTPUT-2 …, of the volume, or of each its state", "there is one frame", unit="s", above=0, sizes=(),
-            needs=(_COUNTS, _MADE), option="--frame-times"),
+            needs=(_COUNTS, _MADE), option="--frame-times", label="Frame Times (s)"),
     Setting("frames.starts", float, None, "When they start after the reference time of the activity; of gates, all with the "
-            "scan", "each as the one before ends", unit="s", sizes=(), needs=("frames.times",), option="--frame-starts"),
+            "scan", "each as the one before ends", unit="s", sizes=(), needs=("frames.times",), option="--frame-starts",
+            label="Frame Starts (s)"),
     Setting("frames.bins", float, None, "Energy bins of X rays, from, to, from, to …: a run of each, as OUTPUT-1, "
             "OUTPUT-2 …", "one, the window", unit="keV", least=0, sizes=(), option="--bins",
             needs=(_XRAYS, "no model.panel=energy", "no model.window", "no volume.states")),

@@ -23,6 +23,7 @@ _PLANES = ("Sagittal", "Coronal", "Axial")  # across world x, y, z
 _KEY = "mphdrr_slice"  # custom property: the axis of the grid that a plane is across
 _LATTICE = "mphdrr_slice_of"  # custom property: shape and affine that the planes were made for
 _MATERIAL = "mphdrr_material"  # custom property: a plane's own material, with its picture
+_GROUP = "mphDRR Slice"  # of nodes, which draws all slices
 _SHADES = 256
 _FRONT = (0.7, -0.5, 0.5)  # direction from which a scene is looked at first: the volume is cut open on that side
 
@@ -61,7 +62,7 @@ def remove_slices(item: bpy.types.Object) -> None:
         pictures = [tree.nodes["Slice"].image for tree in trees if "Slice" in tree.nodes]
         objects.remove_objects([plane])
         objects.remove_unused(materials)
-        objects.remove_unused(pictures)
+        objects.remove_unused([*pictures, bpy.data.node_groups.get(_GROUP)])
     looks.show(item, None)
 
 
@@ -257,16 +258,34 @@ def _plane(item: bpy.types.Object, volume: Volume, axis: int, name: str) -> bpy.
 
 
 def _material(name: str, image: bpy.types.Image) -> bpy.types.Material:
-    """A picture that shines by itself, seen from both sides, in colours that no light changes."""
+    """A picture drawn by the group of nodes that all slices share."""
     material = compat.blank_material(name)
     tree, shown = material.node_tree, {"image": image, "interpolation": "Closest", "extension": "EXTEND"}
     texture = compat.add_node(tree, "ShaderNodeTexImage", (0.0, 0.0), name="Slice", **shown)
-    emission = compat.add_node(tree, "ShaderNodeEmission", (300.0, 0.0), {"Color": texture.outputs["Color"]})
-    nothing = compat.add_node(tree, "ShaderNodeBsdfTransparent", (300.0, -150.0))
-    mixed = {0: texture.outputs["Alpha"], 1: nothing.outputs[0], 2: emission.outputs[0]}
-    mix = compat.add_node(tree, "ShaderNodeMixShader", (500.0, 0.0), mixed)
-    compat.add_node(tree, "ShaderNodeOutputMaterial", (700.0, 0.0), {"Surface": mix.outputs[0]})
+    given = {name: texture.outputs[name] for name in ("Color", "Alpha")}
+    drawn = compat.add_node(tree, "ShaderNodeGroup", (300.0, 0.0), given, node_tree=_group())
+    compat.add_node(tree, "ShaderNodeOutputMaterial", (500.0, 0.0), {"Surface": drawn.outputs[0]})
     return material
+
+
+def _group() -> bpy.types.NodeTree:
+    """What makes a picture shine by itself, seen from both sides, in colours that no light changes."""
+    if (tree := bpy.data.node_groups.get(_GROUP)) is not None:
+        return tree
+    tree = bpy.data.node_groups.new(_GROUP, "ShaderNodeTree")
+    tree.interface.new_socket("Color", in_out="INPUT", socket_type="NodeSocketColor")
+    for name in ("Alpha", "Strength", "Opacity"):
+        tree.interface.new_socket(name, in_out="INPUT", socket_type="NodeSocketFloat").default_value = 1.0
+    tree.interface.new_socket("Surface", in_out="OUTPUT", socket_type="NodeSocketShader")
+    given = compat.add_node(tree, "NodeGroupInput", (0.0, 0.0)).outputs
+    shining = {name: given[name] for name in ("Color", "Strength")}
+    emission = compat.add_node(tree, "ShaderNodeEmission", (300.0, 0.0), shining)
+    nothing = compat.add_node(tree, "ShaderNodeBsdfTransparent", (300.0, -150.0))
+    seen = compat.add_math(tree, "MULTIPLY", (300.0, 150.0), given["Alpha"], given["Opacity"])
+    mixed = {0: seen, 1: nothing.outputs[0], 2: emission.outputs[0]}
+    mix = compat.add_node(tree, "ShaderNodeMixShader", (500.0, 0.0), mixed)
+    compat.add_node(tree, "NodeGroupOutput", (700.0, 0.0), {0: mix.outputs[0]})
+    return tree
 
 
 def colors(quantity: str, ramp: volume_materials.Ramp | None = None) -> NDArray[np.float32]:

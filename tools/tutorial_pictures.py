@@ -1,6 +1,6 @@
 """Write pictures that tests in tests/app have taken: the tutorial's (`make tutorial`), or docs/images/xray-blender.webp.
 
-    pytest tests/app -k six_clicks && python tools/tutorial_pictures.py xray
+pytest tests/app -k six_clicks && python tools/tutorial_pictures.py xray
 """
 
 import sys

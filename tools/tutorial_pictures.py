@@ -17,8 +17,9 @@ CLICKS = ROOT / "out" / "test-app" / "test_six_clicks_lead_from_an_empty_scene_o
 
 def clicks() -> None:
     """Four of the six clicks to a dose map, on one page."""
-    taken = [Image.open(CLICKS / f"click-{number}.png").convert("RGB") for number in (1, 2, 4, 5)]
-    width, height = (round(0.6 * side) for side in taken[0].size)
+    shown = (0, 28, 1313, 905)  # without menus and what stands beside the two editors
+    taken = [Image.open(CLICKS / f"click-{number}.png").convert("RGB").crop(shown) for number in (1, 2, 4, 5)]
+    width, height = (round(0.7 * side) for side in taken[0].size)
     page = Image.new("RGB", (2 * width + 8, 2 * height + 8), (24, 26, 29))
     for i, picture in enumerate(taken):
         small = picture.resize((width, height), Image.Resampling.LANCZOS)

@@ -23,6 +23,9 @@ def steps():
         xdotool("click", 1)
         yield from idle()
         yield 2
+        if number == 1:
+            editor()[2].data.view_distance *= 0.55
+            yield 1
         picture(f"click-{number}")
         scene.mphdrr_reconstruction.iterations = 30 if number < 3 else 0  # of the CT, for speed
     volumes = ours("addon.volumes.volumes")

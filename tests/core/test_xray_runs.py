@@ -150,6 +150,10 @@ def test_the_command_makes_the_same_counts_and_lines(tmp_path, capsys):
         found = mph.read_run(tmp_path / f"run-{number}.npz")
         assert f"run-{number}.npz" in lines and found.seed == 3 + number
         np.testing.assert_array_equal(found.projections, expected.projections)
+    first, again = str(tmp_path / "run-1.npz"), str(tmp_path / "again.npz")
+    assert main(["project", first, "-o", again]) == 0
+    np.testing.assert_array_equal(mph.read_run(again).projections, mph.read_run(first).projections)
+    capsys.readouterr()
     assert main(project) == 1
     assert capsys.readouterr().err.rstrip().endswith("of mu, give the energy at which it holds (--energy)")
 

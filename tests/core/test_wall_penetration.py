@@ -69,7 +69,7 @@ def test_through_a_neighbour_a_point_is_seen_as_solid_angle_times_walls():
     """Each point of its hole: the line through it leaves one wall and enters the other."""
     system, mu = two_modules(), 0.4
     place = seen_through_neighbour(system)
-    _, through = beside_and_through(system, pixel_points=233, aperture_mu=mu)
+    _, through = beside_and_through(system, pixel_points=89, aperture_points=150, aperture_mu=mu)
     squared, factors, (front, channel) = 16 + 2 * 4 / mu, [], profile(4.0)  # d (d + 2 / mu)
     for point in disk_points(300) * math.sqrt(squared) / 2:
         q, path = system.centers[1] + point @ system.frames()[1, :2], 0.0

@@ -67,10 +67,10 @@ def test_walls_that_stop_all_leave_every_count_as_it_is(rng):
 
 def test_through_a_neighbour_a_point_is_seen_as_solid_angle_times_walls():
     """Each point of its hole: the line through it leaves one wall and enters the other."""
-    system = two_modules()
+    system, mu = two_modules(), 0.4
     place = seen_through_neighbour(system)
-    _, through = beside_and_through(system, pixel_points=233)
-    squared, factors, (front, channel) = 16 + 2 * 4 / MU, [], profile(4.0)  # d (d + 2 / mu)
+    _, through = beside_and_through(system, pixel_points=89, aperture_points=150, aperture_mu=mu)
+    squared, factors, (front, channel) = 16 + 2 * 4 / mu, [], profile(4.0)  # d (d + 2 / mu)
     for point in disk_points(300) * math.sqrt(squared) / 2:
         q, path = system.centers[1] + point @ system.frames()[1, :2], 0.0
         away = place - q
@@ -85,7 +85,7 @@ def test_through_a_neighbour_a_point_is_seen_as_solid_angle_times_walls():
                 (half + rise * (depth - s) - at) / (line @ u + rise * (line @ k)) for half, s, rise in (outside, inside)
             )
             path += abs(leave - enter)
-        factors.append(-(line @ system.frames()[1, 2]) / (away @ away) * math.exp(-MU * path))
+        factors.append(-(line @ system.frames()[1, 2]) / (away @ away) * math.exp(-mu * path))
     assert counted(system, through, place, 0.5, 64) == pytest.approx(squared / 16 * np.mean(factors), rel=0.01)
 
 

@@ -26,8 +26,7 @@ class MPHDRR_GT_preview(bpy.types.Gizmo):
         return {"RUNNING_MODAL"}
 
     def modal(self, context: bpy.types.Context, event: bpy.types.Event, tweak: set[str]) -> set[str]:
-        way = event.mouse_x - self._mouse[0], event.mouse_y - self._mouse[1]
-        preview_drawing.drag(context, self._start, way)
+        preview_drawing.drag(context, self._start, (event.mouse_x - self._mouse[0], event.mouse_y - self._mouse[1]))
         return {"RUNNING_MODAL"}
 
     def exit(self, context: bpy.types.Context, cancel: bool) -> None:

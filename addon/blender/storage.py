@@ -192,9 +192,8 @@ def references() -> Iterator[tuple[Any, str]]:
 
 @dataclass
 class _Kept:
-    """Which files were copied into a folder, and which stay where they are."""
+    """Which files were copied into a .blend's folder, and which stay where they are."""
 
-    target: Path
     copied: dict[Path, int] = field(default_factory=dict)  # their sizes in bytes
     shared: dict[Path, int] = field(default_factory=dict)  # files of other .blend files' folders
     outside: dict[Path, int] = field(default_factory=dict)  # the user's own
@@ -209,9 +208,9 @@ class _Kept:
     @property
     def text(self) -> str:
         """What was done, in a line; "" for nothing."""
-        homes = ", ".join(sorted({path.parent.name for path in self.shared}))
+        target, homes = (", ".join(sorted({path.parent.name for path in each})) for each in (self.copied, self.shared))
         amounts = {
-            f"copied {_amount(self.copied)} into {self.target.name}": self.copied,
+            f"copied {_amount(self.copied)} into {target}": self.copied,
             f"shares {_amount(self.shared)} with {homes}": self.shared,
             f"{_amount(self.outside)} elsewhere: Collect Files copies them": self.outside,
         }
@@ -226,7 +225,7 @@ def _amount(files: dict[Path, int]) -> str:
 
 def _keep_together(target: Path, is_wanted: Callable[[str, Path], bool]) -> _Kept:
     """Copy the wanted files into the folder `target` of a .blend, and have all paths lead to where files are, from there."""
-    kept, changed = _Kept(target), []
+    kept, changed = _Kept(), []
     for owner, name in references():
         old = getattr(owner, name)
         path = absolute(old)
@@ -273,7 +272,7 @@ def collect() -> str:
     for text in (*stay, *filter(None, [kept.absent, *kept.problems])):
         warn(text)
     names = several(sorted(path.name for path in kept.copied), 6)
-    return f"Copied {_amount(kept.copied)} into {kept.target}: {names}. Save the .blend" if names else "All are there"
+    return f"Copied {_amount(kept.copied)} into {_folder()}: {names}. Save the .blend" if names else "All are there"
 
 
 def before_save(filepath: str, _: Any = None) -> None:

@@ -40,6 +40,7 @@ SMALLER = (
     (r"^(mphdrr project \S+xlsx (?!.*(--voxels|--volume|--counts|--states)).*)", r"\1 --voxels 24 --spacing 6"),
     (r"^(mphdrr project \S+xlsx (?!.*(--size|--counts|--write-recipe)).*)", r"\1 --size 16 16"),
     (r"^(mphdrr phantom (?!.*(--voxels|-o \S+toml)).*)", r"\1 --voxels 16 --spacing 25"),
+    (r"^(mphdrr backproject .*)", r"\1 --voxels 16 --spacing 6"),
     (r"^(mphdrr reconstruct (?!.*(--voxels|study.toml|model.pt)).*)", r"\1 --voxels 16 --spacing 6"),
     (r"(?<=-n )(1000|500|20)\b", "6"),
     (r"-n 40", "-n 8"),
@@ -145,7 +146,7 @@ liver = volume.array > 0
 def progress(done, total):
     if 2 * done > total:
         raise mph.Cancelled
-expected, truth, volumes = counts, mph.Volume(volume.array, mph.Grid.centered(16, 6.0)), np.ones((1, 2, 16, 16, 16))
+expected, truth, volumes = mph.read_run("run.h5").projections, mph.Volume(volume.array, mph.Grid.centered(16, 6.0)), np.ones((1, 2, 16, 16, 16))
 mph.write_volume(truth, "truth.nii.gz")
 mph.write_volume(mph.read_volume("heart.nii.gz"), "volume.nii.gz")
 """,

@@ -9,9 +9,10 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core import Cancelled, files
+from ...core import Cancelled
 from ...core.errors import InputError
 from ...core.figures.page import Page
+from ...core.files import write_bytes
 from ..blender import compat, ids, jobs
 
 _PAUSE = 0.02  # s between two looks at Blender's render job
@@ -86,6 +87,6 @@ def write_film(pictures: Sequence[Path], path: Path, fps: int, page: Page) -> Ge
         with tempfile.TemporaryDirectory(prefix="mphdrr-") as folder:
             made = Path(folder) / "film.mp4"
             yield from written(scene, made, animation=True)
-            files.write_bytes(path, made.read_bytes())
+            write_bytes(path, made.read_bytes())
     finally:
         bpy.data.scenes.remove(scene)

@@ -254,7 +254,7 @@ def _titles(stage: Stage) -> tuple[str, str]:
     modules = f"{'Module' if len(numbers) == 1 else 'Modules'} {listed}"
     name, within = stage.subject.name if stage.shown.volume else "", f"ROI of radius {stage.radius:g} mm"
     if stage.shown.lit:
-        return name, f"{modules} of {len(stage.system)}, {within}"
+        return name, f"Rays of {modules.lower()} of {len(stage.system)}, {within}"
     return modules, ", ".join(filter(None, (name, within)))
 
 

@@ -22,9 +22,9 @@ class MPHDRR_PT_phantom(Folded, bpy.types.Panel):
     def draw(self, context: bpy.types.Context) -> None:
         layout = layouts.invoking(layouts.labelled(self.layout))
         adding = layout.column()
-        column = adding.column(align=True)
-        column.menu("MPHDRR_MT_add", text="Add Phantom", icon="OUTLINER_DATA_VOLUME")
-        column.operator("mphdrr.import_volume", text="Import Volume", icon="IMPORT")
+        row = adding.row(align=True)
+        row.menu("MPHDRR_MT_add", text="Add Phantom", icon="OUTLINER_DATA_VOLUME")
+        row.operator("mphdrr.import_volume", text="Import Volume", icon="IMPORT")
         if storage.missing_volumes():
             _draw_missing(adding.column(align=True), context.scene)
         item = volumes.meant(context)

@@ -1,5 +1,7 @@
 """``mphdrr figure KIND FILE … -o PICTURE``; only the figures that are rendered, and a .blend, need Blender."""
 
+from __future__ import annotations
+
 import argparse
 import contextlib
 from pathlib import Path
@@ -7,24 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from ...core import (
-    Grid,
-    InputError,
-    ProjectionRun,
-    euler_pose,
-    kinds_in,
-    read_phantom,
-    read_recipe,
-    read_scanner,
-    read_volume,
-)
+from ... import core as mph
 from ...core.cli.options import add_command, output_path, progress_bar, refuse
 from ...core.figures.kinds import FILMS, KINDS, PAPERS, SAMPLES, FigureKind, How, figure_kind
 from ...core.figures.page import SUFFIXES, Page
 from ...core.figures.subject import NEEDS, Subject, require
 from ...core.phantoms.kinds import KINDS as PHANTOMS
-from ...core.runs.files import FORMATS, read_run
-from ...core.runs.run_recipe import phantom_pose, run_recipe
+from ...core.runs.formats import FORMATS
 from ...core.toml import read_toml
 from . import COMMANDS
 from .scene import new_scene, quiet
@@ -89,17 +80,17 @@ def _run(arguments: argparse.Namespace) -> None:
         )
         return
     if arguments.kind is None:
-        raise InputError("figure: name a kind; --list shows them")
+        raise mph.InputError("figure: name a kind; --list shows them")
     kind = figure_kind(arguments.kind)
     if not arguments.output:
-        raise InputError("nothing to write: give --output FILE")
+        raise mph.InputError("nothing to write: give --output FILE")
     paths = [output_path(name, kind.suffixes) for name in arguments.output]
     how = How(*(not arguments.no_labels, *(getattr(arguments, name) for name in How._fields[1:])))
     page = kind.page(arguments.size, how)
     blends = [file for file in arguments.files if file.lower().endswith(".blend")]
     if blends:
         if len(arguments.files) > 1:
-            raise InputError(f"{blends[0]}: a .blend holds all that is shown; give no other file")
+            raise mph.InputError(f"{blends[0]}: a .blend holds all that is shown; give no other file")
         refuse(arguments, _POSED, "is for phantoms that are named on the command line, not for a .blend")
         _of_scene(arguments, kind, Path(blends[0]), paths, how)
     else:
@@ -127,7 +118,7 @@ def _of_scene(arguments: argparse.Namespace, kind: FigureKind, blend: Path, path
         try:
             bpy.ops.wm.open_mainfile(filepath=str(blend.absolute()))
         except RuntimeError as error:
-            raise InputError(f"{blend}: cannot be opened ({str(error).strip().splitlines()[0]})") from None
+            raise mph.InputError(f"{blend}: cannot be opened ({str(error).strip().splitlines()[0]})") from None
         job = figures.figure_job(bpy.context, kind.name, paths, arguments.size, arguments.modules, **how._asdict())
         _follow(job.finish(job.work(lambda done, total: None)))
 
@@ -170,37 +161,39 @@ def _read(arguments: argparse.Namespace, file: str, scanner: Any) -> dict[str, A
     """What one of the files holds, by the names of `Subject`'s fields."""
     suffix = Path(file).suffix.lower()
     if suffix in _WORKBOOKS:
-        return {"scanner": read_scanner(file, next(iter(kinds_in(file)), "pinhole"))}
+        return {"scanner": mph.read_scanner(file, next(iter(mph.kinds_in(file)), "pinhole"))}
     if suffix == ".toml" and "shape" not in read_toml(file):
-        (run,) = run_recipe(read_recipe(file), scanner, stages=progress_bar)
+        (run,) = mph.run_recipe(mph.read_recipe(file), scanner, stages=progress_bar)
         return _of_run(run)
     kinds = [kind for kind in PHANTOMS if kind.name == file]
     if kinds or suffix == ".toml":
-        phantom: Any = kinds[0].phantom(**kinds[0].usual) if kinds else read_phantom(file)
+        phantom: Any = kinds[0].phantom(**kinds[0].usual) if kinds else mph.read_phantom(file)
         phi, theta, psi = np.deg2rad(arguments.euler_degrees)
-        pose = euler_pose(phi, theta, psi, arguments.position)
+        pose = mph.euler_pose(phi, theta, psi, arguments.position)
         # As large as the phantom however it is turned, and a voxel free all around.
         spacing = phantom.extent / max(1, arguments.voxels - 2)
-        grid = Grid.centered(arguments.voxels, spacing, arguments.position)
+        grid = mph.Grid.centered(arguments.voxels, spacing, arguments.position)
         volume = phantom.voxelize(grid, pose, progress_bar("voxelizing"))
         return {"volume": volume, "pose": pose, "name": phantom.title, "posed": True}
     if suffix in FORMATS:
         try:
-            return _of_run(read_run(file))
-        except InputError:
+            return _of_run(mph.read_run(file))
+        except mph.InputError:
             if suffix == ".pt" or not Path(file).is_file():
                 raise
-    return {"volume": read_volume(file), "pose": None, "name": Path(file).name}
+    return {"volume": mph.read_volume(file), "pose": None, "name": Path(file).name}
 
 
-def _of_run(run: ProjectionRun) -> dict[str, Any]:
+def _of_run(run: mph.ProjectionRun) -> dict[str, Any]:
     found: dict[str, Any] = {
         "scanner": run.system,
         "volume": run.volume,
         "run": run,
         "name": str(run.settings.get("volume", "")),
     }
-    with contextlib.suppress(InputError):  # of version 0.1.0, which keeps no recipe
+    with contextlib.suppress(mph.InputError):  # of version 0.1.0, which keeps no recipe
         if any(key.startswith("phantom.") for key in run.recipe.given):
+            from ...core.runs.run_recipe import phantom_pose
+
             found["pose"] = phantom_pose(run.recipe)
     return {"pose": None, **found}

@@ -17,7 +17,7 @@ from ...core.figures.subject import Subject
 from ...core.volumes.meshes.mesh import Mesh
 from ..blender import compat, ids
 from ..scanner import collimators
-from ..volumes import looks, meshes
+from ..volumes import looks, meshes, volume_materials
 from . import studio
 
 Moment = tuple[float, list[int], list[int]]
@@ -118,12 +118,12 @@ class Stage:
         now = int(share * len(self.numbers))
         return 0.0, self.numbers[: now + 1], [self.numbers[now]]
 
-    def draw_surface(self, mesh: Mesh, quantity: str) -> None:
+    def draw_surface(self, mesh: Mesh, colors: volume_materials.Ramp) -> None:
         """Draw a mesh in the place of the volume."""
         for part in self.drawn:
             part.hide_render = True
         surface = meshes.add_mesh(mesh, ids.STUDIO, np.eye(4), self.scene.collection)
-        surface.data.materials.append(looks.new_material(ids.STUDIO, quantity))
+        surface.data.materials.append(looks.new_material(ids.STUDIO, colors))
         self.drawn = [surface]
 
     def remove(self) -> None:

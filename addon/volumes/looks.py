@@ -50,8 +50,8 @@ def show(item: bpy.types.Object, cut: volume_materials.Cut | None) -> None:
     high = max(settings.display_high / factor, low + max(1e-30, 1e-6 * abs(low)))
     exponent, gain = _SMOKE.get(settings.look, (1.0, 0.0))
     for material in filter(None, item.data.materials):
-        volume_materials.set_range(material, low, high)
-        volume_materials.set_opacity(material, exponent, gain)
+        inputs = {"Low": low, "High": high, "Exponent": exponent, "Gain": gain, "Size": settings.extent}
+        volume_materials.set_look(material, settings.quantity, **inputs)
         if material.node_tree is not None:
             volume_materials.set_cut(material.node_tree, cut)
     volume_materials.set_display(item.data, low, high, settings.extent, gain if cut is None else 0.0)
@@ -95,7 +95,7 @@ def _new_surface(item: bpy.types.Object) -> bpy.types.Object:
     mesh = bpy.data.meshes.new(name)
     settings = item.mphdrr_volume
     tissue = _TISSUES.get(settings.look) if settings.quantity in volume_materials.XRAY else None
-    mesh.materials.append(new_material(name, settings.quantity, tissue and tissue[1]))
+    mesh.materials.append(new_material(name, volume_materials.ramp_of(item, smoke=True), tissue and tissue[1]))
     surface = bpy.data.objects.new(name, mesh)
     surface[_KEY] = True
     surface.parent, surface.hide_select = item, True
@@ -120,10 +120,12 @@ def _cutting(name: str) -> bpy.types.NodeTree:
     return tree
 
 
-def new_material(name: str, quantity: str, rgb: tuple[float, float, float] | None = None) -> bpy.types.Material:
-    """A dull surface in the brighter colours of a quantity, or in a linear colour."""
+def new_material(
+    name: str, colors: volume_materials.Ramp, rgb: tuple[float, float, float] | None = None
+) -> bpy.types.Material:
+    """A dull surface in the brighter of some colours, or in a linear colour."""
     material, shader = compat.surface_material(name, "ShaderNodeBsdfPrincipled")
-    color = (*(rgb or volume_materials.ramp(quantity, smoke=True)[-2][1]), 1.0)
+    color = (*(rgb or colors[-2][1]), 1.0)
     material.diffuse_color = color
     shader.inputs["Base Color"].default_value, shader.inputs["Roughness"].default_value = color, 0.6
     return material

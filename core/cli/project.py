@@ -3,16 +3,17 @@
 Every setting of `runs.settings` is an option; the help lists the most used ones.
 """
 
+from __future__ import annotations
+
 import argparse
 from pathlib import Path
 from typing import Any
 
 from ... import core as mph
 from ..phantoms.kinds import KINDS
-from ..runs.files import FORMATS
+from ..runs.formats import FORMATS
 from ..runs.mosaic import write_sheet
 from ..runs.presets import PRESETS
-from ..runs.run_recipe import frames_of
 from ..runs.settings import SETTINGS
 from .options import add_run, numbered_path, output_path, progress_bar
 from .recipe_options import add_entries, add_option, add_setting, typed_entries
@@ -127,6 +128,8 @@ def _run(arguments: argparse.Namespace) -> None:
     mphdrr project scanner.xlsx --counts counts.npy --frames 1-80 --orientation front+v --time 600 -o run.h5
         --mosaic check.png
     """
+    from ..runs.run_recipe import frames_of
+
     if arguments.write_recipe:
         path = output_path(arguments.write_recipe, (".toml",))
         recipe, _ = _chosen(arguments)

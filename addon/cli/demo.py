@@ -20,9 +20,9 @@ from ...core.runs.mosaic import write_sheet
 from . import COMMANDS
 from .scene import INSTALL_BLENDER, new_scene, quiet, save_scene
 
-_FIGURES = {"phantom": "inside", "cut-away": "cut-away", "sums": "sums"}
+_FIGURES = {"phantom": "picture", "cut-away": "cut-away", "sums": "sums"}
 """Name and kind of those besides the modules' ranges."""
-_SIZE = dict.fromkeys(("scanner", "inside", "cut-away"), (880, 510))
+_SIZE = dict.fromkeys(("scanner", "picture", "cut-away"), (880, 510))
 """Smaller than usual: they take most of the demo's time."""
 
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from ... import core as mph
 from ...core.cli.options import add_command, output_path, progress_bar, refuse
-from ...core.figures.kinds import KINDS, FigureKind, figure_kind
+from ...core.figures.kinds import FILMS, KINDS, PAPERS, SAMPLES, FigureKind, How, figure_kind
 from ...core.figures.page import SUFFIXES, Page
 from ...core.figures.subject import NEEDS, Subject, require
 from ...core.phantoms.kinds import KINDS as PHANTOMS
@@ -37,17 +37,19 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
         COMMANDS[__name__],
         "mphdrr figure cut-away scanner.xlsx derenzo -o figure.png --size 1600x900\n"
         "example: mphdrr figure scanner scanner.xlsx --modules 1-40 -o modules.svg\n"
+        "example: mphdrr figure light-up scanner.xlsx derenzo -o modules.mp4 --seconds 8 --size 640x400\n"
         "example: mphdrr figure mosaic run.h5 -o mosaic.png -o mosaic.svg",
     )
     add = parser.add_argument
     add("kind", nargs="?", metavar="KIND", help=f"one of {', '.join(KINDS)}; --list explains them")
     text = "what it is of: a workbook, a phantom (its kind or a .toml), a volume, a recipe, a run, or a .blend alone"
     add("files", nargs="*", metavar="FILE", help=text)
-    text = f"{', '.join(SUFFIXES)}; in .svg the labels are text; may be repeated"
+    text = f"{', '.join(SUFFIXES)}, {', '.join(FILMS)} of animations; in .svg the labels are text; may be repeated"
     add("-o", "--output", action="append", default=[], metavar="FILE", help=text)
     add("--list", action="store_true", help="list the kinds of figures")
     add("--size", type=_size, metavar="WIDTHxHEIGHT", help="pixels; the kind's own by default")
-    add("--modules", metavar="RANGE", help="such as 1-40 or 1-20,41; default: all. c-arm shows the first")
+    text = "such as 1-40 or 1-20,41; default: all, but a picture's rays are of a ring, and c-arm shows the first"
+    add("--modules", metavar="RANGE", help=text)
     add(
         "--position", type=float, nargs=3, default=[0.0, 0.0, 0.0], metavar="MM", help="of a phantom: its middle, x y z"
     )
@@ -55,7 +57,10 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     add("--euler-degrees", type=float, nargs=3, default=[0.0, 0.0, 0.0], metavar="DEG", help=text)
     add("--voxels", type=int, default=200, metavar="N", help="of a phantom, along each side")
     add("--no-labels", action="store_true", help="without title and axes, where the figure is rendered")
-    add("--samples", type=int, default=16, metavar="N", help="rays per pixel, where the figure is rendered")
+    add("--samples", type=int, default=SAMPLES, metavar="N", help="rays per pixel, where the figure is rendered")
+    add("--style", choices=list(PAPERS), default="dark", help="of figures that are rendered")
+    add("--seconds", type=float, default=How().seconds, metavar="S", help="how long an animation is")
+    add("--fps", type=int, default=How().fps, metavar="N", help="pictures of an animation per second")
     parser.set_defaults(run=_run)
 
 
@@ -79,34 +84,34 @@ def _run(arguments: argparse.Namespace) -> None:
     kind = figure_kind(arguments.kind)
     if not arguments.output:
         raise mph.InputError("nothing to write: give --output FILE")
-    paths = [output_path(name, SUFFIXES) for name in arguments.output]
-    page = Page(*(arguments.size or kind.size))
+    paths = [output_path(name, kind.suffixes) for name in arguments.output]
+    how = How(*(not arguments.no_labels, *(getattr(arguments, name) for name in How._fields[1:])))
+    page = kind.page(arguments.size, how)
     blends = [file for file in arguments.files if file.lower().endswith(".blend")]
     if blends:
         if len(arguments.files) > 1:
             raise mph.InputError(f"{blends[0]}: a .blend holds all that is shown; give no other file")
         refuse(arguments, _POSED, "is for phantoms that are named on the command line, not for a .blend")
-        _of_scene(arguments, kind, Path(blends[0]), paths)
+        _of_scene(arguments, kind, Path(blends[0]), paths, how)
     else:
         subject = _subject(arguments)
         have = [need for need in NEEDS if getattr(subject, need) is not None]
         require(kind.needs, have, kind.name, _MISSING)
-        if kind.draw is not None:
-            kind.draw(page, subject)
+        if kind.draw is None:
+            _render(kind, page, subject, paths, how)
         else:
-            _render(arguments, kind, page, subject)
-        for path in paths:
-            page.write(path)
+            kind.draw(page, subject)
+            for path in paths:
+                page.write(path)
     for path in paths:
         print(path)
 
 
-def _of_scene(arguments: argparse.Namespace, kind: FigureKind, blend: Path, paths: list[Path]) -> None:
+def _of_scene(arguments: argparse.Namespace, kind: FigureKind, blend: Path, paths: list[Path], how: How) -> None:
     """A figure of the scene in a .blend, as the window makes it."""
     new_scene()
     import bpy
 
-    from ..blender import jobs
     from ..figures import figures
 
     with quiet():
@@ -114,12 +119,11 @@ def _of_scene(arguments: argparse.Namespace, kind: FigureKind, blend: Path, path
             bpy.ops.wm.open_mainfile(filepath=str(blend.absolute()))
         except RuntimeError as error:
             raise mph.InputError(f"{blend}: cannot be opened ({str(error).strip().splitlines()[0]})") from None
-        labels = not arguments.no_labels
-        given = arguments.size, arguments.modules, labels, arguments.samples
-        jobs.run(figures.figure_job(bpy.context, kind.name, paths, *given))
+        job = figures.figure_job(bpy.context, kind.name, paths, arguments.size, arguments.modules, **how._asdict())
+        _follow(job.finish(job.work(lambda done, total: None)))
 
 
-def _render(arguments: argparse.Namespace, kind: FigureKind, page: Page, subject: Subject) -> None:
+def _render(kind: FigureKind, page: Page, subject: Subject, paths: list[Path], how: How) -> None:
     """A figure that Blender renders."""
     new_scene()
     from ..figures import figures
@@ -130,8 +134,14 @@ def _render(arguments: argparse.Namespace, kind: FigureKind, page: Page, subject
     if kind.studio.volume and subject.volume is not None:
         item = volumes.add_volume(subject.volume, subject.name or "Volume")
     with quiet():
-        for _ in figures.rendering(page, subject, kind.studio, item, not arguments.no_labels, arguments.samples):
-            pass
+        _follow(figures.drawing(page, subject, kind, item, paths, how, figures.Reel()))
+
+
+def _follow(steps: Any) -> None:
+    """Take the steps of a drawing, and show how far it is."""
+    show = progress_bar("rendering")
+    for step in filter(None, steps):
+        show(*step[1:])
 
 
 def _subject(arguments: argparse.Namespace) -> Subject:

@@ -11,6 +11,7 @@ from typing import Any
 
 from ... import core as mph
 from ..phantoms.kinds import KINDS
+from ..physics.ct_numbers import CT_ENERGY
 from ..runs.formats import FORMATS
 from ..runs.mosaic import write_sheet
 from ..runs.presets import PRESETS
@@ -115,6 +116,8 @@ def _chosen(arguments: argparse.Namespace) -> tuple[mph.Recipe, dict[str, Any]]:
                 f"{file}: it holds measured counts, not what was measured; name a volume, a phantom, or --counts"
             )
         kept["volume"] = run.volume
+        if run.recipe["model.kind"] == recipe["model.kind"] == "spectral":  # whose runs hold mu at that energy
+            recipe = recipe.updated({"volume.energy": CT_ENERGY})
     return recipe, kept
 
 

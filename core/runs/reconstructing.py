@@ -22,6 +22,7 @@ from ..reconstruction.stopping import StoppingRule, StopWhen
 from ..volumes.resampling import resample
 from ..volumes.volume import Volume
 from ..volumes.volume_files import read_volume
+from ..xray.scan import SpectralScan
 from .recipe import Recipe
 from .run import ProjectionRun
 from .run_recipe import projector_of_run, recipe_model, truth_of_run
@@ -291,11 +292,16 @@ def _by_depth(recipe: Recipe) -> bool:
 
 
 def line_integrals(run: ProjectionRun, recipe: Recipe) -> Floats32:
-    """What a run's pixels say of its volume linearly: counts as they are, of photons that pass the line integrals.
+    """What a run's pixels say of its volume linearly: counts as they are, of photons that pass the line integrals, of X rays
+    those of the mu of `SpectralScan.line_integrals`.
 
     Where no photon has passed, half a photon is taken for it.
     """
     photons = recipe["model.photons"]
+    if recipe["model.kind"] == "spectral":
+        model = recipe_model(recipe, run.system)
+        assert isinstance(model, SpectralScan)
+        return model.line_integrals(run.projections, run.views, not recipe["reconstruction.ignore_beam_hardening"])
     if photons is None:
         return run.projections
     return np.asarray(np.log(photons / np.maximum(run.projections, 0.5)), np.float32)

@@ -26,7 +26,7 @@ MODULE = "bl_ext.user_default.mphdrr"
 # Where the script binds the top folder of this repository's path into Blender's root.
 BOUND = Path(os.environ.get("REAL_BLENDER_ROOT", "/opt/real-blender")).joinpath(*ROOT.parts[1:2])
 
-PATIENCE = 300  # s after which a window that has not said that it is done is closed
+PATIENCE = 600  # s after which a window that has not said that it is done is closed
 
 Run = Callable[..., subprocess.CompletedProcess[str]]
 

@@ -82,8 +82,8 @@ def test_help_imports_nothing_that_commands_work_with():
 
 
 @functools.cache
-def tree_of(path: Path) -> ast.Module:
-    return ast.parse(path.read_text(encoding="utf-8"))
+def nodes_of(path: Path) -> list[ast.AST]:
+    return list(ast.walk(ast.parse(path.read_text(encoding="utf-8"))))
 
 
 def module_of(path: Path) -> str:
@@ -98,7 +98,7 @@ def imported_modules(path: Path) -> set[str]:
     """Modules whose names a file imports; a package counts only where names of its own are taken."""
     package = path.relative_to(ROOT).parent.parts
     found = set()
-    for node in ast.walk(tree_of(path)):
+    for node in nodes_of(path):
         if isinstance(node, ast.ImportFrom) and node.level:
             base = package[: len(package) - node.level + 1]
             module = ".".join((*base, node.module) if node.module else base)
@@ -117,7 +117,7 @@ def test_the_extension_starts_no_other_process_opens_no_connection_and_runs_no_t
     """As docs/extension-review.md says."""
     banned = {"subprocess", "multiprocessing", "socket", "http", "urllib", "requests", "ftplib", "webbrowser"}
     for path in SOURCES:
-        for node in ast.walk(tree_of(path)):
+        for node in nodes_of(path):
             names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
             names += [node.module or ""] if isinstance(node, ast.ImportFrom) and not node.level else []
             # Of mphdrr events make --workers, and of the look at HDF5 files that have no seal.
@@ -156,7 +156,7 @@ def test_import_loads_nothing_heavy(module: str, unwanted: set[str]):
 @pytest.mark.parametrize("path", [path for path in SOURCES if "bpy" in path.read_text(encoding="utf-8")], ids=str)
 def test_labels_can_be_translated(path):
     """A label is a text that a catalogue can have: what is put into it comes after `pgettext_iface`."""
-    for call in ast.walk(tree_of(path)):
+    for call in nodes_of(path):
         for keyword in call.keywords if isinstance(call, ast.Call) else ():
             if keyword.arg in ("text", "heading", "placeholder") and isinstance(keyword.value, ast.JoinedStr):
                 words = [part.value for part in keyword.value.values if isinstance(part, ast.Constant)]
@@ -205,7 +205,7 @@ def test_only_one_file_writes_files():
     But for the two files of event sets that only grow at their ends, whose readers leave out what is not whole there.
     """
     for path in set(SOURCES) - {ROOT / "core" / name for name in ("files.py", "events/index.py", "events/store.py")}:
-        calls = [node for node in ast.walk(tree_of(path)) if isinstance(node, ast.Call)]
+        calls = [node for node in nodes_of(path) if isinstance(node, ast.Call)]
         assert [call.lineno for call in calls if writes(call)] == [], path
 
 

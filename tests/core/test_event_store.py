@@ -244,7 +244,7 @@ def test_writers_of_the_same_events_overlap_without_harm(tmp_path, made, monkeyp
 def test_works_overlap_without_harm(tmp_path, made):
     """Requeued jobs and repairs beside them, as processes: each ends with status 0, and the bytes are the same."""
     small_recipe(tmp_path)
-    for turn in range(4):
+    for turn in range(2):
         folder = str(tmp_path / str(turn))
         make = ["events", "make", folder, "--recipe", str(tmp_path / "small.toml"), "-n", str(COUNT), "--quiet"]
         slow = (
@@ -258,7 +258,7 @@ def test_works_overlap_without_harm(tmp_path, made):
         works += [
             subprocess.Popen([sys.executable, "-c", slow, "events", "check", folder, "--repair"]) for _ in range(2)
         ]
-        assert [work.wait(120) for work in works] == [0] * 5
+        assert [work.wait(600) for work in works] == [0] * 5
         assert tree(Path(folder)) == tree(made)
 
 

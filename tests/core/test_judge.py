@@ -9,7 +9,7 @@ import pytest
 
 import mphdrr.core as mph
 from mphdrr.core.learning.judging.judge import judge
-from mphdrr.core.learning.judging.methods import Family, JudgedMethod, smoothed
+from mphdrr.core.learning.judging.methods import Family, JudgedMethod, smoothed, tuned
 from mphdrr.core.learning.judging.recipe import read_judge_recipe
 from mphdrr.core.learning.judging.scoring import Case
 from mphdrr.core.learning.judging.sets import SETS, events_by_recipe, set_fingerprint, set_text
@@ -303,3 +303,25 @@ def test_every_event_of_the_pairs_has_one_altered_rod_and_one_left_out_had_neigh
         assert (np.abs(apart - 2) < 1e-9).sum() == 2 if phantom.altered > 0 else apart.min() == 0
         drawn.add(phantom.altered)
     assert drawn == {*range(-6, 0), *range(1, 7)}
+
+
+@pytest.mark.parametrize("name", ["osem", "bsrem"])
+def test_the_best_choice_is_found_where_few_are_tried_on_all_events(name):
+    grid, asked = mph.Grid.centered(4, 1.0), []
+    truth = mph.Volume(np.ones(grid.shape, np.float32), grid, "activity")
+    errors = np.random.default_rng(1).normal([3.0, 2.0, 1.1, 1.0, 2.0, 3.0], 0.1, (25, 6))
+
+    class Known(Family):
+        def volumes(self, run, threads=None):
+            for choice in self.choices:
+                asked.append(choice)
+                yield mph.Volume(truth.array * (1 + errors[run, int(choice[0])]), grid, "activity")
+
+    cases = [Case(None, run, grid, 0, {}) for run in range(25)]
+    for case in cases:
+        object.__setattr__(case, "truth", truth)
+    found = tuned(Known(name, grid, 1, 1, tuple((float(i),) for i in range(6))), cases)
+    means = errors.mean(0)
+    assert found["choice"] == [means.argmin()] and found["events"] == 25
+    assert found["nrmse"] == pytest.approx(means.min(), rel=1e-5)
+    assert len(asked) == (25 * 6 if name == "osem" else 10 * 6 + 15 * 3)

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 from ...geometry.grid import Grid
 from ...physics.crystal import gaussian_blur
 from ...progress import Progress, tell
+from ...projector.parallel import in_order, thread_count
 from ...reconstruction.scores.images import nrmse
 from ...runs.recipe import Recipe
 from ...runs.reconstructing import reconstruct_run
@@ -18,6 +20,7 @@ from ...volumes.volume import Volume
 from .scoring import Case
 from .sets import short_hash
 
+_FIRST, _BEST = 10, 3  # events that all choices are compared on, and choices that are compared on all events
 _FWHM = 2.3548  # of a Gaussian, in its standard deviations
 
 
@@ -54,11 +57,11 @@ class Family:
         """All that the volumes depend on, as JSON holds it."""
         return {**vars(self), "grid": [list(self.grid.shape), self.grid.affine.tolist()]}
 
-    def volumes(self, run: ProjectionRun) -> Iterator[Volume]:
+    def volumes(self, run: ProjectionRun, threads: int | None = None) -> Iterator[Volume]:
         """The volume of each choice; one run of OSEM gives all of its own."""
         if self.name == "bsrem":
             for (weight,) in self.choices:
-                yield reconstruct_run(run, self._recipe(prior="relative-difference", weight=weight)).volume
+                yield reconstruct_run(run, self._recipe(threads, prior="relative-difference", weight=weight)).volume
             return
         found: dict[int, NDArray[Any]] = {}
 
@@ -66,7 +69,7 @@ class Family:
             if any(iteration == stop for stop, _ in self.choices):
                 found[iteration] = np.array(values)
 
-        reconstruct_run(run, self._recipe(), watch=watch)
+        reconstruct_run(run, self._recipe(threads), watch=watch)
         for stop, width in self.choices:
             yield Volume(smoothed(found[int(stop)], self.grid, width), self.grid, "activity")
 
@@ -78,10 +81,11 @@ class Family:
         name = f"{self.name} {iterations} x {self.subsets}, {last}"
         return JudgedMethod(name, lambda run: next(only.volumes(run)), short_hash(only.record))
 
-    def _recipe(self, **settings: Any) -> Recipe:
+    def _recipe(self, threads: int | None, **settings: Any) -> Recipe:
         given = {"voxels": self.grid.shape, "spacing": self.grid.spacing.tolist(), "center": self.grid.center.tolist()}
         given |= {"method": self.name, "iterations": self.iterations, "subsets": self.subsets, **settings}
-        return Recipe({f"reconstruction.{key}": value for key, value in given.items()})
+        own = {} if threads is None else {"compute.threads": threads}
+        return Recipe(own | {f"reconstruction.{key}": value for key, value in given.items()})
 
 
 def smoothed(values: NDArray[Any], grid: Grid, width: float) -> NDArray[np.float32]:
@@ -97,13 +101,22 @@ def smoothed(values: NDArray[Any], grid: Grid, width: float) -> NDArray[np.float
 def tuned(family: Family, cases: Iterable[Case], progress: Progress | None = None) -> dict[str, Any]:
     """The choice of a family with the least mean NRMSE over events, and that of all others, as JSON holds them.
 
-    `progress` is called as ``progress(events done, 0)``.
+    Choices that cost a reconstruction each are compared on the first events, the best of them on all. Several events are
+    worked on at once. `progress` is called as ``progress(events done, 0)``.
     """
-    errors = []
-    for case in cases:
-        errors.append([nrmse(volume, case.truth) for volume in family.volumes(case.run)])
-        tell(progress, len(errors), 0)
-    means = np.mean(errors, axis=0).tolist()
-    rows = [[*choice, mean] for choice, mean in zip(family.choices, means, strict=True)]
-    *choice, least = min(rows, key=lambda row: row[-1])
-    return {"choice": choice, "nrmse": least, "events": len(errors), "all": rows}
+    others, kept, errors = iter(cases), family, np.empty((0, len(family.choices)))
+    for some in (islice(others, _FIRST), others):
+
+        def of(case: Case, family: Family = kept) -> list[float]:
+            return [nrmse(volume, case.truth) for volume in family.volumes(case.run, threads=1)]
+
+        for found in in_order(of, some, thread_count(None)):
+            known = dict(zip(kept.choices, found, strict=True))
+            errors = np.vstack([errors, [known.get(choice, np.nan) for choice in family.choices]])
+            tell(progress, len(errors), 0)
+        means = np.nanmean(errors, axis=0)
+        if family.name == "bsrem":
+            kept = replace(family, choices=tuple(family.choices[i] for i in sorted(np.argsort(means)[:_BEST])))
+    least, choice = min((float(mean), c) for c, mean in zip(family.choices, means, strict=True) if c in kept.choices)
+    rows = [[*choice, mean] for choice, mean in zip(family.choices, means.tolist(), strict=True)]
+    return {"choice": list(choice), "nrmse": least, "events": len(errors), "all": rows}

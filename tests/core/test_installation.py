@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import os
 import shutil
@@ -21,10 +22,10 @@ pytestmark = pytest.mark.long
 ROOT = Path(__file__).parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
 PYTHONS = ("3.11", "3.12", "3.13")
-FROM_PACKAGE = "import mphdrr.core as mph\n"
+PIP = (sys.executable, "-m", "pip")
 PROJECTED = """
 rods = mph.DerenzoPhantom(40, (8, 6, 5, 4, 3, 2), 40).voxelize(mph.Grid.centered((12, 12, 12), 8.0))
-A = mph.Projector(rods.grid, mph.read_system(WORKBOOK)[:3].views(shape=(16, 16)), threads=1)
+A = mph.Projector(rods.grid, mph.read_system(workbook)[:3].views(shape=(16, 16)), threads=1)
 images = A(rods)
 """
 SAID = """
@@ -52,87 +53,72 @@ def run(*command: object, folder: Path) -> str:
     return done.stdout
 
 
-@pytest.fixture(scope="session")
-def house(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder of the source archive and of all that is needed besides, downloaded."""
-    pytest.importorskip("pip")
-    folder = tmp_path_factory.mktemp("house")
+def download(folder: Path) -> None:
+    """Put the source archive, and all that is needed besides, into a folder."""
     leave = shutil.ignore_patterns(
         ".*", "out", "dist", "build", "wheels", "*.egg-info", "__pycache__", "*.so", "*.dll", "*.dylib"
     )
     shutil.copytree(ROOT, folder / "tree", ignore=leave)
     code = f"from setuptools.build_meta import build_sdist; build_sdist({str(folder)!r})"
     subprocess.run([sys.executable, "-c", code], cwd=folder / "tree", check=True, capture_output=True)
-    fetch = [sys.executable, "-m", "pip", "download", "-qq", "--only-binary=:all:", "-d", str(folder)]
-    wanted = [[*PROJECT["build-system"]["requires"]]]
-    wanted += [["--python-version", python, *PROJECT["project"]["dependencies"]] for python in PYTHONS]
-    for words in wanted:
-        fetched = subprocess.run([*fetch, *words], capture_output=True, text=True)
+    for_pythons = [["--python-version", python, *PROJECT["project"]["dependencies"]] for python in PYTHONS]
+    for words in [PROJECT["build-system"]["requires"], *for_pythons]:
+        command = [*PIP, "download", "-qq", "--only-binary=:all:", "-d", str(folder), *words]
+        fetched = subprocess.run(command, capture_output=True, text=True)
         if fetched.returncode:
             pytest.skip(f"cannot be downloaded here: {fetched.stderr.strip().splitlines()[-1]}")
-    return folder
 
 
-@pytest.fixture(scope="session")
-def wheel(house: Path) -> Path:
-    """Built from the source archive, the kernels with the compiler that came as a wheel."""
-    command = (
-        sys.executable,
-        "-m",
-        "pip",
-        "wheel",
-        "-qq",
-        "--no-index",
-        "--find-links",
-        house,
-        "--no-deps",
-        "-w",
-        house,
-    )
-    run(*command, house / f"mphdrr-{VERSION}.tar.gz", folder=house)
-    (built,) = house.glob("mphdrr-*.whl")
-    return built
+def interpreter(version: str) -> str | None:
+    """A Python of this version, if there is any."""
+    kept = sorted(Path.home().glob(f".pyenv/versions/{version}.*/bin/python"))
+    return str(kept[-1]) if kept else shutil.which(f"python{version}")
 
 
-@pytest.fixture(params=PYTHONS)
-def python(request: pytest.FixtureRequest, wheel: Path, tmp_path: Path) -> Path:
-    """The Python of a clean environment in which the wheel is installed."""
-    kept = sorted(Path.home().glob(f".pyenv/versions/{request.param}.*/bin/python"))
-    found = kept[-1] if kept else shutil.which(f"python{request.param}")
-    if found is None:
-        pytest.skip(f"there is no Python {request.param} here")
-    subprocess.run([found, "-m", "venv", "--without-pip", tmp_path / "env"], check=True)
-    python = tmp_path / "env" / "bin" / "python"
-    pip = (sys.executable, "-m", "pip", "--python", python, "install", "-qq", "--no-compile")
-    run(*pip, "--no-index", "--find-links", wheel.parent, wheel, folder=tmp_path)
-    return python
+def test_the_source_archive_becomes_a_wheel_that_projects_alike_in_every_python(tmp_path: Path):
+    """One test, for one download and one compilation of the kernels, by the compiler that pip fetched."""
+    pytest.importorskip("pip")
+    house = tmp_path / "house"
+    house.mkdir()
+    download(house)
+    offline = ("-qq", "--no-index", "--find-links", house)
+    run(*PIP, "wheel", *offline, "--no-deps", "-w", house, house / f"mphdrr-{VERSION}.tar.gz", folder=house)
+    (wheel,) = house.glob("mphdrr-*.whl")
+    shutil.copy(ROOT / "examples" / "dc-spect-80.xlsx", tmp_path / "scanner.xlsx")
+    here: dict = {"mph": mph, "workbook": str(tmp_path / "scanner.xlsx")}
+    exec(PROJECTED, here)
+
+    tried = []
+    for version in PYTHONS:
+        if (found := interpreter(version)) is None:
+            continue
+        folder = tmp_path / version
+        subprocess.run([found, "-m", "venv", "--without-pip", folder], check=True)
+        python = folder / "bin" / "python"
+        run(*PIP, "--python", python, "install", *offline, "--no-compile", wheel, folder=folder)
+        assert run(python.with_name("mphdrr"), "--version", folder=folder) == f"mphDRR {VERSION}\n"
+        code = f"import mphdrr.core as mph\nworkbook = {here['workbook']!r}\n{PROJECTED}{SAID}"
+        said = json.loads(run(python, "-c", code, folder=folder))
+        assert said["version"] == VERSION and said["backend"] == "cpu" and str(folder) in said["place"]
+        np.testing.assert_array_equal(np.array(said["images"], np.float32), here["images"])
+        tried.append(python)
+    assert tried, f"expected one of Python {', '.join(PYTHONS)}"
+    assert_metadata(said["metadata"], said["files"], said["commands"])
+    assert_types_are_seen(tried[-1], tmp_path)
 
 
-def test_an_installed_package_projects_as_the_source_does(python: Path, tmp_path: Path):
-    assert run(python.with_name("mphdrr"), "--version", folder=tmp_path) == f"mphDRR {VERSION}\n"
-    workbook = str(tmp_path / "scanner.xlsx")
-    shutil.copy(ROOT / "examples" / "dc-spect-80.xlsx", workbook)
-    projected = PROJECTED.replace("WORKBOOK", repr(workbook))
-    said = json.loads(run(python, "-c", FROM_PACKAGE + projected + SAID, folder=tmp_path))
-    assert said["version"] == VERSION and said["backend"] == "cpu" and str(tmp_path) in said["place"]
-    here: dict = {"mph": mph}
-    exec(projected, here)
-    np.testing.assert_array_equal(np.array(said["images"], np.float32), here["images"])
-
-    about, files = said["metadata"], said["files"]
+def assert_metadata(about: dict, files: list[str], commands: list[str]) -> None:
     assert about["License-Expression"] == ["GPL-3.0-or-later"] and about["License-File"] == ["LICENSE"]
     assert {f"Programming Language :: Python :: {version}" for version in PYTHONS} <= set(about["Classifier"])
     assert set(about["Provides-Extra"]) == set(PROJECT["project"]["optional-dependencies"])
-    assert said["commands"] == ["mphdrr.addon.cli:main"] and "mphdrr/py.typed" in files
+    assert commands == ["mphdrr.addon.cli:main"] and "mphdrr/py.typed" in files
     assert [file for file in files if file.endswith("licenses/LICENSE")]
-
-    if (python.parents[1] / "lib" / f"python{PYTHONS[-1]}").is_dir():
-        assert_types_are_seen(python, tmp_path)
 
 
 def assert_types_are_seen(python: Path, folder: Path) -> None:
-    """By a type checker, those of the installed package; one Python is enough."""
-    pytest.importorskip("mypy")
+    """By a type checker, those of the installed package."""
+    if importlib.util.find_spec("mypy") is None:
+        return
     (folder / "script.py").write_text(TYPED)
     command = [sys.executable, "-m", "mypy", "--python-executable", str(python), "script.py"]
     alone = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "MYPYPATH")}

@@ -148,7 +148,7 @@ liver = volume.array > 0
 def progress(done, total):
     if 2 * done > total:
         raise mph.Cancelled
-expected, truth, volumes = mph.read_run("run.h5").projections, mph.Volume(volume.array, mph.Grid.centered(16, 6.0)), np.ones((1, 2, 16, 16, 16))
+expected, truth, volumes = mph.read_run("run.h5").projections, mph.Volume(volume.array, grid), np.ones((1, 2, 16, 16, 16))
 mph.write_volume(truth, "truth.nii.gz")
 mph.write_volume(mph.read_volume("heart.nii.gz"), "volume.nii.gz")
 """,

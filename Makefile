@@ -30,6 +30,9 @@ ANY_PYTHON = $$(for p in "$(PYTHON)" python3 python3.11 python3.13; do "$$p" -c 
 ENVIRONMENT = @p=$(ANY_PYTHON); [ -n "$$p" ] || { echo "no Python found; name one: make PYTHON=/path/to/python3.11"; exit 1; }; \
 	"$$p" tools/environment.py $(VENV) --python "$(PYTHON)"
 
+# Python keeps what it has compiled: else each process of the tests compiles everything anew.
+unexport PYTHONDONTWRITEBYTECODE
+
 .PHONY: demo gallery test test-long lint test-app test-kernels test-gate test-peers bench bench-events bench-reconstruction docs tutorial dist clean env env-dev env-gate env-peers
 
 demo: env
@@ -80,8 +83,9 @@ test-app: env-dev
 	$(BIN)/python -m pytest tests/app -m alone
 
 test-kernels: env-dev
-	$(BIN)/python -m pytest tests/kernels
-	@for level in $$($(BIN)/python -c "from mphdrr.core.projector.backends import cpu; print(*cpu.levels())"); do \
+	$(BIN)/python -m pytest tests/kernels -n auto --dist worksteal
+	@# make test runs at the highest level
+	@for level in $$($(BIN)/python -c "from mphdrr.core.projector.backends import cpu; print(*cpu.levels()[:-1])"); do \
 		echo "accuracy of $$level"; MPHDRR_CPU_LEVEL=$$level $(BIN)/python -m pytest -k cpu tests/core/test_projector.py \
 		tests/core/test_emission.py tests/core/test_emission_gradients.py tests/core/test_geometry_gradients.py tests/core/test_hole_by_depth.py || exit 1; done
 

@@ -1,4 +1,4 @@
-"""The example: the bundled scanner around a Derenzo phantom, projected and shown, in one step."""
+"""The examples: the bundled scanner around a phantom, which it or X-ray tubes beside it have projected, in one step."""
 
 from typing import Any
 
@@ -6,9 +6,11 @@ import bpy
 import numpy as np
 from mathutils import Euler
 
-from ..core import Recipe, euler_pose, read_system, run_recipe
+from ..core import Recipe, euler_pose, read_system, run_recipe, xray_ring
 from ..core.example import EULER_DEGREES, EXAMPLE
+from ..core.geometry.scanner import Scanner
 from ..core.progress import Progress, stages_of
+from ..core.runs.display import Display
 from .blender import jobs
 from .figures import studio
 from .phantoms import phantom_properties, phantoms
@@ -18,42 +20,80 @@ from .scanner import scanner
 
 _VOXELS, _PIXELS = 128, 128
 _VIEW = Euler((1.05, 0.0, 0.95))  # from above, into the opening of the rings
+EXAMPLES = (
+    ("DERENZO", "Derenzo Phantom", "What 80 modules see of a Derenzo phantom"),
+    ("XRAY", "X-ray Inside SPECT", "CT by 24 X-ray tubes above the modules, SPECT with it, dose"),
+)
+"""Identifier, label and description of each."""
+_RING: dict[str, Any] = {
+    "source_radius": 600, "panel_radius": 480, "panel_size": (864, 648), "shape": (96, 128), "kvp": 120, "mas": 0.5,
+}  # fmt: skip
+"""Wide panels: each source sees the whole torso, and all of its grid lies before them."""
+_MIDDLE = (35.0, -30.0, -30.0)  # of the torso, whose heart is at the isocentre, mm
 _STARTUP = ("Cube", "Light", "Camera")
 
 
-def example_job(context: bpy.types.Context) -> jobs.Job:
-    """The job that puts the example into the context's scene and shows it."""
-    scene, system = context.scene, read_system(EXAMPLE)
-    pose = euler_pose(*np.deg2rad(EULER_DEGREES))
-    settings = phantom_properties.plain_settings("derenzo", voxels=_VOXELS)
-    adding = phantoms.adding(settings, "Derenzo", pose)
-    detector = {"detector.rows": _PIXELS, "detector.columns": _PIXELS}
-    recipe = rendering.of_phantom(Recipe({"system.file": str(EXAMPLE), **detector}), settings, pose)
-    scene_uid, path, display = scene.session_uid, rendering.run_path(scene), scene.mphdrr_display.display()
+def example_job(context: bpy.types.Context, of_xrays: bool = False, replace: bool = False) -> jobs.Job:
+    """The job that puts the example into the context's scene and shows it: `EXAMPLES`' first, or that of X rays.
+
+    `replace`: also in place of a changed one.
+    """
+    scene, pinholes = context.scene, read_system(EXAMPLE)
+    system: Scanner = xray_ring(**_RING) if of_xrays else pinholes
+    kind, name = ("torso", "Cardiac Torso") if of_xrays else ("derenzo", "Derenzo")
+    pose = np.eye(4) if of_xrays else euler_pose(*np.deg2rad(EULER_DEGREES))
+    # Of activity beside the modules' field of view, which few of them see, the voxels at its edge would shine.
+    without = dict.fromkeys(("liver", "lung", "body"), 0.0) if of_xrays else {}
+    settings = phantom_properties.plain_settings(kind, voxels=_VOXELS, **without)
+    adding = phantoms.adding(settings, name, pose, attenuation=of_xrays)
+    given: dict[str, Any] = {"system.file": str(EXAMPLE), "detector.rows": _PIXELS, "detector.columns": _PIXELS}
+    if of_xrays:
+        given = {"model.kind": "spectral", "volume.energy": settings.phantom().mu_energy, "noise.seed": 1}
+    recipe = rendering.of_phantom(Recipe(given), settings, pose)
+    scene_uid, path = scene.session_uid, rendering.run_path(scene)
+    display = Display("grey", "log") if of_xrays else scene.mphdrr_display.display()
 
     def work(progress: Progress) -> Any:
         stages = stages_of(progress)
         stored = adding.work(progress)
-        (run,) = run_recipe(recipe, system, stored[0].volume, stages=stages)
+        (run,) = run_recipe(recipe, system, stored[-1].volume, stages=stages)
         return stored, run, rendering.kept(run, path, display, stages)
 
     def finish(result: Any) -> jobs.Finishing:
         stored, run, made = result
         scene = jobs.scene_again(scene_uid, "the projections are")
+        if of_xrays:
+            scene.mphdrr_display.colors, scene.mphdrr_display.scale = "GREY", "LOG"
         mosaic = yield from images.storing(run, made)
-        collection = scanner.build_scanner(scene, system)
+        collection = scanner.build_scanner(scene, pinholes, replace=replace)
         yield None
+        if of_xrays:
+            collection = scanner.build_scanner(scene, system, "X-ray", replace=replace)
+            yield None
         adding.finish(stored)
         yield None
         rendering.place(scene, run, collection)
-        runs.add(scene, run, path, rendering.taken_over(scene, run, bpy.context.object), collection)
+        projected = phantoms.with_children(bpy.context.object)[-1]
+        runs.add(scene, run, path, rendering.taken_over(scene, run, projected), collection)
+        if of_xrays:
+            _ask_for_spect(scene)
         _hide_startup(scene, collection)
         studio.light(scene)
         images.show_below(mosaic, bpy.context)
         scanner.set_up_scene(scene, collection, _VIEW.to_quaternion())
-        return f"Loaded the example: {len(system)} modules and what they see of a Derenzo phantom"
+        seers = "X-ray tubes" if of_xrays else "modules"
+        return f"Loaded the example: {len(system)} {seers} and what they see of a {name} phantom"
 
     return jobs.Job("Loading the example", work, finish, lambda: path.unlink(missing_ok=True))
+
+
+def _ask_for_spect(scene: bpy.types.Scene) -> None:
+    """Set the panels for SPECT of the torso in seconds, by ideal holes, and for the CT before it."""
+    for name, value in {"hole": "POINT", "pixel_points": 4, "width": 48, "height": 48}.items():
+        setattr(scene.mphdrr_projections, name, value)
+    settings = {"method": "TV", "fitted": "TV", "weight": 0.5, "voxels": 56, "spacing": 8.0, "center": _MIDDLE}
+    for name, value in settings.items():
+        setattr(scene.mphdrr_reconstruction, name, value)
 
 
 def _hide_startup(scene: bpy.types.Scene, collection: bpy.types.Collection) -> None:

@@ -9,6 +9,8 @@ from typing import Any
 import bpy
 
 from ..core.physics.maps import MAPS
+from ..core.xray.dose import decays
+from . import spect_ct
 from .events import event_notes
 from .preferences import website
 from .runs import runs
@@ -35,6 +37,7 @@ class Step:
     text: str
     icon: str
     settings: Mapping[str, Any] = field(default_factory=dict)
+    item: bpy.types.Object | None = None  # which it takes for the active one
 
 
 _RENDER = Step("mphdrr.render_projections", "Render Projections", "RENDER_STILL")
@@ -43,29 +46,36 @@ _RENDER = Step("mphdrr.render_projections", "Render Projections", "RENDER_STILL"
 def stages(context: bpy.types.Context) -> list[Stage]:
     """The stages in their order."""
     scene = context.scene
-    collection, run, known = scanner.active_scanner(scene), runs.shown(scene), _phantoms(scene)
-    stale, scores = _stale(scene), _reconstruction(scene).get("scores", ())
+    collection, run, known = scanner.active_scanner(scene), _run(scene), _phantoms(scene)
+    stale, found = (_stale(scene), spect_ct.shown_reconstruction(scene)) if run else ([], {})
+    scores = found.get("scores", ())
     made = event_notes.of_set(scene.mphdrr_events.folder)
     return [
         Stage("Scanner", collection.name if collection else ""),
         Stage("Phantom", known[0].name if len(known) == 1 else f"{len(known)} volumes" if known else ""),
         Stage("Run", stale[0] if stale else run.summary.partition(",")[0] if run else "", bool(stale)),
-        Stage("Reconstruction", ": ".join(scores[0]) if scores else "not scored" if _reconstruction(scene) else ""),
+        Stage("Reconstruction", ": ".join(scores[0]) if scores else "not scored" if found else ""),
         Stage("Event Set", made.text.partition(",")[0] if made else ""),
     ]
 
 
 def next_step(context: bpy.types.Context) -> Step:
     """The step that comes next."""
-    scene, run = context.scene, runs.shown(context.scene)
+    scene, run = context.scene, _run(context.scene)
     if run is None and scanner.active_scanner(scene) is None:
         return Step("mphdrr.load_example", "Load Example", "PLAY")
     if run is None or _stale(scene):
         if not _phantoms(scene):
             return Step("mphdrr.add_derenzo", "Add Phantom", "OUTLINER_DATA_VOLUME", {"confirmed": True})
         return _RENDER if run is None else Step(_RENDER.operator, "Render Again", "FILE_REFRESH")
-    if not _reconstruction(scene):
+    if not spect_ct.shown_reconstruction(scene):
         return Step("mphdrr.reconstruct", "Reconstruct", "OUTLINER_OB_VOLUME")
+    if spect_ct.chain(scene):
+        return Step("mphdrr.use_ct", "Use CT for SPECT", "MOD_FLUIDSIM")
+    if _is_without_dose(scene):
+        isotope = {"isotope": runs.settings_of(scene)["model.isotope"]}
+        item = scene.mphdrr_reconstruction.volume
+        return Step("mphdrr.add_dose_map", "Dose Map", "OUTLINER_DATA_VOLUME", isotope, item)
     if scene.mphdrr_events.recipe:
         return Step("mphdrr.make_event_set", "Make Event Set", "FILE_CACHE")
     return Step("mphdrr.export_dataset", "Export Dataset", "EXPORT")
@@ -86,13 +96,18 @@ def _phantoms(scene: bpy.types.Scene) -> list[bpy.types.Object]:
     return [item for item in volumes.volume_objects(scene) if item != found and volumes.quantity_of(item) not in MAPS]
 
 
-def _reconstruction(scene: bpy.types.Scene) -> Mapping[str, Any]:
-    """What is known of the reconstruction of the shown run; empty where there is none."""
-    settings, run = scene.mphdrr_reconstruction, runs.shown(scene)
-    if run is None or settings.volume not in volumes.volume_objects(scene):
-        return {}
-    known = settings.known
-    return known if run.file.endswith(known.get("run", "")) else {}
+def _run(scene: bpy.types.Scene) -> bpy.types.PropertyGroup | None:
+    """The shown run, unless it is of another scanner than the panels work on."""
+    run = runs.shown(scene)
+    is_other = run is not None and run.scanner not in (None, scanner.active_scanner(scene))
+    return None if is_other else run
+
+
+def _is_without_dose(scene: bpy.types.Scene) -> bool:
+    """Whether SPECT beside X-ray tubes has been reconstructed, of an isotope whose dose is known, and no dose made yet."""
+    has_tubes = any("activity" not in scanner.kind_of(each).takes for each in scanner.scanners(scene))
+    has_dose = any(volumes.quantity_of(each) == "dose_rate" for each in volumes.volume_objects(scene))
+    return has_tubes and not has_dose and runs.settings_of(scene).get("model.isotope") in decays()
 
 
 def _stale(scene: bpy.types.Scene) -> list[str]:

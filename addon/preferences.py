@@ -8,19 +8,23 @@ import tomllib
 from pathlib import Path
 
 import bpy
+import rna_keymap_ui
 from bpy.app.translations import pgettext_iface as iface
-from bpy.props import IntProperty
+from bpy.props import BoolProperty, IntProperty
 
 from ..core import cache
 from ..core.memory import readable_size
 from ..core.projector import backends, parallel
+from .blender import storage
 from .blender.layouts import invoking
 
+PIE, PIE_KEYMAP = "MPHDRR_MT_module", "Object Mode"  # the menu on a key, and Blender's keymap with that
 PACKAGE = __package__.rpartition(".")[0]  # "mphdrr", or "bl_ext.<repo>.mphdrr" when installed as an extension
 
 
-def _threads_set(self: MPHDRR_Preferences, context: bpy.types.Context) -> None:
+def _set(self: MPHDRR_Preferences, context: bpy.types.Context) -> None:
     parallel.set_usual_threads(self.threads or None)
+    storage.copies = self.copies
 
 
 class MPHDRR_Preferences(bpy.types.AddonPreferences):
@@ -30,7 +34,12 @@ class MPHDRR_Preferences(bpy.types.AddonPreferences):
 
     threads: IntProperty(
         name="Threads", description="Processor threads that projections use where the panel does not say; 0: all",
-        default=0, min=0, soft_max=64, update=_threads_set,
+        default=0, min=0, soft_max=64, update=_set,
+    )  # fmt: skip
+    copies: BoolProperty(
+        name="Save As Copies Files", description="Copy the voxels and runs of a scene into the folder beside the new "
+        ".blend; else both .blend files share those of the old one",
+        default=True, update=_set,
     )  # fmt: skip
 
     def draw(self, context: bpy.types.Context) -> None:
@@ -38,6 +47,7 @@ class MPHDRR_Preferences(bpy.types.AddonPreferences):
         layout = self.layout
         row = invoking(layout.row())
         row.operator("mphdrr.load_example", icon="PLAY")
+        row.operator("mphdrr.add_looks", icon="ASSET_MANAGER")
         if website():
             row.operator("wm.url_open", text="Website and Documentation", icon="URL").url = website()
         box = layout.box()
@@ -48,7 +58,13 @@ class MPHDRR_Preferences(bpy.types.AddonPreferences):
             states.label(text=state[:1].upper() + state[1:])
         layout.use_property_split = True
         layout.prop(self, "threads", text="Threads" if self.threads else "Threads (0: all)")
-        folder = cache_folder()
+        layout.prop(self, "copies")
+        known = context.window_manager.keyconfigs.user
+        keymap = known.keymaps.get(PIE_KEYMAP)
+        for item in keymap.keymap_items if keymap else ():
+            if getattr(item.properties, "name", "") == PIE:
+                rna_keymap_ui.draw_kmi([], known, keymap, item, layout, 0)
+        folder = own_folder()
         if folder is not None:
             row = layout.row()
             text = iface("Compiled code, {size} in {folder}")
@@ -56,23 +72,23 @@ class MPHDRR_Preferences(bpy.types.AddonPreferences):
             row.operator("mphdrr.clean_cache", text="Clean", icon="TRASH")
 
 
-def cache_folder() -> Path | None:
-    """The folder in the extension's own one for what can be made again; None where this is no installed extension."""
+def own_folder(name: str = "cache") -> Path | None:
+    """A folder in the extension's own one for what can be made again; None where this is no installed extension."""
     try:
-        return Path(bpy.utils.extension_path_user(PACKAGE, path="cache"))
+        return Path(bpy.utils.extension_path_user(PACKAGE, path=name))
     except ValueError:
         return None
 
 
 def cache_size() -> int:
-    """Bytes of the files in `cache_folder`."""
-    folder = cache_folder()
+    """Bytes of the files in `own_folder`."""
+    folder = own_folder()
     return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()) if folder else 0
 
 
 def clean_cache() -> str:
-    """Delete what is in `cache_folder`; returns the line to report."""
-    size, folder = cache_size(), cache_folder()
+    """Delete what is in `own_folder`; returns the line to report."""
+    size, folder = cache_size(), own_folder()
     if folder is not None:
         shutil.rmtree(folder, ignore_errors=True)  # a library that is loaded cannot be deleted on Windows
     return f"Deleted {readable_size(size - cache_size())}"
@@ -87,7 +103,7 @@ def website() -> str:
 
 def apply() -> None:
     """Do as the preferences say, when the extension is enabled."""
-    folder, addon = cache_folder(), bpy.context.preferences.addons.get(PACKAGE)
+    folder, addon = own_folder(), bpy.context.preferences.addons.get(PACKAGE)
     cache.keep_in(folder)
     if addon is not None and addon.preferences is not None:
-        parallel.set_usual_threads(addon.preferences.threads or None)
+        _set(addon.preferences, bpy.context)

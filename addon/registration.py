@@ -12,6 +12,7 @@ import bpy
 
 from .. import operators, panels
 from ..operators import add_phantom
+from ..panels import menus
 from . import preferences, properties, recovery
 from .blender import ids, jobs, layouts, plots, storage, timers, updates
 from .events import event_notes
@@ -57,6 +58,7 @@ ENTRIES = {
         "mphdrr.export_dataset": "mphDRR Dataset (.h5/.npz/.pt)",
         "mphdrr.export_figure": "mphDRR Figure (.png/.svg)",
     },
+    bpy.types.TOPBAR_MT_file_external_data: {"mphdrr.collect_files": "Collect mphDRR's Files Beside the .blend"},
     bpy.types.VIEW3D_MT_object_convert: {
         "mphdrr.voxelize_objects": "Voxelize Meshes",
         "mphdrr.mesh_from_volume": "Mesh from Volume",
@@ -92,15 +94,26 @@ def _draw_splash(menu: bpy.types.Menu, context: bpy.types.Context) -> None:
 
 
 MENUS = [(menu, _draw_entries(entries)) for menu, entries in ENTRIES.items()]
-MENUS.append((bpy.types.STATUSBAR_HT_header, jobs.draw_status))
+MENUS += [(bpy.types.STATUSBAR_HT_header, draw) for draw in (storage.draw_said, jobs.draw_status)]
 MENUS += [(menu, _draw_submenu(*submenu)) for menu, submenu in SUBMENUS.items()]
 MENUS.append((bpy.types.WM_MT_splash, _draw_splash))
+MENUS += [
+    (each, menus.draw_in_context_menu)
+    for each in (bpy.types.VIEW3D_MT_object_context_menu, bpy.types.OUTLINER_MT_object)
+]
 
 _UNDONE = (recoloring.check, runs.after_update, live_scanner.after_undo, slices.after_undo, framing.after_undo)
 _UPDATED = (
     live_scanner.after_update, selection.after_update, planes.after_update, frustums.after_update, slices.after_update,
 )  # fmt: skip
-_LOADED = (volumes.after_load, recovery.after_load, live_scanner.after_load, runs.after_load, recoloring.check)
+_LOADED = (
+    storage.after_load,
+    volumes.after_load,
+    recovery.after_load,
+    live_scanner.after_load,
+    runs.after_load,
+    recoloring.check,
+)
 _FRAME = (runs.after_update, live_scanner.after_frame, preview.after_update, slices.after_frame_change)
 # By lists of bpy.app.handlers; all of them stay when a file is loaded.
 _HANDLERS: dict[str, tuple[Any, ...]] = {
@@ -187,10 +200,15 @@ def register(command: Callable[..., int] | None = None) -> None:
             for space, draw, when in DRAWINGS:
                 drawing = space.draw_handler_add(draw, (), "WINDOW", when)
                 _registered.callback(space.draw_handler_remove, drawing, "WINDOW")
+            keymaps = bpy.context.window_manager.keyconfigs.addon.keymaps
             for name in ("Image", "Image Editor Tool: Sample"):  # the editor's usual tool takes clicks first
-                keymap = bpy.context.window_manager.keyconfigs.addon.keymaps.new(name, space_type="IMAGE_EDITOR")
+                keymap = keymaps.new(name, space_type="IMAGE_EDITOR")
                 click = keymap.keymap_items.new("mphdrr.pick_module", "LEFTMOUSE", "PRESS")
                 _registered.callback(keymap.keymap_items.remove, click)
+            keymap = keymaps.new(preferences.PIE_KEYMAP)
+            key = keymap.keymap_items.new("wm.call_menu_pie", "Q", "PRESS", shift=True)
+            key.properties.name = preferences.PIE
+            _registered.callback(keymap.keymap_items.remove, key)
         if command is not None:
             _registered.callback(bpy.utils.unregister_cli_command, bpy.utils.register_cli_command(ids.PREFIX, command))
     except Exception:

@@ -68,6 +68,7 @@ def page(results: Results, picture: Path | None) -> str:
     parts = [
         "# Benchmarks",
         f"Written by `make bench`, {date.today()}; do not edit. mphDRR {VERSION}.",
+        "What the window's main thread takes is in [window](window.md#what-the-window-takes).",
         machine(results),
         f"""The work: {case.n_views} pinhole views of {case.pixels} x {case.pixels} pixels (of modules all over
 `examples/dc-spect-80.xlsx`, from the pinhole to the virtual detector at 10 l) through {case.voxels}^3 voxels in a cube of

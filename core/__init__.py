@@ -9,10 +9,9 @@ Everything imported here is the public interface. Arguments that cannot be used 
 >>> images = mph.Projector(grid, views)(mph.DerenzoPhantom(40, (8, 6, 5, 4, 3, 2), 40).voxelize(grid))
 """
 
-import ast
-from importlib import import_module
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from .lazy import public
 
 if TYPE_CHECKING:
     from . import design, events, learning
@@ -128,24 +127,9 @@ if TYPE_CHECKING:
     from .xray.detectors import EnergyIntegrator, PhotonCounter
     from .xray.dose import absorbed_dose, absorbed_dose_rate, isocentre_kerma
     from .xray.motion import Motion, MotionFinder, find_change, find_motion
+    from .xray.scan import SpectralScan
     from .xray.spectra import Spectrum, tube_spectrum
     from .xray.spectral import SpectralTransmission, panel_blur, water_and_bone
     from .xray.system import XraySystem
 
-(_BLOCK,) = (each for each in ast.parse(Path(__file__).read_text("utf-8")).body if isinstance(each, ast.If))
-_MODULES = {name.name: line.module for line in _BLOCK.body if isinstance(line, ast.ImportFrom) for name in line.names}
-"""Public name -> module, of the imports above: each is imported when it is first asked for."""
-
-__all__ = [name for name, module in _MODULES.items() if module]
-
-
-def __getattr__(name: str) -> Any:
-    if name not in _MODULES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    module = import_module(f".{_MODULES[name] or name}", __name__)
-    found = globals()[name] = getattr(module, name) if _MODULES[name] else module
-    return found
-
-
-def __dir__() -> list[str]:
-    return sorted({*globals(), *_MODULES})
+__getattr__, __dir__, __all__ = public(__name__)

@@ -1,10 +1,13 @@
-"""mphDRR's version, the same as in pyproject.toml and blender_manifest.toml, and what tells builds of one version apart."""
+"""mphDRR's version, which package and documentation take from here, and what tells builds of one version apart.
+
+Blender's manifest and CITATION.cff repeat it; a test compares them.
+"""
 
 import hashlib
 from functools import cache
 from pathlib import Path
 
-VERSION = "0.1.0"
+VERSION = "0.2.0"
 
 
 @cache

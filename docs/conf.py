@@ -19,7 +19,8 @@ from mphdrr.addon.cli import COMMANDS
 from mphdrr.core.cli import build_parser
 from mphdrr.core.version import VERSION
 
-project, author, release = "mphDRR", "The mphDRR authors", VERSION
+project, author = "mphDRR", "The mphDRR authors"
+release = VERSION
 copyright = f"2026 {author}"
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
 html_theme = "furo"

@@ -19,6 +19,7 @@ from PIL import Image, ImageDraw
 import mphdrr.core as mph
 from mphdrr.core.events.contact_sheet import contact_sheet
 from mphdrr.core.events.templates import template_text
+from mphdrr.core.example import EULER_DEGREES
 from mphdrr.core.runs.display import Display
 
 HERE = Path(__file__).parent
@@ -153,7 +154,7 @@ def colored(picture: np.ndarray, grey: bool) -> Image.Image:
 
 
 def in_the_scanner(system: mph.PinholeSystem, folder: Path, ct: mph.Volume | None) -> None:
-    """The sensitivity map, and the CT, between the modules; and the demo's pictures."""
+    """A phantom, the sensitivity map, and the CT, between the modules; and the demo's pictures."""
     try:
         import bpy
     except ImportError:
@@ -174,19 +175,23 @@ def in_the_scanner(system: mph.PinholeSystem, folder: Path, ct: mph.Volume | Non
     scene = new_scene()
     scanner.build_scanner(scene, system)
 
-    def picture(name: str) -> None:
+    def picture(name: str, kind: str = "inside", size: tuple[int, int] = (960, 560)) -> None:
         with tempfile.TemporaryDirectory() as made, quiet():
             path = Path(made, "picture.png")
-            jobs.run(figures.figure_job(bpy.context, "inside", [path], (960, 560), labels=False, samples=12))
+            jobs.run(figures.figure_job(bpy.context, kind, [path], size, samples=12))
             drawn = Image.open(path).convert("RGB")
         keep(drawn, folder / f"{name}.webp")
 
+    pose = mph.euler_pose(*np.deg2rad(EULER_DEGREES), (0.0, 0.0, 0.0))
+    volumes.add_volume(PHANTOMS["Derenzo"].voxelize(mph.Grid.centered(256, 0.4), pose), "Derenzo phantom")
+    picture("picture", "picture", (1200, 750))
+    bpy.data.objects.remove(*volumes.volume_objects(scene))
     jobs.run(maps.mapping(scene, "sensitivity", voxels=128))
     slices.remove_slices(*volumes.volume_objects(scene))  # it is cut open in front of them
     picture("sensitivity")
     if ct is not None:
         bpy.data.objects.remove(*volumes.volume_objects(scene))
-        volumes.add_volume(ct, "chest CT")
+        volumes.add_volume(ct, "chest CT").mphdrr_volume.look = "BONE"
         picture("ct")
 
 

@@ -1,22 +1,30 @@
 """The active volume: slices through it, a CT's attenuation, its files cleaned up or found again."""
 
 import bpy
-from bpy.props import EnumProperty, FloatProperty, StringProperty
+from bpy.props import EnumProperty, FloatProperty, FloatVectorProperty, StringProperty
 
-from ..addon import recovery
+from ..addon import preferences, recovery
 from ..addon.blender import choices, decimals, jobs, storage
 from ..addon.blender.reports import Reported, ask_to_remove, needs
-from ..addon.volumes import slices, volume_import, volumes
+from ..addon.volumes import slices, volume_import, volume_materials, volumes
+from ..core.errors import InputError
 from ..core.xray.dose import decays
 
 
 class MPHDRR_OT_add_slices(Reported, bpy.types.Operator):
     """Show an axial, a coronal and a sagittal slice of the active volume as planes that go with it"""
 
+    place: FloatVectorProperty(
+        name="Place", description="Where the slices meet: share of the way along each of the grid's axes", size=3, min=0.0,
+        max=1.0, default=(0.5, 0.5, 0.5), options={"SKIP_SAVE"},
+    )  # fmt: skip
+
     poll = needs(volumes.ACTIVE)
 
     def act(self, context: bpy.types.Context) -> str:
-        return f"Added {len(slices.add_slices(context.object))} slices"
+        shape = context.object.mphdrr_volume.shape
+        at = [min(int(share * n), n - 1) for share, n in zip(self.place, shape, strict=True)]
+        return f"Added {len(slices.add_slices(context.object, at))} slices"
 
 
 class MPHDRR_OT_remove_slices(Reported, bpy.types.Operator):
@@ -83,6 +91,41 @@ class MPHDRR_OT_clean_volume_files(Reported, bpy.types.Operator):
 
     def act(self, context: bpy.types.Context) -> str:
         return storage.remove_unused()
+
+
+class MPHDRR_OT_collect_files(Reported, bpy.types.Operator):
+    """Copy every file outside that the scene uses, such as its workbook, into the folder beside the .blend, so that both can
+    be moved together. Says what is missing
+    """
+
+    poll = needs((lambda context: bpy.data.filepath, "Save the .blend first: its folder is beside it"))
+
+    def act(self, context: bpy.types.Context) -> str:
+        return storage.collect()
+
+
+class MPHDRR_OT_add_looks(Reported, bpy.types.Operator):
+    """Put the looks of volumes into the Asset Browser, as a library of its own: dragged onto a volume, a look replaces its
+    colours, also on its slices, and the display range stays
+    """
+
+    bl_label = "Looks for Asset Browser"
+    bl_options = {"REGISTER"}
+
+    directory: StringProperty(
+        name="Folder", description="Where the library is written; empty: the extension's own folder", subtype="DIR_PATH"
+    )
+
+    def act(self, context: bpy.types.Context) -> str:
+        folder = storage.absolute(self.directory) if self.directory else preferences.own_folder("assets")
+        if folder is None:
+            raise InputError("no folder given: this is no installed extension, so it has none of its own")
+        volume_materials.write_assets(folder)
+        libraries = context.preferences.filepaths.asset_libraries
+        if not any(storage.absolute(each.path) == folder for each in libraries):
+            library = libraries.new(name="mphDRR", directory=str(folder))
+            library.import_method = "APPEND"  # for each volume one of its own, whose display range can be set
+        return f"Looks are in the Asset Browser's library mphDRR: {folder}"
 
 
 class MPHDRR_OT_remake_volumes(jobs.JobOperator, bpy.types.Operator):

@@ -1,38 +1,44 @@
-"""File > Export > mphDRR Figure: a picture as papers show it, of what is in the scene."""
+"""File > Export > mphDRR Figure, Picture and Animation: what papers and talks show of what is in the scene."""
+
+from typing import Any
 
 import bpy
-from bpy.props import BoolProperty, EnumProperty, IntProperty, StringProperty
+from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, StringProperty
 
-from ..addon.blender import file_properties, jobs, reports
+from ..addon.blender import file_properties, ids, jobs, reports
+from ..addon.blender.choices import items
 from ..addon.figures import figures
 from ..addon.scanner import scanner
 from ..addon.volumes import volumes
 from ..core.errors import InputError
+from ..core.figures.kinds import FILMS, PAPERS, SAMPLES, How
 from ..core.figures.page import LARGEST, SUFFIXES
 
 _PIXELS = {"description": "Pixels; 0: what suits the figure", "min": 0, "max": LARGEST, "subtype": "PIXEL"}
+_STYLES = ((name, name.title(), f"On {name} paper") for name in PAPERS)
 _SHOWN: reports.Need = (
     lambda context: scanner.active_scanner(context.scene) or volumes.volume_objects(context.scene),
     "Nothing to show: import a workbook or add a phantom first",
 )
 
 
-class MPHDRR_OT_export_figure(jobs.ExportJob, bpy.types.Operator):
-    """Draw a figure of the scanner, the volume or the last projections as PNG, or as SVG whose labels are text"""
+class _Drawing(jobs.ExportJob):
+    """What operators that draw a figure share."""
 
-    endings = SUFFIXES
+    endings: tuple[str, ...] = SUFFIXES
     filepath: file_properties.file_property("File to write")
-    filter_glob: file_properties.shown_files(SUFFIXES)
-    figure: EnumProperty(name="Figure", description="What is shown", items=figures.KIND_ITEMS, default="SCANNER")
+    filter_glob: file_properties.shown_files((*SUFFIXES, *FILMS))
     width: IntProperty(name="Width", **_PIXELS)
     height: IntProperty(name="Height", **_PIXELS)
     modules: StringProperty(
-        name="Modules", description="Such as 1-40 or 1-20,41; empty: all, or of figures of one module the active one"
+        name="Modules",
+        description="Such as 1-40 or 1-20,41; empty: all, of a picture those selected or a ring, of one module the active",
     )
-    labels: BoolProperty(name="Labels", description="Write title and axes on rendered figures", default=True)
+    labels: BoolProperty(name="Labels", description="Write titles, axes and scales on rendered figures", default=True)
+    style: EnumProperty(name="Style", description="Of rendered figures", items=items({}, _STYLES), default="dark")
     samples: IntProperty(
         name="Samples", description="Rays per pixel of rendered figures: the more, the smoother and slower",
-        default=figures.SAMPLES, min=1, soft_max=256,
+        default=SAMPLES, min=1, soft_max=256,
     )  # fmt: skip
 
     poll = reports.needs(_SHOWN)
@@ -40,13 +46,40 @@ class MPHDRR_OT_export_figure(jobs.ExportJob, bpy.types.Operator):
     def ask(self, context: bpy.types.Context) -> set[str] | None:
         if self.filepath:
             return None
-        self.filepath = f"figure{SUFFIXES[0]}"
+        self.filepath = ids.label(type(self).__name__).split()[-1].lower() + self.endings[0]
         return super().ask(context)
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        path = self.given_file(f"set filepath to a name ending in {' or '.join(SUFFIXES)}")
-        if bool(self.width) != bool(self.height):
+        own: Any = self
+        path = self.given_file(f"set filepath to a name ending in {' or '.join(self.endings)}")
+        if bool(own.width) != bool(own.height):
             raise InputError("size: give both width and height, or neither")
-        size = (self.width, self.height) if self.width else None
-        name = self.figure.lower().replace("_", "-")
-        return figures.figure_job(context, name, [path], size, self.modules or None, self.labels, self.samples)
+        size = (own.width, own.height) if own.width else None
+        how = {name: value for name, value in self.as_keywords().items() if name in How._fields}
+        name = own.figure.lower().replace("_", "-")
+        return figures.figure_job(context, name, [path], size, own.modules or None, **how)
+
+
+class MPHDRR_OT_export_figure(_Drawing, bpy.types.Operator):
+    """Draw a figure of the scanner, the volume or the last projections as PNG, or as SVG whose labels are text"""
+
+    figure: EnumProperty(name="Figure", description="What is shown", items=figures.kind_items(), default="SCANNER")
+
+
+class MPHDRR_OT_render_picture(_Drawing, bpy.types.Operator):
+    """Render the volume in the scanner for a paper, with scale, colour bar and rays of the selected modules or a ring"""
+
+    figure = "PICTURE"
+
+
+class MPHDRR_OT_render_animation(_Drawing, bpy.types.Operator):
+    """Render pictures and an MP4 of the volume in the scanner: once around it, or one module lit after the other"""
+
+    endings = FILMS
+    figure: EnumProperty(
+        name="Animation", description="What happens", items=figures.kind_items(True), default="TURNTABLE"
+    )
+    seconds: FloatProperty(
+        name="Seconds", description="How long it takes", default=How().seconds, min=0.01, soft_max=60.0
+    )
+    fps: IntProperty(name="Frames per Second", default=How().fps, description="Pictures", min=1, max=60)

@@ -67,6 +67,10 @@ class MPHDRR_OT_import_counts(jobs.JobOperator, bpy.types.Operator):
         name="Smoothing (pixels)", description="FWHM of the Gaussian that smooths the estimate of scatter; 0: none",
         default=0.0, min=0.0,
     )  # fmt: skip
+    scatter_tails: BoolProperty(
+        name="Peak's Tails", description="What the peak's tails add to those windows is no scatter. Needs Isotope and "
+        "Energy FWHM, under Physics",
+    )  # fmt: skip
     dataset: StringProperty(name="Array", description="Its name in .npz and .h5. Empty: the only one of three axes")
     raw_type: EnumProperty(
         name="Type", description="Of the numbers in a raw file",
@@ -82,7 +86,13 @@ class MPHDRR_OT_import_counts(jobs.JobOperator, bpy.types.Operator):
         layouts.draw_all(layout, self, "frames", "orientation", "time")
         layouts.draw_all(layout.column(heading="If Needed"), self, "modules", "pixel", "expected", "dataset")
         layouts.draw_all(
-            layout.column(heading="Scatter"), self, "lower_frames", "upper_frames", "window_widths", "scatter_fwhm"
+            layout.column(heading="Scatter"),
+            self,
+            "lower_frames",
+            "upper_frames",
+            "window_widths",
+            "scatter_fwhm",
+            "scatter_tails",
         )
         layouts.draw_all(layout.column(heading="Raw File"), self, "raw_type", "raw_shape", "raw_big_endian")
 
@@ -102,6 +112,7 @@ class MPHDRR_OT_import_counts(jobs.JobOperator, bpy.types.Operator):
             "counts.upper_frames": self.upper_frames or None,
             "counts.window_widths": tuple(map(decimals.typed, self.window_widths)) if any(self.window_widths) else None,
             "counts.scatter_fwhm": decimals.typed(self.scatter_fwhm) or None,
+            "counts.scatter_tails": self.scatter_tails or None,
             "counts.dataset": self.dataset or None,
             "counts.raw_type": None if self.raw_type == _NONE else self.raw_type,
             "counts.raw_shape": tuple(self.raw_shape) if any(self.raw_shape) else None,

@@ -1,5 +1,6 @@
 """File > Import > Pinhole Geometry: a workbook becomes a scanner, with the column map dialog where headings are unclear."""
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Literal
 
@@ -13,6 +14,21 @@ from ..core import ColumnMap, InputError, PinholeSystem, kinds_in, read_scanner
 from ..core.geometry.collimator import Construction
 from ..core.geometry.scanner import Scanner
 from . import column_map_dialog
+
+
+def ask_to_replace(operator: bpy.types.Operator, context: bpy.types.Context) -> set[str]:
+    """Open the dialog of an operator whose button replaces a scanner that has changed."""
+    return context.window_manager.invoke_props_dialog(
+        operator, width=440, title="Replace the Scanner?", confirm_text="Replace"
+    )
+
+
+def draw_losses(layout: bpy.types.UILayout, losses: Iterable[str]) -> None:
+    """Draw in that dialog what goes with the scanner."""
+    layout.label(text="Importing again drops these changes:", icon="ERROR")
+    column = layout.column(align=True)
+    for line in losses:
+        column.label(text=line[:1].upper() + line[1:], icon="DOT")
 
 
 class MPHDRR_OT_import_geometry(bpy.types.Operator):
@@ -83,22 +99,19 @@ class MPHDRR_OT_import_geometry(bpy.types.Operator):
             column_maps.clear(form)
             self.report({"ERROR"}, reports.in_window(error))
             return {"CANCELLED"}
-        old = scanner.find_scanner(context.scene, self.name or scanner.default_name(system))
-        if old is not None and not self.replace and self._has_window():
-            self._losses = scanner.losses(old)
+        if not self.replace and self._has_window():
+            names = self.name or scanner.default_name(system), *map(self._name_of, self._others)
+            self._losses = scanner.losses_of(context.scene, *names)
             if self._losses:
                 self._dialog = "REPLACE"
                 self.replace = True  # the dialog's button calls execute again
-                return context.window_manager.invoke_props_dialog(
-                    self, width=440, title=f"Replace '{old.name}'?", confirm_text="Replace"
-                )
+                return ask_to_replace(self, context)
         return reports.run_reported(self, lambda: self._build(context, system))
 
     def _build(self, context: bpy.types.Context, system: Scanner) -> str:
         camera = context.scene.camera
         for other in self._others:
-            named = f"{self.name} {other.kind}" if self.name else ""
-            scanner.build_scanner(context.scene, other, named, replace=self.replace)
+            scanner.build_scanner(context.scene, other, self._name_of(other), replace=self.replace)
         context.scene.camera = camera  # which may be none: then the first of the scanner that is built last
         collection = scanner.build_scanner(
             context.scene,
@@ -124,10 +137,7 @@ class MPHDRR_OT_import_geometry(bpy.types.Operator):
             column_map_dialog.draw(layout, context.window_manager.mphdrr_columns)
             return
         if self._dialog == "REPLACE":
-            layout.label(text="Importing again drops these changes:", icon="ERROR")
-            column = layout.column(align=True)
-            for line in self._losses:
-                column.label(text=line[:1].upper() + line[1:], icon="DOT")
+            draw_losses(layout, self._losses)
             return
         if context.space_data.type == "FILE_BROWSER":  # not in the panel of the last operation
             layout.operator("mphdrr.browse_example", icon="FILE_FOLDER")
@@ -137,6 +147,9 @@ class MPHDRR_OT_import_geometry(bpy.types.Operator):
     _dialog: Literal["", "COLUMNS", "REPLACE"] = ""  # which one is open
     _losses: list[str] | tuple[str, ...] = ()
     _others: list[Scanner]
+
+    def _name_of(self, other: Scanner) -> str:
+        return f"{self.name} {other.kind}" if self.name else scanner.default_name(other)
 
     def _has_window(self) -> bool:
         return self.options.is_invoke and not bpy.app.background

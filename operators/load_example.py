@@ -1,20 +1,40 @@
 """The example in one click, and its workbook in the file browser."""
 
+from collections.abc import Sequence
+
 import bpy
+from bpy.props import EnumProperty
 
 from ..addon import example
-from ..addon.blender import jobs
+from ..addon.blender import choices, jobs
 from ..addon.blender.reports import Reported, needs
+from ..addon.scanner import scanner
 from ..core.example import EXAMPLE
+from .import_geometry import ask_to_replace, draw_losses
 
 
 class MPHDRR_OT_load_example(jobs.JobOperator, bpy.types.Operator):
-    """Load the bundled scanner of 80 modules with a Derenzo phantom, and show what every module sees of it"""
+    """Load the bundled scanner of 80 modules with a phantom, and show what every module, or every X-ray tube, sees of it"""
+
+    example: EnumProperty(
+        name="Example", description="What is loaded", items=choices.items({}, example.EXAMPLES), options={"SKIP_SAVE"}
+    )
 
     poll = needs((lambda context: not jobs.is_running(), "Another job is running: wait for it or cancel it"))
 
+    def ask(self, context: bpy.types.Context) -> set[str] | None:
+        """Whether to drop changes of the example that is there."""
+        self._losses = scanner.losses_of(context.scene, EXAMPLE.stem)
+        return ask_to_replace(self, context) if self._losses else None
+
+    def draw(self, context: bpy.types.Context) -> None:
+        if self._losses:  # not in the panel of the last operation
+            draw_losses(self.layout, self._losses)
+
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        return example.example_job(context)
+        return example.example_job(context, self.example == "XRAY", self.confirmed)
+
+    _losses: Sequence[str] = ()
 
 
 class MPHDRR_OT_browse_example(Reported, bpy.types.Operator):

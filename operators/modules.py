@@ -31,6 +31,18 @@ class MPHDRR_OT_show_modules(selection.OnScanner, bpy.types.Operator):
         return f"{scanner.show_modules(collection, self.first, self.last, self.mode)} modules visible"
 
 
+class MPHDRR_OT_isolate_ring(selection.OnModules, bpy.types.Operator):
+    """Show only the modules of the active module's ring; where only they are shown, show all"""
+
+    def change(self, context: bpy.types.Context, collection: bpy.types.Collection) -> str:
+        found, ring = scanner.modules(collection), selection.selected_modules(context)[0].mphdrr_module.ring
+        own = {o for o in found if o.mphdrr_module.ring == ring}
+        is_isolated = own == {o for o in found if o.mphdrr_module.visible}
+        for camera in found:
+            scanner.set_visible(camera, is_isolated or camera in own)
+        return "All modules visible" if is_isolated else f"Ring {ring + 1}: {len(own)} modules visible"
+
+
 class MPHDRR_OT_look_through_module(selection.OnScanner, bpy.types.Operator):
     """Make the module's pinhole camera the scene's camera, and look through it"""
 

@@ -35,7 +35,7 @@ class MPHDRR_OT_pick_pixel(eyedropper.Eyedropper, reports.Reported, bpy.types.Op
         try:
             epipolar.required_views(context.scene)
         except InputError as error:
-            self.report({"ERROR"}, str(error))
+            self.report({"ERROR"}, reports.in_window(error))
             return {"CANCELLED"}
         return super().invoke(context, event)
 
@@ -124,7 +124,7 @@ class MPHDRR_OT_pick_window(eyedropper.Eyedropper, bpy.types.Operator):
         try:
             tiles.set_window(settings, self.end.lower(), found[1], window)
         except InputError as error:
-            self.report({"WARNING"}, str(error))
+            self.report({"WARNING"}, reports.in_window(error))
             return False
         self.report({"INFO"}, f"Window {self.end.lower()} is {found[1]:g} {shown['unit']}: {found[0]}")
         return True
@@ -151,6 +151,6 @@ class MPHDRR_OT_pick_module(bpy.types.Operator):
         try:
             picked = tiles.pick(context, event.mouse_region_x, event.mouse_region_y)
         except InputError as error:
-            self.report({"WARNING"}, str(error))
+            self.report({"WARNING"}, reports.in_window(error))
             return {"CANCELLED"}
         return {"PASS_THROUGH"} if picked is None else {"FINISHED"}

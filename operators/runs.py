@@ -5,12 +5,13 @@ from typing import Any
 import bpy
 from bpy.props import EnumProperty, IntProperty
 
-from ..addon.blender import jobs
+from ..addon.blender import file_properties, jobs, storage
 from ..addon.blender.reports import Need, Reported, ask_to_remove, needs
 from ..addon.pictures import images
 from ..addon.runs import rendering, runs
 from ..core import InputError, Progress, read_run
 from ..core.runs.comparing import difference, difference_sheet
+from ..core.runs.flood_files import write_flood
 
 _others: list[tuple[str, str, str]] = []  # Blender keeps no texts of such a list: they must live on here
 
@@ -62,6 +63,39 @@ def _other_runs(self: Any, context: bpy.types.Context | None) -> list[tuple[str,
     shown = runs.shown(context.scene) if context is not None else None
     _others[:] = [(str(i), item.name, item.summary) for i, item in enumerate(found) if item != shown]
     return _others
+
+
+class MPHDRR_OT_flood_efficiency(jobs.ExportJob, bpy.types.Operator):
+    """Find the efficiencies of pixels, and dead and hot ones, from the shown run of an even source (import the flood as
+    measured counts first). They are written to a file, which Efficiency under Physics then names
+    """
+
+    bl_label = "Efficiencies from Flood"
+    endings = (".npy",)
+    filepath: file_properties.file_property("File of efficiencies to write")
+    filter_glob: file_properties.shown_files(endings)
+
+    poll = needs(_LISTED)
+
+    order: IntProperty(
+        name="Order", description="Largest power of the smooth trend that is taken off; 0: of a source so far away that it "
+        "has none", default=2, min=0, soft_max=4,
+    )  # fmt: skip
+
+    def job(self, context: bpy.types.Context) -> jobs.Job:
+        flood = storage.absolute(runs.required(context.scene, "take efficiencies from").file)
+        path, order, scene_uid = (
+            self.given_file("expected a name ending in .npy"),
+            self.order,
+            context.scene.session_uid,
+        )
+
+        def finish(lines: list[str]) -> str:
+            scene = jobs.scene_again(scene_uid, "the efficiencies are")
+            scene.mphdrr_projections.efficiency_of_modules = storage.stored_path(path)
+            return " ".join(lines)
+
+        return jobs.Job("Flood", lambda progress: write_flood(flood, path, order)[2], finish)
 
 
 class MPHDRR_OT_compare_runs(jobs.JobOperator, bpy.types.Operator):

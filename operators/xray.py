@@ -9,9 +9,10 @@ from typing import Any
 import bpy
 from bpy.props import EnumProperty, FloatProperty, IntProperty, StringProperty
 
-from ..addon.blender import choices, layouts
+from ..addon import spect_ct
+from ..addon.blender import choices, jobs, layouts
 from ..addon.blender.decimals import typed
-from ..addon.blender.reports import Reported
+from ..addon.blender.reports import Reported, needs
 from ..addon.figures import studio
 from ..addon.scanner import scanner
 from ..core import xray_arc, xray_ring
@@ -91,3 +92,21 @@ class MPHDRR_OT_add_xray_system(Reported, bpy.types.Operator):
         if not reconstruction.is_property_set("method"):  # else for counts
             reconstruction.method = reconstruction.fitted = "SIRT"
         return f"Added {len(system)} X-ray sources and panels as '{collection.name}'"
+
+
+class MPHDRR_OT_use_ct(jobs.JobOperator, bpy.types.Operator):
+    """Make CT numbers of the reconstructed CT and reconstruct SPECT with them: from now on the panels are about the pinholes
+    and the activity. The body that the X rays saw is what attenuates its photons
+    """
+
+    bl_label = "Use CT for SPECT"
+
+    poll = needs(
+        (
+            lambda context: spect_ct.chain(context.scene),
+            "Reconstruct X-ray Counts first, beside pinholes and an activity",
+        )
+    )
+
+    def job(self, context: bpy.types.Context) -> jobs.Job:
+        return spect_ct.using_ct(context)

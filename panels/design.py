@@ -45,10 +45,12 @@ class MPHDRR_PT_design(ScannerPanel, bpy.types.Panel):
             row = layout.row(align=True)
             row.prop(properties, "keep_aimed", toggle=True, icon="CON_TRACKTO")
             row.operator("mphdrr.aim_modules")
-        column = layouts.invoking(layout.column(align=True))
-        column.operator("mphdrr.optimise", text="Optimise", icon="OPTIONS")
-        for text in json.loads(properties.design or "[]"):
-            draw_text(column, text, icon="DOT")
+        row = layouts.invoking(layout.row(align=True))
+        row.operator("mphdrr.optimise", text="Optimise", icon="OPTIONS")
+        row.operator("mphdrr.calibrate", icon="TRACKER")
+        column = layout.column(align=True)
+        for text in json.loads(properties.design or "[]") + json.loads(properties.calibration or "[]"):
+            draw_text(column, text, icon="ERROR" if "not fit" in text else "DOT")
 
 
 class MPHDRR_PT_scanner_design(ScannerPanel, bpy.types.Panel):
@@ -63,10 +65,11 @@ class MPHDRR_PT_scanner_design(ScannerPanel, bpy.types.Panel):
         column = _draw_values(layout, properties, kind, properties.mixed.split())
         if pinholes.has_pinholes(kind):
             _draw_pinholes(layout, column, properties)
-        layout.operator_menu_enum("mphdrr.renumber_modules", "order", text="Renumber", icon="LINENUMBERS_ON")
+        row = layout.row(align=True)
+        row.operator_menu_enum("mphdrr.renumber_modules", "order", text="Renumber", icon="LINENUMBERS_ON")
+        row.operator("mphdrr.check_geometry", text="Check", icon="CHECKMARK")
         if not pinholes.has_pinholes(kind):
             layout.prop(properties, "bore", text="Bore (mm)")
-        layout.operator("mphdrr.check_geometry", icon="CHECKMARK")
         if properties.findings:
             findings = json.loads(properties.findings)
             if not findings:
@@ -80,10 +83,10 @@ class MPHDRR_PT_scanner_design(ScannerPanel, bpy.types.Panel):
         if pinholes.has_pinholes(kind):
             column.operator_menu_enum("mphdrr.add_map", "quantity", text="Add Map", icon="OUTLINER_DATA_VOLUME")
         column = layouts.invoking(layout.column(align=True))
-        column.operator("mphdrr.export_geometry", text="Export Workbook", icon="EXPORT")
+        row = column.row(align=True)
+        row.operator("mphdrr.export_geometry", text="Export Workbook", icon="EXPORT")
+        row.operator("mphdrr.remove_scanner", text="", icon="TRASH")
         column.operator("mphdrr.export_for_program", text="Export for a Program", icon="EXPORT")
-        column.separator()
-        column.operator("mphdrr.remove_scanner", icon="TRASH")
 
 
 def _draw_pinholes(layout: bpy.types.UILayout, column: bpy.types.UILayout, properties: bpy.types.PropertyGroup) -> None:
@@ -145,15 +148,3 @@ def _label(column: module_values.Column, mixed: Sequence[str]) -> str:
     if column.field in mixed:
         return iface("{name}, mixed").format(name=name)
     return iface("{name} (mm)").format(name=name) if column.kind == "length" else name
-
-
-class MPHDRR_PT_calibration(ScannerPanel, bpy.types.Panel):
-    """Where the modules are, by measurement, and what the last calibration found."""
-
-    def draw_scanner(self, context: bpy.types.Context, collection: bpy.types.Collection) -> None:
-        layout = layouts.invoking(self.layout)
-        layout.operator("mphdrr.calibrate", icon="TRACKER")
-        lines = json.loads(collection.mphdrr_scanner.calibration or "[]")
-        box = layout.box().column() if lines else layout
-        for line in lines:
-            draw_text(box, line, icon="ERROR" if "not fit" in line else "DOT")

@@ -23,11 +23,10 @@ class _Display:
         layout.prop(settings, "automatic", text="Automatic Window")
         column = layout.column(align=True)
         column.active = not settings.automatic
-        column.prop(settings, "low", text="Window Low")
-        column.prop(settings, "high")
-        picks = layout.row(align=True)
-        picks.operator("mphdrr.pick_window", text="Pick Low", icon="EYEDROPPER").end = "LOW"
-        picks.operator("mphdrr.pick_window", text="Pick High", icon="EYEDROPPER").end = "HIGH"
+        for name, text in (("low", "Low"), ("high", "High")):
+            row = column.row(align=True)
+            row.prop(settings, name, text=text)
+            row.operator("mphdrr.pick_window", text="", icon="EYEDROPPER").end = name.upper()
         layout.prop(settings, "half")
         if settings.problem:
             layout.label(text=settings.problem, icon="ERROR")

@@ -25,7 +25,10 @@ class _Epipolar:
         run = epipolar.run_views(context.scene)
         if run is None or settings.views != run.name:
             return
-        layouts.draw_all(layout.column(align=True), settings, "module", "column", "row")
+        layout.prop(settings, "module")
+        row = layout.row(align=True)
+        row.use_property_split = False
+        layouts.draw_all(row, settings, "column", "row")
         found, problem = epipolar.shown(context.scene)
         if problem:
             draw_text(layout, problem)

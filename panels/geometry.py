@@ -124,7 +124,7 @@ class MPHDRR_PT_modules(ScannerPanel, bpy.types.Panel):
         head.label(text="", icon="BLANK1")
         head.separator(factor=2.0)  # the list's scroll bar
         layout.template_list(
-            "MPHDRR_UL_modules", "", collection, "all_objects", state, "active_index", rows=5, maxrows=8
+            "MPHDRR_UL_modules", "", collection, "all_objects", state, "active_index", rows=5, maxrows=5
         )
 
         camera = selection.listed_module(context.scene)
@@ -135,9 +135,9 @@ class MPHDRR_PT_modules(ScannerPanel, bpy.types.Panel):
         row = layout.row(align=True)
         for name in ("show_rays", "show_frustums", "show_detectors"):
             row.prop(state, name, toggle=True)
-        row = layout.row()
-        row.active = state.show_rays or state.show_frustums or state.show_detectors
-        row.prop(state, "sight_all")
+        one = row.row(align=True)
+        one.active = state.show_rays or state.show_frustums or state.show_detectors
+        one.prop(state, "sight_all", text="All", toggle=True)
 
 
 def _columns(layout: bpy.types.UILayout, name: str, *numbers: str) -> None:

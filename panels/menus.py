@@ -39,6 +39,7 @@ class MPHDRR_MT_commands(bpy.types.Menu):
         layout.menu("MPHDRR_MT_projections", icon="RENDER_STILL")
         layout.separator()
         layout.operator("mphdrr.load_example", icon="PLAY")
+        layout.operator("mphdrr.load_example", text="Load Example: X-ray Inside SPECT", icon="PLAY").example = "XRAY"
 
 
 class MPHDRR_MT_modules(bpy.types.Menu):
@@ -59,6 +60,7 @@ class MPHDRR_MT_modules(bpy.types.Menu):
         camera = selection.listed_module(context.scene)
         look = layout.operator("mphdrr.look_through_module", text="Look Through Active Module")
         look.number = camera.mphdrr_module.number if camera else 1
+        layout.operator("mphdrr.isolate_ring")
         layout.separator()
         layout.operator("mphdrr.duplicate_modules", icon="DUPLICATE")
         layout.operator("mphdrr.remove_modules", icon="TRASH")
@@ -74,6 +76,37 @@ class MPHDRR_MT_modules(bpy.types.Menu):
         layout.separator()
         layout.operator("mphdrr.set_up_scene", icon="SCENE_DATA")
         layout.operator("mphdrr.remove_scanner", icon="TRASH")
+
+
+class MPHDRR_MT_module(bpy.types.Menu):
+    """What is done most often, as a pie (`addon/registration.py`)."""
+
+    bl_label = "mphDRR Module"
+
+    def draw(self, context: bpy.types.Context) -> None:
+        pie = invoking(self.layout.menu_pie())  # west, east, south, north, and between them
+        draw_module(pie, selection.active_module(context))
+        pie.operator("mphdrr.render_projections", icon="RENDER_STILL")
+        pie.operator("mphdrr.reconstruct", icon="OUTLINER_OB_VOLUME")
+        pie.operator("mphdrr.show_modules", text="Show All Modules", icon="HIDE_OFF").mode = "ALL"
+        pie.menu("MPHDRR_MT_commands", text="All Commands", icon="COLLAPSEMENU")
+
+
+def draw_module(layout: bpy.types.UILayout, camera: bpy.types.Object | None) -> None:
+    """What is done with one module."""
+    look = layout.operator("mphdrr.look_through_module", text="Look Through", icon="OUTLINER_OB_CAMERA")
+    look.number = camera.mphdrr_module.number if camera else 1
+    layout.operator("mphdrr.isolate_ring", icon="HIDE_OFF")
+    layout.operator("mphdrr.live_preview", icon="VIEW_CAMERA")
+    layout.operator("mphdrr.pick_pixel", icon="EYEDROPPER")
+
+
+def draw_in_context_menu(menu: bpy.types.Menu, context: bpy.types.Context) -> None:
+    """Draw the active module's commands in Blender's menu of an object."""
+    camera = selection.module_of(context.object)
+    if camera is not None:
+        menu.layout.separator()
+        draw_module(invoking(menu.layout), camera)
 
 
 class MPHDRR_MT_volumes(bpy.types.Menu):
@@ -101,7 +134,9 @@ class MPHDRR_MT_volumes(bpy.types.Menu):
         layout.operator("mphdrr.export_volume", icon="EXPORT")
         layout.operator("mphdrr.remake_volumes", icon="FILE_REFRESH")
         layout.operator("mphdrr.find_volume_files", icon="VIEWZOOM")
+        layout.operator("mphdrr.collect_files", icon="FILE_FOLDER")
         layout.operator("mphdrr.clean_volume_files", icon="TRASH")
+        layout.operator("mphdrr.add_looks", icon="ASSET_MANAGER")
 
 
 class MPHDRR_MT_projections(bpy.types.Menu):
@@ -118,6 +153,7 @@ class MPHDRR_MT_projections(bpy.types.Menu):
         layout.operator("mphdrr.reconstruct", icon="OUTLINER_OB_VOLUME")
         layout.operator("mphdrr.continue_reconstruction", icon="FORWARD")
         layout.operator("mphdrr.show_reconstruction", icon="IMAGE_DATA")
+        layout.operator("mphdrr.use_ct", icon="MOD_FLUIDSIM")
         layout.operator_menu_enum("mphdrr.backproject", "how", icon="OUTLINER_DATA_VOLUME")
         layout.separator()
         layout.operator_menu_enum("mphdrr.new_event_recipe", "like", icon="FILE_NEW")
@@ -126,9 +162,12 @@ class MPHDRR_MT_projections(bpy.types.Menu):
         layout.separator()
         settings = context.scene.mphdrr_projections
         layout.operator_menu_enum("mphdrr.compare_runs", "other", icon="SELECT_DIFFERENCE")
+        layout.operator("mphdrr.flood_efficiency", icon="MESH_GRID")
         layout.operator("mphdrr.remove_run", icon="TRASH").index = settings.active_run
         layout.separator()
         layout.operator_menu_enum("mphdrr.use_preset", "preset", icon="PRESET")
         layout.operator("mphdrr.load_recipe", icon="FILE_FOLDER")
         layout.operator("mphdrr.export_dataset", icon="EXPORT")
         layout.operator("mphdrr.export_figure", icon="IMAGE_DATA")
+        layout.operator("mphdrr.render_picture", icon="RENDER_STILL")
+        layout.operator("mphdrr.render_animation", icon="RENDER_ANIMATION")

@@ -25,12 +25,15 @@ class MPHDRR_PT_next_step(Sidebar, bpy.types.Panel):
             return
         row = layout.row(align=True)
         row.scale_y = 1.6
+        if step.item is not None:
+            row.context_pointer_set("object", step.item)
         button = row.operator(step.operator, text=step.text, icon=step.icon)
         for name, value in step.settings.items():
             setattr(button, name, value)
         if step.operator == "mphdrr.add_derenzo":
             row.menu("MPHDRR_MT_add", text="", icon="DOWNARROW_HLT")
         elif is_empty:
+            layout.operator("mphdrr.load_example", text="X-ray Inside SPECT", icon="PLAY").example = "XRAY"
             layout.operator("mphdrr.import_geometry", text="Import Geometry", icon="IMPORT")
 
 

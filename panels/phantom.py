@@ -22,9 +22,9 @@ class MPHDRR_PT_phantom(Folded, bpy.types.Panel):
     def draw(self, context: bpy.types.Context) -> None:
         layout = layouts.invoking(layouts.labelled(self.layout))
         adding = layout.column()
-        column = adding.column(align=True)
-        column.menu("MPHDRR_MT_add", text="Add Phantom", icon="OUTLINER_DATA_VOLUME")
-        column.operator("mphdrr.import_volume", text="Import Volume", icon="IMPORT")
+        row = adding.row(align=True)
+        row.menu("MPHDRR_MT_add", text="Add Phantom", icon="OUTLINER_DATA_VOLUME")
+        row.operator("mphdrr.import_volume", text="Import Volume", icon="IMPORT")
         if storage.missing_volumes():
             _draw_missing(adding.column(align=True), context.scene)
         item = volumes.meant(context)
@@ -124,7 +124,7 @@ def _draw_display(layout: bpy.types.UILayout, item: bpy.types.Object) -> None:
     column.prop(settings, "display_high", text=iface("High, {unit}").format(unit=settings.unit))
     looks = layout.grid_flow(columns=2, align=True)
     looks.use_property_split = False  # or each name stands beside its button
-    for name, *_ in phantom_properties.LOOKS[: None if settings.quantity == "hu" else 4]:
+    for name, *_ in phantom_properties.LOOKS[: None if settings.quantity in ("hu", "mu") else 4]:
         looks.prop_enum(settings, "look", name)
     if settings.look not in ("DENSITY", "BRIGHTEST"):
         layout.prop(settings, "surface", text=iface("Surface, {unit}").format(unit=settings.unit))

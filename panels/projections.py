@@ -13,7 +13,8 @@ from .sidebar import Folded, draw_text
 _MAIN = ("model", "time", "hole", "height", "width")
 """A beginner's settings, which the panel itself shows."""
 _PHYSICS = (
-    "photons", "isotope", "window", "aperture_material", "aperture_mu", "crystal_material", "crystal_mu",
+    "photons", "isotope", "panel", "window", "sensor", "sensor_thickness", "materials",
+    "aperture_material", "aperture_mu", "crystal_material", "crystal_mu",
     "intrinsic_fwhm", "background",
 )  # fmt: skip
 """Settings under Physics; all others stand under Advanced."""
@@ -44,6 +45,13 @@ class MPHDRR_PT_projections(Folded, bpy.types.Panel):
         row.scale_y = 1.4
         row.enabled = _can_render(context)
         row.operator("mphdrr.render_projections", icon="RENDER_STILL")
+        session = preview.session()
+        row.operator("mphdrr.live_preview", text="", icon="HIDE_OFF", depress=session is not None)
+        if session is not None:
+            column = layout.column(align=True)
+            column.active = False
+            draw_text(column, session.problem)
+            column.label(text=iface("{size} of voxels kept in memory").format(size=session.kept))
         if rendering.integrates_activity(context):
             draw_text(layout, "Line integrals of activity: for counts choose the model SPECT Counts.", icon="INFO")
         if settings.run_file:
@@ -53,23 +61,6 @@ class MPHDRR_PT_projections(Folded, bpy.types.Panel):
 def _can_render(context: bpy.types.Context) -> bool:
     """Whether there is a scanner and a volume."""
     return scanner.active_scanner(context.scene) is not None and bool(volumes.volume_objects(context.scene))
-
-
-class MPHDRR_PT_preview(Folded, bpy.types.Panel):
-    bl_label = "Live Preview"
-    bl_parent_id = "MPHDRR_PT_projections"
-
-    poll = layouts.shown_where(_can_render)
-
-    def draw(self, context: bpy.types.Context) -> None:
-        layout, session = self.layout, preview.session()
-        layout.operator("mphdrr.live_preview", icon="HIDE_OFF", depress=session is not None)
-        if session is None:
-            return
-        column = layout.column(align=True)
-        column.active = False
-        draw_text(column, session.problem)
-        column.label(text=iface("{size} of voxels kept in memory").format(size=session.kept))
 
 
 class MPHDRR_PT_physics(Folded, bpy.types.Panel):
@@ -107,7 +98,7 @@ class MPHDRR_PT_advanced(Folded, bpy.types.Panel):
         column = layout.column(align=True)
         if settings.model == "EMISSION" and collection is not None:
             column.prop(collection.mphdrr_scanner, "opening_angle")
-        for table in ("model", "detector", "compute"):
+        for table in ("model", "frames", "detector", "compute"):
             others = (each for each in drawn(settings, table) if each[0] not in (*_MAIN, *_PHYSICS))
             layouts.draw_settings(column, settings, others)
         column.prop(settings, "all_modules")
@@ -124,10 +115,14 @@ class MPHDRR_PT_export(Folded, bpy.types.Panel):
     def draw(self, context: bpy.types.Context) -> None:
         layout = layouts.invoking(self.layout)
         run_file = context.scene.mphdrr_projections.run_file
-        row = layout.row()
+        both = layout.row(align=True)
+        row = both.row(align=True)
         row.enabled = bool(run_file)
         row.operator("mphdrr.export_dataset", text="Export Dataset", icon="EXPORT")
-        layout.operator("mphdrr.export_figure", text="Export Figure", icon="IMAGE_DATA")
+        both.operator("mphdrr.export_figure", text="Export Figure", icon="IMAGE_DATA")
+        both = layout.row(align=True)
+        both.operator("mphdrr.render_picture", icon="RENDER_STILL")
+        both.operator("mphdrr.render_animation", icon="RENDER_ANIMATION")
         if run_file:
             kept = run_file if run_file.startswith("//") else iface("Kept when the .blend is saved")
             layout.label(text=kept, translate=False, icon="FILE")

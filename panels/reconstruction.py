@@ -52,12 +52,16 @@ def _draw_result(layout: bpy.types.UILayout, settings: bpy.types.PropertyGroup, 
         row.label(text=name, translate=False)
         draw_text(row, value, "NONE")
     rods = known.get("rods", ())
-    for name, light, *values in [("Rods", "", "Valley/Peak", "Contrast"), *rods] if rods else ():
+    scored = [row for row in rods if row[3]]
+    for name, light, *values in [("Rods", "", "Valley/Peak", "Contrast"), *scored] if scored else ():
         row = scores.split(factor=0.3)
         row.label(text=name, translate=name == "Rods", icon=_DOTS.get(light, "BLANK1"))
-        row = row.split(factor=0.55) if values[1] else row
-        for text in filter(None, values):
+        row = row.split(factor=0.55)
+        for text in values:
             row.label(text=text, translate=name == "Rods")
+    for reason in dict.fromkeys(row[2] for row in rods if not row[3]):
+        sizes = ", ".join(row[0] for row in rods if row[2] == reason)
+        draw_text(scores, f"{sizes}: {reason}", "BLANK1")
     for text in known.get("flatters", ()):
         draw_text(box, text)
     row = layouts.invoking(box.row())
@@ -73,7 +77,10 @@ class MPHDRR_PT_reconstruction_model(Folded, bpy.types.Panel):
     def draw(self, context: bpy.types.Context) -> None:
         settings = context.scene.mphdrr_reconstruction
         others = (each for each in drawn(settings) if each[0] not in _MAIN)
-        layouts.draw_settings(layouts.labelled(self.layout).column(), settings, others)
+        column = layouts.labelled(self.layout).column()
+        if runs.holds_counts(context.scene):
+            column.prop(settings, "mu", placeholder="The run's")
+        layouts.draw_settings(column, settings, others)
 
 
 class MPHDRR_PT_backprojection(Folded, bpy.types.Panel):

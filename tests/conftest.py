@@ -3,11 +3,50 @@
 from __future__ import annotations
 
 import atexit
+import functools
+import gc
 import os
+from pathlib import Path
+
+import pytest
 
 # Each of several processes leaves the other cores to the others; BLAS and torch would wait for theirs, busily.
 if "PYTEST_XDIST_WORKER" in os.environ:
     os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+
+from mphdrr.core.workbook import reader
+
+# No test cuts the power: to wait until each small file is on the disk would be most of what some of them take.
+os.fsync = lambda descriptor: None
+
+# Python's search for garbage among a million objects of imported libraries, again and again, would be a sixth of the
+# tests' time: it rests while they are collected, and what stays after a file of tests is not looked at again.
+gc.disable()
+_file: Path | None = None
+
+
+def pytest_collection_finish() -> None:
+    gc.freeze()
+    gc.enable()
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    global _file
+    if item.path != _file:
+        _file = item.path
+        gc.collect()
+        gc.freeze()
+
+
+# The users' workbook is read hundreds of times in a process; what it gives cannot be changed, but a kind's columns can.
+WORKBOOK = Path(__file__).parents[1] / "examples" / "dc-spect-80.xlsx"
+_read = reader._read
+_read_workbook = functools.cache(lambda kind, columns: _read(WORKBOOK, kind, None))
+reader._read = lambda path, kind, columns: (
+    _read_workbook(kind, tuple(kind.columns))
+    if columns is None and Path(path) == WORKBOOK
+    else _read(path, kind, columns)
+)
 
 
 @atexit.register

@@ -1,4 +1,4 @@
-"""Build the package's wheels and the extension's zips in dist/, for each platform: `make dist`.
+"""Build the package's wheels, its source archive and the extension's zips in dist/, for each platform: `make dist`.
 
 The C kernels are compiled for all platforms here. A zip contains every wheel that it needs. Needs an environment with bpy,
 whose command-line tool builds and validates the zips; no Blender application is needed.
@@ -125,6 +125,12 @@ def build_wheel(name: str, tree: Path, output: Path) -> None:
     subprocess.run((sys.executable, "-m", "pip", "wheel", *options, asked, tree), check=True)
 
 
+def build_source_archive(tree: Path, output: Path) -> None:
+    """Build the package's source archive from a copy of the tree."""
+    code = f"from setuptools.build_meta import build_sdist; build_sdist({str(output.absolute())!r})"
+    subprocess.run((sys.executable, "-c", code), cwd=tree, check=True, stdout=subprocess.DEVNULL)
+
+
 def build_zip(name: str, tree: Path, output: Path) -> Path:
     """Build the extension's zip for platform `name` from a copy of the tree, to which kernels and wheels are added."""
     build_kernels.build(name, tree / build_kernels.KERNELS.relative_to(ROOT))
@@ -171,6 +177,9 @@ def main() -> None:
     parser.add_argument("--output", type=Path, default=ROOT / "dist", help="folder of the wheels and zips")
     arguments = parser.parse_args()
     arguments.output.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory() as folder:
+        stage(Path(folder))
+        build_source_archive(Path(folder), arguments.output)
     for name in arguments.platform or names:
         with tempfile.TemporaryDirectory() as folder:
             tree = Path(folder)

@@ -1,5 +1,9 @@
-"""Write the pictures that the tutorial's test in tests/app has taken as docs/images/tutorial: `make tutorial`."""
+"""Write pictures that tests in tests/app have taken: the tutorial's (`make tutorial`), or docs/images/xray-blender.webp.
 
+pytest tests/app -k six_clicks && python tools/tutorial_pictures.py xray
+"""
+
+import sys
 from pathlib import Path
 
 from PIL import Image
@@ -8,6 +12,19 @@ ROOT = Path(__file__).resolve().parents[1]
 TAKEN = ROOT / "out" / "test-app" / "test_tutorial"
 FOLDER = ROOT / "docs" / "images" / "tutorial"
 WIDTH = 1280  # pixels
+CLICKS = ROOT / "out" / "test-app" / "test_six_clicks_lead_from_an_empty_scene_over_a_ct_to_a_dose_map"
+
+
+def clicks() -> None:
+    """Four of the six clicks to a dose map, on one page."""
+    shown = (0, 28, 1313, 905)  # without menus and what stands beside the two editors
+    taken = [Image.open(CLICKS / f"click-{number}.png").convert("RGB").crop(shown) for number in (1, 2, 4, 5)]
+    width, height = (round(0.7 * side) for side in taken[0].size)
+    page = Image.new("RGB", (2 * width + 8, 2 * height + 8), (24, 26, 29))
+    for i, picture in enumerate(taken):
+        small = picture.resize((width, height), Image.Resampling.LANCZOS)
+        page.paste(small, (i % 2 * (width + 8), i // 2 * (height + 8)))
+    page.save(ROOT / "docs" / "images" / "xray-blender.webp", quality=80, method=6)
 
 
 def main() -> None:
@@ -26,4 +43,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    clicks() if sys.argv[1:] == ["xray"] else main()

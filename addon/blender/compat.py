@@ -9,11 +9,16 @@ import bpy
 VDB_CENTER_SHIFT = 0.0 if bpy.app.version >= (5, 0, 0) else -0.5
 
 
+def use_nodes(data: bpy.types.Material | bpy.types.World) -> None:
+    """Give a material or a world its node tree."""
+    if bpy.app.version < (5, 0, 0):  # since then each has one
+        data.use_nodes = True
+
+
 def blank_material(name: str) -> bpy.types.Material:
     """A new material with an empty node tree."""
     material = bpy.data.materials.new(name)
-    if bpy.app.version < (5, 0, 0):  # since then every material has a node tree
-        material.use_nodes = True
+    use_nodes(material)
     material.node_tree.nodes.clear()  # 4.5 begins with a volume's nodes where a volume is active
     return material
 
@@ -51,3 +56,10 @@ def surface_material(name: str, kind: str) -> tuple[bpy.types.Material, bpy.type
     shader = add_node(material.node_tree, kind, (0.0, 0.0))
     add_node(material.node_tree, "ShaderNodeOutputMaterial", (300.0, 0.0), {"Surface": shader.outputs[0]})
     return material, shader
+
+
+def write_films(settings: bpy.types.ImageFormatSettings) -> None:
+    """Have renders written as films."""
+    if bpy.app.version >= (5, 0, 0):
+        settings.media_type = "VIDEO"
+    settings.file_format = "FFMPEG"

@@ -29,7 +29,7 @@ from . import reports, storage, windows
 _INTERVAL = 0.1  # s between two looks at the thread, and between two drawings of how far it is
 _STEP = 0.02  # s that finishing may take of the main thread before the window has its turn, which is as long
 _SHARE, _MOST = 0.1, 0.05  # of the time since the last step, and s, that it may take where the window is drawn slowly
-_PATIENCE = 10.0  # s that `stop` waits for a thread
+_PATIENCE = 0.2  # s that `stop` waits for a thread; one that takes longer ends by itself, and nobody takes its result
 _STATUS_UNITS = 16  # the job's width in the status bar
 _SOON = 1.0  # s of a stage after which the time left is guessed
 
@@ -178,7 +178,7 @@ def is_running() -> bool:
 
 
 def stop(*_: Any) -> None:
-    """Stop all jobs and wait for the running one's thread: before a file is loaded, or the extension is disabled."""
+    """Stop all jobs, and wait a moment for the running one's thread: before a file is loaded, or the extension disabled."""
     global _current
     worker, _current = _current, None
     _waiting.clear()

@@ -9,8 +9,12 @@ import bpy
 
 from ...core.errors import InputError
 from ...core.recording import recorded_warnings
+from ...core.runs.settings import SETTINGS
 
-_OPTIONS = re.compile(r" \(--[^()]*\)|, --[a-z-]+ [^;,)]+|, `mphdrr [^`]*`")
+_OPTIONS = re.compile(r" \((?:--|mphdrr )[^()]*\)|, --[a-z-]+ [^;,)]+|, `mphdrr [^`]*`")
+_CLAUSES = re.compile(r"[;:,] [^;:,]*(?:--[a-z]|\bmphdrr [a-z])[^;]*")  # that speak of an option or a command
+_KEYS = "|".join(map(re.escape, sorted(SETTINGS, key=len, reverse=True)))
+_KEY = re.compile(rf"\b({_KEYS})(?![\w.])(?:\s?=\s?\"?([\w-]+)\"?)?")
 _MOST = 5  # nobody reads more lines than that
 
 Need = tuple[Callable[[bpy.types.Context], Any], str]
@@ -18,8 +22,18 @@ Need = tuple[Callable[[bpy.types.Context], Any], str]
 
 
 def in_window(text: object) -> str:
-    """What core says, without the options of the command line."""
-    return _OPTIONS.sub("", str(text))
+    """What core says, without the options of the command line, and with the window's words for a recipe's keys.
+
+    Of a recipe's file, which is a text with these keys, they stay.
+    """
+
+    def labelled(found: re.Match[str]) -> str:
+        setting, word = SETTINGS[found[1]], found[2]
+        label = setting.label.partition(" (")[0]
+        return label if word is None else f"{label} {setting.words.get(word, (word,))[0]}"
+
+    said = _CLAUSES.sub("", _OPTIONS.sub("", str(text)))
+    return said if ".toml" in said else _KEY.sub(labelled, said)
 
 
 @contextmanager

@@ -60,6 +60,9 @@ def properties_of(settings: Settings) -> dict[str, Any]:
         elif setting.kind is str:
             absent_item = ("NONE", "None", setting.absent.capitalize()) if setting.default is None else None
             made[name] = _enumeration(name, setting, absent_item)
+        elif is_list(setting):
+            text = f"{setting.text}; such as 10, 20, 30. Empty: {setting.absent}"
+            made[name] = StringProperty(name=setting.label, description=text)
         elif _is_vector(setting):
             made[name] = FloatVectorProperty(size=setting.sizes[0], default=(0.0,) * setting.sizes[0], **common)  # type: ignore[index]
         else:
@@ -68,7 +71,9 @@ def properties_of(settings: Settings) -> dict[str, Any]:
             made[name] = make(default=default, **common)
         if each := of_modules(name, setting):
             or_file = f", or a file with an image for each ({', '.join(setting.endings)})" if setting.endings else ""
+            as_file = {"subtype": "FILE_PATH", "options": {"PATH_SUPPORTS_BLEND_RELATIVE"}} if setting.endings else {}
             made[each] = StringProperty(
+                **as_file,
                 name=f"Each {setting.label.partition(' (')[0]}",
                 description=f"A number for each module that is projected, such as 10, 20, 30{or_file}. Empty: one for all",
             )
@@ -82,7 +87,7 @@ def unset_of(settings: Settings) -> dict[str, Any]:
     """
     marks = {}
     for name, setting in settings.items():
-        if setting.kind in (int, float) and setting.default is None:
+        if setting.kind in (int, float) and setting.default is None and not is_list(setting):
             first = setting.kind((setting.slider or 10) / 10)
             values = tuple(first * (k + 1) for k in range(setting.sizes[0])) if _is_vector(setting) else first  # type: ignore[index]
             marks[layouts.unset_name(name)] = check_mark(name, setting.unset, setting.absent, values)
@@ -116,7 +121,9 @@ def values_of(settings: Settings, get: Callable[[str], Any]) -> dict[str, Any]:
             continue
         if material is not None and get(material) != "NUMBER":
             name, value = material, get(material)
-        if isinstance(value, str):
+        if is_list(setting):
+            values[setting.key] = _numbers(setting, value)
+        elif isinstance(value, str):
             words = {identifier(name, word): word for word in setting.words} | {"NONE": None}
             if value not in words:
                 raise InputError(f"{setting.label}: {value!r} is not known to this version; choose another")
@@ -164,11 +171,25 @@ def set_property(owner: Any, settings: Settings, name: str, value: Any) -> None:
         owner.property_unset(own)
     if each and isinstance(value, str | list | tuple):
         setattr(owner, each, value if isinstance(value, str) else ", ".join(map(str, value)))
+    elif is_list(setting):
+        setattr(owner, name, ", ".join(f"{number:g}" for number in value or ()))
     elif isinstance(value, str) and value != "auto":
         own = material or name
         setattr(owner, own, identifier(own, value))
     elif value not in (None, "auto"):
         setattr(owner, name, value)
+
+
+def is_list(setting: Setting) -> bool:
+    """Whether it has any number of values; its property is a text."""
+    return setting.sizes == () and setting.kind is float
+
+
+def _numbers(setting: Setting, text: str) -> tuple[float, ...] | None:
+    try:
+        return tuple(map(float, text.replace(",", " ").split())) or None
+    except ValueError:
+        raise InputError(f"{setting.label}: expected numbers such as 10, 20, 30, got {text!r}") from None
 
 
 def _is_vector(setting: Setting) -> bool:

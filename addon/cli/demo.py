@@ -1,5 +1,7 @@
 """``mphdrr demo``: the main job on the example workbook, from the geometry to a file to train on."""
 
+from __future__ import annotations
+
 import argparse
 import contextlib
 import importlib.util
@@ -8,7 +10,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from ...core import ProjectionRun, Recipe, files, run_recipe, write_run
+from ... import core as mph
+from ...core import files
 from ...core.cli.options import add_command, progress_bar
 from ...core.cli.scanners import add_workbook, read_workbook
 from ...core.errors import warn
@@ -17,20 +20,15 @@ from ...core.runs.mosaic import write_sheet
 from . import COMMANDS
 from .scene import INSTALL_BLENDER, new_scene, quiet, save_scene
 
-_FIGURES = {"phantom": "inside", "cut-away": "cut-away", "sums": "sums"}
+_FIGURES = {"phantom": "picture", "cut-away": "cut-away", "sums": "sums"}
 """Name and kind of those besides the modules' ranges."""
-_SIZE = dict.fromkeys(("scanner", "inside", "cut-away"), (880, 510))
+_SIZE = dict.fromkeys(("scanner", "picture", "cut-away"), (880, 510))
 """Smaller than usual: they take most of the demo's time."""
 
 
 def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     """Add the command."""
-    parser = add_command(
-        subparsers,
-        "demo",
-        COMMANDS[__name__],
-        "mphdrr demo --output out",
-    )
+    parser = add_command(subparsers, "demo", COMMANDS[__name__], "mphdrr demo --output out")
     parser.add_argument("--output", default="out", metavar="FOLDER", help="where the results go")
     add_workbook(parser, "--workbook", str(EXAMPLE))
     parser.add_argument("--voxels", type=int, default=256, metavar="N", help="voxels along each side of the volume")
@@ -45,7 +43,7 @@ def _run(arguments: argparse.Namespace) -> None:
     with _step("geometry"):
         system = read_workbook(arguments)
     with _step("projections"):
-        recipe = Recipe({
+        recipe = mph.Recipe({
             "system.file": arguments.workbook,
             "phantom.kind": "derenzo",
             "phantom.euler_degrees": EULER_DEGREES,
@@ -54,9 +52,9 @@ def _run(arguments: argparse.Namespace) -> None:
             "detector.rows": arguments.size,
             "detector.columns": arguments.size,
         })  # fmt: skip
-        (run,) = run_recipe(recipe, system, stages=progress_bar)
+        (run,) = mph.run_recipe(recipe, system, stages=progress_bar)
     with _step("dataset"):
-        write_run(run, out / "run.h5")
+        mph.write_run(run, out / "run.h5")
         write_sheet(run, out / "mosaic.png")
     if scene is None:
         warn(f"no scene and no pictures of it, which need Blender: {INSTALL_BLENDER}")
@@ -65,7 +63,7 @@ def _run(arguments: argparse.Namespace) -> None:
     print(f"{out}: {', '.join(sorted(p.name for p in out.iterdir() if p.suffix in ('.blend', '.h5', '.png')))}")
 
 
-def _make_scene(scene: Any, run: ProjectionRun, out: Path) -> None:
+def _make_scene(scene: Any, run: mph.ProjectionRun, out: Path) -> None:
     """Write the scene of a run, and pictures of it."""
     import bpy
 

@@ -1,5 +1,7 @@
 """``mphdrr figure KIND FILE … -o PICTURE``; only the figures that are rendered, and a .blend, need Blender."""
 
+from __future__ import annotations
+
 import argparse
 import contextlib
 from pathlib import Path
@@ -7,24 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from ...core import (
-    Grid,
-    InputError,
-    ProjectionRun,
-    euler_pose,
-    kinds_in,
-    read_phantom,
-    read_recipe,
-    read_scanner,
-    read_volume,
-)
+from ... import core as mph
 from ...core.cli.options import add_command, output_path, progress_bar, refuse
-from ...core.figures.kinds import KINDS, FigureKind, figure_kind
+from ...core.figures.kinds import FILMS, KINDS, PAPERS, SAMPLES, FigureKind, How, figure_kind
 from ...core.figures.page import SUFFIXES, Page
 from ...core.figures.subject import NEEDS, Subject, require
 from ...core.phantoms.kinds import KINDS as PHANTOMS
-from ...core.runs.files import FORMATS, read_run
-from ...core.runs.run_recipe import phantom_pose, run_recipe
+from ...core.runs.formats import FORMATS
 from ...core.toml import read_toml
 from . import COMMANDS
 from .scene import new_scene, quiet
@@ -46,17 +37,19 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
         COMMANDS[__name__],
         "mphdrr figure cut-away scanner.xlsx derenzo -o figure.png --size 1600x900\n"
         "example: mphdrr figure scanner scanner.xlsx --modules 1-40 -o modules.svg\n"
+        "example: mphdrr figure light-up scanner.xlsx derenzo -o modules.mp4 --seconds 8 --size 640x400\n"
         "example: mphdrr figure mosaic run.h5 -o mosaic.png -o mosaic.svg",
     )
     add = parser.add_argument
     add("kind", nargs="?", metavar="KIND", help=f"one of {', '.join(KINDS)}; --list explains them")
     text = "what it is of: a workbook, a phantom (its kind or a .toml), a volume, a recipe, a run, or a .blend alone"
     add("files", nargs="*", metavar="FILE", help=text)
-    text = f"{', '.join(SUFFIXES)}; in .svg the labels are text; may be repeated"
+    text = f"{', '.join(SUFFIXES)}, {', '.join(FILMS)} of animations; in .svg the labels are text; may be repeated"
     add("-o", "--output", action="append", default=[], metavar="FILE", help=text)
     add("--list", action="store_true", help="list the kinds of figures")
     add("--size", type=_size, metavar="WIDTHxHEIGHT", help="pixels; the kind's own by default")
-    add("--modules", metavar="RANGE", help="such as 1-40 or 1-20,41; default: all. c-arm shows the first")
+    text = "such as 1-40 or 1-20,41; default: all, but a picture's rays are of a ring, and c-arm shows the first"
+    add("--modules", metavar="RANGE", help=text)
     add(
         "--position", type=float, nargs=3, default=[0.0, 0.0, 0.0], metavar="MM", help="of a phantom: its middle, x y z"
     )
@@ -64,7 +57,10 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     add("--euler-degrees", type=float, nargs=3, default=[0.0, 0.0, 0.0], metavar="DEG", help=text)
     add("--voxels", type=int, default=200, metavar="N", help="of a phantom, along each side")
     add("--no-labels", action="store_true", help="without title and axes, where the figure is rendered")
-    add("--samples", type=int, default=16, metavar="N", help="rays per pixel, where the figure is rendered")
+    add("--samples", type=int, default=SAMPLES, metavar="N", help="rays per pixel, where the figure is rendered")
+    add("--style", choices=list(PAPERS), default="dark", help="of figures that are rendered")
+    add("--seconds", type=float, default=How().seconds, metavar="S", help="how long an animation is")
+    add("--fps", type=int, default=How().fps, metavar="N", help="pictures of an animation per second")
     parser.set_defaults(run=_run)
 
 
@@ -84,51 +80,50 @@ def _run(arguments: argparse.Namespace) -> None:
         )
         return
     if arguments.kind is None:
-        raise InputError("figure: name a kind; --list shows them")
+        raise mph.InputError("figure: name a kind; --list shows them")
     kind = figure_kind(arguments.kind)
     if not arguments.output:
-        raise InputError("nothing to write: give --output FILE")
-    paths = [output_path(name, SUFFIXES) for name in arguments.output]
-    page = Page(*(arguments.size or kind.size))
+        raise mph.InputError("nothing to write: give --output FILE")
+    paths = [output_path(name, kind.suffixes) for name in arguments.output]
+    how = How(*(not arguments.no_labels, *(getattr(arguments, name) for name in How._fields[1:])))
+    page = kind.page(arguments.size, how)
     blends = [file for file in arguments.files if file.lower().endswith(".blend")]
     if blends:
         if len(arguments.files) > 1:
-            raise InputError(f"{blends[0]}: a .blend holds all that is shown; give no other file")
+            raise mph.InputError(f"{blends[0]}: a .blend holds all that is shown; give no other file")
         refuse(arguments, _POSED, "is for phantoms that are named on the command line, not for a .blend")
-        _of_scene(arguments, kind, Path(blends[0]), paths)
+        _of_scene(arguments, kind, Path(blends[0]), paths, how)
     else:
         subject = _subject(arguments)
         have = [need for need in NEEDS if getattr(subject, need) is not None]
         require(kind.needs, have, kind.name, _MISSING)
-        if kind.draw is not None:
-            kind.draw(page, subject)
+        if kind.draw is None:
+            _render(kind, page, subject, paths, how)
         else:
-            _render(arguments, kind, page, subject)
-        for path in paths:
-            page.write(path)
+            kind.draw(page, subject)
+            for path in paths:
+                page.write(path)
     for path in paths:
         print(path)
 
 
-def _of_scene(arguments: argparse.Namespace, kind: FigureKind, blend: Path, paths: list[Path]) -> None:
+def _of_scene(arguments: argparse.Namespace, kind: FigureKind, blend: Path, paths: list[Path], how: How) -> None:
     """A figure of the scene in a .blend, as the window makes it."""
     new_scene()
     import bpy
 
-    from ..blender import jobs
     from ..figures import figures
 
     with quiet():
         try:
             bpy.ops.wm.open_mainfile(filepath=str(blend.absolute()))
         except RuntimeError as error:
-            raise InputError(f"{blend}: cannot be opened ({str(error).strip().splitlines()[0]})") from None
-        labels = not arguments.no_labels
-        given = arguments.size, arguments.modules, labels, arguments.samples
-        jobs.run(figures.figure_job(bpy.context, kind.name, paths, *given))
+            raise mph.InputError(f"{blend}: cannot be opened ({str(error).strip().splitlines()[0]})") from None
+        job = figures.figure_job(bpy.context, kind.name, paths, arguments.size, arguments.modules, **how._asdict())
+        _follow(job.finish(job.work(lambda done, total: None)))
 
 
-def _render(arguments: argparse.Namespace, kind: FigureKind, page: Page, subject: Subject) -> None:
+def _render(kind: FigureKind, page: Page, subject: Subject, paths: list[Path], how: How) -> None:
     """A figure that Blender renders."""
     new_scene()
     from ..figures import figures
@@ -139,8 +134,14 @@ def _render(arguments: argparse.Namespace, kind: FigureKind, page: Page, subject
     if kind.studio.volume and subject.volume is not None:
         item = volumes.add_volume(subject.volume, subject.name or "Volume")
     with quiet():
-        for _ in figures.rendering(page, subject, kind.studio, item, not arguments.no_labels, arguments.samples):
-            pass
+        _follow(figures.drawing(page, subject, kind, item, paths, how, figures.Reel()))
+
+
+def _follow(steps: Any) -> None:
+    """Take the steps of a drawing, and show how far it is."""
+    show = progress_bar("rendering")
+    for step in filter(None, steps):
+        show(*step[1:])
 
 
 def _subject(arguments: argparse.Namespace) -> Subject:
@@ -160,37 +161,39 @@ def _read(arguments: argparse.Namespace, file: str, scanner: Any) -> dict[str, A
     """What one of the files holds, by the names of `Subject`'s fields."""
     suffix = Path(file).suffix.lower()
     if suffix in _WORKBOOKS:
-        return {"scanner": read_scanner(file, next(iter(kinds_in(file)), "pinhole"))}
+        return {"scanner": mph.read_scanner(file, next(iter(mph.kinds_in(file)), "pinhole"))}
     if suffix == ".toml" and "shape" not in read_toml(file):
-        (run,) = run_recipe(read_recipe(file), scanner, stages=progress_bar)
+        (run,) = mph.run_recipe(mph.read_recipe(file), scanner, stages=progress_bar)
         return _of_run(run)
     kinds = [kind for kind in PHANTOMS if kind.name == file]
     if kinds or suffix == ".toml":
-        phantom: Any = kinds[0].phantom(**kinds[0].usual) if kinds else read_phantom(file)
+        phantom: Any = kinds[0].phantom(**kinds[0].usual) if kinds else mph.read_phantom(file)
         phi, theta, psi = np.deg2rad(arguments.euler_degrees)
-        pose = euler_pose(phi, theta, psi, arguments.position)
+        pose = mph.euler_pose(phi, theta, psi, arguments.position)
         # As large as the phantom however it is turned, and a voxel free all around.
         spacing = phantom.extent / max(1, arguments.voxels - 2)
-        grid = Grid.centered(arguments.voxels, spacing, arguments.position)
+        grid = mph.Grid.centered(arguments.voxels, spacing, arguments.position)
         volume = phantom.voxelize(grid, pose, progress_bar("voxelizing"))
         return {"volume": volume, "pose": pose, "name": phantom.title, "posed": True}
     if suffix in FORMATS:
         try:
-            return _of_run(read_run(file))
-        except InputError:
+            return _of_run(mph.read_run(file))
+        except mph.InputError:
             if suffix == ".pt" or not Path(file).is_file():
                 raise
-    return {"volume": read_volume(file), "pose": None, "name": Path(file).name}
+    return {"volume": mph.read_volume(file), "pose": None, "name": Path(file).name}
 
 
-def _of_run(run: ProjectionRun) -> dict[str, Any]:
+def _of_run(run: mph.ProjectionRun) -> dict[str, Any]:
     found: dict[str, Any] = {
         "scanner": run.system,
         "volume": run.volume,
         "run": run,
         "name": str(run.settings.get("volume", "")),
     }
-    with contextlib.suppress(InputError):  # of version 0.1.0, which keeps no recipe
+    with contextlib.suppress(mph.InputError):  # of version 0.1.0, which keeps no recipe
         if any(key.startswith("phantom.") for key in run.recipe.given):
+            from ...core.runs.run_recipe import phantom_pose
+
             found["pose"] = phantom_pose(run.recipe)
     return {"pose": None, **found}

@@ -10,10 +10,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ...core import InputError, read_run
+from ... import core as mph
 from ...core.cli.options import add_command, output_path
 from ...core.cli.scanners import add_workbook, chosen_modules, read_any
-from ...core.volumes.volume_files import read_volume, read_volume_of
 from . import COMMANDS
 
 if TYPE_CHECKING:
@@ -26,30 +25,26 @@ INSTALL_BLENDER = 'pip install "mphdrr[blender]", or ".[blender]" in its source;
 def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     """Add the command."""
     parser = add_command(
-        subparsers,
-        "scene",
-        COMMANDS[__name__],
-        "mphdrr scene scanner.xlsx --run run.h5 -o scanner.blend",
+        subparsers, "scene", COMMANDS[__name__], "mphdrr scene scanner.xlsx --run run.h5 -o scanner.blend"
     )
     add_workbook(parser)
-    parser.add_argument("--modules", metavar="RANGE", help="such as 1-40 or 1-20,41; default: all")
-    parser.add_argument(
-        "--volume", metavar="FILE", help="also put in this volume, of any format that volume info reads"
-    )
-    parser.add_argument(
-        "--mu", metavar="FILE", help="and this volume of attenuation coefficients (1/mm), for SPECT counts"
-    )
-    parser.add_argument("--run", metavar="FILE", dest="run_file", help="also put in this run's volume and projections")
-    parser.add_argument("-o", "--output", required=True, metavar="FILE", help="the .blend to write")
+    add = parser.add_argument
+    add("--modules", metavar="RANGE", help="such as 1-40 or 1-20,41; default: all")
+    add("--volume", metavar="FILE", help="also put in this volume, of any format that volume info reads")
+    add("--mu", metavar="FILE", help="and this volume of attenuation coefficients (1/mm), for SPECT counts")
+    add("--run", metavar="FILE", dest="run_file", help="also put in this run's volume and projections")
+    add("-o", "--output", required=True, metavar="FILE", help="the .blend to write")
     parser.set_defaults(run=_run)
 
 
 def _run(arguments: argparse.Namespace) -> None:
+    from ...core.volumes.volume_files import read_volume_of
+
     path = output_path(arguments.output, (".blend",))
     system = chosen_modules(read_any(arguments), arguments.modules)
-    volume = read_volume(arguments.volume) if arguments.volume else None
+    volume = mph.read_volume(arguments.volume) if arguments.volume else None
     mu = read_volume_of(arguments.mu, "mu") if arguments.mu else None
-    run = read_run(arguments.run_file) if arguments.run_file else None
+    run = mph.read_run(arguments.run_file) if arguments.run_file else None
 
     blender_scene = new_scene()
     from ..figures import studio
@@ -75,9 +70,9 @@ def new_scene() -> bpy.types.Scene:
     try:
         import bpy
     except ModuleNotFoundError:
-        raise InputError(f"this command needs Blender: {INSTALL_BLENDER}") from None
+        raise mph.InputError(f"this command needs Blender: {INSTALL_BLENDER}") from None
     except ImportError as error:  # a shared library is missing
-        raise InputError(
+        raise mph.InputError(
             f"Blender's bpy package does not load ({error}); on Debian and Ubuntu install libx11-6 libxi6 libxfixes3 "
             "libxrender1 libxkbcommon0 libsm6 libgl1"
         ) from None
@@ -121,10 +116,10 @@ def save_scene(path: Path) -> None:
         with quiet():
             bpy.ops.wm.save_as_mainfile(filepath=os.path.abspath(path), check_existing=False)
     except RuntimeError as error:
-        raise InputError(f"{path}: cannot be written ({str(error).strip().splitlines()[0]})") from error
+        raise mph.InputError(f"{path}: cannot be written ({str(error).strip().splitlines()[0]})") from error
     with open(path, "rb") as file:
         file.seek(max(0, path.stat().st_size - _BLEND_END))
         end = file.read()
     if not end.endswith(_PACKED_END) and b"ENDB" not in end:
         path.unlink()  # Blender 5.2 says of what it has cut that it was saved
-        raise InputError(f"{path}: cannot be written (Blender left it incomplete: is the disk full?)")
+        raise mph.InputError(f"{path}: cannot be written (Blender left it incomplete: is the disk full?)")

@@ -16,7 +16,7 @@ from ...core import InputError, events, recording
 from ...core.events.folders import INDEX, RECIPE, SetFolder
 from ...core.events.store import EVENTS, SHARDS, size_of
 from ...core.memory import readable_size
-from ..blender import storage, timers, windows
+from ..blender import reports, storage, timers, windows
 
 _INTERVAL = 0.1  # s between two looks at a thread that reads
 _LOOK = 2.0  # s between two looks at a file's date
@@ -102,7 +102,7 @@ def _read(path: Path, stamp: _Stamp, read: Callable[[Path], Note]) -> None:
         with recording.recorded_warnings():
             note = read(path)
     except InputError as error:
-        note = Note(str(error).removeprefix(f"{path}: "), is_wrong=True)
+        note = Note(reports.in_window(error).removeprefix(f"{path}: "), is_wrong=True)
     except Exception as error:  # such as a file that is being written
         note = Note(f"{path.name}: cannot be read ({type(error).__name__}: {error})", is_wrong=True)
     _known[path] = stamp, note

@@ -8,7 +8,7 @@ import numpy as np
 from gpu_extras.batch import batch_for_shader
 
 from ..blender import windows
-from ..volumes import slices, volumes
+from ..volumes import slices, volume_materials, volumes
 from . import frustums
 
 _LEFT, _BOTTOM, _WIDTH, _HEIGHT, _LETTERS = 90, 60, 14, 180, 12  # at a resolution scale of 1, pixels
@@ -44,7 +44,7 @@ def draw() -> None:
     if item is None:
         return
     left, bottom, width, height = place()
-    colors = slices.colors(item.mphdrr_volume.quantity)
+    colors = slices.colors(item.mphdrr_volume.quantity, volume_materials.ramp_of(item))
     colors[:, 3] = 1.0
     up = bottom + height * np.linspace(0.0, 1.0, len(colors))
     corners = np.stack([np.column_stack([np.full(len(up), x), up]) for x in (left, left + width)], axis=1)

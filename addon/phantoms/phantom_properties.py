@@ -271,8 +271,9 @@ LOOKS = (
     ("BRIGHTEST", "Brightest", "The highest values shine through, as in a maximum intensity projection"),
     ("SHELL", "Shell", "The surface at a value: spheres, rods, the heart"),
     ("CUT", "Cut-Away", "The outer surface, cut open at the slices"),
-    ("BONE", "Bone", "Of a CT: the bones' surface, and their window"),
-    ("SOFT", "Soft Tissue", "Of a CT: the skin, and the window of soft tissue"),
+    ("BONE", "Bone", "Of a CT or mu: the bones' surface, and their window"),
+    ("SOFT", "Soft Tissue", "Of a CT or mu: the skin, and the window of soft tissue"),
+    ("LUNG", "Lung", "Of a CT or mu: where air begins, so that a cut shows the lungs, and their window"),
 )
 
 

@@ -1,7 +1,7 @@
 """How projections are shown: `Scene.mphdrr_display`."""
 
 import bpy
-from bpy.props import BoolProperty, EnumProperty, FloatProperty
+from bpy.props import BoolProperty, EnumProperty, FloatProperty, FloatVectorProperty
 
 from ...core.errors import InputError
 from ...core.runs.display import COLORS, SCALES, Display
@@ -54,6 +54,10 @@ class DisplayProperties(bpy.types.PropertyGroup):
     plane_distance: FloatProperty(
         name="Distance", description="Of the planes from the pinholes, mm; 0: between pinhole and ROI", min=0.0,
         soft_max=500.0, update=updates.on_edit("planes"),
+    )  # fmt: skip
+    preview_place: FloatVectorProperty(
+        name="Preview's Place", description="Of the live preview in the 3D views: shares of the way to the right, and up",
+        size=2, default=(1.0, 0.0), min=0.0, max=1.0, options={"HIDDEN"},
     )  # fmt: skip
     plane_at_detector: BoolProperty(
         name="At Virtual Detector", description="Put the planes where the images truly are: behind the ROI",

@@ -46,7 +46,7 @@ _FILES = ", ".join(METHOD_FILES)
 ReconstructionSettings.__annotations__ = properties_of(PROPERTIES)
 ReconstructionSettings.__annotations__["method_file"] = StringProperty(
     name="Method File", description=f"A trained network ({_FILES}) instead of the method; it has voxels of its own",
-    subtype="FILE_PATH",
+    subtype="FILE_PATH", options={"PATH_SUPPORTS_BLEND_RELATIVE"},
 )  # fmt: skip
 _OF_FILES = ("ignore_attenuation", "ignore_blur", "hole", "aperture_points", "pixel_points")
 """Settings that matter to methods in files: of the model alone."""
@@ -106,6 +106,11 @@ class ReconstructionProperties(ReconstructionSettings, bpy.types.PropertyGroup):
     volume: PointerProperty(
         name="Reconstruction", description="The last reconstructed volume", type=bpy.types.Object,
         poll=lambda self, item: volumes.is_volume(item), options={"HIDDEN"},
+    )  # fmt: skip
+    mu: PointerProperty(
+        name="Attenuation", description="Volume of attenuation coefficients (1/mm) or CT numbers for counts, in place of "
+        "that which the run was made with; empty: the run's", type=bpy.types.Object,
+        poll=lambda self, item: volumes.is_volume(item) and volumes.quantity_of(item) in ("mu", "hu"),
     )  # fmt: skip
     fitted: StringProperty(
         name="Fitted Method", description="The method that what a run holds has chosen", options={"HIDDEN"}

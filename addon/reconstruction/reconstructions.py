@@ -89,7 +89,8 @@ def _reconstructing(
 ) -> jobs.Job:
     scene, folder = context.scene, storage.folder()
     method = method_of(recipe["reconstruction.method"])
-    readers = _readers_of_mu(scene)
+    readers, instead = _readers_of_mu(scene), scene.mphdrr_reconstruction.mu
+    own_mu = instead.name if instead in volumes.volume_objects(scene) else None
     uid, start = scene.session_uid, time.perf_counter()
     is_watched = windows.has_window()
     if is_watched:
@@ -124,7 +125,7 @@ def _reconstructing(
                 before = time.monotonic()
             return shelf.enough.is_set()
 
-        mu = _mu(run, recipe, readers)
+        mu = _mu(run, recipe, readers, own_mu)
         found = reconstruct_run(run, recipe, mu, last.found if last else None, watch, stages, method)
         scores = _scores(run, found.volume, stages("scoring"))
         return shown_of(found.volume.array, found.objective.tolist(), scores, found.settings["flatters"]), found
@@ -274,10 +275,12 @@ def _readers_of_mu(scene: bpy.types.Scene) -> dict[str, Callable[[], Volume]]:
     return found
 
 
-def _mu(run: ProjectionRun, recipe: Recipe, readers: Mapping[str, Callable[[], Volume]]) -> Volume | None:
-    """The attenuation of a run that was an object of the scene; None of others, which the run itself knows."""
-    name = run.recipe["attenuation.object"]
-    if name is None or recipe["reconstruction.ignore_attenuation"]:
+def _mu(
+    run: ProjectionRun, recipe: Recipe, readers: Mapping[str, Callable[[], Volume]], instead: str | None
+) -> Volume | None:
+    """The attenuation `instead` of the run's, or of a run's object of the scene; None of others, which the run knows."""
+    name = run.recipe["attenuation.object"] if instead is None else instead
+    if name is None or run.recipe["model.kind"] != "emission" or recipe["reconstruction.ignore_attenuation"]:
         return None
     if name not in readers:
         raise InputError(

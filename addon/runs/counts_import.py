@@ -17,7 +17,10 @@ from ..pictures import images
 from ..scanner import scanner
 from . import rendering, runs
 
-_OF_FRAMES = ("detector.rows", "detector.columns", "detector.plane", "detector.magnification", "detector.pitch")
+_OF_FRAMES = (
+    *("detector.rows", "detector.columns", "detector.plane", "detector.magnification", "detector.pitch"),
+    *("frames.times", "frames.starts"),
+)
 
 
 def importing(context: bpy.types.Context, paths: list[Path], given: Mapping[str, Any]) -> jobs.Job:

@@ -22,7 +22,7 @@ from ...core.memory import readable_size
 from ...core.runs.display import Display
 from ...core.runs.mosaic import as_seen, sized, totals
 from ...core.runs.run_recipe import recipe_model, recipe_views, run_recipe
-from ..blender import jobs, timers, windows
+from ..blender import jobs, reports, timers, windows
 from ..phantoms import phantoms
 from ..pictures import planes
 from ..scanner import scanner, selection
@@ -103,7 +103,9 @@ def request(context: bpy.types.Context) -> Request:
     distance = float(recipe_views(recipe, system).fields(system.poses())[0, 2])
     share = None if shown.planes == "NONE" else planes.share_of_way(shown, module, distance)
     mu = None if mu_item is None else volumes.source(mu_item)
-    return Request(recipe, system, volumes.source(item), mu, shown.display(), share, tuple(lines))
+    return Request(
+        rendering.with_energy(recipe, item), system, volumes.source(item), mu, shown.display(), share, tuple(lines)
+    )
 
 
 def make(asked: Request, quick: bool, voxels: dict[Path, Volume]) -> Preview:
@@ -119,7 +121,7 @@ def make(asked: Request, quick: bool, voxels: dict[Path, Volume]) -> Preview:
         if path not in voxels:
             voxels[path] = vdb.read_vdb(path)
     volume, *mu = (stored_volumes.moved(voxels[path], pose) for path, pose in sources)
-    (run,) = run_recipe(quick_recipe(recipe) if quick else recipe, system, volume, mu[0] if mu else None)
+    run, *_ = run_recipe(quick_recipe(recipe) if quick else recipe, system, volume, mu[0] if mu else None)
     shown = run.projections
     if run.unit == "counts" and quick:  # shown per pixel of the panel's size, as the full picture and the runs are
         shown = shown * np.float32(_pixel_area(recipe_views(recipe, system)) / _pixel_area(run.views))
@@ -228,7 +230,8 @@ class Session:
         self.worker, self.late = None, ""
         error = worker.error
         if error is None:
-            self.shown, self.problem, self.cautions = worker.result, "", tuple(worker.caught[:_MOST_CAUTIONS])
+            self.shown, self.problem = worker.result, ""
+            self.cautions = tuple(map(reports.in_window, worker.caught[:_MOST_CAUTIONS]))
         elif isinstance(error, InputError):
             self._fail(str(error))
         elif isinstance(error, MemoryError):
@@ -238,7 +241,7 @@ class Session:
         windows.redraw("VIEW_3D")
 
     def _fail(self, problem: str) -> None:
-        self.shown, self.problem, self.asked, self.full_at = None, problem, None, None
+        self.shown, self.problem, self.asked, self.full_at = None, reports.in_window(problem), None, None
         windows.redraw("VIEW_3D")
 
     @property

@@ -1,4 +1,4 @@
-"""The live preview's picture in the 3D views: in a corner, with its lines, and where the module's plane stands.
+"""The live preview's picture in the 3D views: in a box that can be dragged, and where the module's plane stands.
 
 It is drawn over the views and is no datablock: nothing of it is saved, undone or rendered.
 """
@@ -17,11 +17,15 @@ from numpy.typing import NDArray
 from ...core.runs.letters import wrapped
 from ..blender import windows
 
-_WIDTH, _LEAST = 150.0, 60.0  # of the picture in the corner, and its least height, in Blender's units of its interface
+_WIDTH, _LEAST = 150.0, 60.0  # of the picture in the box, and its least height, in Blender's units of its interface
 _ABOVE, _BESIDE = 130.0, 50.0  # in such units: for the gizmos that turn the view, above the picture and beside it
 _MARGIN, _TEXT = 20.0, 11.0
 _BACK, _FRONT = (0.05, 0.05, 0.05, 0.75), (1.0, 1.0, 1.0, 1.0)
 _TRIANGLES = ((0, 1, 2), (0, 2, 3))
+
+_Pair = tuple[float, float]
+_boxes: dict[int, tuple[tuple[float, float, float, float], _Pair]] = {}
+"""By 3D view: left, bottom, right and top of the box, and how far it can go to the right and up, pixels of the region."""
 
 
 def start(session: Any) -> Callable[[], None]:
@@ -31,15 +35,37 @@ def start(session: Any) -> Callable[[], None]:
     view = bpy.types.SpaceView3D
     handles = [
         view.draw_handler_add(_draw_plane, (session,), "WINDOW", "POST_VIEW"),
-        view.draw_handler_add(_draw_corner, (session,), "WINDOW", "POST_PIXEL"),
+        view.draw_handler_add(_draw_box, (session,), "WINDOW", "POST_PIXEL"),
     ]
 
     def end() -> None:
         for handle in handles:
             view.draw_handler_remove(handle, "WINDOW")
         _textures.cache_clear()
+        _boxes.clear()
 
     return end
+
+
+def is_over(region: bpy.types.Region, x: float, y: float) -> bool:
+    """Whether a pixel of a 3D view is in the box."""
+    (left, bottom, right, top), _ = _boxes.get(region.as_pointer(), ((0.0,) * 4, (0.0, 0.0)))
+    return left <= x < right and bottom <= y < top
+
+
+def outline(region: bpy.types.Region) -> None:
+    """Frame the box, which the mouse is over."""
+    left, bottom, right, top = _boxes[region.as_pointer()][0]
+    frame = _box(left, bottom, right, top)
+    windows.draw_lines([*frame, frame[0]], _FRONT, 1.0, "LINE_STRIP")
+
+
+def drag(context: bpy.types.Context, start: _Pair, pixels: _Pair) -> None:
+    """Put the box, which was at the `start` of its ways, so many pixels further to the right and up."""
+    room = _boxes[context.region.as_pointer()][1]
+    place = [min(1.0, max(0.0, a + b / max(c, 1.0))) for a, b, c in zip(start, pixels, room, strict=True)]
+    context.scene.mphdrr_display.preview_place = place
+    windows.redraw("VIEW_3D")
 
 
 @functools.lru_cache(maxsize=1)
@@ -56,8 +82,8 @@ def _texture(picture: NDArray[np.uint8]) -> Any:
     return gpu.types.GPUTexture((width, height), format="RGBA8", data=data)
 
 
-def _draw_corner(session: Any) -> None:
-    """Draw the picture and its lines in the lower right corner, beside the sidebar."""
+def _draw_box(session: Any) -> None:
+    """Draw the picture and its lines where the user has dragged them, at first lower right, beside the sidebar."""
     context = bpy.context
     unit = context.preferences.system.ui_scale
     margin, size = _MARGIN * unit, _TEXT * unit
@@ -72,13 +98,19 @@ def _draw_corner(session: Any) -> None:
         free = context.region.height - _ABOVE * unit - 2 * margin - (1.4 * len(lines) + 2) * size
         aspect, most = columns / rows, max(free, _LEAST * unit)
         width, height = min(width, aspect * most), min(most, width / aspect)  # as large as fits
-    left, top = right - max(width, _WIDTH * unit), margin + height + (1.4 * len(lines) + 2) * size
+    wide, high = max(width, _WIDTH * unit), height + (1.4 * len(lines) + 2) * size
+    room = max(0.0, right - wide - margin), max(0.0, context.region.height - 2 * margin - high)
+    x, y = context.scene.mphdrr_display.preview_place
+    left, bottom = margin + x * room[0], margin + y * room[1]
+    top = bottom + high
+    box = left - size, bottom - size, left + wide + size, top
+    _boxes[context.region.as_pointer()] = box, room
     gpu.state.blend_set("ALPHA")
-    windows.draw_rectangle((left - size, margin - size, right + size, top), _BACK)
+    windows.draw_rectangle(box, _BACK)
     if shown is not None:
         picture, colors = _textures(shown)
-        _picture(picture, _box(left, margin + size, left + width, margin + size + height))
-        _picture(colors, _box(left, margin, left + width, margin + 0.6 * size))
+        _picture(picture, _box(left, bottom + size, left + width, bottom + size + height))
+        _picture(colors, _box(left, bottom, left + width, bottom + 0.6 * size))
     blf.color(0, *_FRONT)
     for number, line in enumerate(lines):
         blf.position(0, left, top - (1.4 * number + 1.7) * size, 0)

@@ -33,13 +33,14 @@ OPENING_ANGLE = "model.opening_angle_degrees"
 USUAL_TIME = 600.0
 """s, of a cardiac acquisition: what the panel has when a preset or a volume makes it count photons."""
 
-_NAMES = {"model.kind": "model", "detector.plane": "detector", "detector.rows": "height", "detector.columns": "width"}
+_NAMES = {"model.kind": "model", "detector.plane": "detector", "detector.rows": "height", "detector.columns": "width",
+          "frames.times": "frame_times", "frames.starts": "frame_starts"}  # fmt: skip
 """Names that .blend files keep, where they are not those of the settings."""
 
 PROPERTIES = {
     _NAMES.get(key, key.partition(".")[2]): setting
     for key, setting in SETTINGS.items()
-    if key.startswith(("model.", "detector.", "compute.")) and key != OPENING_ANGLE
+    if key.startswith(("model.", "detector.", "frames.", "compute.")) and key not in (OPENING_ANGLE, "frames.bins")
 }
 """The settings by the names of their properties. A coefficient has a second property, of its material."""
 
@@ -94,8 +95,8 @@ def set_panel(settings: ProjectionProperties, recipe: Recipe) -> None:
     """Set the panel as a recipe says, and the rest to its defaults; raises InputError for what the panel cannot show."""
     if recipe["model.pixel_points"] == "auto" and recipe["model.kind"] != "emission":
         raise InputError("model.pixel_points: the panel has no automatic number for radiographs")
-    if recipe["frames.times"] is not None:
-        raise InputError("frames.times: the panel has one frame; mphdrr project makes a run of each")
+    if recipe["frames.bins"] is not None:
+        raise InputError("frames.bins: the panel has one bin")
     text = recipe["system.modules"] or "-"
     first, dash, last = text.partition("-")
     try:
@@ -118,7 +119,7 @@ def use_preset(settings: ProjectionProperties, preset: str) -> None:
     for name, setting in PROPERTIES.items():
         if setting.key in changes:
             set_property(settings, PROPERTIES, name, changes[setting.key])
-    _set_time(settings)
+    set_time(settings)
 
 
 def fit_model(settings: ProjectionProperties, quantity: str) -> None:
@@ -128,10 +129,10 @@ def fit_model(settings: ProjectionProperties, quantity: str) -> None:
         return
     settings.model = settings.fitted = model
     if model == "EMISSION":
-        _set_time(settings)
+        set_time(settings)
 
 
-def _set_time(settings: ProjectionProperties) -> None:
+def set_time(settings: ProjectionProperties) -> None:
     """Nobody acquires for the default time, 1 s, which only makes counts the sensitivity's rates."""
     if not settings.is_property_set("time"):
         settings.time = USUAL_TIME
@@ -139,14 +140,17 @@ def _set_time(settings: ProjectionProperties) -> None:
 
 def drawn(settings: ProjectionProperties, table: str) -> Iterator[tuple[str, bool]]:
     """The properties of a table that the chosen model and hole have, each with whether it has an effect."""
-    of_others = drawn_of(PROPERTIES, settings, lambda need: "model.kind=" in need or "model.hole=rays" in need, table)
+    of_others = drawn_of(
+        PROPERTIES, settings, lambda need: need.startswith("model.kind=") or "model.hole=rays" in need, table
+    )
     for name, is_active in of_others:
         yield name, is_active and (name != "magnification" or settings.detector == "VIRTUAL")
 
 
 def makes_counts(settings: ProjectionProperties) -> bool:
     """Whether images hold numbers of photons, which may have noise."""
-    return settings.model == "EMISSION" or (settings.model == "TRANSMISSION" and settings.photons > 0)
+    of_xrays = settings.model == "SPECTRAL" and settings.panel == "COUNTING"
+    return settings.model == "EMISSION" or of_xrays or (settings.model == "TRANSMISSION" and settings.photons > 0)
 
 
 def _is_ours(self: ProjectionProperties, item: bpy.types.Object) -> bool:

@@ -50,30 +50,36 @@ def render_job(context: bpy.types.Context, recipe: Recipe, volume: str = "", mu:
     # The array, means and colours of it, and the packed images, in our memory and in Blender's beside those of the last run.
     memory.require(16.0 * len(system) * rows * columns, f"{len(system)} images of {columns} x {rows} pixels")
     recipe = recipe.updated({"volume.object": item.name, "attenuation.object": mu_item and mu_item.name})
-    recipe = _with_volume(recipe, item)
+    recipe = _with_volume(with_energy(recipe, item), item)
     read_volume, read_mu = volumes.reader(item), mu_item and volumes.reader(mu_item)
     energy = mu_item and phantoms.mu_energy(mu_item)
-    path, display = run_path(scene), scene.mphdrr_display.display()
+    paths, display = [run_path(scene) for _ in recipe["frames.times"] or [0.0]], scene.mphdrr_display.display()
     state = runs.state_of(system, recipe, item, mu_item)
     scene_uid, scanner_uid, start = scene.session_uid, collection.session_uid, time.perf_counter()
 
-    def work(progress: Progress) -> tuple[ProjectionRun, images.Pictures]:
+    def work(progress: Progress) -> list[tuple[ProjectionRun, images.Pictures]]:
         stages = stages_of(progress)
         warn_of_energy(model, energy, repr(recipe["attenuation.object"]))
         stages("reading")
-        (run,) = run_recipe(recipe, system, read_volume(), read_mu and read_mu(), stages)
-        return run, kept(run, path, display, stages)
+        made = run_recipe(recipe, system, read_volume(), read_mu and read_mu(), stages)
+        return [(run, kept(run, path, display, stages)) for run, path in zip(made, paths, strict=True)]
 
-    def finish(result: tuple[ProjectionRun, images.Pictures]) -> jobs.Finishing:
-        run, made = result
+    def finish(result: list[tuple[ProjectionRun, images.Pictures]]) -> jobs.Finishing:
         scene = jobs.scene_again(scene_uid, "the projections are")
         owner = jobs.found_again(bpy.data.collections, scanner_uid)  # which need not be the panel's any more
-        images.show_below((yield from storing(scene, run, path, state, owner, made)), bpy.context)
+        for number, (path, (run, made)) in enumerate(zip(paths, result, strict=True)):
+            mosaic = yield from storing(scene, run, path, state, owner, made)
+            scene.mphdrr_projections.runs[-1].keep = number < len(paths) - 1  # each frame is a run
+        images.show_below(mosaic, bpy.context)
         where = path if bpy.data.filepath else f"{path} until the .blend is saved"
         seconds = time.perf_counter() - start
         return f"Projected {recipe['volume.object']!r} into {len(run.views)} modules in {seconds:.1f} s: {where}"
 
-    return jobs.Job("Projecting", work, finish, lambda: path.unlink(missing_ok=True))
+    def undo() -> None:
+        for path in paths:
+            path.unlink(missing_ok=True)
+
+    return jobs.Job("Projecting", work, finish, undo)
 
 
 def kept(run: ProjectionRun, path: Path, display: Display, stages: Stages) -> images.Pictures:
@@ -91,6 +97,11 @@ def sources(
     taken = tuple(each for each in taken if each in (("mu",) if recipe["model.photons"] else model.takes))
     item = _chosen_volume(context, volume, taken, model.name)
     return item, attenuating(context, recipe, mu)
+
+
+def with_energy(recipe: Recipe, item: bpy.types.Object) -> Recipe:
+    """The recipe with the energy at which an object's mu holds, if spectra need it."""
+    return recipe.updated({"volume.energy": phantoms.mu_energy(item)}) if recipe["model.kind"] == "spectral" else recipe
 
 
 def attenuating(context: bpy.types.Context, recipe: Recipe, mu: str = "") -> bpy.types.Object | None:

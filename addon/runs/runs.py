@@ -19,7 +19,7 @@ from ...core.memory import readable_size
 from ...core.runs.recipe import Recipe, fitting_recipe
 from ...core.runs.run import ProjectionRun
 from ...core.runs.settings import SAMPLING, SETTINGS, Setting
-from ..blender import decimals, ids, objects, storage, timers, windows
+from ..blender import decimals, ids, objects, reports, storage, timers, windows
 from ..phantoms import phantoms
 from ..scanner import following, module_values, scanner, scanner_parts
 from ..volumes import volumes
@@ -115,11 +115,17 @@ def shown(scene: bpy.types.Scene) -> bpy.types.PropertyGroup | None:
     return next((item for item in settings.runs if item.file == settings.run_file), None)
 
 
-def holds_counts(scene: bpy.types.Scene) -> bool | None:
-    """Whether the `shown` run is of SPECT counts; None where that is not known."""
+def settings_of(scene: bpy.types.Scene) -> Mapping[str, Any]:
+    """The settings that the `shown` run was made with, all that its numbers depend on; empty where they are not known."""
     item = shown(scene)
     settings = json.loads(item.state).get("settings") if item is not None and item.state else None
-    return None if settings is None else settings.get("model.kind", _DEFAULTS["model.kind"]) == "emission"
+    return {} if settings is None else {**_DEFAULTS, **settings}
+
+
+def holds_counts(scene: bpy.types.Scene) -> bool | None:
+    """Whether the `shown` run is of SPECT counts; None where that is not known."""
+    settings = settings_of(scene)
+    return settings["model.kind"] == "emission" if settings else None
 
 
 def required(scene: bpy.types.Scene, to_do: str) -> bpy.types.PropertyGroup:
@@ -144,7 +150,7 @@ def _changes(scene: bpy.types.Scene, item: bpy.types.PropertyGroup | None = None
     try:
         return list(_differences(scene, json.loads(item.state), item.scanner))
     except InputError as error:
-        return [(str(error), None)]
+        return [(reports.in_window(error), None)]
 
 
 def _last_changes(scene: bpy.types.Scene) -> _Changes:

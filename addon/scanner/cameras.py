@@ -82,6 +82,22 @@ def _field(text: str) -> Field:
     return numbers if len(numbers) > 2 else (0.0, 0.0, *numbers, numbers[1])
 
 
+def take_backgrounds(new: Any, old: Any) -> None:
+    """Show behind a camera the pictures that stood behind another one, where and as they did."""
+    new.show_background_images = old.show_background_images
+    for picture in old.background_images:
+        _take_settings(new.background_images.new(), picture)
+
+
+def _take_settings(new: Any, old: Any) -> None:
+    for setting in old.bl_rna.properties:
+        name = setting.identifier
+        if not setting.is_readonly:
+            setattr(new, name, getattr(old, name))
+        elif name in ("image_user", "clip_user"):  # which frames are shown when
+            _take_settings(getattr(new, name), getattr(old, name))
+
+
 def set_up_camera(camera: bpy.types.Camera, field: Field, distance: float) -> None:
     """Set up the camera data of a module that sees `field` from `distance` to the isocentre, mm."""
     set_field_of_view(camera, field)

@@ -24,6 +24,7 @@ _Parts = dict[bpy.types.Object, list[bpy.types.Object]]
 _Old = tuple[int, str, list[bpy.types.Object]]
 """Index of a module, its values, and its parts that were built from others."""
 _writing = 0
+_places: dict[int, bytes] = {}  # by the session's number of a camera: its world matrix when its module last followed
 
 
 @contextmanager
@@ -107,6 +108,11 @@ def set_for_all(collection: bpy.types.Collection, name: str) -> None:
     refresh(collection)
 
 
+def has_moved(camera: bpy.types.Object) -> bool:
+    """Whether a module's camera stands elsewhere than when the module last followed."""
+    return _places.get(camera.session_uid) != objects.world_matrix(camera).tobytes()
+
+
 def _refresh_modules(kind: Kind, parts: _Parts, scanner: bpy.types.PropertyGroup, aim: bool) -> bool:
     """Make modules follow, all together, which is faster than one by one; returns whether a value has changed."""
     cameras_, matrices = list(parts), objects.world_matrices(list(parts))
@@ -121,6 +127,7 @@ def _refresh_modules(kind: Kind, parts: _Parts, scanner: bpy.types.PropertyGroup
     for m in to_aim:
         objects.set_world_matrix(cameras_[m], exact[m])
         matrices[m], aimed[m] = objects.world_matrix(cameras_[m]), True
+    _places.update(zip((camera.session_uid for camera in cameras_), map(np.ndarray.tobytes, matrices), strict=True))
     distances = np.linalg.norm(matrices[:, :3, 3], axis=1)
     changed = [
         _follow(found, [cameras_[m] for m in which], aimed[which].tolist(), distances[which].tolist(), parts, scanner)

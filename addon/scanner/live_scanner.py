@@ -36,22 +36,25 @@ def _follow(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph, aim: bool) -
     # Both when objects were added, deleted, shown or hidden; selecting is an update of the scene alone.
     structure = _overlooked or (depsgraph.id_type_updated("SCENE") and depsgraph.id_type_updated("COLLECTION"))
     updates = [u for u in depsgraph.updates if u.id.id_type == "OBJECT"]
-    objects = [u.id.original for u in updates if u.is_updated_transform]
+    placed = [u.id.original for u in updates if u.is_updated_transform]
     # Blender does not say that an animation or a driver has changed a module's number: the animated are looked at.
     animated = [u.id.original for u in updates if u.id.animation_data is not None]
-    moved = {item for item in (*objects, *animated) if item.mphdrr_module.is_module}
+    moved = {item for item in placed if item.mphdrr_module.is_module and following.has_moved(item)}
+    moved |= {item for item in animated if item.mphdrr_module.is_module}
     off = [
-        item for item in (scene.objects if _overlooked else objects) if grabbing.is_part(item) and grabbing.is_off(item)
+        item for item in (scene.objects if _overlooked else placed) if grabbing.is_part(item) and grabbing.is_off(item)
     ]
     if not (moved or off or structure):
         return
-    _overlooked = _is_busy()
+    everything, _overlooked = _overlooked, _is_busy()
     if _overlooked:
         return
     moved |= _carry(off)
     for collection in _local(scanner.scanners(scene)):
-        own = (camera for camera in moved if collection.all_objects.get(camera.name) == camera)
-        following.refresh(collection, scanner.modules(collection) if structure else list(own), aim)
+        own = [camera for camera in moved if collection.all_objects.get(camera.name) == camera]
+        if structure:
+            own = [o for o in scanner.modules(collection) if everything or o in moved or following.has_moved(o)]
+        following.refresh(collection, own, aim)
         if structure:
             _look_for_copies(collection)
 

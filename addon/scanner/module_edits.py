@@ -36,10 +36,12 @@ def copied_cameras(collection: bpy.types.Collection) -> list[bpy.types.Object]:
 
 def orphan_parts(collection: bpy.types.Collection) -> list[bpy.types.Object]:
     """Parts whose camera was deleted."""
+    there = set(scanner.modules(collection))  # Blender takes long to say which collections an object is in
     return [
         item
         for item in collection.all_objects
         if item.mphdrr_module.part in collimators.PARTS
+        and item.parent not in there
         and not (item.parent is not None and item.parent.mphdrr_module.is_module and item.parent.users_collection)
     ]
 

@@ -7,7 +7,6 @@ children are its parts: its collimator and its crystal.
 import json
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict
-from pathlib import Path
 
 import bpy
 import numpy as np
@@ -19,7 +18,7 @@ from ...core.geometry.finding import Finding
 from ...core.geometry.scanner import Scanner
 from ...core.scanner_kinds import SCANNERS
 from ...core.workbook import ColumnMap, QuantityCells, SystemSource
-from ..blender import ids, objects
+from ..blender import ids, objects, storage
 from ..blender.decimals import typed
 from . import cameras, collimators, following, framing, pinholes
 from .following import modules
@@ -109,7 +108,8 @@ def source(collection: bpy.types.Collection) -> SystemSource | None:
     if not values:
         return None
     columns = values.get("columns")  # files of earlier versions have none
-    values["path"], values["numbers"] = Path(values["path"]), tuple(values["numbers"])
+    values["path"] = storage.absolute(collection.mphdrr_scanner.workbook or values["path"])  # it may be a copy by now
+    values["numbers"] = tuple(values["numbers"])
     values["cells"] = tuple(QuantityCells(**{**cells, "rows": tuple(cells["rows"])}) for cells in values["cells"])
     values["columns"] = ColumnMap.from_toml(columns) if columns else None
     return SystemSource(**values)
@@ -179,6 +179,12 @@ def scanner_of(scene: bpy.types.Scene, item: bpy.types.Object | None) -> bpy.typ
         return None
     found = sorted(scanners(scene), key=lambda c: c != scene.mphdrr_geometry.scanner)
     return next((c for c in found if c.all_objects.get(item.name) == item), None)
+
+
+def losses_of(scene: bpy.types.Scene, *names: str) -> list[str]:
+    """The `losses` if the scene's scanners of these names were replaced."""
+    found = filter(None, (find_scanner(scene, name) for name in names))
+    return [line for collection in found for line in losses(collection)]
 
 
 def active_scanner(scene: bpy.types.Scene) -> bpy.types.Collection | None:

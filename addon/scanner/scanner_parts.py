@@ -148,8 +148,11 @@ def clear(scene: bpy.types.Scene, collection: bpy.types.Collection, replacements
     bpy.data.batch_remove([o for o in parts if o not in new_of])
     rings = set(homes[1:])
     for camera, users in bpy.data.user_map(subset=set(new_of)).items():
-        if new_of[camera] is not None and users - rings:
-            camera.user_remap(new_of[camera])
+        new = new_of[camera]
+        if new is not None:
+            cameras.take_backgrounds(new.data, camera.data)
+            if users - rings:
+                camera.user_remap(new)
     bpy.data.batch_remove([*new_of, *rings])
     objects.remove_unused(datas)
 

@@ -9,22 +9,34 @@ from functools import partial
 import bpy
 from mathutils import Vector
 
+from ...core.physics.ct_numbers import mu_of_hu
 from ..blender import compat, objects
-from . import volume_materials
+from . import vdb, volume_materials, volumes
 
 _KEY = "mphdrr_surface"  # custom property of a surface's object
 # Exponent and gain of the extinction; where a surface is drawn, the volume itself is not.
 _SMOKE = {"DENSITY": (1.0, 1.0), "BRIGHTEST": (3.0, 0.4)}
 _ON_SURFACE = {"SHELL": 0.6, "CUT": 0.1}  # share of the display range
-_TISSUES = {"BONE": (150.0, 1300.0, 250.0), "SOFT": (-160.0, 240.0, -160.0)}  # HU: display range and surface
+_TISSUES = {  # HU: display range and surface; linear RGB
+    "BONE": ((150.0, 1300.0, 250.0), (0.80, 0.68, 0.46)),
+    "SOFT": ((-160.0, 240.0, -160.0), (0.72, 0.33, 0.20)),
+    "LUNG": ((-1000.0, 150.0, -500.0), (0.62, 0.20, 0.17)),
+}
+_ENERGY = 140.5  # keV, at which a volume's mu is taken to hold where its file does not say
 _FINE = 160  # voxels along a side of a surface, at most
 
 
 def choose(item: bpy.types.Object) -> None:
     """Set the surface, and of tissues the display range, to where `VolumeProperties.look` has them."""
     settings = item.mphdrr_volume
-    if settings.look in _TISSUES and settings.quantity == "hu":
-        settings.display_low, settings.display_high, settings.surface = _TISSUES[settings.look]
+    remove_surface(item)  # the next has the look's own colour
+    if settings.look in _TISSUES and settings.quantity in volume_materials.XRAY:
+        numbers, _ = _TISSUES[settings.look]
+        if settings.quantity == "mu":
+            path = volumes.file_of(item)
+            known = vdb.provenance_of(path) if path.is_file() else {}
+            numbers = mu_of_hu(numbers, float(known.get("energy_keV", _ENERGY))).tolist()
+        settings.display_low, settings.display_high, settings.surface = numbers
         return
     share = _ON_SURFACE.get(settings.look, 0.6)
     settings.surface = settings.display_low + share * (settings.display_high - settings.display_low)
@@ -38,8 +50,8 @@ def show(item: bpy.types.Object, cut: volume_materials.Cut | None) -> None:
     high = max(settings.display_high / factor, low + max(1e-30, 1e-6 * abs(low)))
     exponent, gain = _SMOKE.get(settings.look, (1.0, 0.0))
     for material in filter(None, item.data.materials):
-        volume_materials.set_range(material, low, high)
-        volume_materials.set_opacity(material, exponent, gain)
+        inputs = {"Low": low, "High": high, "Exponent": exponent, "Gain": gain, "Size": settings.extent}
+        volume_materials.set_look(material, settings.quantity, **inputs)
         if material.node_tree is not None:
             volume_materials.set_cut(material.node_tree, cut)
     volume_materials.set_display(item.data, low, high, settings.extent, gain if cut is None else 0.0)
@@ -81,7 +93,9 @@ def _shift(item: bpy.types.Object) -> Vector:
 def _new_surface(item: bpy.types.Object) -> bpy.types.Object:
     name = f"{item.name} surface"
     mesh = bpy.data.meshes.new(name)
-    mesh.materials.append(_material(name, item.mphdrr_volume.quantity))
+    settings = item.mphdrr_volume
+    tissue = _TISSUES.get(settings.look) if settings.quantity in volume_materials.XRAY else None
+    mesh.materials.append(new_material(name, volume_materials.ramp_of(item, smoke=True), tissue and tissue[1]))
     surface = bpy.data.objects.new(name, mesh)
     surface[_KEY] = True
     surface.parent, surface.hide_select = item, True
@@ -106,10 +120,12 @@ def _cutting(name: str) -> bpy.types.NodeTree:
     return tree
 
 
-def _material(name: str, quantity: str) -> bpy.types.Material:
-    """A dull surface in the brighter colours of a quantity."""
+def new_material(
+    name: str, colors: volume_materials.Ramp, rgb: tuple[float, float, float] | None = None
+) -> bpy.types.Material:
+    """A dull surface in the brighter of some colours, or in a linear colour."""
     material, shader = compat.surface_material(name, "ShaderNodeBsdfPrincipled")
-    color = (*volume_materials.ramp(quantity)[-2][1], 1.0)
+    color = (*(rgb or colors[-2][1]), 1.0)
     material.diffuse_color = color
     shader.inputs["Base Color"].default_value, shader.inputs["Roughness"].default_value = color, 0.6
     return material

@@ -22,13 +22,15 @@ from . import looks, vdb, volume_materials, volumes
 _PLANES = ("Sagittal", "Coronal", "Axial")  # across world x, y, z
 _KEY = "mphdrr_slice"  # custom property: the axis of the grid that a plane is across
 _LATTICE = "mphdrr_slice_of"  # custom property: shape and affine that the planes were made for
+_MATERIAL = "mphdrr_material"  # custom property: a plane's own material, with its picture
+_GROUP = "mphDRR Slice"  # of nodes, which draws all slices
 _SHADES = 256
 _FRONT = (0.7, -0.5, 0.5)  # direction from which a scene is looked at first: the volume is cut open on that side
 
 # The volume that slices were last taken of: reading it takes longer than all the rest.
 _last: tuple[Path, Volume] | None = None
 # By the session's number of a plane's image: the file, index and display range that it was painted of.
-_painted: dict[int, tuple[Path, int, float, float]] = {}
+_painted: dict[int, tuple[Path, int, float, float, volume_materials.Ramp]] = {}
 
 
 def add_slices(item: bpy.types.Object, at: Sequence[int] | None = None) -> list[bpy.types.Object]:
@@ -60,7 +62,7 @@ def remove_slices(item: bpy.types.Object) -> None:
         pictures = [tree.nodes["Slice"].image for tree in trees if "Slice" in tree.nodes]
         objects.remove_objects([plane])
         objects.remove_unused(materials)
-        objects.remove_unused(pictures)
+        objects.remove_unused([*pictures, bpy.data.node_groups.get(_GROUP)])
     looks.show(item, None)
 
 
@@ -140,8 +142,9 @@ def update(item: bpy.types.Object) -> None:
 def _paint(item: bpy.types.Object, plane: bpy.types.Object) -> None:
     """Paint a plane's image, unless it is so; raises InputError where the voxels' file is missing."""
     settings, axis = item.mphdrr_volume, plane[_KEY]
-    image = plane.data.materials[0].node_tree.nodes["Slice"].image
-    wanted = volumes.file_of(item), settings.slices[axis], settings.display_low, settings.display_high
+    image = _image(plane)
+    ramp = volume_materials.ramp_of(item)
+    wanted = volumes.file_of(item), settings.slices[axis], settings.display_low, settings.display_high, ramp
     if image is None or _painted.get(image.session_uid) == wanted:
         return
     array = _stored(item).array
@@ -151,7 +154,7 @@ def _paint(item: bpy.types.Object, plane: bpy.types.Object) -> None:
         high - low, 1e-30
     )
     shades = np.clip(relative * (_SHADES - 1), 0, _SHADES - 1).astype(np.uint8)
-    image.pixels.foreach_set(colors(settings.quantity)[shades].ravel())
+    image.pixels.foreach_set(colors(settings.quantity, ramp)[shades].ravel())
     image.update()
     _painted[image.session_uid] = wanted
 
@@ -179,14 +182,21 @@ def before_save(*_: object) -> None:
     """Pack the planes' images: Blender does not save what was painted."""
     for item in bpy.data.objects:
         if _KEY in item:
-            image = item.data.materials[0].node_tree.nodes["Slice"].image
+            image = _image(item)
             if image is not None and image.is_dirty:
                 image.pack()
 
 
 def after_update(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
     """Volumes were hidden or shown: their planes, too."""
-    if scene != bpy.context.scene or not depsgraph.id_type_updated("SCENE"):
+    if scene != bpy.context.scene:
+        return
+    if depsgraph.id_type_updated("MATERIAL") or depsgraph.id_type_updated("NODETREE"):  # another look, or an edited one
+        for item in volumes.volume_objects(scene):
+            for plane in planes_of(item):
+                _pass_on(item, plane)
+            update(item)
+    if not depsgraph.id_type_updated("SCENE"):
         return
     for item in volumes.volume_objects(scene):
         for plane in planes_of(item):
@@ -198,6 +208,20 @@ def after_frame_change(scene: bpy.types.Scene, *_: object) -> None:
     for item in volumes.volume_objects(scene):
         if item.data.is_sequence:
             update(item)
+
+
+def _image(plane: bpy.types.Object) -> bpy.types.Image | None:
+    """A plane's picture; None where the user has given it another material."""
+    material = next(iter(plane.data.materials), None)
+    node = material.node_tree.nodes.get("Slice") if material and material.node_tree else None
+    return node.image if node else None
+
+
+def _pass_on(item: bpy.types.Object, plane: bpy.types.Object) -> None:
+    """Give a look that was dropped on a plane to its volume, and the plane its own material again."""
+    material, own = next(iter(plane.data.materials), None), plane.get(_MATERIAL)
+    if material is not None and own not in (None, material) and volume_materials.is_look(material):
+        item.data.materials[0], plane.data.materials[0] = material, own
 
 
 def _stored(item: bpy.types.Object) -> Volume:
@@ -227,28 +251,48 @@ def _plane(item: bpy.types.Object, volume: Volume, axis: int, name: str) -> bpy.
     image = bpy.data.images.new(name, volume.grid.shape[across], volume.grid.shape[up], alpha=True)
     mesh.materials.append(_material(name, image))
     plane = bpy.data.objects.new(name, mesh)
-    plane[_KEY], plane[_LATTICE] = axis, _lattice(volume)
+    plane[_KEY], plane[_LATTICE], plane[_MATERIAL] = axis, _lattice(volume), mesh.materials[0]
     plane.parent = item
     objects.link_beside(plane, item)
     return plane
 
 
 def _material(name: str, image: bpy.types.Image) -> bpy.types.Material:
-    """A picture that shines by itself, seen from both sides, in colours that no light changes."""
+    """A picture drawn by the group of nodes that all slices share."""
     material = compat.blank_material(name)
     tree, shown = material.node_tree, {"image": image, "interpolation": "Closest", "extension": "EXTEND"}
     texture = compat.add_node(tree, "ShaderNodeTexImage", (0.0, 0.0), name="Slice", **shown)
-    emission = compat.add_node(tree, "ShaderNodeEmission", (300.0, 0.0), {"Color": texture.outputs["Color"]})
-    nothing = compat.add_node(tree, "ShaderNodeBsdfTransparent", (300.0, -150.0))
-    mixed = {0: texture.outputs["Alpha"], 1: nothing.outputs[0], 2: emission.outputs[0]}
-    mix = compat.add_node(tree, "ShaderNodeMixShader", (500.0, 0.0), mixed)
-    compat.add_node(tree, "ShaderNodeOutputMaterial", (700.0, 0.0), {"Surface": mix.outputs[0]})
+    given = {name: texture.outputs[name] for name in ("Color", "Alpha")}
+    drawn = compat.add_node(tree, "ShaderNodeGroup", (300.0, 0.0), given, node_tree=_group())
+    compat.add_node(tree, "ShaderNodeOutputMaterial", (500.0, 0.0), {"Surface": drawn.outputs[0]})
     return material
 
 
-def colors(quantity: str) -> NDArray[np.float32]:
-    """RGBA (256, 4) of the display range, as an sRGB image holds them; the lowest is transparent."""
-    positions, colors = zip(*volume_materials.ramp(quantity), strict=True)
+def _group() -> bpy.types.NodeTree:
+    """What makes a picture shine by itself, seen from both sides, in colours that no light changes."""
+    if (tree := bpy.data.node_groups.get(_GROUP)) is not None:
+        return tree
+    tree = bpy.data.node_groups.new(_GROUP, "ShaderNodeTree")
+    tree.interface.new_socket("Color", in_out="INPUT", socket_type="NodeSocketColor")
+    for name in ("Alpha", "Strength", "Opacity"):
+        tree.interface.new_socket(name, in_out="INPUT", socket_type="NodeSocketFloat").default_value = 1.0
+    tree.interface.new_socket("Surface", in_out="OUTPUT", socket_type="NodeSocketShader")
+    given = compat.add_node(tree, "NodeGroupInput", (0.0, 0.0)).outputs
+    shining = {name: given[name] for name in ("Color", "Strength")}
+    emission = compat.add_node(tree, "ShaderNodeEmission", (300.0, 0.0), shining)
+    nothing = compat.add_node(tree, "ShaderNodeBsdfTransparent", (300.0, -150.0))
+    seen = compat.add_math(tree, "MULTIPLY", (300.0, 150.0), given["Alpha"], given["Opacity"])
+    mixed = {0: seen, 1: nothing.outputs[0], 2: emission.outputs[0]}
+    mix = compat.add_node(tree, "ShaderNodeMixShader", (500.0, 0.0), mixed)
+    compat.add_node(tree, "NodeGroupOutput", (700.0, 0.0), {0: mix.outputs[0]})
+    return tree
+
+
+def colors(quantity: str, ramp: volume_materials.Ramp | None = None) -> NDArray[np.float32]:
+    """RGBA (256, 4) of the display range, as an sRGB image holds them, of a ramp or else the quantity's; the lowest is
+    transparent.
+    """
+    positions, colors = zip(*(ramp or volume_materials.ramp(quantity)), strict=True)
     shades = np.linspace(0, 1, _SHADES)
     rgb = np.stack([np.interp(shades, positions, channel) for channel in np.transpose(colors)], axis=1)
     srgb = np.where(rgb <= 0.0031308, 12.92 * rgb, 1.055 * rgb ** (1 / 2.4) - 0.055)

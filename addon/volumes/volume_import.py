@@ -6,7 +6,7 @@ from typing import Any
 
 import bpy
 
-from ...core import Volume, absorbed_dose_rate, centered, hu_to_mu, memory
+from ...core import Volume, absorbed_dose_rate, centered, hu_to_mu, memory, mu_to_hu
 from ...core.progress import Progress, part_of
 from ...core.volumes.volume_files import READ_FORMATS, read_volume
 from ..blender import jobs, storage
@@ -92,6 +92,11 @@ def converting(item: bpy.types.Object, energy: float) -> jobs.Job:
     """The job that adds the attenuation of a CT, for photons of an energy in keV; the CT stays."""
     provenance = {"ct": item.name, "energy_keV": energy}
     return _made_of(item, "mu", f" at {energy:g} keV", provenance, lambda ct, _: hu_to_mu(ct, energy))
+
+
+def ct_numbers(item: bpy.types.Object) -> jobs.Job:
+    """The job that adds the CT numbers of a mu that holds at the energy of CTs; the mu stays."""
+    return _made_of(item, "CT", "", {"mu": item.name}, lambda mu, _: mu_to_hu(mu))
 
 
 def dosing(item: bpy.types.Object, isotope: str) -> jobs.Job:

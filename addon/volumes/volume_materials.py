@@ -1,19 +1,26 @@
 """How volumes look: colours, units, the volume material, and the density of the solid viewport's smoke.
 
-Activity glows in purples, maps are green, attenuation and CT numbers look like a radiograph, the higher the brighter. None
-has a hue of the crystals (`core.geometry.part_colors`) or of what Blender marks as selected.
+Activity glows in purples, maps are green; attenuation and CT numbers look like a radiograph on slices and like tissue as
+smoke, the higher the brighter. Neither activity nor maps have a hue of the crystals (`core.geometry.part_colors`) or of what
+Blender marks as selected.
 """
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import bpy
+import numpy as np
 
+from ...core.files import ensure_folder
 from ...core.volumes.volume import UNITS
 from ..blender import objects
 from ..blender.compat import add_math, add_node, blank_material
 
-# Positions and linear RGB, evenly brighter.
+Ramp = tuple[tuple[float, tuple[float, ...]], ...]
+"""Positions (0 to 1) and linear RGB."""
+
+# Evenly brighter.
 _PURPLES = (
     (0.00, (0.0060, 0.0020, 0.0180)),
     (0.25, (0.0500, 0.0090, 0.1750)),
@@ -29,15 +36,35 @@ _GREENS = (
     (1.00, (0.6200, 0.7600, 0.0200)),
 )
 _GREYS = ((0.00, (0.02, 0.02, 0.02)), (1.00, (0.80, 0.80, 0.80)))
-_XRAY = ("mu", "hu")
+_TISSUES = (  # of the smoke of CT numbers and mu: blood, muscle, fat, bone
+    (0.00, (0.0200, 0.0050, 0.0050)),
+    (0.25, (0.2200, 0.0350, 0.0250)),
+    (0.50, (0.5500, 0.1900, 0.1000)),
+    (0.75, (0.8000, 0.5000, 0.2800)),
+    (1.00, (0.9500, 0.8800, 0.7200)),
+)
+_FIRE = ((0.0, (0.004, 0.0, 0.0)), (0.4, (0.5, 0.01, 0.0)), (0.75, (0.9, 0.3, 0.01)), (1.0, (1.0, 0.9, 0.5)))
+_ICE = ((0.0, (0.0, 0.002, 0.01)), (0.5, (0.0, 0.12, 0.5)), (1.0, (0.6, 0.9, 1.0)))
+XRAY = ("mu", "hu")
 # Not in the voxels' own unit: as every other sensitivity in the window, and in few letters.
 _SHOWN_AS = {"sensitivity": ("cps/MBq", 1e6), "backprojection": ("as images", 1.0)}
 _CT_WINDOW = (-200.0, 1000.0)  # HU: skin to bone
 # Extinction times the volume's size: a rod of a twentieth of it looks solid; attenuation and maps can be looked through.
 _OPACITY, _OPACITY_THROUGH = 60.0, 20.0
 _SMOKE = 15.0  # the same for the solid viewport's smoke, which is denser: thin enough that rods show behind rods
-# Nodes: the values at the ramp's ends; the extinction, for relative values ** exponent and times a gain.
-_RANGE, _OPACITY_NODE, _EXPONENT, _GAIN = "Display Range", "Opacity", "Exponent", "Gain"
+_VALUES, _LOOK, _COLORS = "Values", "Look", "Colors"  # nodes: the grid's values, the look, and its ramp
+# A look's inputs: the values at the ramp's ends; the extinction, for relative values ** exponent, times density / size and a
+# gain; and where it is shown.
+_INPUTS = {
+    "Value": 0.0, "Low": 0.0, "High": 1.0, "Density": _OPACITY, "Size": 100.0, "Exponent": 1.0, "Gain": 1.0, "Shown": 1.0,
+}  # fmt: skip
+# Where materials of versions without looks have these: a node and the place of its input.
+_EARLIER = {"Low": ("Display Range", 1), "High": ("Display Range", 2), "Exponent": ("Exponent", 1), "Gain": ("Gain", 1)}
+_LOOKS: dict[str, Ramp] = {
+    "mphDRR Purples": _PURPLES, "mphDRR Greens": _GREENS, "mphDRR Greys": _GREYS,
+    "mphDRR Tissues": _TISSUES, "mphDRR Fire": _FIRE, "mphDRR Ice": _ICE,
+}  # fmt: skip
+_ICON = 128  # pixels
 _CUT = "Cut"  # nodes, numbered by the grid's axes: what lies beyond all three is cut away
 _THINNEST = 1e-5  # Blender's least density of smoke
 _FAR = 1e9  # where nothing is cut
@@ -46,9 +73,11 @@ Cut = Sequence[tuple[Sequence[float], float]]
 """A vector n and a number t for each axis of a grid; points x, mm in the object's space, with n x > t lie in front."""
 
 
-def ramp(quantity: str) -> tuple[tuple[float, tuple[float, float, float]], ...]:
-    """Positions (0 to 1) and colours (linear RGB) that show a quantity's display range."""
-    return _GREYS if quantity in _XRAY else _PURPLES if quantity == "activity" else _GREENS
+def ramp(quantity: str, smoke: bool = False) -> Ramp:
+    """Positions (0 to 1) and colours (linear RGB) that show a quantity's display range: on slices, or as smoke."""
+    if quantity in XRAY:
+        return _TISSUES if smoke else _GREYS
+    return _PURPLES if quantity == "activity" else _GREENS
 
 
 def shown_unit(quantity: str) -> tuple[str, float]:
@@ -63,44 +92,109 @@ def usual_range(quantity: str, low: float, high: float) -> tuple[float, float]:
     return 0.0, high if high > 0 else max(-low, 1.0)
 
 
-def new_material(name: str, quantity: str, size: float) -> bpy.types.Material:
-    """A material that glows and is opaque where the grid `quantity` is high (`set_range`); for a volume of `size` mm."""
+def new_material(name: str, quantity: str, size: float, look: str = "") -> bpy.types.Material:
+    """A material that glows and is opaque where the grid `quantity` is high (`set_look`); for a volume of `size` mm.
+
+    Its `look` is a group of nodes, by default the quantity's.
+    """
     material = blank_material(name)
-    tree, colors = material.node_tree, ramp(quantity)
-    attribute = add_node(tree, "ShaderNodeAttribute", (0.0, 0.0), attribute_name=quantity)
-    ranged = {"Value": attribute.outputs["Fac"]}
-    relative = add_node(
-        tree, "ShaderNodeMapRange", (220.0, 0.0), ranged, name=_RANGE, label=_RANGE, clamp=True
-    ).outputs[0]
-    color = add_node(tree, "ShaderNodeValToRGB", (440.0, 220.0), {"Fac": relative})
+    look = look or next(each for each, colors in _LOOKS.items() if colors is ramp(quantity, smoke=True))
+    tree = material.node_tree
+    values = add_node(tree, "ShaderNodeAttribute", (0.0, 0.0), name=_VALUES, attribute_name=quantity).outputs["Fac"]
+    place = add_node(tree, "ShaderNodeTexCoord", (-440.0, -660.0)).outputs["Object"]
+    shown = add_math(tree, "SUBTRACT", (440.0, -726.0), 1.0, in_front(tree, place), label="Not Cut Away")
+    density = _OPACITY if quantity == "activity" else _OPACITY_THROUGH
+    given = {"Value": values, "Shown": shown, "Density": density, "Size": size}
+    group = {"name": _LOOK, "label": look, "width": 200.0, "node_tree": _group(look)}
+    drawn = add_node(tree, "ShaderNodeGroup", (660.0, 0.0), given, **group)
+    add_node(tree, "ShaderNodeOutputMaterial", (920.0, 0.0), {"Volume": drawn.outputs[0]})
+    material.diffuse_color = (*_LOOKS[look][-1][1], 1.0)  # of the solid viewport's smoke
+    return material
+
+
+def _group(name: str) -> bpy.types.NodeTree:
+    """The group of nodes that is a look; an existing one keeps what the user has changed."""
+    if (tree := bpy.data.node_groups.get(name)) is not None:
+        return tree
+    tree, colors = bpy.data.node_groups.new(name, "ShaderNodeTree"), _LOOKS[name]
+    for each, default in _INPUTS.items():
+        tree.interface.new_socket(each, in_out="INPUT", socket_type="NodeSocketFloat").default_value = default
+    tree.interface.new_socket("Volume", in_out="OUTPUT", socket_type="NodeSocketShader")
+    given = add_node(tree, "NodeGroupInput", (-220.0, 0.0)).outputs
+    ranged = {"Value": given["Value"], "From Min": given["Low"], "From Max": given["High"]}
+    relative = add_node(tree, "ShaderNodeMapRange", (0.0, 0.0), ranged, clamp=True).outputs[0]
+    color = add_node(tree, "ShaderNodeValToRGB", (220.0, 220.0), {"Fac": relative}, name=_COLORS)
     elements = color.color_ramp.elements
     while len(elements) < len(colors):
         elements.new(0.5)
     for element, (position, rgb) in zip(elements, colors, strict=True):
         element.position, element.color = position, (*rgb, 1.0)
-    opacity = add_node(tree, "ShaderNodeValue", (220.0, -286.0), name=_OPACITY_NODE, label="Opacity (1/mm)").outputs[0]
-    opacity.default_value = (_OPACITY if quantity == "activity" else _OPACITY_THROUGH) / size
-    exponent = add_math(tree, "POWER", (440.0, -286.0), relative, 1.0, name=_EXPONENT, label=_EXPONENT)
-    gain = add_math(tree, "MULTIPLY", (440.0, -506.0), opacity, 1.0, name=_GAIN, label=_GAIN)
-    place = add_node(tree, "ShaderNodeTexCoord", (-440.0, -660.0)).outputs["Object"]
-    kept = add_math(tree, "SUBTRACT", (440.0, -726.0), 1.0, in_front(tree, place), label="Not Cut Away")
-    seen = add_math(tree, "MULTIPLY", (660.0, -506.0), gain, kept)
-    extinction = add_math(tree, "MULTIPLY", (660.0, -66.0), exponent, seen)
+    extinction = add_math(tree, "POWER", (220.0, -66.0), relative, given["Exponent"])
+    opacity = add_math(tree, "DIVIDE", (0.0, -286.0), given["Density"], given["Size"], label="Opacity (1/mm)")
+    for row, factor in enumerate((opacity, given["Gain"], given["Shown"])):
+        extinction = add_math(tree, "MULTIPLY", (440.0, -66.0 - 180.0 * row), extinction, factor)
     black = {"Color": (0.0, 0.0, 0.0, 1.0), "Density": extinction}
-    absorption = add_node(tree, "ShaderNodeVolumeAbsorption", (880.0, -132.0), black)
+    absorption = add_node(tree, "ShaderNodeVolumeAbsorption", (660.0, -132.0), black)
     glow = {"Color": color.outputs["Color"], "Strength": extinction}
-    emission = add_node(tree, "ShaderNodeEmission", (880.0, 88.0), glow)
-    both = add_node(tree, "ShaderNodeAddShader", (1100.0, 0.0), {0: absorption.outputs[0], 1: emission.outputs[0]})
-    add_node(tree, "ShaderNodeOutputMaterial", (1320.0, 0.0), {"Volume": both.outputs[0]})
-    material.diffuse_color = (*colors[-1][1], 1.0)  # of the solid viewport's smoke
-    return material
+    emission = add_node(tree, "ShaderNodeEmission", (660.0, 88.0), glow)
+    both = add_node(tree, "ShaderNodeAddShader", (880.0, 0.0), {0: absorption.outputs[0], 1: emission.outputs[0]})
+    add_node(tree, "NodeGroupOutput", (1100.0, 0.0), {0: both.outputs[0]})
+    return tree
 
 
-def set_range(material: bpy.types.Material, low: float, high: float) -> None:
-    """Spread the colours from the value `low` to `high`; a material that the user made is left alone."""
-    if material.node_tree and (node := material.node_tree.nodes.get(_RANGE)):
-        objects.change(node.inputs["From Min"], default_value=low)
-        objects.change(node.inputs["From Max"], default_value=high)
+def set_look(material: bpy.types.Material, quantity: str, **inputs: float) -> None:
+    """Have a material draw the grid `quantity` with these inputs of its look; one that the user made is left alone."""
+    if material.node_tree is None or material.library is not None:
+        return
+    nodes = material.node_tree.nodes
+    if (values := nodes.get(_VALUES)) is not None:
+        objects.change(values, attribute_name=quantity)
+    for name, value in inputs.items():
+        earlier, index = _EARLIER.get(name, ("", 0))
+        if _LOOK in nodes and name in nodes[_LOOK].inputs:
+            objects.change(nodes[_LOOK].inputs[name], default_value=value)
+        elif earlier in nodes:
+            objects.change(nodes[earlier].inputs[index], default_value=value)
+
+
+def is_look(material: bpy.types.Material) -> bool:
+    """Whether a material draws volumes in a look."""
+    return material.node_tree is not None and _LOOK in material.node_tree.nodes
+
+
+def ramp_of(item: bpy.types.Object, smoke: bool = False) -> Ramp:
+    """Positions and colours of a volume's display range, as the look of its material has them: on slices, or as smoke.
+
+    What is in tissues' colours as smoke is grey on slices.
+    """
+    quantity = item.mphdrr_volume.quantity
+    for material in filter(None, item.data.materials):
+        look = material.node_tree.nodes[_LOOK].node_tree if is_look(material) else None
+        if look is not None and (node := look.nodes.get(_COLORS)):
+            colors = tuple((each.position, tuple(each.color[:3])) for each in node.color_ramp.elements)
+            is_own = np.allclose([c for _, c in colors], [c for _, c in _TISSUES]) if len(colors) == 5 else False
+            return ramp(quantity, smoke) if is_own else colors
+    return ramp(quantity, smoke)
+
+
+def write_assets(folder: Path) -> Path:
+    """Write the looks as materials for the Asset Browser into a folder; returns the file."""
+    made = [new_material(name, "activity", 100.0, name) for name in _LOOKS]
+    groups = [material.node_tree.nodes[_LOOK].node_tree for material in made]
+    for material, colors in zip(made, _LOOKS.values(), strict=True):
+        material.asset_mark()
+        material.asset_data.description = "Drag it onto a volume: its display range goes along"
+        positions, rgb = zip(*colors, strict=True)
+        shades = [np.interp(np.linspace(0, 1, _ICON), positions, channel) ** (1 / 2.2) for channel in np.transpose(rgb)]
+        icon = np.broadcast_to(np.stack([*shades, np.ones(_ICON)], axis=1), (_ICON, _ICON, 4))
+        preview = material.preview_ensure()
+        preview.image_size = _ICON, _ICON
+        preview.image_pixels_float = icon.ravel().tolist()
+    path = ensure_folder(folder) / "mphdrr-looks.blend"
+    bpy.data.libraries.write(str(path), set(made), fake_user=True)
+    bpy.data.batch_remove(made)
+    objects.remove_unused(groups)
+    return path
 
 
 def in_front(tree: bpy.types.NodeTree, place: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
@@ -122,19 +216,6 @@ def set_cut(tree: bpy.types.NodeTree, cut: Cut | None) -> None:
         if along is not None and beyond is not None:  # a tree of an earlier version, or of the user's, has none
             objects.change(along.inputs[1], default_value=normal)
             objects.change(beyond.inputs[1], default_value=limit)
-
-
-def set_opacity(material: bpy.types.Material, exponent: float, gain: float) -> None:
-    """Make extinction follow a power of the relative values, times a gain."""
-    for name, value in ((_EXPONENT, exponent), (_GAIN, gain)):
-        if material.node_tree and (node := material.node_tree.nodes.get(name)):
-            objects.change(node.inputs[1], default_value=value)
-
-
-def resize(material: bpy.types.Material, old: float, new: float) -> None:
-    """Keep a volume as opaque as before when its size, mm, changes from `old` to `new`."""
-    if material.node_tree and (node := material.node_tree.nodes.get(_OPACITY_NODE)):
-        node.outputs[0].default_value *= old / new
 
 
 def set_display(data: bpy.types.Volume, low: float, high: float, size: float, gain: float = 1.0) -> None:

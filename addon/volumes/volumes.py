@@ -93,8 +93,6 @@ def replace_stored(item: bpy.types.Object, stored: StoredVolume) -> None:
     old, settings = item.data, item.mphdrr_volume
     if old.users == 1 and settings.quantity == stored.volume.quantity:  # in place: what the user set on it stays
         _show(old, stored)
-        for material in filter(None, old.materials):
-            volume_materials.resize(material, settings.extent, stored.extent)
         _describe(item, stored)
         return
     item.data = data = _volume_data(stored, item.name)

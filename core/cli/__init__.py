@@ -7,6 +7,7 @@ arguments. `addon.cli` adds those that need Blender.
 import argparse
 import contextlib
 import io
+import os
 import sys
 import warnings
 from collections.abc import Mapping, Sequence
@@ -95,8 +96,14 @@ def main(argv: Sequence[str] | None = None, more_commands: Mapping[str, str] = M
 
 def _status(argv: Sequence[str] | None, more_commands: Mapping[str, str]) -> int:
     try:
-        words = sys.argv[1:] if argv is None else argv
-        arguments = build_parser(more_commands, next(iter(words), "")).parse_args(words)
+        asked = os.environ.get("COMP_LINE", "").split()[1:] if "_ARGCOMPLETE" in os.environ else None
+        words = asked or (sys.argv[1:] if argv is None else argv)
+        parser = build_parser(more_commands, next(iter(words), ""))
+        if asked is not None:  # by a shell, for what may follow
+            import argcomplete
+
+            argcomplete.autocomplete(parser)
+        arguments = parser.parse_args(words)
     except SystemExit as stop:  # --help, --version and usage errors
         return stop.code if isinstance(stop.code, int) else USAGE
     with warnings.catch_warnings():

@@ -4,8 +4,7 @@ import argparse
 
 from ... import core as mph
 from ..perspective.backprojection import HOW
-from ..runs.backprojecting import backprojection_grid
-from ..runs.files import FORMATS
+from ..runs.formats import FORMATS
 from ..runs.settings import SETTINGS
 from ..volumes.volume_files import VOLUME_FORMATS
 from .options import add_run, described, output_path, print_answer, progress_bar
@@ -32,6 +31,8 @@ def _run(arguments: argparse.Namespace) -> None:
 
     mphdrr backproject run.h5 --how product --voxels 128 128 64 --spacing 1 -o product.nii.gz
     """
+    from ..runs.backprojecting import backprojection_grid
+
     path = output_path(arguments.output, VOLUME_FORMATS)
     counted = output_path(arguments.views_that_see, VOLUME_FORMATS) if arguments.views_that_see else None
     if counted is not None and counted.resolve() == path.resolve():

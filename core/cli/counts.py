@@ -1,14 +1,8 @@
 """``mphdrr counts flood FLOOD -o efficiency.npy``: what measured counts say of the detectors."""
 
 import argparse
-import io
-from pathlib import Path
 
-import numpy as np
-
-from ... import core as mph
-from ..files import require_ending, write_bytes
-from ..runs.files import FORMATS
+from ..runs.formats import FORMATS
 from . import COMMANDS
 from .options import add_command, add_run, output_path, print_answer
 
@@ -31,23 +25,8 @@ def _run(arguments: argparse.Namespace) -> None:
     mphdrr project scanner.xlsx --counts flood.npy --frames 1-80 --orientation front+v --time 600 -o flood.h5
     mphdrr counts flood flood.h5 -o efficiency.npy
     """
-    path, file = output_path(arguments.output, (".npy",)), Path(arguments.file)
-    require_ending(file, (*FORMATS, ".npy"))  # frames of other files may be of any module, and lie in any way
-    run = mph.read_run(file) if file.suffix.lower() in FORMATS else None
-    images = mph.read_counts(file) if run is None else run.projections
-    numbers = list(range(1, len(images) + 1)) if run is None else run.system.numbers.tolist()
-    found = mph.flood_efficiency(images, arguments.order)
-    np.save(memory := io.BytesIO(), found.efficiency.astype(np.float32))
-    write_bytes(path, memory.getbuffer())
-    answer: dict[str, list[list[int]]] = {
-        "dead": [[numbers[m], int(v) + 1, int(u) + 1] for m, v, u in found.dead],
-        "hot": [[numbers[m], int(v) + 1, int(u) + 1] for m, v, u in found.hot],
-        "dead modules": [[numbers[m]] for m in found.dead_modules],
-    }
-    lines = [
-        f"{name}: {', '.join('/'.join(map(str, place)) for place in places)}"
-        for name, places in answer.items()
-        if places
-    ]
-    note = ["module/row/column, from 1:"] if lines else []
-    print_answer(arguments, answer, [f"{path}: {found}", *note, *lines])
+    from ..runs.flood_files import write_flood
+
+    path = output_path(arguments.output, (".npy",))
+    _, answer, lines = write_flood(arguments.file, path, arguments.order)
+    print_answer(arguments, answer, lines)

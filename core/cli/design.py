@@ -2,12 +2,8 @@
 
 import argparse
 
-from ..design.evaluating import evaluate
-from ..design.fronts import pareto
-from ..design.optimising import optimize
-from ..design.recipe import TEMPLATE, read_design_recipe
+from ... import core as mph
 from ..files import read_text
-from ..workbook import write_system
 from . import COMMANDS
 from .options import add_command, add_run, give_recipe, output_path, print_answer, progress_bar, say
 
@@ -35,6 +31,8 @@ def _new(arguments: argparse.Namespace) -> None:
 
     mphdrr design new -o design.toml
     """
+    from ..design.recipe import TEMPLATE
+
     give_recipe(read_text(TEMPLATE), arguments.output, "mphdrr design optimize {path} -o scanner.xlsx")
 
 
@@ -44,17 +42,18 @@ def _optimize(arguments: argparse.Namespace) -> None:
     mphdrr design optimize design.toml -o new.xlsx
     """
     path = output_path(arguments.output, (".xlsx",))
-    recipe, state = read_design_recipe(arguments.recipe), path.with_suffix(".design.json")
+    recipe, state = mph.design.read_design_recipe(arguments.recipe), path.with_suffix(".design.json")
     try:
-        found = optimize(recipe, None if arguments.quiet else progress_bar("designing"), state)
+        found = mph.design.optimize(recipe, None if arguments.quiet else progress_bar("designing"), state)
     except KeyboardInterrupt:
         say(f"{state}: what was done is kept; the same command goes on")
         raise
-    write_system(found.system, path)
+    mph.write_system(found.system, path)
     record = {"parameters": found.parameters, "objectives": found.values, "faults": found.faults}
     *lines, verdict = found.summary()
     if arguments.evaluate:
-        gain = evaluate(recipe, found.start, found.system, None if arguments.quiet else progress_bar("evaluating"))
+        bar = None if arguments.quiet else progress_bar("evaluating")
+        gain = mph.design.evaluate(recipe, found.start, found.system, bar)
         record["evaluation"] = gain._asdict()
         lines.append(f"{gain.score}: {gain.start:.4g} at the start, now {gain.found:.4g}; better by {gain.gain:.1%}, "
                      f"95 % interval {gain.low:.1%} to {gain.high:.1%}")  # fmt: skip
@@ -67,7 +66,7 @@ def _pareto(arguments: argparse.Namespace) -> None:
     mphdrr design pareto front.toml -o front.csv front.png
     """
     paths = [output_path(name, (".csv", ".json", ".png", ".svg")) for name in arguments.output]
-    found = pareto(arguments.recipe, None if arguments.quiet else progress_bar("designing"))
+    found = mph.design.pareto(arguments.recipe, None if arguments.quiet else progress_bar("designing"))
     for path in paths:
         found.write(path)
     lines = ["  ".join(f"{name} {value:.5g}" for name, value in row.items()) for row in found.rows]

@@ -4,10 +4,7 @@ import argparse
 
 from .. import learning
 from ..errors import InputError
-from ..learning.judging.judge import judge
-from ..learning.judging.recipe import read_judge_recipe
 from ..learning.networks import NETWORKS
-from ..learning.recipe import template_text
 from ..progress import Progress
 from . import COMMANDS
 from .options import add_command, add_run, give_recipe, output_path, progress_bar, say
@@ -42,6 +39,8 @@ def _new(arguments: argparse.Namespace) -> None:
 
     mphdrr learn new --like unrolled -o training.toml
     """
+    from ..learning.recipe import template_text
+
     give_recipe(template_text(arguments.like), arguments.output, "mphdrr learn train {path} -o model.pt")
 
 
@@ -68,10 +67,10 @@ def _judge(arguments: argparse.Namespace) -> None:
 
     mphdrr learn judge judge.toml -o judgement
     """
-    recipe = read_judge_recipe(arguments.recipe)
+    recipe = learning.read_judge_recipe(arguments.recipe)
     models = {name: learning.read_model(path) for name, path in recipe.models.items()}
     methods = [model.judged(name) for name, model in models.items()]
-    found = judge(recipe, arguments.output, methods, _stage("judging", arguments.quiet))
+    found = learning.judge(recipe, arguments.output, methods, _stage("judging", arguments.quiet))
     for name, model in models.items() if arguments.into_models else ():
         rows = [row for row in found.rows if row["method"] == name]
         learning.with_judgement(model.path, {**found.record, "rows": rows})

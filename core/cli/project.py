@@ -3,16 +3,18 @@
 Every setting of `runs.settings` is an option; the help lists the most used ones.
 """
 
+from __future__ import annotations
+
 import argparse
 from pathlib import Path
 from typing import Any
 
 from ... import core as mph
 from ..phantoms.kinds import KINDS
-from ..runs.files import FORMATS
+from ..physics.ct_numbers import CT_ENERGY
+from ..runs.formats import FORMATS
 from ..runs.mosaic import write_sheet
 from ..runs.presets import PRESETS
-from ..runs.run_recipe import frames_of
 from ..runs.settings import SETTINGS
 from .options import add_run, numbered_path, output_path, progress_bar
 from .recipe_options import add_entries, add_option, add_setting, typed_entries
@@ -114,6 +116,8 @@ def _chosen(arguments: argparse.Namespace) -> tuple[mph.Recipe, dict[str, Any]]:
                 f"{file}: it holds measured counts, not what was measured; name a volume, a phantom, or --counts"
             )
         kept["volume"] = run.volume
+        if run.recipe["model.kind"] == recipe["model.kind"] == "spectral":  # whose runs hold mu at that energy
+            recipe = recipe.updated({"volume.energy": CT_ENERGY})
     return recipe, kept
 
 
@@ -127,6 +131,8 @@ def _run(arguments: argparse.Namespace) -> None:
     mphdrr project scanner.xlsx --counts counts.npy --frames 1-80 --orientation front+v --time 600 -o run.h5
         --mosaic check.png
     """
+    from ..runs.run_recipe import frames_of
+
     if arguments.write_recipe:
         path = output_path(arguments.write_recipe, (".toml",))
         recipe, _ = _chosen(arguments)

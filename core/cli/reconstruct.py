@@ -1,5 +1,7 @@
 """``mphdrr reconstruct RUN -o volume.nii.gz``: from a run's images back to a volume."""
 
+from __future__ import annotations
+
 import argparse
 import signal
 import sys
@@ -7,20 +9,14 @@ import time
 from collections.abc import Sequence
 from typing import Any
 
-from ..errors import InputError
+from ... import core as mph
 from ..figures.page import DARK, SUFFIXES, Page
-from ..figures.reconstructions import SIZE, SIZE_BESIDE_TRUTH, draw
 from ..progress import Cancelled, Progress
-from ..reconstruction.files import read_reconstruction, write_reconstruction
 from ..reconstruction.methods import Method, method_of
-from ..reconstruction.result import Reconstruction, iterations_text
-from ..runs.files import FORMATS, read_run
-from ..runs.recipe import Recipe, read_recipe, write_recipe
-from ..runs.reconstructing import TABLES, recipe_of, reconstruct_run, voxels_text
-from ..runs.run import ProjectionRun
-from ..runs.settings import SETTINGS
-from ..volumes.volume import Volume
-from ..volumes.volume_files import VOLUME_FORMATS, read_volume, write_volume
+from ..reconstruction.result import iterations_text
+from ..runs.formats import FORMATS
+from ..runs.settings import HOW_TABLES, SETTINGS
+from ..volumes.volume_files import VOLUME_FORMATS
 from .options import add_run, output_path, progress_bar, say
 from .recipe_options import add_entries, add_setting, typed_entries
 
@@ -32,7 +28,7 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     """Add the command."""
     parser = add_run(subparsers, "reconstruct", _run)
     parser.add_argument("file", metavar="RUN", help=f"a run of mphDRR: {', '.join(FORMATS)}")
-    text = f"recipe (.toml) whose tables {', '.join(f'[{table}]' for table in TABLES)} say how; options override it"
+    text = f"recipe (.toml) whose tables {', '.join(f'[{table}]' for table in HOW_TABLES)} say how; options override it"
     parser.add_argument("--recipe", metavar="FILE", help=text)
     for setting in SETTINGS.values():
         if setting.key.startswith("reconstruction.") or setting.key in _OTHERS:
@@ -53,12 +49,14 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     parser.add_argument("--write-recipe", metavar="FILE", help=text)
 
 
-def _chosen(arguments: argparse.Namespace, run: ProjectionRun) -> Recipe:
-    asked = Recipe() if arguments.recipe is None else read_recipe(arguments.recipe)
+def _chosen(arguments: argparse.Namespace, run: mph.ProjectionRun) -> mph.Recipe:
+    from ..runs.reconstructing import recipe_of
+
+    asked = mph.Recipe() if arguments.recipe is None else mph.read_recipe(arguments.recipe)
     changes = typed_entries(arguments)
     for key in changes:
-        if key.partition(".")[0] not in TABLES:
-            raise InputError(f"--set {key}: expected an entry of {', '.join(f'[{table}]' for table in TABLES)}")
+        if key.partition(".")[0] not in HOW_TABLES:
+            raise mph.InputError(f"--set {key}: expected an entry of {', '.join(f'[{table}]' for table in HOW_TABLES)}")
     recipe = recipe_of(run, asked if "recipe" in run.settings else asked.updated(changes))
     if changes.get("attenuation.file") is not None:  # instead of what attenuated in the run
         changes = {"attenuation.of_phantom": None, "attenuation.object": None} | changes
@@ -72,31 +70,34 @@ def _run(arguments: argparse.Namespace) -> None:
     mphdrr reconstruct run.h5 --recipe study.toml -o volume.nii.gz
     mphdrr reconstruct run.h5 --set model.intrinsic_fwhm=3 -o volume.nii.gz
     """
+    from ..figures.reconstructions import SIZE, SIZE_BESIDE_TRUTH, draw
+    from ..runs.reconstructing import voxels_text
+
     if arguments.write_recipe:
         recipe_path = output_path(arguments.write_recipe, (".toml",))
-        write_recipe(_chosen(arguments, read_run(arguments.file)), recipe_path)
+        mph.write_recipe(_chosen(arguments, mph.read_run(arguments.file)), recipe_path)
         print(recipe_path)
         return
     if not arguments.output and not arguments.picture:
-        raise InputError("nothing to write: give --output FILE, --picture FILE or --write-recipe FILE")
+        raise mph.InputError("nothing to write: give --output FILE, --picture FILE or --write-recipe FILE")
     path = output_path(arguments.output, VOLUME_FORMATS) if arguments.output else None
     picture = output_path(arguments.picture, SUFFIXES) if arguments.picture else None
     state = output_path(arguments.save_state, (".h5", ".hdf5")) if arguments.save_state else None
-    run = read_run(arguments.file)
+    run = mph.read_run(arguments.file)
     recipe = _chosen(arguments, run)
-    start: Volume | Reconstruction | None = None
+    start: mph.Volume | mph.Reconstruction | None = None
     if arguments.start is not None:
-        start = read_volume(arguments.start, "activity" if run.volume is None else run.volume.quantity)
+        start = mph.read_volume(arguments.start, "activity" if run.volume is None else run.volume.quantity)
     elif arguments.resume is not None:
-        start = read_reconstruction(arguments.resume)
+        start = mph.read_reconstruction(arguments.resume)
     method = method_of(recipe["reconstruction.method"])
     log = _Log(method, recipe["reconstruction.iterations"], arguments.quiet, start)
     usual = signal.signal(signal.SIGINT, log.interrupt) if state is not None else None
     try:
-        found = reconstruct_run(run, recipe, start=start, watch=log, stages=log.stage, method=method)
+        found = mph.reconstruct_run(run, recipe, start=start, watch=log, stages=log.stage, method=method)
     except Cancelled as cancelled:
         if state is not None and cancelled.reconstruction is not None:
-            write_reconstruction(cancelled.reconstruction, state)
+            mph.write_reconstruction(cancelled.reconstruction, state)
             done = cancelled.reconstruction.iterations
             say(f"{state}: iterations done: {done}; --resume goes on")
         raise
@@ -104,9 +105,9 @@ def _run(arguments: argparse.Namespace) -> None:
         if usual is not None:
             signal.signal(signal.SIGINT, usual)
     if state is not None:
-        write_reconstruction(found, state)
+        mph.write_reconstruction(found, state)
     if path is not None:
-        write_volume(found.volume, path)
+        mph.write_volume(found.volume, path)
     if picture is not None:
         page = Page(*(SIZE if run.volume is None else SIZE_BESIDE_TRUTH), DARK)
         draw(page, found.volume, found.objective.tolist(), run.volume, f"{method.label} of {arguments.file}",
@@ -117,7 +118,7 @@ def _run(arguments: argparse.Namespace) -> None:
     print(f"{path or picture}: {', '.join(filter(None, (method.label, settings_line(found), voxels, largest)))}")
 
 
-def settings_line(found: Reconstruction) -> str:
+def settings_line(found: mph.Reconstruction) -> str:
     """The numbers of iterations and subsets that a picture shows of a reconstruction, where it has any."""
     subsets = found.settings.get("subsets", 1)
     return ", ".join(filter(None, (iterations_text(found.iterations), f"{subsets} subsets" if subsets > 1 else "")))
@@ -127,7 +128,7 @@ class _Log:
     """A line on standard error after each iteration; before the first, the stages' bars."""
 
     def __init__(self, method: Method, iterations: int | None, quiet: bool, start: Any) -> None:
-        goes_on = isinstance(start, Reconstruction) and start.settings.get("method") == method.label
+        goes_on = isinstance(start, mph.Reconstruction) and start.settings.get("method") == method.label
         iterations = iterations or method.own.get("iterations", 0)
         self.total, self.quiet = (start.iterations if goes_on else 0) + iterations, quiet
         self.name = method.objective

@@ -2,12 +2,12 @@
 
 import argparse
 
+from ... import core as mph
 from ..errors import InputError
 from ..geometry.scanner import Scanner
 from ..geometry.system import PinholeSystem
 from ..geometry.system import chosen_modules as chosen_modules
 from ..scanner_kinds import SCANNERS
-from ..workbook import kinds_in, read_scanner
 
 
 def add_workbook(parser: argparse.ArgumentParser, name: str = "workbook", default: str | None = None) -> None:
@@ -26,13 +26,13 @@ def add_workbook(parser: argparse.ArgumentParser, name: str = "workbook", defaul
 
 def kind_of(arguments: argparse.Namespace) -> str:
     """The kind of scanner that the options of `add_workbook` ask for."""
-    found = () if arguments.scanner_kind or arguments.columns else kinds_in(arguments.workbook)
+    found = () if arguments.scanner_kind or arguments.columns else mph.kinds_in(arguments.workbook)
     return arguments.scanner_kind or next(iter(found), PinholeSystem.kind)
 
 
 def read_any(arguments: argparse.Namespace) -> Scanner:
     """The scanner of the workbook of `add_workbook`, of any kind."""
-    return read_scanner(arguments.workbook, kind_of(arguments), arguments.columns)
+    return mph.read_scanner(arguments.workbook, kind_of(arguments), arguments.columns)
 
 
 def read_workbook(arguments: argparse.Namespace) -> PinholeSystem:

@@ -1,5 +1,7 @@
 """``mphdrr score VOLUME --truth FILE`` and ``mphdrr score VOLUME KIND …``."""
 
+from __future__ import annotations
+
 import argparse
 from dataclasses import replace
 from pathlib import Path
@@ -8,10 +10,7 @@ from ... import core as mph
 from ..arrays import Floats
 from ..errors import naming
 from ..figures.page import SUFFIXES, Page
-from ..figures.scores import SIZE, draw
-from ..runs.files import FORMATS
-from ..runs.reconstructing import flattering
-from ..runs.run_recipe import truth_of_run
+from ..runs.formats import FORMATS
 from ..volumes.volume import UNITS
 from .options import add_run, output_path, print_answer, progress_bar, refuse
 from .phantom import Make, add_kinds, add_pose, read_pose
@@ -60,8 +59,12 @@ def _run(arguments: argparse.Namespace) -> None:
     volume = mph.read_volume(arguments.volume, arguments.quantity, progress=progress_bar("reading"))
     score = mph.score_volume(volume, truth, pose, progress_bar("truth"))
     if run is not None:
+        from ..runs.reconstructing import flattering
+
         score = replace(score, notes=(*flattering(run, volume.grid), *score.notes))
     if picture is not None:
+        from ..figures.scores import SIZE, draw
+
         page = Page(*SIZE)
         draw(page, score, Path(arguments.volume).name)
         page.write(picture)
@@ -85,6 +88,8 @@ def _truth(
             raise
         run = None
     if run is not None:
+        from ..runs.run_recipe import truth_of_run
+
         with naming(file):
             return *truth_of_run(run), run
     return mph.read_volume(file, arguments.quantity, progress=progress_bar("reading the truth")), None, None

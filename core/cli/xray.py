@@ -5,7 +5,6 @@ import argparse
 import numpy as np
 
 from ... import core as mph
-from ..runs.reconstructing import line_integrals
 from ..volumes.volume_files import VOLUME_FORMATS
 from ..xray.dose import decays
 from . import COMMANDS
@@ -22,29 +21,25 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     actions = xray.add_subparsers(metavar="ACTION", required=True)
 
     motion = add_run(actions, "motion", _motion)
-    motion.add_argument("radiographs", metavar="RUN", help="of the body now")
-    motion.add_argument(
-        "reference", metavar="VOLUME", help="the body before: its attenuation, such as a reconstruction"
-    )
-    motion.add_argument(
-        "--change", metavar="FILE", help=f"also write what else has changed: {', '.join(VOLUME_FORMATS)}"
-    )
-    motion.add_argument("--json", action="store_true", help="print JSON")
+    add = motion.add_argument
+    add("radiographs", metavar="RUN", help="of the body now")
+    add("reference", metavar="VOLUME", help="the body before: its attenuation, such as a reconstruction")
+    add("--change", metavar="FILE", help=f"also write what else has changed: {', '.join(VOLUME_FORMATS)}")
+    add("--json", action="store_true", help="print JSON")
 
     kerma = add_run(actions, "kerma", _kerma)
     add_workbook(kerma)
     kerma.add_argument("--json", action="store_true", help="print JSON")
 
     dose = add_run(actions, "dose", _dose)
-    dose.add_argument("activity", metavar="VOLUME", help="activity, kBq/mL")
-    dose.add_argument("--isotope", required=True, choices=tuple(decays()), help="of the activity")
+    add = dose.add_argument
+    add("activity", metavar="VOLUME", help="activity, kBq/mL")
+    add("--isotope", required=True, choices=tuple(decays()), help="of the activity")
     text = "CT numbers, of which the density is made, 1 + HU / 1000; default: water everywhere"
-    dose.add_argument("--ct", metavar="VOLUME", help=text)
-    dose.add_argument("--biological-half-life", type=float, metavar="H", help="hours; default: nothing is washed out")
-    dose.add_argument(
-        "--rate", action="store_true", help="the dose rate at the beginning, mGy/h, instead of the dose, mGy"
-    )
-    dose.add_argument("-o", "--output", required=True, metavar="FILE", help=", ".join(VOLUME_FORMATS))
+    add("--ct", metavar="VOLUME", help=text)
+    add("--biological-half-life", type=float, metavar="H", help="hours; default: nothing is washed out")
+    add("--rate", action="store_true", help="the dose rate at the beginning, mGy/h, instead of the dose, mGy")
+    add("-o", "--output", required=True, metavar="FILE", help=", ".join(VOLUME_FORMATS))
 
 
 def _motion(arguments: argparse.Namespace) -> None:
@@ -52,6 +47,8 @@ def _motion(arguments: argparse.Namespace) -> None:
 
     mphdrr xray motion radiographs.h5 mu70.nii.gz --change change.nii.gz
     """
+    from ..runs.reconstructing import line_integrals
+
     path = output_path(arguments.change, VOLUME_FORMATS) if arguments.change else None
     run, reference = mph.read_run(arguments.radiographs), mph.read_volume(arguments.reference, "mu")
     images = line_integrals(run, run.recipe)

@@ -223,7 +223,8 @@ def _check_model(model: Emission, system: PinholeSystem, views: Views) -> None:
     model.check(views)
     uneven = np.ndim(model.efficiency) == 3 or not np.all(model.efficiency)
     others = {"edge 'path'": model.edge == "path", "depth_layers": model.depth_layers > 1}
-    others |= {"lines apart": len(model.parts()) > 1, "efficiency of single pixels, or of 0": uneven}
+    others |= {"wall_thickness": model.wall_thickness is not None}
+    others |= {"lines apart": model.is_apart, "efficiency of single pixels, or of 0": uneven}
     for name, is_other in others.items():
         if is_other:
             raise InputError(f"calibrate: model: takes no {name}: a spot is a hole's shadow on the crystal's front")

@@ -5,17 +5,18 @@
 >>> events[0].truth, events[0].images("emission", noise_seed=1), events[0].radon(96)
 """
 
-import types
+from typing import TYPE_CHECKING
 
-from .checking import Fault, Status, check, repair, status
-from .event_set import Event, EventSet
-from .exports import export_events
-from .making import EventArrays, EventMaker
-from .planning import PlannedEvent, plan
-from .recipe import EventRecipe, read_recipe
-from .training import torch_dataset
-from .work import Made, make, making
+from ..lazy import public
 
-__all__ = [
-    name for name, value in globals().items() if not (name.startswith("_") or isinstance(value, types.ModuleType))
-]
+if TYPE_CHECKING:
+    from .checking import Fault, Status, check, repair, status
+    from .event_maker import EventArrays, EventMaker
+    from .event_set import Event, EventSet
+    from .exports import export_events
+    from .planning import PlannedEvent, plan
+    from .recipe import EventRecipe, read_recipe
+    from .training import torch_dataset
+    from .work import Made, make, making
+
+__getattr__, __dir__, __all__ = public(__name__)

@@ -19,7 +19,7 @@ from ..memory import cores
 from ..runs.run import versions
 from ..version import build
 from ..volumes.volume import Volume
-from .making import EventArrays
+from .event_maker import EventArrays
 from .recipe import EventRecipe
 
 VERSION = 2

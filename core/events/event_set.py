@@ -28,9 +28,9 @@ from ..validation import freeze, positive
 from ..volumes.images import Images
 from ..volumes.volume import Volume
 from .event_files import Place, read_array, read_truth
+from .event_maker import radon_views
 from .folders import SetFolder
 from .index import column
-from .making import radon_views
 from .planning import PlannedEvent, plan
 from .recipe import EventRecipe
 

@@ -11,9 +11,9 @@ from ..errors import InputError, warn
 from ..files import AnyPath, ensure_folder, folder_path, remove_leftovers, write_bytes
 from ..version import build
 from .event_files import Header, Place, header
+from .event_maker import EventMaker
 from .index import Index
 from .inputs import Input
-from .making import EventMaker
 from .recipe import EventRecipe, read_recipe
 from .store import Store
 

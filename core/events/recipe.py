@@ -261,6 +261,8 @@ class EventRecipe:
         recipe = Recipe(given)
         if recipe["model.photons"] is not None and self.quantity != "mu":
             raise InputError('photons: they are of a truth of attenuation: [truth] quantity = "mu"')
+        if recipe["model.kind"] == "spectral":
+            raise InputError("spectral: event sets have X rays of one energy; expected transmission, with photons")
         if recipe["model.kind"] == "emission" and self.quantity != "activity":
             raise InputError(f"emission is of activity, but the truth is {self.quantity}")
         return recipe

@@ -13,9 +13,9 @@ from ..memory import readable_size
 from ..progress import Progress, tell
 from ..validation import seed_number, whole_number
 from .dask_work import in_cluster
+from .event_maker import EventMaker
 from .event_set import EventSet
 from .folders import SetFolder
-from .making import EventMaker
 from .planning import plan
 from .pool import in_processes
 from .recipe import EventRecipe

@@ -8,8 +8,8 @@ from ..files import AnyPath, write_bytes
 from ..progress import Progress
 from ..recording import recorded_warnings
 from .event_files import Place, packed
+from .event_maker import EventMaker
 from .folders import SetFolder
-from .making import EventMaker
 
 
 class Written(NamedTuple):

@@ -4,13 +4,38 @@ A new kind is a line here: one that is drawn has a function of a page and a subj
 into the studio (`addon.figures.figures`).
 """
 
+import math
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
+from ..errors import InputError
 from ..validation import one_of
 from . import mosaics, sums, virtual_c_arm
-from .page import Page
+from .page import DARK, SUFFIXES, Page
 from .subject import Subject
+
+PAPERS = {"dark": DARK, "light": "#ffffff"}
+"""What rendered figures lie on, by their style."""
+
+
+FILMS = (".mp4",)
+SAMPLES = 16
+"""Rays per pixel; what noise they leave is smoothed."""
+
+
+class How(NamedTuple):
+    """How figures are rendered."""
+
+    labels: bool = True
+    samples: int = SAMPLES
+    style: str = "dark"  # of `PAPERS`
+    seconds: float = 8.0  # of an animation
+    fps: int = 24  # its pictures in a second
+
+    @property
+    def frames(self) -> int:
+        """The number of an animation's pictures."""
+        return max(1, round(self.seconds * self.fps))
 
 
 class Studio(NamedTuple):
@@ -18,8 +43,10 @@ class Studio(NamedTuple):
 
     volume: bool = False
     rays: bool = False  # the modules' principal rays
-    cut: bool = False  # the modules between the isocentre and the viewer are left out
-    near: bool = False  # the ROI fills the picture's height
+    cut: bool = False  # the modules between the isocentre and the viewer fade
+    near: float = 0.0  # ROI radii from the isocentre to the picture's edge; 0: the whole scanner fits
+    lens: float = 50.0  # mm, of a camera whose film is 36 mm wide: a short one shows what is near large
+    lit: bool = False  # the chosen modules are lit and have rays, and the others stay
 
 
 class FigureKind(NamedTuple):
@@ -33,8 +60,24 @@ class FigureKind(NamedTuple):
     draw: Callable[[Page, Subject], None] | None = None
     studio: Studio | None = None  # of a figure that Blender renders
     one_module: bool = False  # it shows the first of the chosen modules
+    motion: Literal["turn", "light"] | None = None  # of an animation
+
+    @property
+    def suffixes(self) -> tuple[str, ...]:
+        """How the names of its files end."""
+        return FILMS if self.motion else SUFFIXES
+
+    def page(self, size: tuple[int, int] | None, how: How) -> Page:
+        """A page for it; only rendered figures have a style. Raises InputError of what no animation can be."""
+        page = Page(*(size or self.size), PAPERS["light" if self.studio is None else how.style])
+        if self.motion and (page.width % 2 or page.height % 2):
+            raise InputError(f"size {page.width}x{page.height}: of an animation both must be even")
+        if not (0 < how.seconds < math.inf and how.fps > 0):
+            raise InputError(f"{how.seconds:g} s of {how.fps} pictures each: expected more than 0 of both")
+        return page
 
 
+_PICTURE = Studio(volume=True, rays=True, cut=True, near=1.25, lens=30.0, lit=True)
 KINDS = {
     kind.name: kind
     for kind in (
@@ -48,7 +91,19 @@ KINDS = {
         ),
         FigureKind(
             "inside", "Volume in the Scanner", "a volume seen from near by, between the modules", ("scanner", "volume"),
-            (1600, 1000), studio=Studio(volume=True, near=True),
+            (1600, 1000), studio=Studio(volume=True, near=1.7),
+        ),
+        FigureKind(
+            "picture", "Picture", "a volume with its scale and colour bar, and the rays of chosen modules or of a ring",
+            ("scanner", "volume"), (2400, 1500), studio=_PICTURE,
+        ),
+        FigureKind(
+            "turntable", "Turntable", "the picture, once around: an animation", ("scanner", "volume"), (1280, 800),
+            studio=_PICTURE._replace(near=1.7), motion="turn",
+        ),
+        FigureKind(
+            "light-up", "Modules Light Up", "the picture, one module after the other with its ray: an animation",
+            ("scanner", "volume"), (1280, 800), studio=_PICTURE._replace(near=2.2), motion="light",
         ),
         FigureKind(
             "sums", "Orthogonal Sums", "a volume's sums along x, y and z, value x mm, with its translation T and rotation R",

@@ -39,7 +39,7 @@ class Page:
         for side in (width, height):
             if not SMALLEST <= side <= LARGEST:
                 raise InputError(f"size {width}x{height}: expected {SMALLEST} to {LARGEST} pixels along each side")
-        self.width, self.height = width, height
+        self.width, self.height, self.paper = width, height, paper
         self.em = em or max(7.0, min(width, 1.8 * height) / 72)
         self.ink, self.faint = ("#20262d", "#6b7480") if _rgb(paper).mean() > 127 else ("#eceef2", "#98a2b0")
         self._pixels = np.empty((height, width, 3), np.float32)

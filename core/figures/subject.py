@@ -1,7 +1,10 @@
 """What a figure is of."""
 
+from __future__ import annotations
+
 from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 from ..arrays import Floats
 from ..errors import InputError
@@ -9,8 +12,10 @@ from ..geometry.collimator import Construction
 from ..geometry.scanner import Scanner
 from ..geometry.system import AnyScanner, chosen_modules
 from ..runs.display import Display
-from ..runs.run import ProjectionRun
 from ..volumes.volume import Volume
+
+if TYPE_CHECKING:
+    from ..runs.run import ProjectionRun
 
 NEEDS = ("scanner", "volume", "run")
 """What a figure may need: fields of `Subject`."""

@@ -4,9 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import Floats, Floats32
-from ..projector.tracing import trace_rays
 from ..runs.display import Display
-from ..runs.run_recipe import euler_degrees
 from ..volumes.volume import LINE_INTEGRALS, Volume, require_quantity
 from .page import Page
 from .parts import INK, Axes, arranged, bar_width, color_bar, heading, number, ticks
@@ -34,6 +32,8 @@ def orthogonal_sum(volume: Volume, axis: int) -> tuple[Floats32, Floats]:
     ends = np.empty((2, counts[right], counts[up], 3))
     ends[..., right], ends[..., up] = at[right][:, None], at[up]
     ends[0, ..., axis], ends[1, ..., axis] = box[:, axis] + [-1.0, 1.0]
+    from ..projector.tracing import trace_rays  # takes a while, and the list of figures needs neither
+
     sums = trace_rays(volume, ends[0].reshape(-1, 3), ends[1].reshape(-1, 3))
     return np.asarray(sums, np.float32).reshape(counts[right], counts[up]), box
 
@@ -71,6 +71,8 @@ def _placed(subject: Subject) -> list[str]:
     if pose is None:
         lines = [f"Grid's centre ({_numbers(grid.center)}) mm"]
     else:
+        from ..runs.run_recipe import euler_degrees
+
         angles = euler_degrees(pose)
         turn = "with a change of size" if angles is None else f"({_numbers(angles)})°"
         lines = [f"T = ({_numbers(pose[:3, 3])}) mm    R = (φ, θ, ψ) = {turn}"]

@@ -10,6 +10,7 @@ import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import fields
+from functools import lru_cache
 from inspect import signature
 from typing import Any, ClassVar, Literal, Self
 
@@ -31,6 +32,8 @@ Fault = tuple[str, int, str]
 
 SCANNERS: dict[str, type[Scanner]] = {}
 """Name -> class, of the kinds of scanners; each enters itself when it is defined."""
+
+_signature = lru_cache(signature)  # which takes long
 
 
 class Scanner(ABC):
@@ -108,7 +111,7 @@ class Scanner(ABC):
     @classmethod
     def of(cls, values: Mapping[str, Any]) -> Self:
         """The scanner with these attributes, of which some may be columns without a field of the class."""
-        own = signature(cls).parameters
+        own = _signature(cls).parameters
         more = {name: value for name, value in values.items() if name not in own}
         return cls(**{name: value for name, value in values.items() if name in own}, more=more)  # type: ignore[call-arg]
 

@@ -4,28 +4,17 @@ Files of this room import torch, MONAI and Lightning only in their own modules; 
 commands and panels can say what is missing. `read_model`, `read_recipe` and `train` are imported when they are asked for.
 """
 
-from importlib import import_module
-from typing import Any
+from typing import TYPE_CHECKING
 
-from ..errors import needing
+from ..lazy import public
 
-_PUBLIC = {
-    "read_model": "model_file",
-    "TrainedNetwork": "model_file",
-    "with_judgement": "model_file",
-    "read_recipe": "recipe",
-    "train": "training",
-    "read_judge_recipe": "judging.recipe",
-    "judge": "judging.judge",
-}
+if TYPE_CHECKING:
+    from .judging.judge import judge as judge
+    from .judging.recipe import read_judge_recipe as read_judge_recipe
+    from .model_file import TrainedNetwork as TrainedNetwork
+    from .model_file import read_model as read_model
+    from .model_file import with_judgement as with_judgement
+    from .recipe import read_recipe as read_recipe
+    from .training import train as train
 
-
-def __getattr__(name: str) -> Any:
-    if name not in _PUBLIC:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    with needing("mphdrr[learning]"):
-        return getattr(import_module(f".{_PUBLIC[name]}", __name__), name)
-
-
-def __dir__() -> list[str]:
-    return sorted(_PUBLIC)
+__getattr__, __dir__, _ = public(__name__, "mphdrr[learning]")

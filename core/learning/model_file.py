@@ -43,7 +43,10 @@ ALLOWED = ("scanner", "grid", "physics")
 """What may be allowed to differ from what a network was trained for."""
 _NO_PHYSICS = ("time", "background")
 """Entries of a model's record that may differ: a network is given counts and background of each scan."""
-_LATER = {"start": 0.0, "efficiency": 1.0, "energy_fwhm": None, "lines": "together", "plate_thickness": None}
+_LATER = {
+    "start": 0.0, "efficiency": 1.0, "energy_fwhm": None, "lines": "together", "plate_thickness": None,
+    "wall_thickness": None,
+}  # fmt: skip
 """Entries that records of earlier versions lack, and what they stand for."""
 _KEPT = 4
 _SETUPS: dict[Any, Setup] = {}

@@ -8,8 +8,9 @@ Nucl. Sci. 50 (2003) 1510-1515).
 import math
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from ..arrays import ArrayOrTensor, checked, is_tensor, namespace
+from ..arrays import ArrayOrTensor, Floats, checked, is_tensor, namespace
 from ..errors import InputError, warn
 from ..memory import require
 from ..validation import freeze, instance, real_array
@@ -44,18 +45,13 @@ def hu_to_mu(volume: Volume, energy: float = 140.5, ct_energy: float = CT_ENERGY
     """
     instance(volume, Volume, "hu_to_mu")
     require_quantity(volume.quantity, ("hu",), "hu_to_mu")
-    water, air, bone = (attenuation(name, energy) for name in ("water", "air", "bone"))
-    ct_water, ct_bone = (attenuation(name, ct_energy) for name in ("water", "bone"))
     require(4.0 * volume.grid.n_voxels, "the attenuation map")
     mu = np.empty(volume.grid.shape, np.float32)
     outside = metal = 0
     for hu, slab in zip(volume.array, mu, strict=True):
         outside += int(np.count_nonzero(hu < _PADDING_HU))
         metal += int(np.count_nonzero(hu > _METAL_HU))
-        exact = hu.astype(np.float64)  # air is the small difference of two large terms
-        below = np.clip(exact, AIR_HU, 0) * ((water - air) / 1000)
-        above = np.maximum(exact, 0) * ((bone - water) * ct_water / (ct_bone - ct_water) / 1000)
-        slab[:] = water + below + above
+        slab[:] = mu_of_hu(hu, energy, ct_energy)
     lowest, highest = float(volume.array.min()), float(volume.array.max())
     if 0 < max(-lowest, highest) < _WATER_HU:
         warn(
@@ -69,6 +65,16 @@ def hu_to_mu(volume: Volume, energy: float = 140.5, ct_energy: float = CT_ENERGY
         if count:
             warn(f"{count / mu.size:.2%} of the voxels are {what}", 2)
     return Volume(freeze(mu), volume.grid, "mu")
+
+
+def mu_of_hu(hu: ArrayLike, energy: float = 140.5, ct_energy: float = CT_ENERGY) -> Floats:
+    """The law of `hu_to_mu`: attenuation coefficients, 1/mm, of CT numbers, in float64."""
+    water, air, bone = (attenuation(name, energy) for name in ("water", "air", "bone"))
+    ct_water, ct_bone = (attenuation(name, ct_energy) for name in ("water", "bone"))
+    exact = np.asarray(hu, np.float64)  # air is the small difference of two large terms
+    below = np.clip(exact, AIR_HU, 0) * ((water - air) / 1000)
+    above = np.maximum(exact, 0) * ((bone - water) * ct_water / (ct_bone - ct_water) / 1000)
+    return water + below + above
 
 
 def mu_to_hu(volume: Volume, energy: float = CT_ENERGY) -> Volume:

@@ -60,6 +60,28 @@ def counted_lines(
     return tuple((energy, photons) for energy, photons in found if photons > _LEAST_SHARE * most)
 
 
+def peak_shares(
+    isotope: Isotope, windows: Sequence[tuple[float, float] | None], energy_fwhm: float
+) -> tuple[float, float, float]:
+    """Shares of the photons of the peak's lines that are measured in the lower, the peak and the upper window; 0 of None.
+
+    The lines are those within the peak window, and `energy_fwhm` is that of `counted_lines`.
+    """
+    peak = windows[1]
+    lines = () if peak is None else isotope.lines_within(*peak)
+    if not lines:
+        raise InputError(f"energy window scatter: {isotope.name} has no line in the peak window, {peak} keV")
+    reference, _ = max(lines, key=lambda line: line[1])
+    total = sum(photons for _, photons in lines)
+
+    def share(window: tuple[float, float] | None) -> float:
+        own = ((e, photons, energy_fwhm * math.sqrt(reference * e)) for e, photons in lines)
+        return 0.0 if window is None else sum(photons * acceptance(e, window, fwhm) for e, photons, fwhm in own) / total
+
+    lower, middle, upper = map(share, windows)
+    return lower, middle, upper
+
+
 def energy_window_scatter(
     lower: ArrayLike | None,
     peak: ArrayLike,
@@ -67,6 +89,7 @@ def energy_window_scatter(
     widths: Sequence[float | None],
     fwhm: float | None = None,
     efficiency: ArrayLike = 1.0,
+    shares: Sequence[float] | None = None,
 ) -> tuple[Floats, Floats]:
     """Scattered photons in the peak window, from the counts in the windows below and above it.
 
@@ -88,6 +111,11 @@ def energy_window_scatter(
     efficiency : number or array (M, n_v, n_u)
         Of the pixels, as in `Emission`: photons are smoothed, of which each pixel counts its share. Those of dead and hot
         pixels, 0, are no part of it, and the smoothed estimate of them is 0.
+    shares : sequence of 3 numbers, optional
+        Of the photons that are not scattered, those measured in the three windows (`peak_shares`). What the peak's tails add
+        to the outer windows is then no scatter: with T the estimate as above, P the peak's counts and
+        ``t = w_p / 2 (a_l / w_l + a_u / w_u) / a_p`` it is ``(T - t P) / (1 - t)``, by chance below 0 here and there. None:
+        no tails.
 
     Returns
     -------
@@ -97,7 +125,8 @@ def energy_window_scatter(
     Raises
     ------
     InputError
-        Both windows are missing, shapes differ, counts are negative, or a width is not a number above 0.
+        Both windows are missing, shapes differ, counts are negative, or a width is not a number above 0; or there are no
+        fewer photons per keV beside the peak than in it.
     """
     name = "energy window scatter"
     shape = np.shape(peak)
@@ -110,8 +139,11 @@ def energy_window_scatter(
     if lower is None and upper is None:
         raise InputError(f"{name}: expected counts of the lower or the upper window, or both")
     w_peak = positive(widths[1], f"{name}: width of the peak window", "keV")
-    scatter, variance = np.zeros(shape), np.zeros(shape)
-    for word, counts, width in (("lower", lower, widths[0]), ("upper", upper, widths[2])):
+    scatter, variance, tails = np.zeros(shape), np.zeros(shape), 0.0
+    a_lower, a_peak, a_upper = (
+        (0.0, 1.0, 0.0) if shares is None else real_array(shares, f"{name}: shares", (3,)).tolist()
+    )
+    for word, counts, width, share in (("lower", lower, widths[0], a_lower), ("upper", upper, widths[2], a_upper)):
         if counts is None:
             continue
         array = real_array(counts, f"{name}: {word}", shape)
@@ -120,12 +152,21 @@ def energy_window_scatter(
         factor = w_peak / (2 * positive(width, f"{name}: width of the {word} window", "keV"))
         scatter += factor * array
         variance += factor**2 * array
+        tails += factor * share / positive(a_peak, f"{name}: share in the peak window")
+    if tails:
+        if not 0 < tails < 1:
+            raise InputError(f"{name}: shares: expected less of the photons per keV beside the peak than in it")
+        of_peak = real_array(peak, f"{name}: peak", shape)
+        scatter, variance = (
+            (scatter - tails * of_peak) / (1 - tails),
+            (variance + tails**2 * of_peak) / (1 - tails) ** 2,
+        )
     if fwhm is None:
         return scatter, variance
     sigma = positive(fwhm, f"{name}: fwhm", "pixels") / FWHM_PER_SIGMA
     along_v, along_u = (gaussian_blur(n, sigma) for n in shape[1:])
-    shares = np.broadcast_to(real_array(efficiency, f"{name}: efficiency", None), shape)
-    around = along_v @ shares @ along_u.T
-    factors: Floats = np.divide(shares, around, out=np.zeros(shape), where=shares > 0)
-    scatter, variance = (np.where(shares > 0, x, 0.0) for x in (scatter, variance))
+    counting = np.broadcast_to(real_array(efficiency, f"{name}: efficiency", None), shape)
+    around = along_v @ counting @ along_u.T
+    factors: Floats = np.divide(counting, around, out=np.zeros(shape), where=counting > 0)
+    scatter, variance = (np.where(counting > 0, x, 0.0) for x in (scatter, variance))
     return factors * (along_v @ scatter @ along_u.T), factors**2 * (along_v**2 @ variance @ (along_u**2).T)

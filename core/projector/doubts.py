@@ -1,6 +1,7 @@
 """What of a projector's arguments looks wrong, though it may be meant: texts of warnings, each with its number."""
 
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 
@@ -33,7 +34,8 @@ def doubts(grid: Grid, views: Views, model: Model) -> Iterator[str]:
         yield f"the grid is {wide:.3g} mm wide, {near:.3g} mm from the sources: lengths are in mm; is it in metres?"
     if not isinstance(model, Emission):
         return
-    yield from dict.fromkeys(text for part in model.parts() for text in _doubts_of_coefficients(part))
+    parts: Any = model.parts() if model.is_apart else [model]
+    yield from dict.fromkeys(text for part in parts for text in _doubts_of_coefficients(part))
 
 
 def _doubts_of_coefficients(model: Emission) -> Iterator[str]:
@@ -43,14 +45,14 @@ def _doubts_of_coefficients(model: Emission) -> Iterator[str]:
         value = np.max(0.0 if getattr(model, name) is None else getattr(model, name))
         if value > _ABOVE_METALS * most:
             yield f"{name} is {value:g} 1/mm, more than any material's at its energy ({most:.3g}): is it in 1/cm?"
-    if model.plate_thickness is not None:
+    if model.plate_thickness is not None and model.wall_thickness is None:
         yield from _doubts_of_plates(model)
     if isinstance(model.mu, Volume):
         yield from doubts_of_mu(model.mu.array, model)
 
 
 def _doubts_of_plates(model: Emission) -> Iterator[str]:
-    """Of what passes the solid plates, which no model counts."""
+    """Of what passes the solid plates, which only models with walls count."""
     shares = []
     for m in range(len(model.system)):
         optics = model.optics.of_modules(m, len(model.system))

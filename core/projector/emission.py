@@ -28,13 +28,11 @@ from .bundles import Beam
 from .hole_nodes import Passage
 from .hole_response import WholeHoles
 from .models import Model, checked_background, checked_times
+from .module_views import require_views_of
 from .photon_lines import checked_mu, checked_photons, models_of_lines
 from .pixel_points import TOLERANCE, expected_error, lattices, offsets, points_needed, require_points, shadow_edges
 from .rays import Fan, view_rays
-
-# Views may differ from their system by a file's rounding (mm; sine of an angle).
-_SAME_PLACE = 1e-3
-_SAME_DIRECTION = 1e-6
+from .wall_penetration import models_with_walls
 
 # A box of this width has the same variance as a Gaussian of sigma 1.
 _BOX_PER_SIGMA = math.sqrt(12)
@@ -117,7 +115,11 @@ class Emission(Model):
         Full angle alpha of the knife edge's double cone, rad.
     plate_thickness : float or array (M,), optional
         With edge "path" the thickness of the plate, mm, in whose middle the knife edge is. What passes it where it is solid,
-        far from the hole, is not counted; a warning says so from 0.5 % on. None: infinite.
+        far from the hole, is not counted without `wall_thickness`; a warning says so from 0.5 % on. None: infinite.
+    wall_thickness : float, optional
+        Of the collimators, mm, of the aperture's material. Then photons are counted, too, that pass a module's own walls or
+        plate beside its hole, or a neighbour's hole and then walls: by rays (`wall_penetration`). Neighbours are the other
+        modules of `system`. None: nothing passes walls.
     edge : str
         How photons penetrate the knife edge. ``"paix"``: as if the hole had the diameter d_e with
         ``d_e^2 = d (d + 2 / mu tan(alpha / 2))`` (Paix 1967), in every direction. ``"path"``: rays beyond the rim are
@@ -182,6 +184,7 @@ class Emission(Model):
     energy_fwhm: float | None = None
     lines: Literal["together", "apart"] = "together"
     plate_thickness: float | None = None
+    wall_thickness: float | None = None
 
     photon_lines: ClassVar[tuple[tuple[float, float], ...]] = ()  # each model's own once made
     """The isotope's lines that are counted: energies, keV, in order, and counted photons per decay."""
@@ -210,6 +213,10 @@ class Emission(Model):
         if self.hole not in ("auto", "depth", "rays", "point"):
             raise InputError(f"emission: hole: expected 'auto', 'depth', 'rays' or 'point', got {self.hole!r}")
         has_points = (self.aperture_points, self.aperture_tolerance) != (None, None)
+        if self.wall_thickness is not None:
+            self._set("wall_thickness", positive(self.wall_thickness, "emission: wall_thickness", "mm"))
+            if self.aperture_mu is None:
+                raise InputError("emission: wall_thickness needs aperture_mu, of the walls' material")
         if has_points and self.hole in ("depth", "point"):
             raise InputError(f"emission: hole {self.hole!r} takes no points of it; use hole 'rays', or leave that out")
 
@@ -243,25 +250,25 @@ class Emission(Model):
             given = {f.name: getattr(self, f.name) for f in fields(Optics)}
             given = {name: real_array(x, name, None) if is_tensor(x) else x for name, x in given.items()}
             optics = Optics.of(self.system, self.photon_lines, **given)
-        if self._is_apart:  # coefficients stay as they are given, for each line
+        if self.is_apart:  # coefficients stay as they are given, for each line
             self._set("optics", optics)
         for f in fields(Optics):
-            if not (self._is_apart and f.name.endswith("_mu") and np.ndim(given[f.name]) == 0):
+            if not (self.is_apart and f.name.endswith("_mu") and np.ndim(given[f.name]) == 0):
                 self._set(f.name, getattr(optics, f.name))
 
     @property
-    def _is_apart(self) -> bool:
+    def is_apart(self) -> bool:
         """Whether each line has a model of its own."""
         is_one = self.mu is None or (isinstance(self.mu, Volume) and self.mu.quantity == "mu")
         return len(self.photon_lines) > 1 and (self.lines == "apart" or not is_one)
 
-    def parts(self) -> tuple[Self, ...]:
-        """The model of each line, where they are apart; else the model alone."""
-        return self._models_of_lines if self._is_apart else (self,)
+    def parts(self) -> tuple[Model, ...]:
+        """The model of each line, where they are apart; else what passes walls after the rest, or the model alone."""
+        return (self,) if self.wall_thickness is None and not self.is_apart else self._models
 
     @functools.cached_property
-    def _models_of_lines(self) -> tuple[Self, ...]:
-        return models_of_lines(self, self.photon_lines)
+    def _models(self) -> tuple[Model, ...]:
+        return models_of_lines(self, self.photon_lines) if self.is_apart else models_with_walls(self)
 
     def record(self) -> dict[str, Any]:
         """The settings, for a run's record: of mu its grid, of the isotope its name, of a background's images a word."""
@@ -291,31 +298,13 @@ class Emission(Model):
         """The model of the modules `which` (indices) alone."""
         own = {f.name: getattr(self, f.name) for f in fields(self) if isinstance(getattr(self, f.name), np.ndarray)}
         changed = replace(self, system=self.system[which], **{name: values[which] for name, values in own.items()})
-        if self._is_apart:  # their attenuation is made only once
-            changed._set("_models_of_lines", tuple(part.of_views(which) for part in self.parts()))
+        if self.parts() != (self,):  # their attenuation is made only once, and neighbours stay
+            changed._set("_models", tuple(part.of_views(which) for part in self.parts()))
         return changed
 
     def check(self, views: Views) -> None:
         """Raise `InputError` unless `views` are of this system."""
-        if len(views) != len(self.system):
-            raise InputError(
-                f"emission: {len(self.system)} modules but {len(views)} views; give the system whose views they are"
-            )
-        views.require_pinholes("emission")
-        u, v, k = self._frames.transpose(1, 0, 2)
-        moved = np.linalg.norm(views.sources - self.system.centers, axis=1) > _SAME_PLACE
-        turned = np.zeros(len(views), dtype=bool)
-        for steps, axis in ((views.u_steps, u), (views.v_steps, v)):
-            sine = np.linalg.norm(np.cross(steps, axis), axis=1) / np.linalg.norm(steps, axis=1)
-            turned |= sine > _SAME_DIRECTION
-        behind = np.einsum("mi,mi->m", views.detector_centers - views.sources, k) <= 0
-        for bad, why in (
-            (moved, "its source is not the module's pinhole"),
-            (turned, "its pixels do not lie along the module's u and v"),
-            (behind, "its detector is not in front of the pinhole (see PinholeSystem.views)"),
-        ):
-            if bad.any():
-                raise InputError(f"emission: view {int(np.argmax(bad))}: {why}")
+        require_views_of(self.system, views, "emission")
         for name in ("background", "efficiency"):
             checked_background(getattr(self, name), f"emission: {name}", len(views), views.shape)
 

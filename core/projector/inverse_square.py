@@ -13,8 +13,8 @@ from ..geometry.system import PinholeSystem
 from ..geometry.views import Views
 from ..validation import instance
 from .bundles import Beam
-from .emission import Emission
 from .models import Model
+from .module_views import require_views_of
 from .rays import view_rays
 
 
@@ -45,7 +45,7 @@ class InverseSquareSum(Model):
 
     def check(self, views: Views) -> None:
         """Raise `InputError` unless `views` are of this system."""
-        Emission(self.system).check(views)
+        require_views_of(self.system, views, self.name)
 
     def beams(self, views: Views, m: int, grid: Grid) -> Iterator[Beam]:
         """The rays of `views`, weighted with ``d^2 sin^3(theta) / 16``."""

@@ -88,10 +88,11 @@ def run_line_integrals(run: ProjectionRun) -> Floats32:
     instance(run, ProjectionRun, "run_line_integrals")
     recipe = run.recipe
     kind = recipe["model.kind"]
-    if kind == "transmission":
+    if kind in ("transmission", "spectral"):
         return line_integrals(run, recipe)
     if kind != "emission":
-        raise InputError(f"model.kind: the images of {kind} are no line integrals; expected transmission or emission")
+        known = "transmission, spectral or emission"
+        raise InputError(f"model.kind: the images of {kind} are no line integrals; expected {known}")
     background = run.background
     if isinstance(background, np.ndarray) and background.ndim == 1:
         background = background[:, None, None]

@@ -23,6 +23,7 @@ from ..hdf5 import attributes, datasets, numbers, opened, pack
 from ..scanner_kinds import scanner_kind
 from ..volumes.formats import numpy_files
 from ..volumes.volume import Volume
+from .formats import FORMATS
 from .run import ProjectionRun
 
 _FORMAT = "mphDRR run"
@@ -237,10 +238,5 @@ def _torch() -> Any:
 
 
 _Format = tuple[Callable[[_Arrays, dict[str, Any]], memoryview], Callable[[Path], _Contents]]
-_FORMATS: dict[str, _Format] = {
-    ".h5": (_packed_hdf5, _read_hdf5),
-    ".hdf5": (_packed_hdf5, _read_hdf5),
-    ".npz": (_packed_npz, _read_npz),
-    ".pt": (_packed_pt, _read_pt),
-}
-FORMATS = tuple(_FORMATS)
+_HDF5: _Format = (_packed_hdf5, _read_hdf5)
+_FORMATS = dict(zip(FORMATS, (_HDF5, _HDF5, (_packed_npz, _read_npz), (_packed_pt, _read_pt)), strict=True))

@@ -169,7 +169,10 @@ def _scatter(recipe: Recipe) -> ScatterWindows | None:
     """The windows of a recipe from which scatter is estimated."""
     names = "lower_frames", "upper_frames", "window_widths", "scatter_fwhm"
     given = [recipe[f"counts.{name}"] for name in names]
-    return None if given[:2] == [None, None] else ScatterWindows(*given)
+    if given[:2] == [None, None]:
+        return None
+    photons = [recipe["model.isotope"], recipe["model.energy_fwhm"]] if recipe["counts.scatter_tails"] else []
+    return ScatterWindows(*given, *photons)
 
 
 def require_given(frames: Any, orientation: Any, time: Any, found: Counts) -> None:

@@ -1,9 +1,12 @@
 """Pictures of projections: upright, as seen from the pinhole, alone or all in one with numbers and a colour bar."""
 
+from __future__ import annotations
+
 import math
 import struct
 import zlib
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,7 +17,9 @@ from ..files import AnyPath, write_bytes
 from ..validation import real_numbers
 from . import letters
 from .display import Display, unit_text
-from .run import ProjectionRun
+
+if TYPE_CHECKING:  # pages of figures read this file, and runs take a while
+    from .run import ProjectionRun
 
 
 def as_seen(images: ArrayLike) -> NDArray:

@@ -11,7 +11,7 @@ from typing import Any
 
 _RESET = (
     *("isotope", "window", "aperture_points", "aperture_tolerance", "hole", "aperture_mu", "edge", "plate_thickness"),
-    *("crystal_mu", "depth_layers", "within_cone", "within_walls", "within_crystal"),
+    *("wall_thickness", "crystal_mu", "depth_layers", "within_cone", "within_walls", "within_crystal"),
 )
 """Settings of the model that every preset decides: those that it does not give have their defaults."""
 

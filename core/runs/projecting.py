@@ -21,6 +21,7 @@ from ..projector import Emission, Model, Projector, Transmission, intensity
 from ..projector.doubts import doubts_of_mu
 from ..validation import positive, seed_number
 from ..volumes.volume import Volume
+from ..xray.scan import SpectralScan
 from .counting import scaled
 from .run import ProjectionRun
 
@@ -76,7 +77,10 @@ class Imaging:
         if mu is not None and isinstance(self.model, Emission):
             for doubt in doubts_of_mu(mu, self.model):
                 warn(doubt)
-        images = np.asarray(A(volume, progress, mu))
+        if isinstance(self.model, SpectralScan):
+            images = self.model.counts(volume, A, progress)
+        else:
+            images = np.asarray(A(volume, progress, mu))
         for image, background in zip(images, A.background, strict=True):
             passed = image if self.photons is None else intensity(image, self.photons)
             image[...] = passed + background.astype(image.dtype)
@@ -114,12 +118,12 @@ def project_run(
     settings
         More to record in the run.
     model
-        `Transmission` (the default), an `Emission` or an `InverseSquareSum` of the same system.
+        `Transmission` (the default), an `Emission`, an `InverseSquareSum` or a `SpectralScan` of the same system.
     photons
         Photons of an X-ray source, per pixel: the run of a volume of mu holds those that pass (`intensity`), not line
         integrals.
     noise_seed
-        With an `Emission` or `photons`: the run holds counts drawn with this seed (`sample_counts`), not their means.
+        With counts or `photons`: the run holds counts drawn with this seed (`sample_counts`), not their means.
     progress
         Called after every view.
     dead_time
@@ -133,8 +137,8 @@ def project_run(
     """
     photons = None if photons is None else positive(photons, "photons")
     if noise_seed is not None:
-        if photons is None and not isinstance(model, Emission):
-            raise InputError("noise_seed: only the counts of an Emission, or photons that pass, have noise")
+        if photons is None and not (isinstance(model, Emission | SpectralScan) and model.unit(volume) == "counts"):
+            raise InputError("noise_seed: only counts of an Emission or of X rays, or photons that pass, have noise")
         noise_seed = seed_number(noise_seed)
     views = system.views(shape=shape, detector=detector, magnification=magnification, pitch=pitch)
     n_v, n_u = views.shape

@@ -22,10 +22,11 @@ from ..reconstruction.stopping import StoppingRule, StopWhen
 from ..volumes.resampling import resample
 from ..volumes.volume import Volume
 from ..volumes.volume_files import read_volume
+from ..xray.scan import SpectralScan
 from .recipe import Recipe
 from .run import ProjectionRun
 from .run_recipe import projector_of_run, recipe_model, truth_of_run
-from .settings import SAMPLING, SETTINGS
+from .settings import HOW_TABLES, SAMPLING, SETTINGS
 
 Watch = Callable[[int, Array, Sequence[float]], bool | None]
 """Called as ``watch(iteration, values, objective)`` after each iteration, with the volume's values and the objective after
@@ -35,9 +36,6 @@ _FEWEST, _MOST = 64, 128
 """Voxels along a side of the ROI's cube, where nobody says how many."""
 _POINTS = 7
 """Points of the hole: enough for its blur, and few enough for an iteration in a fraction of a second."""
-
-TABLES = ("reconstruction", "model", "attenuation", "compute")
-"""A recipe's tables that say how a run is reconstructed. The other tables say how its images were made."""
 
 
 def reconstruct_run(
@@ -56,9 +54,9 @@ def reconstruct_run(
     run : ProjectionRun
         Simulated or measured.
     recipe : Recipe
-        Its tables `TABLES` say how; by default the run's own. What is modelled is what made the run, unless the settings of
-        the reconstruction say otherwise: another model of the hole, no attenuation, no blur. For a run without a recipe, as
-        those of version 0.1.0, it needs the whole model, ``model.kind`` and all that this takes.
+        Its tables `HOW_TABLES` say how; by default the run's own. What is modelled is what made the run, unless the settings
+        of the reconstruction say otherwise: another model of the hole, no attenuation, no blur. For a run without a recipe,
+        as those of version 0.1.0, it needs the whole model, ``model.kind`` and all that this takes.
     mu : Volume
         What attenuates, instead of what the recipe says.
     start : Volume or Reconstruction
@@ -187,13 +185,13 @@ def _rules(recipe: Recipe, grid: Grid) -> StopWhen | None:
 
 
 def recipe_of(run: ProjectionRun, recipe: Recipe | None = None) -> Recipe:
-    """The run's recipe, where `recipe` does not say how to reconstruct, in `TABLES`, otherwise.
+    """The run's recipe, where `recipe` does not say how to reconstruct, in `HOW_TABLES`, otherwise.
 
     A run without one, as those of version 0.1.0, takes all of the model from `recipe`, which then names its kind.
     """
     if recipe is None:
         return run.recipe
-    given = {key: value for key, value in recipe.given.items() if key.partition(".")[0] in TABLES}
+    given = {key: value for key, value in recipe.given.items() if key.partition(".")[0] in HOW_TABLES}
     if run.is_measured and isinstance(given.get("model.start"), int | float):  # as in imports, of the first frame
         starts = np.asarray(run.recipe["model.start"])
         given["model.start"] = (given["model.start"] + starts - starts.min()).tolist()
@@ -294,11 +292,16 @@ def _by_depth(recipe: Recipe) -> bool:
 
 
 def line_integrals(run: ProjectionRun, recipe: Recipe) -> Floats32:
-    """What a run's pixels say of its volume linearly: counts as they are, of photons that pass the line integrals.
+    """What a run's pixels say of its volume linearly: counts as they are, of photons that pass the line integrals, of X rays
+    those of the mu of `SpectralScan.line_integrals`.
 
     Where no photon has passed, half a photon is taken for it.
     """
     photons = recipe["model.photons"]
+    if recipe["model.kind"] == "spectral":
+        model = recipe_model(recipe, run.system)
+        assert isinstance(model, SpectralScan)
+        return model.line_integrals(run.projections, run.views, not recipe["reconstruction.ignore_beam_hardening"])
     if photons is None:
         return run.projections
     return np.asarray(np.log(photons / np.maximum(run.projections, 0.5)), np.float32)

@@ -28,14 +28,19 @@ from ..volumes.rearranging import centered
 from ..volumes.volume import Volume
 from ..volumes.volume_files import read_volume, read_volume_of
 from ..workbook import read_scanner
+from ..xray.detectors import checked_bins
+from ..xray.scan import SpectralScan
 from .counting import dead_time_of, live_shares_of, recipe_efficiency, scaled
 from .measured import recipe_counts
 from .projecting import LINES, Imaging, project_run, warn_of_energy
 from .recipe import Recipe, recorded_recipe
 from .run import ProjectionRun
 
-_MODELS: dict[str, Any] = {"transmission": Transmission, "emission": Emission, "inverse-square": InverseSquareSum}
+_MODELS: dict[str, Any] = {
+    "transmission": Transmission, "emission": Emission, "spectral": SpectralScan, "inverse-square": InverseSquareSum,
+}  # fmt: skip
 _MODULES, _EFFICIENCY = "system.modules", "model.efficiency"
+_MU_ADVICE = "; of mu, give the energy at which it holds (--energy)"
 _MOST_MU = 500.0
 """1/mm: more than any material of the tables attenuates photons of 10 keV or more."""
 
@@ -79,14 +84,18 @@ def run_recipe(
     if volume is not None:
         if mu is None and recipe["attenuation.of_phantom"]:
             raise InputError("attenuation.of_phantom: a volume that is given needs its mu as well")
-        sources = iter([(volume, mu, recorded)])
+        sources = iter([(_taken(volume, model, recipe["volume.energy"]), mu, recorded)])
     elif recipe["volume.file"] is not None or recipe["volume.states"] is not None:
-        sources = _from_files(recipe, recorded, mu, stages)
+        sources = _from_files(recipe, recorded, model, mu, stages)
     else:
         sources = _from_phantom(recipe, recorded, model, mu, stages)
     frames = frames_of(recipe)
     energy = recipe["volume.energy"] or recipe["attenuation.energy"]
-    converted = {} if energy in (None, LINES) else {"ct_converted_at_kev": photon_energy(energy)}
+    converted = (
+        {}
+        if energy in (None, LINES) or isinstance(model, SpectralScan)
+        else {"ct_converted_at_kev": photon_energy(energy)}
+    )
     for number, ((source, mu_of_it, record), times) in enumerate(_in_frames(sources, frames)):
         record, seed = record.updated(times), recipe["noise.seed"]
         if seed is not None:  # noise of its own for each
@@ -102,6 +111,11 @@ def run_recipe(
 def frames_of(recipe: Recipe) -> list[dict[str, Any]]:
     """What each run of a recipe changes in it: its frame's times, if it has frames; `InputError` if their numbers differ."""
     times, starts, states = recipe["frames.times"], recipe["frames.starts"], recipe["volume.states"] or ()
+    if (bins := recipe["frames.bins"]) is not None:
+        if len(bins) % 2:
+            raise InputError(f"frames.bins: expected pairs of energies, from and to, got {len(bins)} numbers")
+        pairs = checked_bins(np.reshape(bins, (-1, 2)).tolist()).tolist()
+        return [{"frames.bins": None, "model.window": pair} for pair in pairs]
     if times is None:
         return [{}] * max(1, len(states))
     if starts is None:
@@ -219,6 +233,8 @@ def projector_of_run(
         else:
             mu = _attenuation(recipe, model, stages)
     model = recipe_model(recipe, run.system, mu, run)
+    if isinstance(model, SpectralScan):  # its images become line integrals
+        model = Transmission()
     if isinstance(model, Emission) and np.ndim(run.background) == 3:  # such as scatter: no recipe says it
         own = recipe_model(run.recipe, run.system, run=run).background if "recipe" in run.settings else 0.0
         more = np.maximum(run.background - each_pixel(own), 0)
@@ -254,18 +270,25 @@ def _attenuation(recipe: Recipe, model: Model, stages: Stages) -> Volume | None:
     return read_mu(path, energy, recipe["attenuation.series"], stages("reading"))
 
 
-def _from_files(recipe: Recipe, record: Recipe, mu: Volume | None, stages: Stages) -> Iterator[_Source]:
+def _from_files(recipe: Recipe, record: Recipe, model: Model, mu: Volume | None, stages: Stages) -> Iterator[_Source]:
     """The volumes of the files, one at a time; ``volume.center`` moves all of them, and mu, as far as the first."""
     middle = None
     states = recipe["volume.states"]
     for file in states or [recipe["volume.file"]]:
-        volume = _read(file, recipe, stages("reading"))
+        volume = _taken(_read(file, recipe, stages("reading")), model, recipe["volume.energy"])
         if recipe["volume.center"]:
             if middle is None:
                 middle = volume.grid.center
                 mu = None if mu is None else centered(mu, mu.grid.center - middle)
             volume = centered(volume, volume.grid.center - middle)
         yield volume, mu, record if states is None else record.updated({"volume.states": [file]})
+
+
+def _taken(volume: Volume, model: Model, energy: float | str | None) -> Volume:
+    """A volume as the model takes it; `energy`, keV or an isotope's, is that at which its mu holds."""
+    if not isinstance(model, SpectralScan):
+        return volume
+    return model.at_ct_energy(volume, None if energy is None else photon_energy(energy))
 
 
 def _read(path: str, recipe: Recipe, progress: Progress | None) -> Volume:
@@ -280,6 +303,9 @@ def _read(path: str, recipe: Recipe, progress: Progress | None) -> Volume:
             values = f"values of {lowest:g} to {highest:g}, as of a CT, are no activity"
             raise InputError(f"{path}: {values}; --quantity activity takes them as such")
         return volume
+    if recipe["model.kind"] == "spectral":
+        held, advice = ("mu", "; CT numbers need no energy") if recipe["volume.energy"] else ("hu", _MU_ADVICE)
+        return read_volume_of(path, held, advice, series=series, progress=progress)
     if recipe["model.photons"] is not None or recipe["volume.energy"] is not None:
         return read_mu(path, recipe["volume.energy"], series, progress)
     volume = read_volume(path, series=series, progress=progress)
@@ -328,9 +354,9 @@ def _from_phantom(recipe: Recipe, record: Recipe, model: Model, mu: Volume | Non
     if recipe["attenuation.of_phantom"]:
         mu = _mu_of_phantom(phantom, pose, grid, model, stages)
     is_described = recipe["phantom.file"] is not None or recipe["phantom.text"] is not None
-    quantity = "mu" if is_described and recipe["model.photons"] is not None else "activity"
-    volume = phantom.voxelize(grid, pose, stages("voxelizing"), quantity)
-    yield volume, mu, with_phantom(record, phantom, pose)
+    is_of_mu = (is_described and recipe["model.photons"] is not None) or recipe["model.kind"] == "spectral"
+    volume = phantom.voxelize(grid, pose, stages("voxelizing"), "mu" if is_of_mu else "activity")
+    yield _taken(volume, model, phantom.mu_energy), mu, with_phantom(record, phantom, pose)
 
 
 def recipe_phantom(recipe: Recipe) -> Phantom:
@@ -351,7 +377,7 @@ def truth_of_run(run: ProjectionRun) -> tuple[Volume | Phantom, Floats | None]:
     if run.volume is None:
         raise InputError("the run was measured: nobody knows the truth; give a volume or a phantom")
     recipe = run.recipe if "recipe" in run.settings else None
-    if recipe is None or "phantom.matrix" not in recipe.given:
+    if recipe is None or recipe["model.kind"] == "spectral" or "phantom.matrix" not in recipe.given:
         return run.volume, None
     return recipe_phantom(recipe), phantom_pose(recipe)
 

@@ -8,7 +8,8 @@ import numpy as np
 
 from ..arrays import Floats, Floats32
 from ..errors import InputError
-from ..physics.energy_window import energy_window_scatter
+from ..physics.energy_window import energy_window_scatter, peak_shares
+from ..physics.isotopes import isotope
 from ..projector.models import each_pixel
 from .frame_files import Counts, differs
 
@@ -28,12 +29,17 @@ class ScatterWindows:
         Widths of the lower, the peak and the upper window, keV. None: what the files say.
     fwhm
         FWHM in pixels of the Gaussian that smooths the estimate. None: it is not smoothed.
+    isotope, energy_fwhm
+        With both, the photopeak's tails in the outer windows are no scatter: the FWHM of the energy resolution is that of
+        `Emission`. The files must say the windows' energies. None: all that is in the outer windows is scatter.
     """
 
     lower_frames: str | Sequence[int | None] | None = None
     upper_frames: str | Sequence[int | None] | None = None
     widths: Sequence[float] | None = None
     fwhm: float | None = None
+    isotope: str | None = None
+    energy_fwhm: float | None = None
 
     def __post_init__(self) -> None:
         if self.lower_frames is None and self.upper_frames is None:
@@ -66,10 +72,26 @@ class ScatterWindows:
         widths = [None if word not in used else self._width(word, used[word], found) for word in _WORDS]
         (lower, peak, upper) = map(images.get, _WORDS)
         assert peak is not None
-        scatter, _ = energy_window_scatter(lower, peak, upper, widths, self.fwhm, each_pixel(efficiency))
+        shares = None
+        if self.isotope is not None and self.energy_fwhm is not None:
+            edges = [None if word not in used else self._edges(word, used[word], found) for word in _WORDS]
+            shares = peak_shares(isotope(self.isotope), edges, self.energy_fwhm)
+        scatter, _ = energy_window_scatter(lower, peak, upper, widths, self.fwhm, each_pixel(efficiency), shares)
+        scatter = scatter.clip(min=0)  # a background cannot be less
         beside = sum(images[word].sum(axis=(1, 2), dtype=float) for word in self.frames)
         record = {"windows": sorted(self.frames), "widths_keV": widths, "fwhm_pixels": self.fwhm}
+        record |= {} if shares is None else {"shares_of_peak": list(shares)}
         return scatter, record | {"counts": np.asarray(beside).tolist()}
+
+    @staticmethod
+    def _edges(word: str, used: Sequence[int], found: Counts) -> tuple[float, float]:
+        """The energies between which the frames of a window are, keV."""
+        low, high = found.about[used[0], -2:].tolist()
+        if not (np.isfinite(low + high) and (found.about[used, -2:] == found.about[used[0], -2:]).all()):
+            raise InputError(
+                f"{found.name}: the peak's tails need the {word} window's energies, the same of all frames"
+            )
+        return low, high
 
     def _width(self, word: str, used: Sequence[int], found: Counts) -> float:
         """The width of a window, keV: what is given, unless a file contradicts it, or what the files say."""

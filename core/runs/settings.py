@@ -167,6 +167,8 @@ def _alternatives(key: str, words: Iterable[str]) -> str:
 
 
 _COUNTS = "model.kind=emission"
+_XRAYS = "model.kind=spectral"
+_PHOTONS = f"{_COUNTS} or {_XRAYS}"
 _METHOD_OF_COUNTS = _alternatives("reconstruction.method", [name for name, m in METHODS.items() if m.of_counts])
 _RAYS = "model.kind=transmission or model.hole=rays or model.hole=point"
 _FILE = "volume.file or volume.states"
@@ -218,8 +220,8 @@ _DECLARED = (
     Setting("volume.quantity", str, None, "What the values of the volume are", "what the file says; a file that says "
             "nothing holds activity for counts, mu for photons, else CT numbers", words=named(LINE_INTEGRALS, ""),
             needs=(_FILE, "no volume.energy")),
-    Setting("volume.energy", float, None, _AT_ENERGY, unit="keV", words=_ISOTOPES, above=0,
-            needs=(_FILE, "no model.kind=emission")),
+    Setting("volume.energy", float, None, f"{_AT_ENERGY}; of spectral, at which the volume's mu holds", unit="keV",
+            words=_ISOTOPES, above=0, needs=(f"{_FILE} or {_XRAYS}", "no model.kind=emission")),
     Setting("volume.center", bool, False, "Move the volume's centre to the isocentre, and other states and the "
             "attenuation with it", needs=(_FILE,)),
     Setting("phantom.kind", str, "derenzo", "Kind of the phantom", needs=(*_PHANTOM, *_NO_PHANTOM[1:]),
@@ -278,9 +280,13 @@ _DECLARED = (
             "file says", unit="keV", above=0, sizes=(3,), needs=("counts.files", _SCATTER)),
     Setting("counts.scatter_fwhm", float, None, "FWHM of the Gaussian that smooths the estimate of scatter", "it is not "
             "smoothed", unit="pixels", above=0, needs=("counts.files", _SCATTER)),
+    Setting("counts.scatter_tails", bool, False, "The photopeak's tails in those windows, by the energy resolution, are no "
+            "scatter", needs=("counts.files", _SCATTER, "model.isotope", "model.energy_fwhm")),
     Setting("model.kind", str, "transmission", "What a pixel holds", label="Model", option="--model", words={
         "transmission": ("Radiograph", "Line integrals of the volume"),
         "emission": ("SPECT Counts", "Photons of a volume of activity that the crystal counts"),
+        "spectral": ("X-ray Counts", "Photons of an X-ray system's tubes that its panels count, or their signal: all "
+                     "energies, by kVp, mAs and filters"),
         "inverse-square": ("Inverse Square Sum", "Line integrals with each segment times a point source's sensitivity, "
                            "as 1/h^2: no counts, for comparison"),
     }),
@@ -293,8 +299,22 @@ _DECLARED = (
     Setting("model.isotope", str, None, "What decays: its photons are counted, and its activity falls during the "
             "acquisition", "one photon per decay, and a constant activity", words=_ISOTOPES, needs=(_COUNTS,)),
     Setting("model.window", float, None, "Energies that are counted, from and to", "10 % around the isotope's strongest "
-            "line", unit="keV", least=0, slider=1000, sizes=(2,), needs=(_COUNTS, "model.isotope"),
-            label="Window (keV)"),
+            "line; of X rays, all", unit="keV", least=0, slider=1000, sizes=(2,), needs=(_PHOTONS,
+            f"model.isotope or {_XRAYS}", "no model.panel=energy"), label="Window (keV)"),
+    Setting("model.panel", str, "counting", "What panels make of X rays", words={
+        "counting": ("Counts Photons", "Those of an energy window"),
+        "energy": ("Integrates Energy", "The energy, keV, that it absorbs"),
+    }, needs=(_XRAYS,)),
+    Setting("model.sensor", str, None, "Material of the panel that stops the X rays", "all are stopped",
+            words=named(("CdTe", "CZT", "silicon", "CsI")), needs=(_XRAYS,)),
+    Setting("model.sensor_thickness", float, 2.0, "Its thickness", unit="mm", above=0, slider=5, needs=(_XRAYS,
+            "model.sensor"), label="Sensor (mm)"),
+    Setting("model.sensor_fwhm", float, 0.0, "FWHM of a panel's energy resolution", unit="keV", least=0, slider=20,
+            needs=(_XRAYS, "no model.panel=energy"), label="FWHM (keV)"),
+    Setting("model.materials", str, "water-bone", "What the volume consists of for X rays", words={
+        "water-bone": ("Water and Bone", "As CT numbers say: up to water's 0, then more and more bone"),
+        **named(("water", "bone", "PMMA", "iodine", "aluminum", "copper"), "At the density that the volume's mu says"),
+    }, needs=(_XRAYS,)),
     Setting("model.energy_fwhm", float, None, "FWHM of the detector's energy resolution at the window's line, as a share of "
             "its energy: of each line, also beside the window, a part is counted", "all photons within the window",
             above=0, most=0.99, slider=0.3, needs=(_COUNTS, "model.isotope"), label="Energy FWHM"),
@@ -326,13 +346,16 @@ _DECLARED = (
     }, needs=(_COUNTS, "model.aperture_mu")),
     Setting("model.plate_thickness", float, None, "Thickness of the aperture's plate, in whose middle the edge is",
             "infinite", unit="mm", above=0, slider=20, needs=(_COUNTS, "model.edge=path"), label="Plate (mm)"),
+    Setting("model.wall_thickness", float, None, "Thickness of the collimators' walls, of the aperture's material: photons "
+            "that pass them, or a neighbour's hole and walls, are counted", "nothing passes them", unit="mm", above=0,
+            slider=20, needs=(_COUNTS, "model.aperture_mu"), label="Walls (mm)", unset="Opaque"),
     Setting("model.crystal_mu", float, None, "Material of the crystal that stops the photons, or its attenuation "
             "coefficient at their energy", "all photons are counted", unit="1/mm", words=named(CRYSTALS, _BY_NAME),
             above=0, slider=5, needs=(_COUNTS,), label="Crystal", unset="None"),
     Setting("model.depth_layers", int, 1, "Depths in the crystal at which photons are recorded (parallax); 1: where they "
             "enter; without rays, more mean all depths", least=1, slider=8, needs=(_COUNTS, "model.crystal_mu")),
-    Setting("model.intrinsic_fwhm", float, 0.0, "Full width at half maximum of the detector's own blur, on the crystal",
-            unit="mm", least=0, slider=10, needs=(_COUNTS,), label="Blur (mm)"),
+    Setting("model.intrinsic_fwhm", float, 0.0, "Full width at half maximum of the detector's own blur, on crystal or panel",
+            unit="mm", least=0, slider=10, needs=(_PHOTONS,), label="Blur (mm)"),
     Setting("model.within_cone", bool, False, "Nothing passes steeper than the knife edge's cone", needs=(_COUNTS,),
             label="Knife-Edge Cone"),
     Setting("model.within_walls", bool, False, "The collimator's walls stop photons that would miss the crystal's front",
@@ -340,7 +363,7 @@ _DECLARED = (
     Setting("model.within_crystal", bool, False, "Pixels beyond the crystal's side count nothing", needs=(_COUNTS,),
             label="Crystal's Side"),
     Setting("model.background", float, 0.0, "Counts of each pixel besides those of the volume, in the whole acquisition: "
-            "scatter and dark counts", least=0, slider=100, needs=(_COUNTS,), option="--background-counts"),
+            "scatter and dark counts", least=0, slider=100, needs=(_PHOTONS,), option="--background-counts"),
     Setting("model.efficiency", float, 1.0, f"Factor of the counts of the volume{_OF_MODULES}, or a file with an image for "
             "each module, as counts flood writes it; 0: dead", least=0, slider=2, needs=(_COUNTS,), of_modules=True,
             endings=(".npy", ".npz", ".h5", ".hdf5")),
@@ -369,12 +392,16 @@ _DECLARED = (
             slider=10, label="Pixel Size (mm)"),
     Setting("frames.times", float, None, "Durations of a scan's frames, or of a heart's gates: a run of each, as OUTPUT-1, "
             "OUTPUT-2 …, of the volume, or of each its state", "there is one frame", unit="s", above=0, sizes=(),
-            needs=(_COUNTS, _MADE), option="--frame-times"),
+            needs=(_COUNTS, _MADE), option="--frame-times", label="Frame Times (s)"),
     Setting("frames.starts", float, None, "When they start after the reference time of the activity; of gates, all with the "
-            "scan", "each as the one before ends", unit="s", sizes=(), needs=("frames.times",), option="--frame-starts"),
+            "scan", "each as the one before ends", unit="s", sizes=(), needs=("frames.times",), option="--frame-starts",
+            label="Frame Starts (s)"),
+    Setting("frames.bins", float, None, "Energy bins of X rays, from, to, from, to …: a run of each, as OUTPUT-1, "
+            "OUTPUT-2 …", "one, the window", unit="keV", least=0, sizes=(), option="--bins",
+            needs=(_XRAYS, "no model.panel=energy", "no model.window", "no volume.states")),
     Setting("noise.seed", int, None, "Draw Poisson counts with this seed; of several states or frames with SEED, SEED + 1 …",
             "their expected means", least=0, most=2**64 - 1,
-            needs=("model.kind=emission or model.photons", _MADE), option="--noise"),
+            needs=(f"model.photons or {_PHOTONS}", "no model.panel=energy", _MADE), option="--noise"),
     Setting("reconstruction.method", str, "osem", "How the volume is found", endings=METHOD_FILES,
             words={name: (method.label, method.text) for name, method in METHODS.items()}),
     _argument("iterations", int, "How often all images are used", "what suits the method", least=1, slider=100),
@@ -403,6 +430,8 @@ _DECLARED = (
             needs=(_METHOD_OF_COUNTS,)),
     Setting("reconstruction.ignore_blur", bool, False, "Model no blur of the detector: no recovery of it",
             needs=(_METHOD_OF_COUNTS,), label="Ignore Detector Blur"),
+    Setting("reconstruction.ignore_beam_hardening", bool, False, "Take mere logarithms of X rays of many energies: no "
+            "correction for water", needs=(f"no {_METHOD_OF_COUNTS}",)),
     _argument("background", float, "Counts expected in each pixel besides those of the volume, such as scatter", least=0,
               slider=100),
     _argument("relaxation", float, "Length of the steps, less than 2", above=0, slider=1.9),
@@ -441,6 +470,9 @@ def settings_with(kind: str) -> Mapping[str, Setting]:
 
 
 TABLES = tuple(dict.fromkeys(key.partition(".")[0] for key in SETTINGS))
+
+HOW_TABLES = ("reconstruction", "model", "attenuation", "compute")
+"""Those that say how a run is reconstructed. The others say how its images were made."""
 
 SAMPLING = tuple(f"model.{name}" for name in ("aperture_points", "aperture_tolerance", "pixel_points", "tolerance"))
 """Numbers of rays and what sets them: counts have them only where the hole is by rays."""

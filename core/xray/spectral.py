@@ -132,7 +132,11 @@ class SpectralTransmission:
 
         `A` is the `Projector` of the volumes' grid into these views; its line integrals of the volumes are the paths.
         """
-        counts = self.expected(self._paths(volumes, A), mAs)
+        return self.images(self._paths(volumes, A), mAs)
+
+    def images(self, paths: ArrayLike, mAs: ArrayLike) -> Floats:
+        """Expected counts (bins, M, n_v, n_u) of the views' `paths` (materials, M, n_v, n_u), with blur and background."""
+        counts = self.expected(paths, mAs)
         for m, (along_v, along_u) in enumerate(self._blurs):
             counts[:, m] = along_v @ counts[:, m] @ along_u.T
         return counts + self.background
@@ -249,16 +253,18 @@ def _pixels(views: Views) -> Floats:
     return pixels
 
 
-def water_and_bone(ct: Volume) -> Floats:
-    """Water and cortical bone, relative to their own densities, from CT numbers: (2, n_x, n_y, n_z).
+def water_and_bone(volume: Volume, energy: float = CT_ENERGY) -> Floats:
+    """Water and cortical bone, relative to their own densities, from CT numbers: (2, n_x, n_y, n_z); or from mu, 1/mm.
 
-    They attenuate as `hu_to_mu` says, at every energy, but for air's own coefficient: below 0 HU water thins out, above
-    it is replaced by bone. Denser than bone is bone alone, as dense as the CT number asks for at the CT's energy.
+    `energy`, keV, is that at which mu holds, or the CT's. They attenuate as `hu_to_mu` says, at every energy, but for air's
+    own coefficient: below water it thins out, above it is replaced by bone. Denser than bone is bone alone, as dense as the
+    number asks for at that energy.
     """
-    instance(ct, Volume, "water_and_bone")
-    require_quantity(ct.quantity, ("hu",), "water_and_bone")
-    water, bone = (float(attenuations(name, np.array([CT_ENERGY]))[0]) for name in ("water", "bone"))
-    hu = ct.array.astype(np.float64) / 1000
+    instance(volume, Volume, "water_and_bone")
+    require_quantity(volume.quantity, ("hu", "mu"), "water_and_bone")
+    water, bone = (float(attenuations(name, np.array([energy]))[0]) for name in ("water", "bone"))
+    values = volume.array.astype(np.float64)
+    hu = values / 1000 if volume.quantity == "hu" else values / water - 1
     share = np.maximum(hu, 0) * water / (bone - water)
     both = np.stack([1 + np.clip(hu, -1, 0) - share, share])
     denser = share > 1

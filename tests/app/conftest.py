@@ -26,7 +26,7 @@ MODULE = "bl_ext.user_default.mphdrr"
 # Where the script binds the top folder of this repository's path into Blender's root.
 BOUND = Path(os.environ.get("REAL_BLENDER_ROOT", "/opt/real-blender")).joinpath(*ROOT.parts[1:2])
 
-PATIENCE = 300  # s after which a window that has not said that it is done is closed
+PATIENCE = 600  # s after which a window that has not said that it is done is closed
 
 Run = Callable[..., subprocess.CompletedProcess[str]]
 
@@ -106,6 +106,17 @@ def blender(home: Path) -> Run:
 
     def run(*arguments: str | Path, **options: float) -> subprocess.CompletedProcess[str]:
         return run_blender(*arguments, home=home, **options)
+
+    return run
+
+
+@pytest.fixture
+def new_blender(request: pytest.FixtureRequest) -> Run:
+    """Like `blender`, in a clean home of the test's own, without the extension."""
+    folder = _emptied(OUTPUT / f"home-{request.node.name}")
+
+    def run(*arguments: str | Path, **options: float) -> subprocess.CompletedProcess[str]:
+        return run_blender(*arguments, home=folder, **options)
 
     return run
 

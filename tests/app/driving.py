@@ -196,7 +196,7 @@ def pause_beyond_redraw() -> Iterator[float]:
     return round(during - longest_pause(), 3)
 
 
-def run(steps: Iterator[float | Callable[[], bool]], patience: float = 40.0, settle: float = 0.0) -> None:
+def run(steps: Iterator[float | Callable[[], bool]], patience: float = 120.0, settle: float = 0.0) -> None:
     """Take the steps: each yields what to wait for, seconds or a function that says when it has happened.
 
     After such an event `settle` seconds more are waited, for what may still come; after `patience` seconds without it the

@@ -45,7 +45,7 @@ def test_readme_in_the_zip_leads_nowhere_that_is_not_there(extension_zip: Path):
     with zipfile.ZipFile(extension_zip) as archive:
         links = re.findall(r"\]\(([^)]+)\)", archive.read("README.md").decode())
         names = set(archive.namelist())
-    assert [link for link in links if link.endswith(".webp")] == ["reconstruction.webp", "load.webp"]
+    assert [link for link in links if link.endswith(".webp")] == ["picture.webp", "reconstruction.webp", "load.webp"]
     assert all(link in names or link.startswith("https://") for link in links), links
 
 

@@ -23,6 +23,11 @@ def steps():
         while not is_idle() or bpy.app.is_job_running("RENDER"):
             seen["ticks"] += 1
             yield 0.05
+    film = {"width": 120, "height": 120, "samples": 1, "seconds": 0.1, "fps": 20}
+    press(bpy.ops.mphdrr.render_animation, filepath=str(folder / "film.mp4"), **film)
+    while not is_idle() or bpy.app.is_job_running("RENDER"):
+        yield 0.05
+    seen["film"] = bpy.data.movieclips.load(str(folder / "film.mp4")).frame_duration
     seen.update(scenes=len(bpy.data.scenes), display=[shown_in, bpy.context.preferences.view.render_display_type])
     # Blender's own Render, as F12 starts it; what is said goes to standard error, which is kept.
     rendered, sys.stderr, scene = time.monotonic(), io.StringIO(), bpy.context.scene

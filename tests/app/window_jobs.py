@@ -1,7 +1,9 @@
 """Jobs in a real Blender's window: how long it stands still in each, their words, the queue, cancelling in every stage."""
 
+import time
 from pathlib import Path
 
+import addon_utils
 import bpy
 import numpy as np
 from driving import WORKBOOK, beat, beats, editor, folder, open_tab, ours, pause_beyond_redraw, press, run, seen, within
@@ -104,6 +106,16 @@ def steps():
     while jobs.is_running():
         yield 0.05
     seen["added"] = sorted(name for name in ("A", "B", "C") if name in bpy.data.objects)
+    # Disabled while a job does not look up.
+    show, jobs.Worker.show = jobs.Worker.show, lambda self, *step: time.sleep(3.0)
+    start(mph.add_derenzo, name="D", voxels=192)
+    yield 0.5
+    since = time.perf_counter()
+    addon_utils.disable("bl_ext.user_default.mphdrr")
+    seen["disabled"] = time.perf_counter() - since
+    yield 4.0
+    jobs.Worker.show = show
+    seen["left"] = "D" in bpy.data.objects
 
 
 bpy.app.timers.register(beat)

@@ -1,10 +1,8 @@
 """The example with a live preview: fifty moves of module and phantom, numbers edited; then the eyedropper."""
 
-import time
-
 import bpy
 import numpy as np
-from driving import editor, idle, on_screen, open_tab, ours, press, run, seen, xdotool
+from driving import editor, folder, idle, on_screen, open_tab, ours, own_time, picture, press, run, seen, xdotool
 
 core, preview, volumes = (ours(name) for name in ("core", "addon.runs.preview", "addon.volumes.volumes"))
 images = ours("addon.pictures.images")
@@ -16,11 +14,11 @@ def timed(function):
     """The function, its time added to that of the move."""
 
     def run(*arguments):
-        started = time.perf_counter()
+        started = own_time()
         try:
             return function(*arguments)
         finally:
-            spent["move"] += time.perf_counter() - started
+            spent["move"] += own_time() - started
 
     return run
 
@@ -29,7 +27,7 @@ original = preview.after_update
 handlers = bpy.app.handlers.depsgraph_update_post
 handlers[handlers.index(original)] = timed(original)
 preview._look = timed(preview._look)
-preview.preview_drawing._draw_corner = timed(preview.preview_drawing._draw_corner)
+preview.preview_drawing._draw_box = timed(preview.preview_drawing._draw_box)
 preview.preview_drawing._draw_plane = timed(preview.preview_drawing._draw_plane)
 
 
@@ -110,6 +108,24 @@ def steps():
     scene.mphdrr_projections.model, phantom.display_type = "EMISSION", "TEXTURED"
     yield 6.0
     seen["unit"] = session.shown.run.unit
+    drawing, _, region = preview.preview_drawing, *editor()[1:]
+    left, bottom, right, top = drawing._boxes[region.as_pointer()][0]
+    xdotool("mousemove", *on_screen((left + right) / 2, (bottom + top) / 2))
+    yield 1.0
+    place = list(camera.location)
+    xdotool("mousedown", 1)
+    yield 0.5
+    for step in range(1, 6):
+        xdotool("mousemove", *on_screen((left + right) / 2 - 20 * step, (bottom + top) / 2 + 10 * step))
+        yield 0.3
+    xdotool("mouseup", 1)
+    yield 3.0
+    box = drawing._boxes[region.as_pointer()][0]
+    seen["dragged"] = [box[0] - left, box[1] - bottom, list(camera.location) == place]
+    picture("dragged")
+    bpy.ops.wm.save_as_mainfile(filepath=str(folder / "a.blend"))
+    yield 3.0
+    picture("saved")
     pick_high(30)
     yield 4.0
     exact = images.projection_array(bpy.data.images["mphDRR 30"])

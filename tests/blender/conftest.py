@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -16,10 +17,17 @@ from mphdrr.core.workbook import read_system, write_system  # noqa: E402
 WORKBOOK = Path(__file__).parents[2] / "examples" / "dc-spect-80.xlsx"
 
 
-@pytest.fixture(autouse=True)
-def scene():
-    """A fresh factory scene with the extension registered."""
+@pytest.fixture(scope="session")
+def factory_settings() -> None:
+    """Blender's own preferences and add-ons, once: to set them up takes five times as long as a scene."""
     bpy.ops.wm.read_factory_settings()
+
+
+@pytest.fixture(autouse=True)
+def scene(factory_settings):
+    """A fresh factory scene with the extension registered."""
+    bpy.ops.wm.read_homefile(use_factory_startup=True)
+    shutil.rmtree(Path(bpy.app.tempdir, "mphdrr"), ignore_errors=True)
     registration.register()
     yield bpy.context.scene
     registration.unregister()

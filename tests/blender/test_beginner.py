@@ -9,10 +9,12 @@ from typing import Any
 
 import blf
 import bpy
+import numpy as np
 import pytest
 
-from mphdrr.addon import next_step, registration
-from mphdrr.addon.blender import reports
+import mphdrr.core as mph
+from mphdrr.addon import example, next_step, registration
+from mphdrr.addon.blender import reports, storage
 from mphdrr.addon.scanner import scanner
 from mphdrr.addon.volumes import slices, volumes
 
@@ -164,10 +166,10 @@ def check(seen: dict[str, Layout]) -> None:
     assert not {name: cut for name, layout in seen.items() if (cut := list(layout.cut(WIDTH)))}
 
 
-def test_an_empty_tab_shows_two_buttons(scene):
+def test_an_empty_tab_shows_three_buttons(scene):
     seen = drawn()
     assert list(seen) == ["MPHDRR_PT_next_step"]
-    assert names(seen, "button") == ["mphdrr.load_example", "mphdrr.import_geometry"]
+    assert names(seen, "button") == ["mphdrr.load_example", "mphdrr.load_example", "mphdrr.import_geometry"]
     assert names(drawn(is_open=True), "property", "name") == []
     check(seen)
 
@@ -204,13 +206,16 @@ def test_everything_is_explained_and_fits(worked, model):
         check(drawn(is_open=True))
 
 
-def test_what_is_proposed_leads_to_a_score(scene, small_workbook):
-    def press() -> str:
-        step = next_step.next_step(bpy.context)
-        group, name = step.operator.split(".")
+def press() -> str:
+    """Press the button that the tab proposes."""
+    step = next_step.next_step(bpy.context)
+    group, name = step.operator.split(".")
+    with bpy.context.temp_override(**({} if step.item is None else {"object": step.item})):
         assert getattr(getattr(bpy.ops, group), name)("INVOKE_DEFAULT", **step.settings) == {"FINISHED"}
-        return step.text
+    return step.text
 
+
+def test_what_is_proposed_leads_to_a_score(scene, small_workbook):
     bpy.ops.mphdrr.import_geometry(filepath=str(small_workbook))
     settings, reconstruction = scene.mphdrr_projections, scene.mphdrr_reconstruction
     settings.width = settings.height = reconstruction.voxels = 12
@@ -227,6 +232,44 @@ def test_what_is_proposed_leads_to_a_score(scene, small_workbook):
     scene.mphdrr_events.recipe = "//heart.toml"
     assert scene.mphdrr_events.folder == "//heart-events"
     assert next_step.next_step(bpy.context).text == "Make Event Set"
+
+
+def test_ct_attenuation_spect_and_dose_are_six_clicks(scene, monkeypatch):
+    monkeypatch.setattr(example, "_VOXELS", 32)
+    monkeypatch.setitem(example._RING, "shape", (24, 32))
+    assert bpy.ops.mphdrr.load_example(example="XRAY") == {"FINISHED"}
+    settings, reconstruction = scene.mphdrr_projections, scene.mphdrr_reconstruction
+    ct_run = mph.read_run(storage.absolute(settings.run_file))
+    assert settings.model == "SPECTRAL" and settings.noise and len(ct_run.system) == 24
+    settings.width = settings.height = 16
+    reconstruction.voxels, reconstruction.spacing, reconstruction.iterations = 28, 16.0, 3
+    assert [press(), press()] == ["Reconstruct", "Use CT for SPECT"]
+    ct = reconstruction.mu
+    assert volumes.quantity_of(ct) == "hu"
+    assert (settings.model, settings.isotope, settings.volume.name) == ("EMISSION", "Tc-99m", "Cardiac Torso")
+    reconstruction.method = "OSEM"  # without a window, what is chosen by the run is the default
+    assert press() == "Render Projections"
+    check(drawn())
+    assert press() == "Reconstruct"
+    assert press() == "Dose Map" and volumes.quantity_of(bpy.context.object) == "dose_rate"
+    assert next_step.next_step(bpy.context).text == "Export Dataset"
+    # By hand: attenuated by the torso, reconstructed with the CT.
+    run = mph.read_run(storage.absolute(settings.run_file))
+    assert run.recipe["attenuation.object"] == "Cardiac Torso mu"
+    recipe = mph.Recipe(
+        {
+            f"reconstruction.{key}": value
+            for key, value in {"voxels": 28, "spacing": 16.0, "iterations": 3, "center": (35.0, -30.0, -30.0)}.items()
+        }
+    )
+    expected = mph.reconstruct_run(run, recipe, volumes.volume_from_object(ct)).volume.array
+    found = volumes.volume_from_object(reconstruction.volume).array
+    np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-4 * expected.max())
+    # By script: the same radiographs.
+    system, body = ct_run.system, volumes.volume_from_object(scene.objects["Cardiac Torso mu"])
+    by_script = mph.Recipe({"model.kind": "spectral", "volume.energy": 140.5, "noise.seed": 1})
+    (again,) = mph.run_recipe(by_script, system, body)
+    np.testing.assert_array_equal(again.projections, ct_run.projections)
 
 
 def test_a_number_that_is_not_given_is_auto(scene):

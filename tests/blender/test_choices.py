@@ -101,6 +101,7 @@ DEFAULTS = {
     "detector": "VIRTUAL", "backend": "AUTO", "rows": "BY_NUMBER", "unit": "NONE",
     "colors": "INFERNO", "scale": "LINEAR", "planes": "ALL", "look": "DENSITY", "figure": "SCANNER",
     "method": "OSEM", "prior": "NONE", "hole": "AUTO", "lines": "TOGETHER", "dead_time_kind": "NON_PARALYSABLE",
+    "panel": "COUNTING", "sensor": "NONE", "materials": "WATER_BONE",
     "how": "SUM", "uniform": "K", "MixturePhantomProperties.look": "solids",
 }  # fmt: skip
 """What files mean that do not hold a choice, because nobody has made it."""
@@ -217,7 +218,7 @@ print("READ", json.dumps([expected, read]))
 @pytest.mark.parametrize("items", [pytest.param("as they are", marks=pytest.mark.long), "more"])
 def test_a_file_of_the_first_version_opens_with_the_choices_it_was_saved_with(items):
     done = subprocess.run(
-        [sys.executable, "-c", OPEN, str(SAVED), items], capture_output=True, text=True, timeout=120, check=False
+        [sys.executable, "-c", OPEN, str(SAVED), items], capture_output=True, text=True, timeout=600, check=False
     )
     answer = [line for line in done.stdout.splitlines() if line.startswith("READ ")]
     assert answer, done.stderr

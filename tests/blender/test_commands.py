@@ -1,4 +1,4 @@
-"""The commands and the example that make scenes, as users run them: in a new process."""
+"""The commands and the example that make scenes, as users run them, once in a new process."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import mphdrr.core as mph
+from mphdrr.addon.cli import main
 from mphdrr.addon.pictures import images
 from mphdrr.addon.scanner import scanner
 from mphdrr.addon.volumes import volumes
@@ -18,9 +19,9 @@ from mphdrr.addon.volumes import volumes
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
 
-def run(*words: object, status: int = 0) -> subprocess.CompletedProcess[str]:
-    done = subprocess.run([sys.executable, *map(str, words)], capture_output=True, text=True, timeout=120)
-    assert done.returncode == status, done.stderr
+def run(*words: object) -> subprocess.CompletedProcess[str]:
+    done = subprocess.run([sys.executable, *map(str, words)], capture_output=True, text=True, timeout=600)
+    assert done.returncode == 0, done.stderr
     return done
 
 
@@ -53,24 +54,27 @@ def test_scene_command_saves_scanner_volume_and_projections(tmp_path, workbook, 
 def test_scene_command_takes_a_volume_of_mu(tmp_path, workbook):
     mu = mph.Volume(np.full((3, 4, 5), 0.0154, np.float32), mph.Grid.centered((3, 4, 5), 30.0), "mu")
     mph.write_volume(mu, tmp_path / "mu.nii")
-    run("-m", "mphdrr", "scene", workbook, "--modules", "1-2", "--mu", tmp_path / "mu.nii", "-o", tmp_path / "s.blend")
+    words = ["scene", workbook, "--modules", "1-2", "--mu", tmp_path / "mu.nii", "-o", tmp_path / "s.blend"]
+    assert main(list(map(str, words))) == 0
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "s.blend"))
     shown = volumes.volume_from_object(bpy.context.scene.mphdrr_projections.mu)
     assert shown.quantity == "mu" and np.array_equal(shown.array, mu.array)
     np.testing.assert_allclose(shown.grid.affine, mu.grid.affine, atol=1e-4)
 
 
-def test_scene_command_refuses_in_one_line(tmp_path, workbook):
-    done = run("-m", "mphdrr", "scene", workbook, "-o", tmp_path / "scanner.txt", status=1)
-    assert done.stderr.count("\n") == 1
-    assert "expected a name ending in .blend" in done.stderr
+def test_scene_command_refuses_in_one_line(tmp_path, workbook, capsys):
+    assert main(["scene", str(workbook), "-o", str(tmp_path / "scanner.txt")]) == 1
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert "expected a name ending in .blend" in said
     assert not list(tmp_path.iterdir())
 
 
-def test_scene_command_refuses_activity_as_mu(tmp_path, workbook):
+def test_scene_command_refuses_activity_as_mu(tmp_path, workbook, capsys):
     mph.write_volume(mph.Volume(np.ones((2, 2, 2)), mph.Grid.centered(2, 1.0), "activity"), tmp_path / "a.nii")
-    done = run("-m", "mphdrr", "scene", workbook, "--mu", tmp_path / "a.nii", "-o", tmp_path / "s.blend", status=1)
-    assert "a.nii: it holds activity, expected mu in 1/mm" in done.stderr
+    words = ["scene", workbook, "--mu", tmp_path / "a.nii", "-o", tmp_path / "s.blend"]
+    assert main(list(map(str, words))) == 1
+    assert "a.nii: it holds activity, expected mu in 1/mm" in capsys.readouterr().err
     assert not (tmp_path / "s.blend").exists()
 
 

@@ -14,7 +14,7 @@ import mphdrr.core as mph
 from mphdrr.addon.blender import jobs, storage
 from mphdrr.addon.cli import main
 from mphdrr.addon.cli.scene import save_scene
-from mphdrr.addon.figures import figures
+from mphdrr.addon.figures import engine, figures
 from mphdrr.addon.runs import rendering
 from mphdrr.addon.scanner import scanner
 from mphdrr.addon.volumes import volumes
@@ -135,7 +135,7 @@ def test_figures_refuse_what_is_not_there(scene, dc_spect, tmp_path):
 def test_pixels_of_a_rendered_picture_are_read_exactly(scene, tmp_path):
     page = Page(250, 240, "#1380ff")
     page.write(tmp_path / "page.png")
-    assert np.array_equal(figures._pixels(tmp_path / "page.png"), page.picture)
+    assert np.array_equal(engine.pixels(tmp_path / "page.png"), page.picture)
     assert "page.png" not in bpy.data.images
 
 
@@ -165,7 +165,7 @@ def test_a_picture_that_a_volume_does_not_change_is_warned_of(example, tmp_path,
         sizes.clear()
         job = figures.figure_job(bpy.context, kind, [path], (640, 480), samples=1)
         (text,) = warned(lambda job=job: jobs.run(job))
-        assert text.startswith(f"the picture shows nothing of {item.name!r}: ") and path.is_file()
+        assert text.startswith(f"the picture shows {item.name!r} as the surface at 50 kBq/mL: ") and path.is_file()
         assert sizes[-1] == (640, True) and {width for width, _ in sizes[:-1]} == {243}
     changes = 60
     assert warned(lambda: jobs.run(figures.figure_job(bpy.context, "inside", [path], (640, 480)))) == []
@@ -210,7 +210,7 @@ def small_render(example):
 
 def test_render_says_which_volumes_of_the_view_it_lacks(small_render, capfd, monkeypatch):
     (item,) = volumes.volume_objects(small_render)
-    monkeypatch.setattr(figures, "rendering", lambda *_: iter(()))  # whose own tests are above
+    monkeypatch.setattr(figures, "drawing", lambda *_: iter(()))  # whose own tests are above
     assert rendered(small_render, capfd) == ""
     item.hide_render = True
     assert (

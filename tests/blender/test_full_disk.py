@@ -56,11 +56,13 @@ def test_a_blend_on_a_full_disk_is_one_line(disk):
     assert list(disk.iterdir()) == []
 
 
-def test_a_figure_on_a_full_disk_is_one_line_and_status_1(disk, workbook, capsys):
+def test_a_figure_on_a_full_disk_is_one_line_and_status_1(disk, small_workbook, capsys):
     from mphdrr.__main__ import main
 
     assert (
-        main(["figure", "scanner", str(workbook), "--size", "400x300", "--samples", "1", "-o", str(disk / "a.png")])
+        main(
+            ["figure", "scanner", str(small_workbook), "--size", "400x300", "--samples", "1", "-o", str(disk / "a.png")]
+        )
         == 1
     )
     assert "No space left on device" in capsys.readouterr().err

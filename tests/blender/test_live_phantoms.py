@@ -42,13 +42,14 @@ def assert_made(item) -> None:
 
 def test_a_small_phantom_follows_every_edit(item):
     data, settings = item.data, item.mphdrr_volume.shepp_logan
-    opacity = data.materials[0].node_tree.nodes["Opacity"].outputs[0]
-    opacity.default_value *= 3
-    opaque, planes = opacity.default_value * item.mphdrr_volume.extent, slices.add_slices(item)
+    look = data.materials[0].node_tree.nodes["Look"].inputs
+    look["Density"].default_value *= 3
+    density, planes = look["Density"].default_value, slices.add_slices(item)
     settings.half_size = 44
     assert_made(item)
     assert item.data == data, "in place: what was set on it stays"
-    assert opacity.default_value * item.mphdrr_volume.extent == pytest.approx(opaque, rel=1e-5)
+    assert look["Density"].default_value == density, "as opaque as before: the opacity per mm follows the size"
+    assert look["Size"].default_value == pytest.approx(item.mphdrr_volume.extent)
     assert slices.planes_of(item) and slices.planes_of(item) != planes
     assert not is_waiting()
 

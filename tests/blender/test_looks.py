@@ -13,6 +13,8 @@ from mphdrr.addon.perspective import color_bar
 from mphdrr.addon.volumes import looks, slices, volume_materials, volumes
 from mphdrr.core.geometry.grid import Grid
 from mphdrr.core.geometry.part_colors import LOOKS
+from mphdrr.core.physics.ct_numbers import hu_to_mu
+from mphdrr.core.physics.materials import attenuation
 from mphdrr.core.volumes.volume import Volume
 
 
@@ -71,6 +73,35 @@ def test_what_lies_in_front_of_the_slices_is_cut_away_and_comes_back(nema):
     assert after == before
 
 
+def test_a_look_from_the_asset_library_restyles_a_volume_and_its_slices(nema, tmp_path):
+    plane = slices.add_slices(nema)[2]
+    nema.mphdrr_volume.display_high = 3.0
+    before = [len(bpy.data.materials), len(bpy.data.node_groups)]
+    assert bpy.ops.mphdrr.add_looks(directory=str(tmp_path)) == {"FINISHED"}
+    assert [len(bpy.data.materials), len(bpy.data.node_groups)] == before
+    assert bpy.context.preferences.filepaths.asset_libraries["mphDRR"].path == str(tmp_path)
+    with bpy.data.libraries.load(str(tmp_path / "mphdrr-looks.blend"), assets_only=True) as (there, wanted):
+        assert len(there.materials) == 5
+        wanted.materials = ["mphDRR Fire"]
+    nema.material_slots[0].material = bpy.data.materials["mphDRR Fire"]  # as a drop does
+    look = nema.data.materials[0].node_tree.nodes["Look"]
+
+    def brightest() -> np.ndarray:
+        bpy.context.view_layer.update()
+        pixels = np.array(plane.data.materials[0].node_tree.nodes["Slice"].image.pixels).reshape(-1, 4)
+        return pixels[pixels[:, :3].sum(axis=1).argmax(), :3]
+
+    assert np.allclose(brightest(), slices.colors("", volume_materials.ramp_of(nema))[-1, :3], atol=0.01)
+    assert look.inputs["High"].default_value == 3.0 and brightest()[2] < brightest()[0]
+    look.node_tree.nodes["Colors"].color_ramp.elements[-1].color = (1.0, 1.0, 1.0, 1.0)
+    assert np.allclose(brightest(), 1.0, atol=0.01)
+    own, other = plane.material_slots[0].material, volume_materials.new_material("Other", "mu", 9.0)
+    plane.material_slots[0].material = other  # a drop on a slice is meant for the volume
+    bpy.context.view_layer.update()
+    assert nema.data.materials[0] == other and plane.material_slots[0].material == own
+    assert nema.data.materials[0].node_tree.nodes["Values"].attribute_name == "activity"
+
+
 @pytest.mark.long
 def test_a_surface_follows_a_phantom_that_changes(nema):
     settings = nema.mphdrr_volume
@@ -99,11 +130,17 @@ def test_presets_of_a_ct(scene):
     array[2:7, 2:7, 2:7], array[4, 4, 4] = 40.0, 900.0
     item = volumes.add_volume(Volume(array, Grid.centered(9, 2.0), "hu"), "CT")
     sides = {}
-    for look in ("BONE", "SOFT"):
+    for look in ("BONE", "LUNG", "SOFT"):
         item.mphdrr_volume.look = look
         sides[look] = np.ptp(surface(item)[0], axis=0).max()
     assert sides["BONE"] < 4.0 and 8.0 < sides["SOFT"] < 10.0  # one voxel, and five
     assert (item.mphdrr_volume.display_low, item.mphdrr_volume.display_high) == (-160.0, 240.0)
+    mu = volumes.add_volume(hu_to_mu(volumes.volume_from_object(item)), "mu").mphdrr_volume
+    water, bone = attenuation("water", 140.5), attenuation("bone", 140.5)
+    mu.look = "SOFT"
+    assert mu.display_low < water < mu.display_high < bone and mu.unit == "1/mm"
+    mu.look = "BONE"
+    assert water < mu.surface < bone
 
 
 def test_slices_of_nema_show_six_spheres_also_after_reopening(nema, tmp_path):

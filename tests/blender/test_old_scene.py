@@ -70,6 +70,9 @@ def test_phantom_and_projections_are_there(old_scene):
     assert (settings.kind, settings.quantity, settings.derenzo.voxels) == ("DERENZO", "activity", 16)
     assert settings.derenzo.activity == 80.0
     assert volumes.volume_from_object(phantom).array.max() == pytest.approx(settings.maximum)
+    phantom.mphdrr_volume.display_high = 33.0
+    looked = phantom.data.materials[0].node_tree.nodes["Display Range"].inputs["From Max"]
+    assert looked.default_value == 33.0, "its material has no look, and follows all the same"
     run = read_run(storage.absolute(old_scene.mphdrr_projections.run_file))
     assert run.system.numbers.tolist() == [3, 31, 66] and run.projections.shape == (3, 16, 24)
     for number, projection in zip(run.system.numbers, run.projections, strict=True):

@@ -19,6 +19,7 @@ from mphdrr.core.runs.presets import PRESETS
 from mphdrr.core.runs.recipe import Recipe, write_recipe
 from mphdrr.core.runs.run_recipe import recipe_model
 from mphdrr.core.volumes.volume import Volume
+from mphdrr.core.xray.arrangements import xray_arc
 
 
 @pytest.fixture
@@ -117,4 +118,6 @@ def test_a_preset_goes_with_every_choice_of_the_panel(settings, objects, ring_sy
                 bpy.ops.mphdrr.use_preset(preset=name)
             if settings.isotope == "NONE":  # at whose energy would materials attenuate? That is refused, and must be
                 settings.aperture_material = settings.crystal_material = "NUMBER"
-            recipe_model(runs.panel_recipe(settings.id_data), scanner.read_scanner(collection))
+            is_of_pinholes = settings.model != "SPECTRAL"
+            system = scanner.read_scanner(collection) if is_of_pinholes else xray_arc(2)
+            recipe_model(runs.panel_recipe(settings.id_data), system)

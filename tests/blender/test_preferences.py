@@ -8,6 +8,7 @@ import bpy
 import pytest
 
 from mphdrr.addon import preferences
+from mphdrr.addon.blender import storage
 from mphdrr.core.projector import backends, parallel
 
 
@@ -71,6 +72,14 @@ def test_threads_are_those_of_projections_that_do_not_say(user):
     assert parallel.thread_count(None) == every
 
 
+def test_save_as_copies_files_unless_the_preferences_share_them(user):
+    assert storage.copies and user.copies
+    user.copies = False
+    assert not storage.copies
+    user.copies = True
+    assert storage.copies
+
+
 def test_the_cache_is_measured_and_cleaned(cache):
     assert preferences.cache_size() == 0 and not bpy.ops.mphdrr.clean_cache.poll()
     (cache / "kernels").mkdir(parents=True)
@@ -81,4 +90,4 @@ def test_the_cache_is_measured_and_cleaned(cache):
 
 
 def test_without_an_extension_there_is_no_cache_to_show():
-    assert preferences.cache_folder() is None and not any("Compiled" in call for call in drawn())
+    assert preferences.own_folder() is None and not any("Compiled" in call for call in drawn())

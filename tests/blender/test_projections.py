@@ -139,7 +139,28 @@ def test_numbers_of_modules_are_texts_of_the_panel(scanned, scene, tmp_path):
     with pytest.raises(RuntimeError, match="time: expected one number, or"):
         bpy.ops.mphdrr.render_projections()
     settings.time_of_modules = "10, soon"
-    with pytest.raises(RuntimeError, match=r"model.time: expected a number above 0"):
+    with pytest.raises(RuntimeError, match=r"Time: expected a number above 0"):
+        bpy.ops.mphdrr.render_projections()
+
+
+def test_frames_are_texts_of_the_panel_and_a_run_each(scanned, scene, tmp_path):
+    settings = scene.mphdrr_projections
+    (tmp_path / "r.toml").write_text(
+        "[model]\nkind = 'emission'\nisotope = 'F-18'\nhole = 'point'\n[detector]\nrows = 4\ncolumns = 6\n"
+        "[frames]\ntimes = [10.0, 20.0, 2.5]\nstarts = [0.0, 10.0, 5000.0]\n"
+    )
+    assert bpy.ops.mphdrr.load_recipe(filepath=str(tmp_path / "r.toml")) == {"FINISHED"}
+    assert (settings.frame_times, settings.frame_starts) == ("10, 20, 2.5", "0, 10, 5000")
+    assert bpy.ops.mphdrr.render_projections() == {"FINISHED"}
+    assert [run.is_kept for run in settings.runs] == [True, True, False] and runs.changes(scene) == []
+    made = [read_run(storage.absolute(run.file)) for run in settings.runs]
+    assert [run.recipe["model.time"] for run in made] == [10.0, 20.0, 2.5]
+    total = np.array([run.projections.sum() for run in made])
+    decay = np.log(2) / (109.77 * 60)
+    law = np.exp(-decay * np.array([0, 10, 5000])) * -np.expm1(-decay * np.array([10, 20, 2.5]))
+    np.testing.assert_allclose(total / total[0], law / law[0], rtol=1e-5)
+    settings.frame_times = "10, soon"
+    with pytest.raises(RuntimeError, match="Frame Times"):
         bpy.ops.mphdrr.render_projections()
 
 
@@ -241,9 +262,9 @@ def test_numbers_that_the_panel_does_not_show_are_not_used(scanned, scene):
     ("settings", "message"),
     [
         ({"aperture_points": 2}, "3 or more"),
-        ({"edge": "PATH"}, "aperture_mu"),
+        ({"edge": "PATH"}, "Knife Edge needs Aperture"),
         ({"aperture_material": "lead"}, "aperture_mu 'lead': at which energy"),
-        ({"depth_layers": 2}, "crystal_mu"),
+        ({"depth_layers": 2}, "Depth Layers needs Crystal"),
         ({"mu": "Nope"}, "no volume is named 'Nope'"),
         ({"mu": "Derenzo"}, "volume of mu"),
     ],
@@ -577,5 +598,6 @@ def test_a_recipe_that_the_panel_cannot_take_is_one_clear_line(scene, tmp_path, 
 
 
 def test_every_setting_has_a_property_of_its_own():
-    shown = [key for key in SETTINGS if key.startswith(("model.", "detector.", "compute."))]
-    assert len({setting.key for setting in PROPERTIES.values()}) == len(shown) - 1  # the opening angle is the scanner's
+    shown = [key for key in SETTINGS if key.startswith(("model.", "detector.", "frames.", "compute."))]
+    elsewhere = 2  # the opening angle is the scanner's, bins are of files
+    assert len({setting.key for setting in PROPERTIES.values()}) == len(shown) - elsewhere

@@ -239,7 +239,8 @@ def test_two_runs_survive_save_and_reopen(render, scene, tmp_path):
     assert not replaced.exists() and all(storage.absolute(item.file).exists() for item in settings.runs)
 
 
-def test_a_file_of_another_blend_is_never_removed(render, scene, tmp_path):
+def test_a_file_of_another_blend_is_never_removed(render, scene, tmp_path, monkeypatch):
+    monkeypatch.setattr(storage, "copies", False)
     render()
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
     (tmp_path / "sub").mkdir()

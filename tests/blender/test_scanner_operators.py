@@ -77,6 +77,31 @@ def test_aim_turns_moved_modules_back(scene, small_workbook):
     assert scanner.off_aim(collection, scanner.modules(collection)) == []
 
 
+def test_import_again_keeps_the_pictures_behind_cameras(scene, small_workbook):
+    bpy.ops.mphdrr.import_geometry(filepath=str(small_workbook))
+    picture = bpy.data.images.new("photo", 4, 4)
+    camera = bpy.data.objects["Module 05"].data
+    camera.show_background_images = True
+    for alpha in (0.25, 0.5):
+        shown = camera.background_images.new()
+        shown.image, shown.alpha, shown.scale, shown.frame_method = picture, alpha, 1.5, "CROP"
+        shown.image_user.frame_offset, shown.offset = 7, (0.1, -0.2)
+    bpy.ops.mphdrr.import_geometry(filepath=str(small_workbook))
+    camera = bpy.data.objects["Module 05"].data
+    assert camera.show_background_images and not bpy.data.objects["Module 06"].data.show_background_images
+    assert [shown.alpha for shown in camera.background_images] == [0.25, 0.5] and picture.users == 2
+    for shown in camera.background_images:
+        assert (shown.image, shown.scale, shown.frame_method) == (picture, 1.5, "CROP")
+        assert shown.image_user.frame_offset == 7 and list(shown.offset) == pytest.approx([0.1, -0.2])
+
+
+def test_what_a_replaced_scanner_loses_is_known_before(scene, small_workbook):
+    assert scanner.losses_of(scene, "small") == []
+    bpy.ops.mphdrr.import_geometry(filepath=str(small_workbook))
+    scanner.module(scanner.active_scanner(scene), 12).rotation_euler.y += 0.2
+    assert scanner.losses_of(scene, "small", "other") == ["module 12 moved or turned"]
+
+
 @pytest.mark.parametrize("operator", ["show_modules", "look_through_module", "aim_modules"])
 def test_without_a_scanner_operators_say_what_to_do(operator):
     with pytest.raises(RuntimeError, match="import a geometry first"):

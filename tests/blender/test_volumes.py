@@ -242,10 +242,10 @@ def test_derenzo_refuses_in_one_line_and_adds_nothing(settings, message):
 
 def test_material_scale_follows_the_data(sparse_volume):
     item = volumes.add_volume(sparse_volume, "Sample")
-    node = item.data.materials[0].node_tree.nodes["Display Range"]
-    assert (node.inputs["From Min"].default_value, node.inputs["From Max"].default_value) == (0, pytest.approx(3e30))
+    node = item.data.materials[0].node_tree.nodes["Look"]
+    assert (node.inputs["Low"].default_value, node.inputs["High"].default_value) == (0, pytest.approx(3e30))
     item.mphdrr_volume.display_low, item.mphdrr_volume.display_high = 0.5, 2.0
-    assert (node.inputs["From Min"].default_value, node.inputs["From Max"].default_value) == (0.5, 2.0)
+    assert (node.inputs["Low"].default_value, node.inputs["High"].default_value) == (0.5, 2.0)
     assert item.data.render.clipping == 0.0
 
 

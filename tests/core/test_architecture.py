@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+import mphdrr
 from mphdrr.core.version import VERSION
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -24,8 +25,13 @@ def toml(name: str) -> dict:
 
 
 def test_version_is_the_same_everywhere():
-    assert toml("pyproject.toml")["project"]["version"] == VERSION
-    assert toml("blender_manifest.toml")["version"] == VERSION
+    texts = {
+        name: (ROOT / name).read_text(encoding="utf-8") for name in ("CITATION.cff", "CHANGELOG.md", "docs/conf.py")
+    }
+    assert toml("pyproject.toml")["tool"]["setuptools"]["dynamic"]["version"] == {"attr": "mphdrr.core.version.VERSION"}
+    assert toml("blender_manifest.toml")["version"] == VERSION == mphdrr.__version__
+    assert f"\nversion: {VERSION}\n" in texts["CITATION.cff"] and "release = VERSION" in texts["docs/conf.py"]
+    assert re.findall(r"^## \[?([0-9.]+)", texts["CHANGELOG.md"], re.MULTILINE)[0] == VERSION
 
 
 def test_one_compiler_builds_the_kernels_everywhere():
@@ -57,9 +63,27 @@ def test_no_modules_import_each_other_in_a_circle():
     assert circles == {}, "what is in a circle, or imports something that is"
 
 
+def test_help_imports_nothing_that_commands_work_with():
+    """Options and help of all commands, so that they and completion are quick."""
+    rooms = (
+        "runs.run_recipe",
+        "runs.files",
+        "workbook",
+        "design",
+        "events.event_files",
+        "learning.data",
+        "figures.scores",
+    )
+    unwanted = {f"mphdrr.core.{name}" for name in rooms} | {"bpy", "h5py", "torch", "trimesh"}
+    parsers = "from mphdrr.addon.cli import COMMANDS; from mphdrr.core.cli import build_parser; build_parser(COMMANDS)"
+    script = f"import sys; {parsers}; print(*(set({sorted(unwanted)!r}) & set(sys.modules)))"
+    loaded = subprocess.run([sys.executable, "-c", script], check=True, capture_output=True, text=True).stdout
+    assert loaded.strip() == ""
+
+
 @functools.cache
-def tree_of(path: Path) -> ast.Module:
-    return ast.parse(path.read_text(encoding="utf-8"))
+def nodes_of(path: Path) -> list[ast.AST]:
+    return list(ast.walk(ast.parse(path.read_text(encoding="utf-8"))))
 
 
 def module_of(path: Path) -> str:
@@ -74,7 +98,7 @@ def imported_modules(path: Path) -> set[str]:
     """Modules whose names a file imports; a package counts only where names of its own are taken."""
     package = path.relative_to(ROOT).parent.parts
     found = set()
-    for node in ast.walk(tree_of(path)):
+    for node in nodes_of(path):
         if isinstance(node, ast.ImportFrom) and node.level:
             base = package[: len(package) - node.level + 1]
             module = ".".join((*base, node.module) if node.module else base)
@@ -93,7 +117,7 @@ def test_the_extension_starts_no_other_process_opens_no_connection_and_runs_no_t
     """As docs/extension-review.md says."""
     banned = {"subprocess", "multiprocessing", "socket", "http", "urllib", "requests", "ftplib", "webbrowser"}
     for path in SOURCES:
-        for node in ast.walk(tree_of(path)):
+        for node in nodes_of(path):
             names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
             names += [node.module or ""] if isinstance(node, ast.ImportFrom) and not node.level else []
             # Of mphdrr events make --workers, and of the look at HDF5 files that have no seal.
@@ -132,7 +156,7 @@ def test_import_loads_nothing_heavy(module: str, unwanted: set[str]):
 @pytest.mark.parametrize("path", [path for path in SOURCES if "bpy" in path.read_text(encoding="utf-8")], ids=str)
 def test_labels_can_be_translated(path):
     """A label is a text that a catalogue can have: what is put into it comes after `pgettext_iface`."""
-    for call in ast.walk(tree_of(path)):
+    for call in nodes_of(path):
         for keyword in call.keywords if isinstance(call, ast.Call) else ():
             if keyword.arg in ("text", "heading", "placeholder") and isinstance(keyword.value, ast.JoinedStr):
                 words = [part.value for part in keyword.value.values if isinstance(part, ast.Constant)]
@@ -181,7 +205,7 @@ def test_only_one_file_writes_files():
     But for the two files of event sets that only grow at their ends, whose readers leave out what is not whole there.
     """
     for path in set(SOURCES) - {ROOT / "core" / name for name in ("files.py", "events/index.py", "events/store.py")}:
-        calls = [node for node in ast.walk(tree_of(path)) if isinstance(node, ast.Call)]
+        calls = [node for node in nodes_of(path) if isinstance(node, ast.Call)]
         assert [call.lineno for call in calls if writes(call)] == [], path
 
 

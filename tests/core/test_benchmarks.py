@@ -17,7 +17,7 @@ SCRIPT = Path(__file__).parents[2] / "benchmarks" / "projector.py"
 def test_plain_c_integrates_the_same(tmp_path):
     size = ["--voxels", "16", "--pixels", "8", "--views", "2", "--rounds", "1", "--no-growth"]
     command = [sys.executable, str(SCRIPT), "--only", "c", *size, "--output", str(tmp_path)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=600)
     assert done.returncode == 0, done.stderr
     page = (tmp_path / "benchmarks.md").read_text().splitlines()
     head, _, *rows = (line.strip("| ").split(" | ") for line in page if line.startswith("|"))
@@ -32,7 +32,7 @@ def test_event_sets_are_measured_and_the_page_keeps_the_rest(tmp_path):
     page.write_text("# Benchmarks\n\nkept\n\n## Event sets\n\nold\n")
     size = ["--voxels", "64", "--pixels", "8", "--events", "2", "--no-pipeline"]
     command = [sys.executable, str(SCRIPT.with_name("events.py")), *size, "--output", str(tmp_path)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=600)
     assert done.returncode == 0, done.stderr
     text = page.read_text()
     assert text.startswith("# Benchmarks\n\nkept\n\n## Event sets\n") and "old" not in text

@@ -22,8 +22,17 @@ def projector(system=SYSTEM, detector="real", pitch=PITCH, offset=OFFSET, double
     return mph.Projector(GRID, views, mph.Emission(system, hole="depth", **{**PHYSICS, **model}), double=double)
 
 
-def numbers(rng):
-    return rng.random(GRID.shape), rng.random((3, *SHAPE))
+def numbers(rng, modules=3):
+    return rng.random(GRID.shape), rng.random((modules, *SHAPE))
+
+
+def by_direction(settings):
+    return "edge" in settings or "depth_layers" in settings
+
+
+def system_for(settings):
+    """One module where kernels depend on the direction, which takes long."""
+    return SYSTEM[:1] if by_direction(settings) else SYSTEM
 
 
 def difference(sums, step):
@@ -39,26 +48,27 @@ def test_derivatives_are_central_differences(settings, rng):
 
     Where kernels depend on the direction steps are smaller: at many places a faint tap is left out or not.
     """
-    x, weights = numbers(rng)
-    small = 0.1 if "edge" in settings or "depth_layers" in settings else 1.0
+    system = system_for(settings)
+    x, weights = numbers(rng, len(system))
+    small = 0.1 if by_direction(settings) else 1.0
 
-    def sums(system=SYSTEM, **changes):
+    def sums(system=system, **changes):
         return (projector(system, **{**settings, **changes})(x) * weights).sum(axis=(1, 2))
 
-    gradient = mph.geometry_gradient(projector(**settings), x, weights)
-    by_centers, by_tilt = gradient.by_columns(SYSTEM)
+    gradient = mph.geometry_gradient(projector(system, **settings), x, weights)
+    by_centers, by_tilt = gradient.by_columns(system)
     found = {"l": gradient.collimator_length, "d": gradient.pinhole_diameter}
     expected = {
-        "l": difference(lambda e: sums(SYSTEM.replace(collimator_length=SYSTEM.collimator_length + e)), 1e-3 * small),
-        "d": difference(lambda e: sums(SYSTEM.replace(pinhole_diameter=SYSTEM.pinhole_diameter + e)), 1e-5 * small),
+        "l": difference(lambda e: sums(system.replace(collimator_length=system.collimator_length + e)), 1e-3 * small),
+        "d": difference(lambda e: sums(system.replace(pinhole_diameter=system.pinhole_diameter + e)), 1e-5 * small),
     }
     for i, axis in enumerate(np.eye(3)):
         found |= {f"center {i}": by_centers[:, i], f"tilt {i}": by_tilt[:, i]}
         expected[f"center {i}"] = difference(
-            lambda e, a=axis: sums(SYSTEM.replace(centers=SYSTEM.centers + e * a)), 1e-4 * small
+            lambda e, a=axis: sums(system.replace(centers=system.centers + e * a)), 1e-4 * small
         )
         expected[f"tilt {i}"] = difference(
-            lambda e, a=axis: sums(SYSTEM.replace(tilt=SYSTEM.tilt + e * a)), 1e-6 * small
+            lambda e, a=axis: sums(system.replace(tilt=system.tilt + e * a)), 1e-6 * small
         )
     for i, axis in enumerate(np.eye(2)):
         found |= {f"pitch {i}": gradient.pitch[:, i], f"offset {i}": gradient.offset[:, i]}
@@ -99,18 +109,19 @@ def test_all_numbers_at_once_where_kernels_depend_on_the_direction(settings, rng
 @pytest.mark.parametrize("settings", [{}, pytest.param({"edge": "path", "depth_layers": 2}, marks=pytest.mark.long)])
 def test_attenuated_too(settings, rng):
     """What passes moves with the pinhole alone. The step is small: rays pass from voxel to voxel at many places."""
-    x, weights = numbers(rng)
+    system = system_for(settings)
+    x, weights = numbers(rng, len(system))
     grid = mph.Grid.centered((5, 6, 5), 11.0)
     mu = mph.Volume(rng.uniform(0, 0.02, grid.shape), grid, "mu")
 
     def sums(**changes):
-        return (projector(SYSTEM.replace(**changes), mu=mu, **settings)(x) * weights).sum(axis=(1, 2))
+        return (projector(system.replace(**changes), mu=mu, **settings)(x) * weights).sum(axis=(1, 2))
 
-    by_centers, by_tilt = mph.geometry_gradient(projector(mu=mu, **settings), x, weights).by_columns(SYSTEM)
-    plain, _ = mph.geometry_gradient(projector(**settings), x, weights).by_columns(SYSTEM)
+    by_centers, by_tilt = mph.geometry_gradient(projector(system, mu=mu, **settings), x, weights).by_columns(system)
+    plain, _ = mph.geometry_gradient(projector(system, **settings), x, weights).by_columns(system)
     for i, axis in enumerate(np.eye(3)):
-        centers = difference(lambda e, a=axis: sums(centers=SYSTEM.centers + e * a), 1e-7)
-        tilt = difference(lambda e, a=axis: sums(tilt=SYSTEM.tilt + e * a), 1e-6)
+        centers = difference(lambda e, a=axis: sums(centers=system.centers + e * a), 1e-7)
+        tilt = difference(lambda e, a=axis: sums(tilt=system.tilt + e * a), 1e-6)
         np.testing.assert_allclose(by_centers[:, i], centers, atol=2e-6 * np.abs(by_centers).max())
         np.testing.assert_allclose(by_tilt[:, i], tilt, atol=2e-6 * np.abs(by_tilt).max())
     assert np.abs(plain - by_centers).max() > 0.1 * np.abs(by_centers).max()
@@ -119,11 +130,12 @@ def test_attenuated_too(settings, rng):
 @pytest.mark.long
 @pytest.mark.parametrize("settings", [{}, {"edge": "path", "depth_layers": 2}])
 def test_the_reference_and_float32_agree_with_it(settings, rng):
-    x, weights = numbers(rng)
-    A = projector(**settings)
+    system = system_for(settings)
+    x, weights = numbers(rng, len(system))
+    A = projector(system, **settings)
     exact = mph.geometry_gradient(A, x, weights)
     reference = mph.Projector(GRID, A.views, A.model, "numpy")
-    for other, bound in ((reference, 1e-7), (projector(double=False, **settings), 1e-4)):
+    for other, bound in ((reference, 1e-7), (projector(system, double=False, **settings), 1e-4)):
         for name, own, expected in zip(exact._fields, mph.geometry_gradient(other, x, weights), exact, strict=True):
             np.testing.assert_allclose(own, expected, atol=bound * np.abs(expected).max(), err_msg=name)
 
@@ -140,10 +152,11 @@ def test_of_a_batch_it_is_the_sum(rng):
 
 @pytest.mark.parametrize("settings", [{}, pytest.param({"depth_layers": 2}, marks=pytest.mark.long)])
 def test_a_part_of_the_volume_has_its_part_of_them(settings, rng):
-    x, weights = numbers(rng)
+    system = system_for(settings)
+    x, weights = numbers(rng, len(system))
     part = np.zeros_like(x)
     part[2:5, 3:7, 1:4] = x[2:5, 3:7, 1:4]
-    A = projector(**settings)
+    A = projector(system, **settings)
     for parts in zip(*(mph.geometry_gradient(A, each, weights) for each in (part, x - part, x)), strict=True):
         np.testing.assert_allclose(parts[0] + parts[1], parts[2], atol=1e-6 * np.abs(parts[2]).max())
 
@@ -163,6 +176,8 @@ def test_in_torch_all_numbers_have_gradients(settings, rng):
         [[0.01, 0.02, 0.1], [0.1, -0.03, 0.02]], [60.0, 50.0], [3.0, 2.5], [[5.0, 5.2], [5.4, 5.0]],
         [[0.1, 0.2], [0.3, -0.4]], [2.0, 3.0], 3.0,
     ]  # fmt: skip
+    if settings:  # of one module
+        given = [*given[:2], *(each[:1] for each in given[2:-1]), given[-1]]
     given = [torch.tensor(np.array(each), requires_grad=True) for each in given]
     if settings:  # by path, penetration has none
         given[-1].requires_grad_(False)

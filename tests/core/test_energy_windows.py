@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 
 import mphdrr.core as mph
+from mphdrr.core.physics.energy_window import peak_shares
 
 from . import dicom_files
 from .conftest import refused
@@ -239,3 +242,44 @@ def test_what_files_contradict_is_refused(system, frames, tmp_path):
     refused(lambda: next(mph.run_recipe(recipe_of(tmp_path / "c.npy"), system)), "c.npy", "--window-widths")
     refused(lambda: mph.ScatterWindows(), "lower_frames", "upper_frames")
     refused(lambda: mph.Recipe({"model.kind": "emission", "counts.files": ["a"], widths: WIDTHS}), "window_widths")
+
+
+@pytest.mark.parametrize("window", ["both", "lower"])
+def test_tails_of_the_peak_are_no_scatter(rng, window):
+    """Counts are a linear continuum, or one that falls to nothing, and a Gaussian peak: the continuum is found exactly."""
+    erf = math.erf
+    sigma, shape = 0.1 * 140.5 / np.sqrt(8 * np.log(2)), (3, 4, 5)
+    edges = EDGES if window == "both" else (*EDGES[:2], None)
+    shares = peak_shares(mph.isotope("Tc-99m"), edges, 0.1)
+    for (low, high), share in zip(EDGES, shares if window == "both" else shares[:2], strict=False):
+        assert share == pytest.approx(
+            (erf((high - 140.5) / sigma / 2**0.5) - erf((low - 140.5) / sigma / 2**0.5)) / 2, rel=1e-9
+        )
+    scatter, photons = continuum(shape, rng, falls_to=None if window == "both" else 157.0), rng.uniform(100, 900, shape)
+    lower, peak, upper = (own + share * photons for own, share in zip(scatter, shares, strict=True))
+    means, widths = (
+        (lower, peak, upper if window == "both" else None),
+        WIDTHS if window == "both" else (6.0, 28.0, None),
+    )
+    found, _ = mph.energy_window_scatter(*means, widths, shares=shares)
+    np.testing.assert_allclose(found, scatter[1], rtol=1e-12)
+    draws = [None if mean is None else rng.poisson(mean[:1], (1000, 4, 5)) for mean in means]
+    found, variance = mph.energy_window_scatter(*draws, widths, shares=shares)
+    assert variance.mean() == pytest.approx(np.var(found, axis=0, ddof=1).mean(), rel=0.05)
+
+
+def test_a_recipe_takes_tails_off(system, frames, tmp_path):
+    pytest.importorskip("pydicom")
+    dicom_files.write_frames(frames, path := tmp_path / "nm.dcm", 60_000, **windows_said())
+    given = {"model.isotope": "Tc-99m", "model.energy_fwhm": 0.1, "counts.scatter_tails": True}
+    (run,) = mph.run_recipe(recipe_of(path, **given), system)
+    shares = peak_shares(mph.isotope("Tc-99m"), EDGES, 0.1)
+    np.testing.assert_allclose(run.background, scatter_of(frames, shares=shares).clip(min=0), rtol=1e-5, atol=1e-5)
+    refused(
+        lambda: mph.run_recipe(recipe_of(path, **{"counts.scatter_tails": True}), system),
+        "scatter_tails",
+        "isotope",
+    )
+    np.save(tmp_path / "c.npy", frames)
+    unsaid = recipe_of(tmp_path / "c.npy", **given, **{"counts.window_widths": WIDTHS})
+    refused(lambda: list(mph.run_recipe(unsaid, system)), "energies", "lower window's")

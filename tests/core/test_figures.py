@@ -218,7 +218,7 @@ def test_figures_that_are_drawn_need_no_blender(tmp_path):
         f"out = {str(tmp_path / 'a.png')!r}; book = {str(WORKBOOK)!r}; "
         "sys.exit(10 * main(['figure', 'c-arm', book, '-o', out]) + main(['figure', 'scanner', book, '-o', out]))"
     )
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=120)
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=600)
     assert done.returncode == 1, done.stderr
     assert f"this command needs Blender: {INSTALL_BLENDER}" in done.stderr
     assert (tmp_path / "a.png").is_file()

@@ -33,15 +33,6 @@ SIZE = 64 << 10
 _needs_torch = pytest.mark.skipif(importlib.util.find_spec("torch") is None, reason="torch is not installed")
 
 
-@pytest.fixture(autouse=True, scope="module")
-def frozen() -> Iterator[None]:
-    """What other tests have left is not looked through in each collection below."""
-    gc.collect()
-    gc.freeze()
-    yield
-    gc.unfreeze()
-
-
 @pytest.fixture(autouse=True)
 def collected() -> Iterator[None]:
     """Here, and not in another test; files of libraries that are still open keep their room on the disk, too."""

@@ -125,7 +125,9 @@ def test_every_example_runs(example, inputs, tmp_path):
     # A few events of many (the fiftieth part of 150 has three), and small pictures, runs and volumes.
     example = example.replace("-n 100000 ", "-n 150 ").replace("-n 1000", "-n 6").replace("1600x900", "320x240")
     if words[1:3] == ["figure", "scanner"]:
-        example += " --size 320x240"
+        example += " --size 320x240 --samples 1"
+    elif words[1:3] == ["figure", "cut-away"]:
+        example += " --samples 1"
     elif words[1:3] == ["project", "scanner.xlsx"] and "--counts" not in words:
         example += " --size 16 16"
     elif "--method model.pt" in example:  # of a scan by the scanner of its training

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 import gzip
 import os
-import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -149,14 +147,14 @@ def test_links_within_a_file_are_followed(tmp_path, rng):
 
 
 @pytest.mark.parametrize(
-    ("body", "words"),
-    [("while True: pass", "no end"), ("import os; os.abort()", "crashes")],
+    ("body", "seconds", "words"),
+    [("while True: pass", 0.5, "no end"), ("import os; os.abort()", 60, "crashes")],
 )
-def test_what_hangs_or_crashes_hdf5_is_one_line(tmp_path, monkeypatch, body, words):
+def test_what_hangs_or_crashes_hdf5_is_one_line(tmp_path, monkeypatch, body, seconds, words):
     with h5py.File(tmp_path / "a.h5", "w") as file:
         file["array"] = np.ones((2, 2, 2))
     monkeypatch.setattr(hdf5, "_PROBE", body)
-    monkeypatch.setattr(hdf5, "_PROBE_SECONDS", 0.5)
+    monkeypatch.setattr(hdf5, "_PROBE_SECONDS", seconds)
     refused(lambda: mph.read_counts(tmp_path / "a.h5"), "a.h5", words)
 
 
@@ -165,12 +163,11 @@ def test_a_file_that_hdf5_does_not_survive_is_one_line(tmp_path, monkeypatch, na
     """Each has one wrong bit. Another HDF5 may refuse it, or read it."""
     (tmp_path / "a.h5").write_bytes(gzip.decompress((DATA / f"{name}.h5.gz").read_bytes()))
     monkeypatch.setattr(hdf5, "_PROBE_SECONDS", 1)
-    code = "import sys; exec(sys.argv[1])"
-    command = [sys.executable, "-c", code, hdf5._PROBE.replace("sys.argv[1]", repr(str(tmp_path / "a.h5")))]
-    with contextlib.suppress(subprocess.TimeoutExpired):
-        if subprocess.run(command, capture_output=True, timeout=1.5).returncode == 0:
-            pytest.skip("this HDF5 reads it")
-    refused(lambda: mph.read_counts(tmp_path / "a.h5", dataset="array"), "a.h5", "damaged")
+    try:
+        mph.read_counts(tmp_path / "a.h5", dataset="array")
+        pytest.skip("this HDF5 reads it")
+    except mph.InputError as error:
+        assert "a.h5" in str(error) and "damaged" in str(error) and "\n" not in str(error)
 
 
 @pytest.mark.parametrize("program", ["", None, "/usr/bin/blender", "/nowhere/python3"])

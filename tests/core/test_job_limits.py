@@ -133,15 +133,15 @@ modules = "1-8"
 rows = 32
 columns = 32
 [truth]
-voxels = 400
-spacing = 0.6
+voxels = 320
+spacing = 0.75
 [[phantoms]]
 kind = "nema"
 [models.rays]
 kind = "transmission"
 """
 JOBS = [
-    "phantom cylinder --radius 40 --height 80 --voxels 480 --spacing 0.2 -o OUT.nrrd",
+    "phantom cylinder --radius 40 --height 80 --voxels 384 --spacing 0.25 -o OUT.nrrd",
     "project WORKBOOK --volume volume.nii.gz --emission --time 1 --hole point --set model.pixel_points=1 "
     "--set model.tolerance=1e6 --noise 1 --size 600 600 -o OUT.h5",
     "reconstruct run.h5 --method cgls --iterations 1 --voxels 320 --spacing 0.4 -o OUT.nii.gz",
@@ -149,9 +149,9 @@ JOBS = [
     "--aperture-points 1 -o OUT.nii.gz",
     "reconstruct counts.h5 --method bsrem --subsets 4 --iterations 1 --voxels 224 --spacing 0.4 --hole rays "
     "--aperture-points 1 --prior relative-difference --weight 0.1 -o OUT.nii.gz",
-    "backproject run.h5 --how product --voxels 400 --spacing 0.25 -o OUT.nii.gz",
-    "volume convert volume.nii.gz --spacing 0.2 -o OUT.nii.gz",
-    "geometry map WORKBOOK --modules 1 --quantity modules --voxels 448 --spacing 0.5 -o OUT.nii.gz",
+    "backproject run.h5 --how product --voxels 320 --spacing 0.3 -o OUT.nii.gz",
+    "volume convert volume.nii.gz --spacing 0.25 -o OUT.nii.gz",
+    "geometry map WORKBOOK --modules 1 --quantity modules --voxels 360 --spacing 0.6 -o OUT.nii.gz",
     "score large.nii.gz --truth run.h5",
     "events make OUT --recipe events.toml -n 2 --workers 2",
 ]
@@ -191,7 +191,7 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     project = f"project {WORKBOOK} --modules 1-8 --volume volume.nii.gz --size 48 48 --quantity activity"
     for command in (
         "phantom cylinder --radius 40 --height 80 --voxels 48 --spacing 2 -o volume.nii.gz",
-        "phantom cylinder --radius 40 --height 80 --voxels 384 --spacing 0.25 -o large.nii.gz",
+        "phantom cylinder --radius 40 --height 80 --voxels 320 --spacing 0.3 -o large.nii.gz",
         f"{project} -o run.h5",
         f"{project} --emission --time 60 --hole point --set model.pixel_points=1 --set model.tolerance=1e6 -o counts.h5",
     ):

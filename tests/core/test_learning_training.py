@@ -338,7 +338,7 @@ def test_ctrl_c_keeps_a_checkpoint_and_the_same_command_goes_on(recipe, tmp_path
                 break
             time.sleep(0.1)
         running.send_signal(signal.SIGINT)
-        said = running.communicate(timeout=60)[1].splitlines()
+        said = running.communicate(timeout=600)[1].splitlines()
         assert running.returncode == 130
         lines = [f"{tmp_path / 'm.pt'}: samples and the last checkpoint are kept; the same command goes on",
                  "cancelled; no file is left half-written"]  # fmt: skip

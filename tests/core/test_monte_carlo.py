@@ -465,7 +465,7 @@ def run_gate10(folder: Path, *command: str, **variables: str) -> str:
     """The output of GATE 10; it must not look for Geant4's data, which it would download."""
     environment = {**os.environ, "GATEONRTD": "1", **variables}
     run = subprocess.run(
-        [sys.executable, *command], cwd=folder, env=environment, capture_output=True, text=True, timeout=120
+        [sys.executable, *command], cwd=folder, env=environment, capture_output=True, text=True, timeout=600
     )
     assert run.returncode == 0, run.stderr
     return run.stdout + run.stderr

@@ -207,7 +207,7 @@ with multiprocessing.get_context("fork").Pool(2) as pool:
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="processes fork on POSIX only")
 def test_forked_processes_project_too():
     """Threads do not survive a fork, which is how data loaders start their workers."""
-    done = run_python(FORK, timeout=120)
+    done = run_python(FORK, timeout=600)
     assert done.stdout.strip() == "1", done.stderr
 
 

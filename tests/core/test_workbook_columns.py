@@ -96,12 +96,12 @@ def test_a_text_that_no_cell_gives_back_is_refused(text, workbook, tmp_path):
         assert not (tmp_path / "new.xlsx").exists()
 
 
-@pytest.mark.parametrize("text", ["a\nb", "5", "1e5", '<&">', "µ 😀", "=1+1", "TRUE", "007", "x" * 32_767])
-def test_other_texts_are_kept_letter_by_letter(text, workbook, tmp_path):
-    system = mph.read_system(workbook)[:3].replace(crystal_material=["NaI", text, ""])
+def test_other_texts_are_kept_letter_by_letter(workbook, tmp_path):
+    texts = ["NaI", "a\nb", "5", "1e5", '<&">', "µ 😀", "=1+1", "TRUE", "007", "x" * 32_767, ""]
+    system = mph.read_system(workbook)[: len(texts)].replace(crystal_material=texts)
     for template in (None, workbook):
         written = mph.write_system(system, tmp_path / "new.xlsx", template)
-        assert mph.read_system(written.path).crystal_material.tolist() == ["NaI", text, ""]
+        assert mph.read_system(written.path).crystal_material.tolist() == texts
 
 
 BAD = {

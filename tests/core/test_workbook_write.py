@@ -144,7 +144,7 @@ else:
         check_a_change_comes_back(tmp_path_factory.mktemp("w"), layout, seed)
 
     @pytest.mark.long
-    @settings(max_examples=150, deadline=None, suppress_health_check=list(HealthCheck))
+    @settings(max_examples=75, deadline=None, suppress_health_check=list(HealthCheck))
     @given(layouts, st.integers(0, 10**6))
     def test_many_changes_of_many_layouts_come_back(tmp_path_factory, layout, seed):
         check_a_change_comes_back(tmp_path_factory.mktemp("w"), layout, seed)

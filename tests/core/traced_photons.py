@@ -79,3 +79,9 @@ def traced_image(system, place, pixels, size=0.3, n=2**18, edge_mu=None, plate=2
 def misplaced(found, expected):
     """The sum of absolute differences, by all counts."""
     return np.abs(found - expected).sum() / expected.sum()
+
+
+def in_blocks(image, n):
+    """The image on pixels `n` times as wide."""
+    rows, columns = image.shape
+    return image.reshape(rows // n, n, columns // n, n).sum(axis=(1, 3))

@@ -1,13 +1,13 @@
 """``mphdrr events check SET``."""
 
+from __future__ import annotations
+
 import argparse
 import time
 from dataclasses import asdict
 
+from ... import events
 from ...errors import InputError
-from ...events.checking import check, index_faults, repair
-from ...events.folders import SetFolder
-from ...events.work import Making
 from ..options import counted, print_answer, progress_bar, say
 from .action import add_action
 from .make import watched
@@ -31,8 +31,12 @@ def _run(arguments: argparse.Namespace) -> None:
     mphdrr events check set
     mphdrr events check set --repair --workers 2
     """
+    from ...events.checking import index_faults
+    from ...events.folders import SetFolder
+    from ...events.work import Making
+
     folder = arguments.folder
-    faults = check(folder, progress_bar("checking"))
+    faults = events.check(folder, progress_bar("checking"))
     lines = [fault.text for fault in faults]
     record = [{**asdict(fault), "path": str(fault.path)} for fault in faults]
     if not arguments.repair or not faults:
@@ -44,14 +48,14 @@ def _run(arguments: argparse.Namespace) -> None:
         return
     for line in lines:
         say(line)
-    again = repair(folder, faults)
+    again = events.repair(folder, faults)
     done = watched(Making(SetFolder(folder), again, arguments.workers), quiet=True)
-    left = check(folder, progress_bar("checking again"))
+    left = events.check(folder, progress_bar("checking again"))
     for _ in range(_TIMES):  # another work that ends now may be writing it
         if {fault.kind for fault in left} != {"index"}:
             break
         time.sleep(_SECONDS)
-        repair(folder, left)
+        events.repair(folder, left)
         left = index_faults(folder)
     record = [{**asdict(fault), "path": str(fault.path)} for fault in left]
     mended = f"{folder}: {counted(len(faults), 'fault')} mended, {done} events made anew"

@@ -2,9 +2,8 @@
 
 import argparse
 
-from ...events.event_set import EventSet
-from ...events.exports import PROGRAMS, planned_export
-from ...events.exports.unet3d import RAW
+from ... import events
+from ...events.programs import PROGRAMS
 from ..options import print_answer, progress_bar, say
 from .action import add_action
 
@@ -22,8 +21,8 @@ def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     add("--noise", type=_noise, metavar="own|SEED", help="with each event's own noise, or another; default: none")
     add("--level", type=float, default=1.0, metavar="SHARE", help="of the acquisition time, with --noise")
     add("--slots", metavar="CSV", help="legacy, 3dunet: which module each slot shows, as slots.csv says")
-    text = "3dunet: images by slots, to Radon images (the default); or back-projection, to truth"
-    add("--raw", choices=RAW, help=text)
+    text = "3dunet: slots, to Radon images (the default); or backprojection, to truth"
+    add("--raw", metavar="WHAT", help=text)
     add("--events-per-shard", type=int, metavar="N", help="webdataset; default: as many as make about a gigabyte")
     add("--uncompressed", action="store_true", default=None, help="webdataset: .npy members instead of .npy.gz")
     programs = "\n".join(f"  {program.name:<13}{program.title}" for program in PROGRAMS.values())
@@ -36,12 +35,14 @@ def _run(arguments: argparse.Namespace) -> None:
     mphdrr events export set --to 3dunet --model counts --noise own -o unet
     mphdrr events export set --to webdataset --split train -o shards
     """
-    events = EventSet(arguments.folder)
+    from ...events.exports import planned_export
+
+    chosen = events.EventSet(arguments.folder)
     if arguments.split is not None:
-        events = events.split(arguments.split)
+        chosen = chosen.split(arguments.split)
     names = ("noise", "level", "slots", "raw", "events_per_shard", "uncompressed")
     options = {name: getattr(arguments, name) for name in names}
-    plan = planned_export(events, arguments.output, arguments.to, models=arguments.model, **options)
+    plan = planned_export(chosen, arguments.output, arguments.to, models=arguments.model, **options)
     say(plan.says())
     plan.write(progress_bar("exporting"))
     record = {"folder": arguments.output, "program": arguments.to, "events": len(plan.rows)}

@@ -1,19 +1,22 @@
 """``mphdrr events make SET -n 1000``."""
 
+from __future__ import annotations
+
 import argparse
 import shutil
 import time
 from itertools import islice
 from pathlib import Path
+from typing import TYPE_CHECKING
 
+from ... import events
 from ...errors import InputError
-from ...events.folders import SetFolder
-from ...events.recipe import EventRecipe, read_recipe
-from ...events.store import size_of
-from ...events.work import Making, making
 from ...memory import readable_size
 from ..options import print_answer, progress_bar, say
 from .action import add_action
+
+if TYPE_CHECKING:
+    from ...events.work import Making
 
 
 def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
@@ -33,10 +36,12 @@ def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     add("--quiet", action="store_true", help="say nothing on standard error but warnings")
 
 
-def chosen_recipe(folder: str, recipe: str | None) -> EventRecipe:
+def chosen_recipe(folder: str, recipe: str | None) -> events.EventRecipe:
     """The recipe in a file, or that of a set's folder."""
+    from ...events.folders import SetFolder
+
     if recipe is not None:
-        return read_recipe(recipe)
+        return events.read_recipe(recipe)
     if Path(folder).is_file():
         raise InputError(
             f"{folder}: is a file; name the set's folder, and a recipe by --recipe: make set --recipe {folder}"
@@ -55,7 +60,7 @@ def _run(arguments: argparse.Namespace) -> None:
     """
     recipe = chosen_recipe(arguments.folder, arguments.recipe)
     options = {name: getattr(arguments, name) for name in ("count", "first", "workers", "shard", "dask", "pack")}
-    work = making(recipe, arguments.folder, **options)
+    work = events.making(recipe, arguments.folder, **options)
     done, folder = watched(work, arguments.quiet), work.folder
     there, asked = len(folder.store.places()), sum(map(len, folder.asked))
     record = {"folder": arguments.folder, "asked": asked, "events": there, "made": done}
@@ -84,6 +89,8 @@ def watched(work: Making, quiet: bool) -> int:
 
 def _expected(work: Making) -> str:
     """How large the missing events become, by the first ones that are there."""
+    from ...events.store import size_of
+
     missing = len(work.missing)
     sizes = [size_of(place) for place in islice(work.folder.store.places().values(), 100)]
     if sizes:

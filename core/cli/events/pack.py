@@ -1,18 +1,22 @@
 """``mphdrr events pack SET`` and ``mphdrr events unpack SET``."""
 
-import argparse
+from __future__ import annotations
 
-from ...events.folders import SetFolder
-from ...events.store import SHARD_BYTES
+import argparse
+from typing import TYPE_CHECKING
+
 from ...validation import positive
 from ..options import counted, print_answer, progress_bar
 from .action import add_action
+
+if TYPE_CHECKING:
+    from ...events.folders import SetFolder
 
 
 def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     """Add both actions."""
     pack = add_action(actions, "pack", _pack)
-    pack.add_argument("--gigabytes", type=float, default=SHARD_BYTES / 1e9, metavar="N", help="size of a shard, about")
+    pack.add_argument("--gigabytes", type=float, default=1.0, metavar="N", help="size of a shard, about")
     add_action(actions, "unpack", _unpack)
 
 
@@ -37,6 +41,8 @@ def _unpack(arguments: argparse.Namespace) -> None:
 
 
 def _set(arguments: argparse.Namespace) -> SetFolder:
+    from ...events.folders import SetFolder
+
     folder = SetFolder(arguments.folder)
     _ = folder.recipe  # refuses what is no event set
     return folder

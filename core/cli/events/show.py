@@ -1,13 +1,14 @@
 """``mphdrr events show SET -o sheet.png``."""
 
+from __future__ import annotations
+
 import argparse
 from collections import Counter
 from pathlib import Path
 from typing import Any
 
+from ... import events
 from ...errors import InputError
-from ...events.contact_sheet import contact_sheet
-from ...events.event_set import EventSet
 from ...figures.page import SUFFIXES
 from ..options import output_path, print_answer
 from .action import add_action
@@ -33,10 +34,12 @@ def _run(arguments: argparse.Namespace) -> None:
     mphdrr events show set -o sheet.png
     mphdrr events show set --events 0 7 12 --model emission -o some.svg
     """
+    from ...events.contact_sheet import contact_sheet
+
     path = None if arguments.output is None else output_path(arguments.output, SUFFIXES)
     if path is None and arguments.model is not None:
         raise InputError("--model says what is drawn: give -o FILE, too")
-    whole = EventSet(arguments.folder)
+    whole = events.EventSet(arguments.folder)
     if not whole:
         raise InputError(f"{arguments.folder}: it holds no events yet; mphdrr events make makes them")
     chosen = _chosen(whole, arguments.events, None if path is None else _ON_SHEET)
@@ -49,7 +52,7 @@ def _run(arguments: argparse.Namespace) -> None:
     print_answer(arguments, rows, [f"{path}: events {', '.join(map(str, chosen.numbers))} of {len(whole)}"])
 
 
-def _chosen(whole: EventSet, numbers: list[int] | None, most: int | None) -> EventSet:
+def _chosen(whole: events.EventSet, numbers: list[int] | None, most: int | None) -> events.EventSet:
     """The events with these numbers; without any, the first ones."""
     if numbers is None:
         return whole[:most]
@@ -60,7 +63,7 @@ def _chosen(whole: EventSet, numbers: list[int] | None, most: int | None) -> Eve
     return whole.where(lambda row: row["event"] in numbers)
 
 
-def _summary(whole: EventSet) -> str:
+def _summary(whole: events.EventSet) -> str:
     """How many events a set has, by phantom and split."""
     parts = [f"{len(whole)} events"]
     for column in ("phantom", "split"):

@@ -3,7 +3,7 @@
 import argparse
 from dataclasses import asdict
 
-from ...events.checking import status
+from ... import events
 from ...memory import readable_size
 from ..options import counted, print_answer
 from .action import add_action
@@ -19,7 +19,7 @@ def _run(arguments: argparse.Namespace) -> None:
 
     mphdrr events status set
     """
-    found = status(arguments.folder)
+    found = events.status(arguments.folder)
     lines = [f"{found.made} of {found.asked} events, {readable_size(found.size)}"]
     for name, counts in (("phantoms", found.phantoms), ("splits", found.splits)):
         if counts:

@@ -1,5 +1,7 @@
 """``mphdrr geometry calibrate RECIPE -o FILE``."""
 
+from __future__ import annotations
+
 import argparse
 import json
 from collections.abc import Iterator
@@ -8,12 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from ...design.calibration import Calibration
-from ...design.calibration_recipe import run_calibration
-from ...design.residuals import residual_sheet
+from .... import core as mph
 from ...files import write_bytes
 from ...runs.mosaic import write_png
-from ...workbook import write_system
 from ..options import add_run, counted, output_path, print_answer, progress_bar
 
 _LISTED = 5
@@ -33,17 +32,20 @@ def _run(arguments: argparse.Namespace) -> None:
 
     mphdrr geometry calibrate points.toml -o calibrated.xlsx
     """
+    from ...design.calibration_recipe import run_calibration  # takes a while, as for --help
+    from ...design.residuals import residual_sheet
+
     path = output_path(arguments.output, (".xlsx", ".xlsm"))
     found = run_calibration(arguments.recipe, progress_bar("finding spots"))
     source = found.system.source
-    write_system(found.system, path, None if source is None else source.path)
+    mph.write_system(found.system, path, None if source is None else source.path)
     record = _record(found)
     write_bytes(path.with_suffix(".json"), json.dumps(record, indent=1).encode())
     write_png(residual_sheet(found).picture, path.with_suffix(".png"))
     print_answer(arguments, record, _lines(found, record, path))
 
 
-def _record(found: Calibration) -> dict[str, Any]:
+def _record(found: mph.Calibration) -> dict[str, Any]:
     """The calibration as JSON has it: no NaN, angles in rad."""
     names = ("points", "covariance", "chi_square", "misfit", "used", "spread", "told", "detector_offset")
     record = {name: _plain(getattr(found, name).tolist()) for name in names}
@@ -61,7 +63,7 @@ def _plain(value: Any) -> Any:
     return [_plain(each) for each in value] if isinstance(value, list) else None if value != value else value
 
 
-def _lines(found: Calibration, record: dict[str, Any], path: Path) -> Iterator[str]:
+def _lines(found: mph.Calibration, record: dict[str, Any], path: Path) -> Iterator[str]:
     unit = np.where([name.startswith("tilt") for name in found.names], np.degrees(1.0), 1.0)
     spread = np.sqrt((found.spread**2).mean(axis=0)) * unit
     images = f"{found.used.sum()} of {found.used.size} images"

@@ -5,14 +5,13 @@ from typing import get_args
 
 import numpy as np
 
+from .... import core as mph
 from ...errors import InputError
-from ...geometry.checks import check_geometry
 from ...geometry.collimator import Construction, EdgePlace, angle_from_degrees
 from ...geometry.scanner import Scanner
 from ...geometry.system import PinholeSystem
 from ...physics.isotopes import ISOTOPES
 from ...recording import recorded_warnings
-from ...workbook import kinds_in, read_scanner
 from ..options import counted, print_answer, refuse
 from ..scanners import read_any
 from .arguments import add_action, add_edge, optics_of
@@ -47,7 +46,7 @@ def _run(arguments: argparse.Namespace) -> None:
     if isinstance(system, PinholeSystem):
         refuse(arguments, ("bore",), "is of X-ray systems")
         optics = optics_of(arguments, system)
-        report = check_geometry(system, **parts, aperture_mu=optics.aperture_mu, opening_angle=optics.opening_angle)
+        report = mph.check_geometry(system, **parts, aperture_mu=optics.aperture_mu, opening_angle=optics.opening_angle)
         findings, geometry = report.messages(), report.as_dict()
     else:
         angle = angle_from_degrees(arguments.opening_angle, "--opening-angle")
@@ -64,8 +63,8 @@ def _run(arguments: argparse.Namespace) -> None:
 
 def _others(arguments: argparse.Namespace, system: Scanner) -> list[Scanner]:
     """The scanners of other kinds in the same workbook."""
-    kinds = kinds_in(arguments.workbook)
-    return [read_scanner(arguments.workbook, kind) for kind in kinds if kind != system.kind]
+    kinds = mph.kinds_in(arguments.workbook)
+    return [mph.read_scanner(arguments.workbook, kind) for kind in kinds if kind != system.kind]
 
 
 def _summary(system: Scanner) -> dict[str, str]:

@@ -5,9 +5,8 @@ import math
 
 import numpy as np
 
+from .... import core as mph
 from ...arrays import table_rows
-from ...physics.performance import magnification, resolution, sensitivity
-from ...physics.sampling import sampling_gaps
 from ..options import print_answer
 from ..scanners import read_workbook
 from .arguments import add_action, add_materials, optics_of
@@ -28,15 +27,15 @@ def _run(arguments: argparse.Namespace) -> None:
     """
     system = read_workbook(arguments)
     points, optics = [arguments.point], optics_of(arguments, system)
-    counts = 1e6 * sensitivity(system, points, optics=optics)[0]
-    fwhm = resolution(system, points, optics=optics)[0]
+    counts = 1e6 * mph.sensitivity(system, points, optics=optics)[0]
+    fwhm = mph.resolution(system, points, optics=optics)[0]
     radius = system.roi_radius_seen()
     columns = {
         "number": system.numbers,
         "ring": system.rings() + 1,
         "sensitivity": counts,
         "resolution": fwhm,
-        "magnification": magnification(system, points)[0],
+        "magnification": mph.magnification(system, points)[0],
         "roi_radius_seen": radius,
         "roi_radius": system.roi_radius,
     }
@@ -48,7 +47,7 @@ def _run(arguments: argparse.Namespace) -> None:
         "modules_seeing": int(seeing.sum()),
         # Up to the rounding of l in the workbook.
         "modules_holding_roi": int(np.count_nonzero(radius >= system.roi_radius - 1e-3)),
-        "sampling_gap_degrees": math.degrees(sampling_gaps(system, points)[0]),
+        "sampling_gap_degrees": math.degrees(mph.sampling_gaps(system, points)[0]),
     }
     rows = table_rows(columns)
     modules = [{name: None if x != x else x for name, x in row.items()} for row in rows]  # no NaN in JSON

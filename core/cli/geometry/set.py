@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from .... import core as mph
 from ...errors import InputError
 from ...geometry.columns import ANGLE_UNITS, Column
 from ...geometry.frames import affine_matrix
@@ -14,7 +15,6 @@ from ...geometry.scanner import Scanner
 from ...geometry.system import PinholeSystem
 from ...recording import recorded_warnings
 from ...scanner_kinds import SCANNERS
-from ...workbook import write_system
 from ..options import output_path, print_answer
 from ..scanners import chosen_modules, read_any
 from .arguments import add_action
@@ -82,7 +82,7 @@ def _run(arguments: argparse.Namespace) -> None:
     map_path = None if arguments.write_columns is None else output_path(arguments.write_columns, (".toml",))
     with recorded_warnings() as messages:
         system = _changed(read_any(arguments), arguments)
-        written = write_system(system, target, template=arguments.workbook)
+        written = mph.write_system(system, target, template=arguments.workbook)
     if map_path is not None and written.columns is not None:
         written.columns.write(map_path)
     answer = {**dataclasses.asdict(written), "path": str(written.path), "warnings": messages}

@@ -5,11 +5,11 @@ from typing import Any
 
 import numpy as np
 
+from .... import core as mph
 from ...arrays import table_rows
 from ...errors import InputError
 from ...geometry.scanner import Scanner
 from ...geometry.system import PinholeSystem
-from ...workbook import draft_column_map
 from ..options import output_path, print_answer
 from ..scanners import chosen_modules, kind_of, read_any
 from .arguments import add_action
@@ -76,7 +76,7 @@ def _write_columns(arguments: argparse.Namespace) -> None:
     path = output_path(arguments.write_columns, (".toml",))
     if arguments.columns is not None:
         raise InputError("--write-columns writes what the headings say, expected it without --columns")
-    draft = draft_column_map(arguments.workbook, kind_of(arguments))
+    draft = mph.draft_column_map(arguments.workbook, kind_of(arguments))
     draft.write(path)
     then = f"check it, then: geometry show {arguments.workbook} --columns {path}"
     lines = [f"{path}: {len(draft.questions)} to be settled; {then}"]

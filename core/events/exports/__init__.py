@@ -1,11 +1,10 @@
 """Exports of event sets for other programs.
 
-To add a program, write its `Layout` in a module here, and list it below; `mphdrr events export` takes it from the list.
+To add a program, write its `Layout` in a module here, and list it in `events/programs.py`; `mphdrr events export` takes it
+from there.
 """
 
-import inspect
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 from ...errors import InputError
@@ -15,40 +14,11 @@ from ...validation import instance, one_of, positive
 from ..event_set import EventSet
 from ..fields import field_shapes
 from ..noise_choice import NoiseChoice, checked_noise, require_counted
-from .layout import Chosen, Layout
-from .legacy import Legacy
-from .npz import Npz
-from .unet3d import Unet3d
-from .webdataset import WebDataset
+from ..programs import PROGRAMS, Program
+from .layout import Chosen
 from .writing import Plan, plan_export
 
 __all__ = ["PROGRAMS", "Plan", "Program", "export_events", "planned_export"]
-
-
-@dataclass(frozen=True)
-class Program:
-    """A program, or a layout, that sets are exported for."""
-
-    name: str  # on the command line
-    title: str  # what is written, in one line
-    layout: type[Layout]  # made of what is chosen, with the program's options as keyword-only parameters
-
-    @property
-    def options(self) -> tuple[str, ...]:
-        """Names of its options."""
-        parameters = inspect.signature(self.layout).parameters.values()
-        return tuple(p.name for p in parameters if p.kind is p.KEYWORD_ONLY)
-
-
-_PROGRAMS = (
-    Program(
-        "legacy", "truth_i.pt, Projections_i.pt by slots, ProjRadonN_i.pt, RunTranslate.npy, RunRotate.npy", Legacy
-    ),
-    Program("3dunet", "pytorch-3dunet: an HDF5 file an event with raw and label, in a folder for each split", Unet3d),
-    Program("webdataset", "tar archives for WebDataset, of one split each", WebDataset),
-    Program("npz", "an archive of numpy an event, with all that is known of it", Npz),
-)
-PROGRAMS: dict[str, Program] = {program.name: program for program in _PROGRAMS}
 
 
 def planned_export(

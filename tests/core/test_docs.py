@@ -53,6 +53,8 @@ SMALLER = (
         r"iterations = 5\nsubsets = 8\nvoxels = 32\nspacing = 5\.0",
         "iterations = 1\nsubsets = 2\nvoxels = 12\nspacing = 13",
     ),
+    (r"range\(5\)", "range(2)"),
+    (r"(?<=views, m, )64", "4"),  # planes of a perspective grid
     (r"--frames (24|8) ", "--frames 2 "),
     (r"--count 100", "--count 2"),
     (r"np\.arange\(180\) \* np\.pi / 180", "np.arange(20) * np.pi / 20"),
@@ -133,7 +135,7 @@ np.save("images.npy", np.full((80, 16, 16), 3))
     "perspective": """
 import torch
 distribution = lambda m: np.ones((32, 32, 64))
-network = lambda image: torch.zeros(32, 32, 64, requires_grad=True)
+network = lambda image: torch.zeros(32, 32, 4, requires_grad=True)
 settings = {"system.file": "scanner.xlsx", "phantom.kind": "derenzo", "phantom.voxels": [32]}
 settings |= {"detector.rows": 32, "detector.columns": 32}
 mph.write_run(next(mph.run_recipe(mph.Recipe(settings))), "run.h5")

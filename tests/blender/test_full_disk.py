@@ -61,7 +61,7 @@ def test_a_figure_on_a_full_disk_is_one_line_and_status_1(disk, small_workbook, 
 
     assert (
         main(
-            ["figure", "scanner", str(small_workbook), "--size", "400x300", "--samples", "1", "-o", str(disk / "a.png")]
+            ["figure", "scanner", str(small_workbook), "--size", "800x600", "--samples", "1", "-o", str(disk / "a.png")]
         )
         == 1
     )

@@ -81,7 +81,7 @@ def test_a_look_from_the_asset_library_restyles_a_volume_and_its_slices(nema, tm
     assert [len(bpy.data.materials), len(bpy.data.node_groups)] == before
     assert bpy.context.preferences.filepaths.asset_libraries["mphDRR"].path == str(tmp_path)
     with bpy.data.libraries.load(str(tmp_path / "mphdrr-looks.blend"), assets_only=True) as (there, wanted):
-        assert len(there.materials) == 5
+        assert len(there.materials) == 6
         wanted.materials = ["mphDRR Fire"]
     nema.material_slots[0].material = bpy.data.materials["mphDRR Fire"]  # as a drop does
     look = nema.data.materials[0].node_tree.nodes["Look"]

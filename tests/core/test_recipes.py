@@ -47,7 +47,10 @@ def test_a_recipe_comes_back_from_its_file(tmp_path):
         ("model = 3", r"model: expected one of the tables \[system\], \[volume\]"),
         ("[modle]\nkind = 1", r"modle: expected one of the tables"),
         ("[model]\ntiem = 1", "model.tiem: no such setting; expected kind, time, "),
-        ("[model]\nkind = 'spect'", "model.kind: expected one of transmission, emission, inverse-square, got 'spect'"),
+        (
+            "[model]\nkind = 'spect'",
+            "model.kind: expected one of transmission, emission, spectral, inverse-square, got 'spect'",
+        ),
         ("[model]\nkind = 'emission'\ntime = 0", r"model.time: expected a number above 0 \(s\), got 0"),
         (
             "[model]\nkind = 'emission'\naperture_points = true",
@@ -241,12 +244,18 @@ def test_what_only_a_scene_has_is_not_left_out(entries, said, workbook):
 
 
 def test_every_argument_of_a_model_is_a_setting():
-    names = {field.name for cls in (mph.Emission, mph.Transmission) for field in dataclasses.fields(cls)}
-    for cls in (mph.Emission, mph.Transmission):  # radiographs have one point of each pixel unless told otherwise
+    models = mph.Emission, mph.Transmission, mph.SpectralScan
+    names = {field.name for cls in models for field in dataclasses.fields(cls)}
+    for cls in models:  # radiographs have one point of each pixel unless told otherwise
         for field in dataclasses.fields(cls):
             setting = SETTINGS.get(f"model.{field.name}")
             assert setting is None or setting.default == field.default or (cls, field.default) == (mph.Transmission, 1)
-    names -= {"system", "mu", "photons_per_decay"}  # the recipe has tables of the first two; the isotope says the third
+    names -= {
+        "system",
+        "mu",
+        "photons_per_decay",
+        "spectrum",
+    }  # the recipe has tables of the first two; the rest follows
     declared = {key.removeprefix("model.").removesuffix("_degrees") for key in SETTINGS if key.startswith("model.")}
     assert names == declared - {"kind", "photons", "dead_time", "dead_time_kind"}  # which are no part of a linear model
     of_reconstruct = [key.startswith("reconstruction.") for key in SETTINGS]

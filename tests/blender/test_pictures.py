@@ -105,7 +105,7 @@ def test_an_animation_that_is_ended_keeps_its_pictures(example, tmp_path, monkey
 
 def test_a_volume_that_cycles_does_not_draw_is_a_surface(example, tmp_path):
     """As in a Blender whose Cycles draws no volumes: its material has nothing to show."""
-    volume_materials.set_opacity(example.data.materials[0], 1.0, 0.0)
+    volume_materials.set_look(example.data.materials[0], "activity", Gain=0.0)
     path = tmp_path / "picture.png"
     with recorded_warnings() as said:
         jobs.run(figures.figure_job(bpy.context, "picture", [path], SIZE, labels=False, samples=2))

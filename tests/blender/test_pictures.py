@@ -11,8 +11,9 @@ import mphdrr.core as mph
 from mphdrr.addon.blender import jobs
 from mphdrr.addon.cli import main
 from mphdrr.addon.figures import figures
+from mphdrr.addon.figures.stage import Stage
 from mphdrr.addon.scanner import scanner, selection
-from mphdrr.addon.volumes import volume_materials, volumes
+from mphdrr.addon.volumes import volumes
 from mphdrr.core.recording import recorded_warnings
 
 SIZE = (192, 120)
@@ -103,9 +104,15 @@ def test_an_animation_that_is_ended_keeps_its_pictures(example, tmp_path, monkey
     assert sorted(found.name for found in tmp_path.iterdir()) == ["film-frames", "film.mp4"]
 
 
-def test_a_volume_that_cycles_does_not_draw_is_a_surface(example, tmp_path):
-    """As in a Blender whose Cycles draws no volumes: its material has nothing to show."""
-    volume_materials.set_opacity(example.data.materials[0], 1.0, 0.0)
+def test_a_volume_that_cycles_does_not_draw_is_a_surface(example, tmp_path, monkeypatch):
+    """As in a Blender whose Cycles draws no volumes: here the stage has it far away."""
+    put = Stage._put_volume
+
+    def put_far_away(stage: Stage, item: bpy.types.Object) -> None:
+        put(stage, item)
+        stage.drawn[0].location.z += 1e5
+
+    monkeypatch.setattr(Stage, "_put_volume", put_far_away)
     path = tmp_path / "picture.png"
     with recorded_warnings() as said:
         jobs.run(figures.figure_job(bpy.context, "picture", [path], SIZE, labels=False, samples=2))

@@ -187,7 +187,7 @@ def test_options_without_effect_are_refused(options, said, tmp_path, capsys):
         (["project", "WORKBOOK", *SMALL, "--magnification", "0", "-o", "FOLDER/a.h5"], "magnification"),
         (
             ["project", "WORKBOOK", *SMALL, "--noise", "1", "-o", "FOLDER/a.h5"],
-            "(--noise) needs model.kind = emission (--emission)",
+            "(--noise) needs model.photons (--photons) or model.kind = emission (--emission)",
         ),
         (
             ["project", "WORKBOOK", *SMALL, "--edge", "path", "-o", "FOLDER/a.h5"],

@@ -8,6 +8,7 @@ import hashlib
 import io
 import pickle
 import re
+import shutil
 import tracemalloc
 import zipfile
 from collections.abc import Callable
@@ -771,7 +772,8 @@ def test_missing_heading_is_named(tmp_path):
         read_edited(tmp_path, lambda main, coordinates: main.delete_cols(4))
 
 
-def test_file_of_absurd_size_is_refused_unread(workbook, monkeypatch):
+def test_file_of_absurd_size_is_refused_unread(workbook, tmp_path, monkeypatch):
+    workbook = shutil.copy(workbook, tmp_path)  # not one that was read before
     monkeypatch.setattr("mphdrr.core.workbook.book.MAX_UNPACKED_BYTES", 100_000)
     with pytest.raises(InputError, match="unpacks to 139152 bytes, expected at most 100000"):
         read_system(workbook)

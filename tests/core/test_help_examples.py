@@ -43,7 +43,9 @@ ALL = list(dict.fromkeys(examples(build_parser(COMMANDS))))
 
 def run(folder: Path, command: str) -> None:
     words = shlex.split(command)[1:]
-    if words[0] == "scene" or words[:2] in (["figure", "cut-away"], ["figure", "scanner"]):  # Blender, by itself
+    if words[0] == "scene" or words[:2] in (
+        [["figure", kind] for kind in ("cut-away", "light-up", "scanner")]
+    ):  # Blender
         pytest.importorskip("bpy")
         done = subprocess.run([sys.executable, "-m", "mphdrr", *words], cwd=folder, capture_output=True, text=True)
         assert done.returncode == 0 and "Traceback" not in done.stderr, f"{command}: {done.stderr}"
@@ -128,6 +130,8 @@ def test_every_example_runs(example, inputs, tmp_path):
         example += " --size 320x240 --samples 1"
     elif words[1:3] == ["figure", "cut-away"]:
         example += " --samples 1"
+    elif words[1:3] == ["figure", "light-up"]:
+        example = example.replace("--seconds 8 --size 640x400", "--seconds 1 --fps 3 --size 160x100 --samples 1")
     elif words[1:3] == ["project", "scanner.xlsx"] and "--counts" not in words:
         example += " --size 16 16"
     elif "--method model.pt" in example:  # of a scan by the scanner of its training

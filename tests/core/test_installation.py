@@ -72,7 +72,10 @@ def download(folder: Path) -> None:
 def interpreter(version: str) -> str | None:
     """A Python of this version, if there is any."""
     kept = sorted(Path.home().glob(f".pyenv/versions/{version}.*/bin/python"))
-    return str(kept[-1]) if kept else shutil.which(f"python{version}")
+    found = str(kept[-1]) if kept else shutil.which(f"python{version}")
+    # pyenv's shim of a version that is not chosen is there, but does not run
+    works = found and subprocess.run([found, "-c", ""], capture_output=True, check=False).returncode == 0
+    return found if works else None
 
 
 def test_the_source_archive_becomes_a_wheel_that_projects_alike_in_every_python(tmp_path: Path):

@@ -151,7 +151,7 @@ JOBS = [
     "--aperture-points 1 --prior relative-difference --weight 0.1 -o OUT.nii.gz",
     "backproject run.h5 --how product --voxels 320 --spacing 0.3 -o OUT.nii.gz",
     "volume convert volume.nii.gz --spacing 0.25 -o OUT.nii.gz",
-    "geometry map WORKBOOK --modules 1 --quantity modules --voxels 360 --spacing 0.6 -o OUT.nii.gz",
+    "geometry map WORKBOOK --modules 1 --quantity modules --voxels 384 --spacing 0.6 -o OUT.nii.gz",
     "score large.nii.gz --truth run.h5",
     "events make OUT --recipe events.toml -n 2 --workers 2",
 ]

@@ -89,6 +89,19 @@ def xdotool(*what: object) -> None:
     subprocess.run(["xdotool", *map(str, what)], check=True)
 
 
+def proposed() -> str:
+    """What the button at the top of the tab says."""
+    return ours("addon.next_step").next_step(bpy.context).text
+
+
+def click_proposed(first: int = 44) -> None:
+    """Click on that button; `first` is how far below the sidebar's top, in pixels, that of an empty scene is."""
+    region, window = sidebar(), editor()[0]
+    down = first if proposed() == "Load Example" else 160
+    xdotool("mousemove", round(region.x + 0.4 * region.width), window.height - region.y - region.height + down)
+    xdotool("click", 1)
+
+
 def on_screen(x: float, y: float, kind: str = "VIEW_3D") -> tuple[int, int]:
     """Where on the screen a place of an editor's region is."""
     window, _, region = editor(kind)

@@ -6,22 +6,9 @@ With the example, and in a new scene with a workbook.
 from collections.abc import Iterator
 
 import bpy
-from driving import WORKBOOK, editor, idle, open_tab, ours, picture, run, seen, sidebar, xdotool
+from driving import WORKBOOK, click_proposed, editor, idle, open_tab, picture, proposed, run, seen
 
-_FIRST, _LATER = 44, 160  # pixels from the sidebar's top to the button, before there is anything, and later
 _MOST = 6
-
-
-def proposed() -> str:
-    return ours("addon.next_step").next_step(bpy.context).text
-
-
-def click() -> None:
-    """Click on the button at the top of the tab."""
-    region, window = sidebar(), editor()[0]
-    down = _FIRST if proposed() == "Load Example" else _LATER
-    xdotool("mousemove", round(region.x + 0.4 * region.width), window.height - region.y - region.height + down)
-    xdotool("click", 1)
 
 
 def clicks(name: str) -> Iterator[float]:
@@ -30,7 +17,7 @@ def clicks(name: str) -> Iterator[float]:
     scene.mphdrr_reconstruction.voxels, scene.mphdrr_reconstruction.iterations = 32, 4  # for speed
     while not scene.mphdrr_reconstruction.known.get("scores") and len(seen[name]) < _MOST:
         seen[name].append(proposed())
-        click()
+        click_proposed()
         yield from idle()
         yield 2
     settings = scene.mphdrr_projections, scene.mphdrr_reconstruction

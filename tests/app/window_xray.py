@@ -1,9 +1,9 @@
 """From a clean home to CT, SPECT with it, and dose, by clicks on the buttons that the tab proposes."""
 
 import bpy
-from driving import editor, idle, open_tab, ours, picture, run, seen, sidebar, xdotool
+from driving import click_proposed, editor, idle, open_tab, ours, picture, proposed, run, seen
 
-_FIRST, _LATER = 78, 160  # pixels from the sidebar's top to the button, before there is anything, and later
+_FIRST = 78  # pixels from the sidebar's top to the button of the X-ray example
 
 
 def steps():
@@ -15,12 +15,8 @@ def steps():
     picture("empty")
     scene, seen["clicks"] = bpy.context.scene, []
     for number in range(1, 7):
-        region, window = sidebar(), editor()[0]
-        text = ours("addon.next_step").next_step(bpy.context).text
-        seen["clicks"].append(text)
-        down = _FIRST if text == "Load Example" else _LATER
-        xdotool("mousemove", round(region.x + 0.4 * region.width), window.height - region.y - region.height + down)
-        xdotool("click", 1)
+        seen["clicks"].append(proposed())
+        click_proposed(_FIRST)
         yield from idle()
         yield 2
         if number == 1:
@@ -31,7 +27,7 @@ def steps():
     volumes = ours("addon.volumes.volumes")
     found = [(item.name, volumes.quantity_of(item)) for item in volumes.volume_objects(scene)]
     seen["volumes"] = found
-    seen["next"] = ours("addon.next_step").next_step(bpy.context).text
+    seen["next"] = proposed()
     seen["tubes"] = scene.mphdrr_reconstruction.mu.name
 
 

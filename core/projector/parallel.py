@@ -2,6 +2,7 @@
 
 import functools
 import os
+import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor, wait
@@ -22,8 +23,9 @@ def in_order(function: Callable[[In], Out], items: Iterable[In], workers: int) -
     """``function(item)`` of every item, in order, on `workers` threads.
 
     Items are taken when there is room for them. When the iterator is closed or fails, no task goes on running.
+    A task that comes here itself does its parts one by one: the threads may all be waiting for such parts.
     """
-    if workers == 1:
+    if workers == 1 or getattr(_own, "is_worker", False):
         yield from map(function, items)
         return
     running: deque[Future[Out]] = deque()
@@ -46,10 +48,13 @@ def run_all(function: Callable[[In], None], items: Iterable[In], workers: int) -
         pass
 
 
+_own = threading.local()
+
+
 @functools.cache
 def _pool(workers: int) -> ThreadPoolExecutor:
     """Threads that stay: starting some for every call would cost a short one more than its work."""
-    return ThreadPoolExecutor(workers, thread_name_prefix="mphdrr")
+    return ThreadPoolExecutor(workers, "mphdrr", lambda: setattr(_own, "is_worker", True))
 
 
 if hasattr(os, "register_at_fork"):  # a forked process, such as a data loader's worker, has none of these threads

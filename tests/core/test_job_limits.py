@@ -215,3 +215,13 @@ def test_a_job_with_half_the_memory_that_it_needs_says_so_in_one_line_and_leaves
     lines = [line for line in said.splitlines() if "warning: " not in line]
     assert status == 1 and len(lines) == 1 and " of memory, but " in lines[0], (status, said)
     assert not list(tmp_path.iterdir())
+
+
+def test_tasks_that_have_tasks_end():
+    """Each task of as many as there are threads asks the same threads for more, as reconstructions of several events do."""
+    code = (
+        "from mphdrr.core.projector.parallel import in_order\n"
+        "outer = lambda i: sum(in_order(lambda j: i * j, range(50), 2))\n"
+        "print(list(in_order(outer, range(20), 2)))"
+    )
+    assert run_python(code, timeout=60).stdout.strip() == str([1225 * i for i in range(20)])

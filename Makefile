@@ -3,6 +3,8 @@
 # make test-long   the tests that take minutes: long property runs, workbooks through LibreOffice
 # make bench   speed, accuracy and memory beside other projectors, into docs/; BENCH=--quick: a minute or two, into out/
 # make bench-events   event sets beside the usual pipeline with DiffDRR, into docs/; BENCH=--quick: a minute, into out/
+# make bench-all   these and others beside all peers in one run, table and picture at the top of docs/benchmarks.md; wants
+#               VENV=.venvbench; BENCH=--quick: some minutes, into out/
 # make bench-reconstruction   an iteration beside other packages' own loops over our operators; wants VENV=.venvpeers
 # make gallery   the documentation's pictures of phantoms, of a CT (CT=FILE), of the scanner's sensitivity and of the demo, into docs/images
 # make docs    docs/ as a site in out/docs, with links and references checked; wrong ones are errors
@@ -33,7 +35,7 @@ ENVIRONMENT = @p=$(ANY_PYTHON); [ -n "$$p" ] || { echo "no Python found; name on
 # Python keeps what it has compiled: else each process of the tests compiles everything anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo gallery test test-long lint test-app test-kernels test-gate test-peers bench bench-events bench-reconstruction docs tutorial dist clean env env-dev env-gate env-peers
+.PHONY: demo gallery test test-long lint test-app test-kernels test-gate test-peers bench bench-all bench-events bench-reconstruction docs tutorial dist clean env env-bench env-dev env-gate env-peers
 
 demo: env
 	$(BIN)/mphdrr demo --output $(OUTPUT)
@@ -60,6 +62,9 @@ bench: env-dev
 
 bench-events: env-dev
 	$(BIN)/python benchmarks/events.py $(BENCH)
+
+bench-all: env-bench
+	$(BIN)/python benchmarks/beside.py $(BENCH)
 
 bench-reconstruction: env-peers
 	$(BIN)/python benchmarks/reconstruction.py $(BENCH)
@@ -102,6 +107,9 @@ env:
 
 env-dev:
 	$(ENVIRONMENT) --extras blender,dev --torch "$(TORCH)"
+
+env-bench:
+	$(ENVIRONMENT) --extras bench,blender,dev,peers --torch "$(TORCH)"
 
 env-gate:
 	$(ENVIRONMENT) --extras gate

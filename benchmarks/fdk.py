@@ -1,6 +1,6 @@
 """FDK beside RTK's: the same views, images and voxels, two calls each in turn, the faster one counts.
 
-    python -m benchmarks.fdk [--voxels 128] [--views 180] [--threads 2]
+    python benchmarks/fdk.py [--voxels 128] [--views 180] [--threads 2]
 
 RTK (the wheel itk-rtk) is left out where it is not installed. Its time is that of its filters alone: weights, ramp and
 backprojection, without our reading or copying.
@@ -13,6 +13,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from beside import tell
 
 RADIUS, DISTANCE, MU = 500.0, 1000.0, 0.02
 
@@ -105,6 +106,9 @@ def main() -> None:
                 print(f"{name}: {middle:.4f} of the truth in the middle")
     for name, seconds in best.items():
         print(f"{name}: {seconds:.3g} s, {seconds / best['mphDRR']:.3g} x mphDRR's")
+    if "RTK" in best:
+        work = f"FDK, {chosen.views} views of {chosen.voxels}², {chosen.voxels}³"
+        tell("X rays", work, best["mphDRR"], "RTK", best["RTK"])
 
 
 if __name__ == "__main__":

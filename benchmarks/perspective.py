@@ -1,6 +1,6 @@
 """Back-projections of 80 views: sum, product and minimum beside scipy's interpolation, the fastest of some turns each.
 
-    python -m benchmarks.perspective [--pixels 128] [--voxels 128 128 64] [--threads 2] [--turns 5]
+    python benchmarks/perspective.py [--pixels 128] [--voxels 128 128 64] [--threads 2] [--turns 5]
 
 scipy (`map_coordinates`, a view at a time, as the usual script does it) has one thread; it is left out where it is not
 installed. Memory is the peak beyond images and result.
@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from beside import tell
 
 WORKBOOK = Path(__file__).parents[1] / "examples" / "dc-spect-80.xlsx"
 SIDE = 150.0  # mm, of the volume
@@ -72,6 +73,8 @@ def main() -> None:
         tracemalloc.stop()
         print(f"{name}: {best[name]:.3g} s; {peak:.2g} volumes beyond images and result")
     if "sum by scipy" in calls:
+        work = f"back-projection, 80 views of {chosen.pixels}², {' x '.join(map(str, grid.shape))}"
+        tell("perspective", work, best["sum"], "scipy", best["sum by scipy"], "scipy has one thread")
         apart = np.abs(results["sum by scipy"] - results["sum"]) / results["sum"].max()
         print(f"the sums differ by {np.quantile(apart, 0.999):.1g} of the largest, in all but 0.1 % of the voxels")
 

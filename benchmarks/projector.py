@@ -25,6 +25,7 @@ from typing import Any
 
 import numpy as np
 import report
+from beside import tell
 from case import Case, Row, reference, save_volumes
 from peers import PEERS, TASKS, cores, set_thread_variables
 
@@ -111,6 +112,15 @@ def main() -> None:
     folder_out = arguments.output
     folder_out.mkdir(parents=True, exist_ok=True)
     report.write(results, folder_out)
+    ours = rows.get(("cpu", len(cores())))
+    for (name, threads), row in rows.items():
+        if ours is None or name in ("cpu", "numpy", "torch") or threads != len(cores()):
+            continue
+        for task in TASKS:
+            if task in row.seconds and task in ours.seconds:
+                work = f"{report.TITLES[task]}, a view of {case.pixels}², {case.voxels}³"
+                note = "" if row.model == "exact" else f"its integral: {row.model}"
+                tell("projector", work, ours.seconds[task], row.label, row.seconds[task], note)
 
 
 def parse_arguments() -> argparse.Namespace:

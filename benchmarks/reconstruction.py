@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from beside import tell
 
 import mphdrr.core as mph
 
@@ -58,6 +59,9 @@ def main() -> None:
             method = "MLEM" if subsets == 1 else f"OSEM, {subsets} subsets"
             row = f"| {method} | {name} | {each:.3f} | {each / own:.2f} | {each / both:.2f} | {differs:.1e} |"
             print(row, flush=True)
+            if name != "mphDRR":
+                work = f"{method}, an iteration, {asked.voxels}³, 80 views of {asked.pixels}²"
+                tell("reconstruction", work, own, name, each, "its loop over our operators")
 
 
 def problem(workbook: str | Path, voxels: int, pixels: int) -> tuple[mph.Projector, np.ndarray]:

@@ -73,7 +73,7 @@ def section(found: list[Beside], missing: list[str], load: float, minutes: float
         )
     slower = [f"{one.work} than {one.peer}" for one in found if one.ratio > SLOWER]
     words = [
-        f"Written by `make bench-all`, {date.today()}; do not edit. One run of {minutes:.0f} minutes (load before it {load:.1f}),"
+        f"Written by `make bench-all`, {date.today()}; do not edit. Minutes: {minutes:.0f}, load before: {load:.1f},"
         f" {memory.cores()} threads, each pair on the same work, in turns. More on projector and event sets below.",
         f"Slower than a peer: {'; '.join(slower)}." if slower else "Nothing is slower than a peer.",
     ]

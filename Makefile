@@ -109,7 +109,7 @@ env-dev:
 	$(ENVIRONMENT) --extras blender,dev --torch "$(TORCH)"
 
 env-bench:
-	$(ENVIRONMENT) --extras bench,blender,dev,peers --torch "$(TORCH)"
+	$(ENVIRONMENT) --extras bench,dev,peers --torch "$(TORCH)"
 
 env-gate:
 	$(ENVIRONMENT) --extras gate

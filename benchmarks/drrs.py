@@ -41,7 +41,9 @@ def main() -> None:
     asked = parser.parse_args()
     system = mph.read_system(WORKBOOK)
     shape, spacing = tuple(asked.voxels), np.array((360.0, 360.0, 332.5)) / asked.voxels
-    pitch, distances = 500.0 / asked.pixels, 10 * np.asarray(system.l)
+    pitch, distances = 500.0 / asked.pixels, 10 * system.collimator_length
+    x, y, z = system.centers.T
+    alpha, beta = np.arctan2(y, x), np.arctan2(z, np.hypot(x, y))
     x, y, z = np.meshgrid(*(np.linspace(-1, 1, n) for n in shape), indexing="ij", sparse=True)
     hu = np.where(1.6 * x**2 + 2.9 * y**2 < 1, 100 * np.sin(9 * x + 7 * y + 5 * z), -1000).astype(np.float32)
     ours = face.DRR(hu, spacing.tolist(), sdr=450.0, height=asked.pixels, delx=pitch)
@@ -49,7 +51,7 @@ def main() -> None:
 
     def by_face(module: int) -> None:
         ours.set_intrinsics_(sdd=float(distances[module]))
-        angles = torch.tensor([[system.alpha[module], system.beta[module], torch.pi / 2]])
+        angles = torch.tensor([[alpha[module], beta[module], torch.pi / 2]])
         ours(angles, middle, parameterization="euler_angles", convention="ZYX")
 
     views = mph.c_arm_views(system, shape=(asked.pixels, asked.pixels), pitch=pitch, elevation="diffdrr")
@@ -70,7 +72,7 @@ def main() -> None:
         theirs = DRR(subject, sdd=float(distances[0]), height=asked.pixels, delx=pitch, patch_size=64)
 
         def by_diffdrr(module: int) -> None:
-            angles = torch.tensor([[system.alpha[module], system.beta[module], 0.0]], dtype=torch.float32)
+            angles = torch.tensor([[alpha[module], beta[module], 0.0]], dtype=torch.float32)
             move = torch.tensor([[0.0, distances[module] / 2, 0.0]], dtype=torch.float32)
             with torch.no_grad():
                 theirs(angles, move, parameterization="euler_angles", convention="ZXY")

@@ -94,6 +94,13 @@ class PinholeSystem(Scanner):
             at = f"at the place of module {numbers[same[i]]} ({place('x1', int(same[i]))})"
             yield "x1", i, f"{puts} {numbers[i]} {at}, expected another place"
 
+    def __repr__(self) -> str:
+        b, l = (
+            f"{name} {x.min():.4g} to {x.max():.4g} mm"
+            for name, x in (("b", self.pinhole_distance), ("l", self.collimator_length))
+        )
+        return f"PinholeSystem({len(self)} modules, {b}, {l})"
+
     @property
     def pinhole_distance(self) -> Floats:
         """b (M,), mm: pinhole centre to isocentre."""

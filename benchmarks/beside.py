@@ -73,8 +73,8 @@ def section(found: list[Beside], missing: list[str], load: float, minutes: float
         )
     slower = [f"{one.work} than {one.peer}" for one in found if one.ratio > SLOWER]
     words = [
-        f"Written by `make bench-all`, {date.today()}; do not edit. Minutes: {minutes:.0f}, load before: {load:.1f},"
-        f" {memory.cores()} threads, each pair on the same work, in turns. More on projector and event sets below.",
+        f"Written by `make bench-all`, {date.today()}; do not edit. {minutes:.0f} minutes (load before: {load:.1f})"
+        f" with {memory.cores()} threads, each pair on the same work, in turns. More on projector and event sets below.",
         f"Slower than a peer: {'; '.join(slower)}." if slower else "Nothing is slower than a peer.",
     ]
     if missing:
@@ -111,7 +111,7 @@ def draw(found: list[Beside], path: Path) -> bool:
     for at, one in enumerate(reversed(found)):
         axes.plot([1, 1 / one.ratio], [at, at], "-", color="#bbbbbb", linewidth=1)
         axes.plot(1 / one.ratio, at, "o", color=f"C{chapters.index(one.chapter)}", markersize=5)
-    axes.set_yticks(range(len(found)), [f"{one.work}: {one.peer}" for one in reversed(found)])
+    axes.set_yticks(range(len(found)), [f"{one.work}: {one.peer}".replace("`", "") for one in reversed(found)])
     axes.axvline(1, color="black", linewidth=0.8)
     axes.set_xscale("log")
     axes.set_xlabel("times as fast as the peer")

@@ -14,15 +14,7 @@ from ...core.runs.presets import PRESETS
 from ...core.runs.recipe import Recipe, fitting_recipe
 from ...core.runs.settings import SETTINGS
 from ..blender import setting_properties
-from ..blender.setting_properties import (
-    drawn_of,
-    identifier,
-    material_of,
-    of_modules,
-    properties_of,
-    set_property,
-    values_of,
-)
+from ..blender.setting_properties import drawn_of, identifier, material_of, of_modules, properties_of, set_property
 from ..blender.updates import on_edit
 from ..scanner import scanner
 from ..volumes import volumes
@@ -59,7 +51,7 @@ ProjectionSettings.__annotations__.update(properties_of(PROPERTIES))
 
 def recipe_values(get: Callable[[str], Any]) -> dict[str, Any]:
     """The values of the settings by their keys in a recipe, None for none; `get` gives a property's."""
-    values = values_of(PROPERTIES, get)
+    values = setting_properties.values_of(PROPERTIES, get)
     values["noise.seed"] = get("seed") if get("noise") else None
     return values
 

@@ -11,7 +11,6 @@ from typing import Any
 
 from ... import core as mph
 from ..figures.page import DARK, SUFFIXES, Page
-from ..progress import Cancelled, Progress
 from ..reconstruction.methods import Method, method_of
 from ..reconstruction.result import iterations_text
 from ..runs.formats import FORMATS
@@ -95,7 +94,7 @@ def _run(arguments: argparse.Namespace) -> None:
     usual = signal.signal(signal.SIGINT, log.interrupt) if state is not None else None
     try:
         found = mph.reconstruct_run(run, recipe, start=start, watch=log, stages=log.stage, method=method)
-    except Cancelled as cancelled:
+    except mph.Cancelled as cancelled:
         if state is not None and cancelled.reconstruction is not None:
             mph.write_reconstruction(cancelled.reconstruction, state)
             done = cancelled.reconstruction.iterations
@@ -134,7 +133,7 @@ class _Log:
         self.name = method.objective
         self.begun, self.interrupted = time.monotonic(), False
 
-    def stage(self, words: str) -> Progress | None:
+    def stage(self, words: str) -> mph.Progress | None:
         if words != "reconstructing":
             return progress_bar(words)
         self.begun = time.monotonic()
@@ -146,7 +145,7 @@ class _Log:
 
     def _check(self, done: int, total: int) -> None:
         if self.interrupted:
-            raise Cancelled
+            raise mph.Cancelled
 
     def __call__(self, iteration: int, values: Any, objective: Sequence[float]) -> None:
         if not self.quiet:

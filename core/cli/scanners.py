@@ -3,9 +3,7 @@
 import argparse
 
 from ... import core as mph
-from ..errors import InputError
 from ..geometry.scanner import Scanner
-from ..geometry.system import PinholeSystem
 from ..geometry.system import chosen_modules as chosen_modules
 from ..scanner_kinds import SCANNERS
 
@@ -27,7 +25,7 @@ def add_workbook(parser: argparse.ArgumentParser, name: str = "workbook", defaul
 def kind_of(arguments: argparse.Namespace) -> str:
     """The kind of scanner that the options of `add_workbook` ask for."""
     found = () if arguments.scanner_kind or arguments.columns else mph.kinds_in(arguments.workbook)
-    return arguments.scanner_kind or next(iter(found), PinholeSystem.kind)
+    return arguments.scanner_kind or next(iter(found), mph.PinholeSystem.kind)
 
 
 def read_any(arguments: argparse.Namespace) -> Scanner:
@@ -35,9 +33,11 @@ def read_any(arguments: argparse.Namespace) -> Scanner:
     return mph.read_scanner(arguments.workbook, kind_of(arguments), arguments.columns)
 
 
-def read_workbook(arguments: argparse.Namespace) -> PinholeSystem:
+def read_workbook(arguments: argparse.Namespace) -> mph.PinholeSystem:
     """The pinholes of the workbook of `add_workbook`; `InputError` of another kind of scanner."""
     system = read_any(arguments)
-    if not isinstance(system, PinholeSystem):
-        raise InputError(f"{arguments.workbook}: its scanner is of the kind {system.kind}, expected one with pinholes")
+    if not isinstance(system, mph.PinholeSystem):
+        raise mph.InputError(
+            f"{arguments.workbook}: its scanner is of the kind {system.kind}, expected one with pinholes"
+        )
     return system

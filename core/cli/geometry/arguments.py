@@ -3,13 +3,10 @@
 import argparse
 from typing import Any
 
+from .... import core as mph
 from ...geometry.collimator import angle_from_degrees
 from ...geometry.scanner import Scanner
-from ...geometry.system import PinholeSystem
-from ...geometry.views import Views
-from ...physics.isotopes import ISOTOPES, isotope
 from ...physics.materials import APERTURES, CRYSTALS
-from ...physics.optics import Optics
 from ..options import add_run, number_or_name
 from ..scanners import add_workbook
 
@@ -35,7 +32,7 @@ def add_views(parser: argparse.ArgumentParser, pixels: str) -> None:
     add("--pitch", type=float, metavar="MM", help="pixel size; default: the crystal's whole side")
 
 
-def views_of(system: Scanner, arguments: argparse.Namespace) -> Views:
+def views_of(system: Scanner, arguments: argparse.Namespace) -> mph.Views:
     """The views of a scanner that the options of `add_views` ask for."""
     shape = tuple(arguments.size) if arguments.size else system.pixels or (256, 256)
     return system.views(shape, arguments.detector, arguments.magnification, arguments.pitch)
@@ -49,7 +46,7 @@ def add_materials(parser: argparse.ArgumentParser) -> None:
     add = group.add_argument
     add("--crystal-mu", type=number_or_name, metavar="MATERIAL", help=crystal)
     add("--intrinsic-fwhm", type=float, default=0.0, metavar="MM", help="resolution of the detector, mm on the crystal")
-    add("--isotope", metavar="NAME", help=f"{', '.join(ISOTOPES)}; without it, one photon per decay")
+    add("--isotope", metavar="NAME", help=f"{', '.join(mph.ISOTOPES)}; without it, one photon per decay")
 
 
 def add_edge(parser: argparse._ActionsContainer) -> None:
@@ -59,12 +56,12 @@ def add_edge(parser: argparse._ActionsContainer) -> None:
     parser.add_argument("--opening-angle", type=float, default=90.0, metavar="DEG", help="full angle of the knife edge")
 
 
-def optics_of(arguments: argparse.Namespace, system: PinholeSystem) -> Optics:
+def optics_of(arguments: argparse.Namespace, system: mph.PinholeSystem) -> mph.Optics:
     """What the options of `add_materials`, or of `add_edge` and ``--isotope``, say of a scanner's modules."""
     lines: tuple[tuple[float, float], ...] = ()
     if arguments.isotope is not None:
-        decaying = isotope(arguments.isotope)
+        decaying = mph.isotope(arguments.isotope)
         lines = decaying.lines_within(*decaying.window)
     settings = {name: value for name, value in vars(arguments).items() if name in MATERIAL_OPTIONS[:-1]}
     angle = angle_from_degrees(settings.pop("opening_angle"), "--opening-angle")
-    return Optics.of(system, lines, **settings, opening_angle=angle)
+    return mph.Optics.of(system, lines, **settings, opening_angle=angle)

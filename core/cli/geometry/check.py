@@ -6,11 +6,8 @@ from typing import get_args
 import numpy as np
 
 from .... import core as mph
-from ...errors import InputError
 from ...geometry.collimator import Construction, EdgePlace, angle_from_degrees
 from ...geometry.scanner import Scanner
-from ...geometry.system import PinholeSystem
-from ...physics.isotopes import ISOTOPES
 from ...recording import recorded_warnings
 from ..options import counted, print_answer, refuse
 from ..scanners import read_any
@@ -26,7 +23,7 @@ def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
     place = "where in the plate the knife edge is; front is the face towards the ROI"
     add("--edge-at", choices=get_args(EdgePlace), default="middle", help=place)
     add_edge(parser)
-    add("--isotope", metavar="NAME", help=f"{', '.join(ISOTOPES)}: its photons must be stopped by the plates")
+    add("--isotope", metavar="NAME", help=f"{', '.join(mph.ISOTOPES)}: its photons must be stopped by the plates")
     add("--bore", type=float, metavar="MM", help="of X-ray systems: radius of the patient's bore around the z axis")
     add("--strict", action="store_true", help="exit with status 1 if there is any warning or finding")
 
@@ -41,9 +38,9 @@ def _run(arguments: argparse.Namespace) -> None:
         refuse(arguments, ("isotope",), "needs --aperture-mu")
     with recorded_warnings() as messages:
         system = read_any(arguments)
-        others = [] if isinstance(system, PinholeSystem) else _others(arguments, system)
+        others = [] if isinstance(system, mph.PinholeSystem) else _others(arguments, system)
     parts = {"plate_thickness": arguments.plate, "wall_thickness": arguments.wall, "edge_at": arguments.edge_at}
-    if isinstance(system, PinholeSystem):
+    if isinstance(system, mph.PinholeSystem):
         refuse(arguments, ("bore",), "is of X-ray systems")
         optics = optics_of(arguments, system)
         report = mph.check_geometry(system, **parts, aperture_mu=optics.aperture_mu, opening_angle=optics.opening_angle)
@@ -58,7 +55,7 @@ def _run(arguments: argparse.Namespace) -> None:
     lines = [*(f"{name:22s} {text}" for name, text in summary.items()), *findings, total]
     print_answer(arguments, answer, lines, [f"warning: {message}" for message in messages])
     if arguments.strict and (messages or findings):
-        raise InputError(f"{arguments.workbook}: {total}")
+        raise mph.InputError(f"{arguments.workbook}: {total}")
 
 
 def _others(arguments: argparse.Namespace, system: Scanner) -> list[Scanner]:
@@ -69,7 +66,7 @@ def _others(arguments: argparse.Namespace, system: Scanner) -> list[Scanner]:
 
 def _summary(system: Scanner) -> dict[str, str]:
     lines = {"modules": str(len(system)), "rings": " + ".join(map(str, np.bincount(system.rings())))}
-    if not isinstance(system, PinholeSystem):
+    if not isinstance(system, mph.PinholeSystem):
         return lines | {"kind": system.kind}
     for name, values in {
         "b, pinhole distance": system.pinhole_distance,

@@ -6,14 +6,9 @@ from typing import Any
 
 import numpy as np
 
+from .... import core as mph
 from ...arrays import Array, table_rows
-from ...errors import InputError
 from ...geometry.scanner import Scanner
-from ...geometry.system import PinholeSystem
-from ...geometry.views import Views
-from ...perspective.epipolar import epipolar_lines, epipolar_segments, epipole
-from ...perspective.triangulation import fit_marker
-from ...perspective.view_rays import points_at_depths
 from ..options import print_answer
 from ..scanners import chosen_modules, read_any
 from .arguments import add_action, add_views, views_of
@@ -46,19 +41,19 @@ def _run(arguments: argparse.Namespace) -> None:
     views = views_of(system, arguments)
     if len(pixels) == 1:
         if arguments.sigma is not None:
-            raise InputError("--sigma: expected several --pixel, whose point is sought")
+            raise mph.InputError("--sigma: expected several --pixel, whose point is sought")
         _print_ray(arguments, system, views, *pixels[0])
         return
     for name in ("depth", "modules"):
         if getattr(arguments, name) is not None:
-            raise InputError(f"--{name}: expected one --pixel; the place sought is the same for several")
+            raise mph.InputError(f"--{name}: expected one --pixel; the place sought is the same for several")
     _print_point(arguments, system, views, pixels)
 
 
-def _print_ray(arguments: argparse.Namespace, system: Scanner, views: Views, m: int, pixel: list[float]) -> None:
+def _print_ray(arguments: argparse.Namespace, system: Scanner, views: mph.Views, m: int, pixel: list[float]) -> None:
     near, far = _depths(arguments.depth, system, m)
-    segments = epipolar_segments(views, m, pixel, near, far)
-    ends = points_at_depths(views, m, pixel, np.array([near, far]))
+    segments = mph.epipolar_segments(views, m, pixel, near, far)
+    ends = mph.points_at_depths(views, m, pixel, np.array([near, far]))
     n_v, n_u = views.shape
     rows: list[dict[str, Any]] = []
     listed = np.isin(system.numbers, chosen_modules(system, arguments.modules).numbers)
@@ -67,10 +62,13 @@ def _print_ray(arguments: argparse.Namespace, system: Scanner, views: Views, m: 
         if n == m:
             rows[-1] |= {"line": None, "epipole": None}
             continue
-        at = epipole(views, m, n)
+        at = mph.epipole(views, m, n)
         place = at[:2] / at[2] if at[2] > 0 else np.full(2, np.nan)
         inside = (place >= -0.5).all() and (place <= [n_u - 0.5, n_v - 0.5]).all()
-        rows[-1] |= {"line": _listed(epipolar_lines(views, m, n, pixel)), "epipole": _listed(place) if inside else None}
+        rows[-1] |= {
+            "line": _listed(mph.epipolar_lines(views, m, n, pixel)),
+            "epipole": _listed(place) if inside else None,
+        }
     number = int(system.numbers[m])
     record = {"module": number, "pixel": pixel, "depths": [near, far], "points": ends.tolist(), "modules": rows}
     text = f"module {number}, pixel ({pixel[0]:g}, {pixel[1]:g})"
@@ -90,15 +88,15 @@ def _print_ray(arguments: argparse.Namespace, system: Scanner, views: Views, m: 
 
 
 def _print_point(
-    arguments: argparse.Namespace, system: Scanner, views: Views, pixels: list[tuple[int, list[float]]]
+    arguments: argparse.Namespace, system: Scanner, views: mph.Views, pixels: list[tuple[int, list[float]]]
 ) -> None:
     index = np.array([m for m, _ in pixels])
     numbers = system.numbers[index].tolist()
     twice = [number for number in numbers if numbers.count(number) > 1]
     if twice:
-        raise InputError(f"--pixel: expected one pixel of each module, got several of module {twice[0]}")
+        raise mph.InputError(f"--pixel: expected one pixel of each module, got several of module {twice[0]}")
     sigma = 1.0 if arguments.sigma is None else arguments.sigma
-    fit = fit_marker(views, index, [pixel for _, pixel in pixels], sigma)
+    fit = mph.fit_marker(views, index, [pixel for _, pixel in pixels], sigma)
     odd = fit.worst if fit.worst is not None and fit.misfit_p_values[fit.worst] < _CHANCE / len(numbers) else None
     columns = {"number": system.numbers[index], "column": fit.residuals[:, 0], "row": fit.residuals[:, 1]}
     rows = table_rows({**columns, "misfit": fit.misfits, "p_value": fit.misfit_p_values})
@@ -132,25 +130,25 @@ def _pixel(system: Scanner, text: str) -> tuple[int, list[float]]:
         if not (math.isfinite(column) and math.isfinite(row)):
             raise ValueError
     except ValueError:
-        raise InputError(f"--pixel {text!r}: expected MODULE:COLUMN,ROW, such as 7:120,130.5") from None
+        raise mph.InputError(f"--pixel {text!r}: expected MODULE:COLUMN,ROW, such as 7:120,130.5") from None
     index = np.flatnonzero(system.numbers == number)
     if not len(index):
         lowest, highest = system.numbers.min(), system.numbers.max()
-        raise InputError(f"--pixel {text!r}: no module {number}; there are {lowest} to {highest}")
+        raise mph.InputError(f"--pixel {text!r}: no module {number}; there are {lowest} to {highest}")
     return int(index[0]), [column, row]
 
 
 def _depths(given: list[float] | None, system: Scanner, m: int) -> tuple[float, float]:
     if given is None:
         distance = float(np.linalg.norm(system.poses()[m, :3, 3]))
-        radius = float(system.roi_radius[m]) if isinstance(system, PinholeSystem) else system.region_radius()
+        radius = float(system.roi_radius[m]) if isinstance(system, mph.PinholeSystem) else system.region_radius()
         return max(distance - radius, 0.0), distance + radius
     if len(given) > 2:
-        raise InputError(f"--depth: expected one depth or two, got {len(given)}")
+        raise mph.InputError(f"--depth: expected one depth or two, got {len(given)}")
     near, far = given[0], given[-1]
     if not 0 <= near <= far < math.inf:
         got = " ".join(f"{depth:g}" for depth in given)
-        raise InputError(f"--depth: expected one depth of 0 mm or more, or two in ascending order, got {got}")
+        raise mph.InputError(f"--depth: expected one depth of 0 mm or more, or two in ascending order, got {got}")
     return near, far
 
 

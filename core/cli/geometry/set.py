@@ -8,11 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .... import core as mph
-from ...errors import InputError
 from ...geometry.columns import ANGLE_UNITS, Column
 from ...geometry.frames import affine_matrix
 from ...geometry.scanner import Scanner
-from ...geometry.system import PinholeSystem
 from ...recording import recorded_warnings
 from ...scanner_kinds import SCANNERS
 from ..options import output_path, print_answer
@@ -78,7 +76,7 @@ def _run(arguments: argparse.Namespace) -> None:
     """
     target = output_path(arguments.output, (".xlsx", ".xlsm"))
     if arguments.write_columns is not None and arguments.columns is None:
-        raise InputError("--write-columns: the workbook is read by its headings, expected it with --columns")
+        raise mph.InputError("--write-columns: the workbook is read by its headings, expected it with --columns")
     map_path = None if arguments.write_columns is None else output_path(arguments.write_columns, (".toml",))
     with recorded_warnings() as messages:
         system = _changed(read_any(arguments), arguments)
@@ -98,25 +96,25 @@ def _changed(system: Scanner, arguments: argparse.Namespace) -> Scanner:
         given = getattr(arguments, name)
         if given is not None:
             if name not in system.columns.fields:
-                raise InputError(f"--{_option(name)}: is no column of a {system.kind} scanner")
+                raise mph.InputError(f"--{_option(name)}: is no column of a {system.kind} scanner")
             value = np.multiply(given, ANGLE_UNITS["deg"]) if columns[0].kind == "angle" else given
             mask = chosen if columns[0].axis is None else chosen[:, None]
             changes[name] = np.where(mask, value, getattr(system, name))
-    if isinstance(system, PinholeSystem):
+    if isinstance(system, mph.PinholeSystem):
         system = _with_lengths(system, arguments, chosen, changes)
     else:
         system = _moved(system, arguments, chosen, changes)
     if arguments.remove is not None:
         removed = np.isin(system.numbers, chosen_modules(system, arguments.remove, "--remove").numbers)
         if removed.all():
-            raise InputError(f"--remove {arguments.remove!r}: are all modules, expected at least one to be left")
+            raise mph.InputError(f"--remove {arguments.remove!r}: are all modules, expected at least one to be left")
         system = system[~removed]
     if arguments.order is None:
         return system
     index = {str(number): i for i, number in enumerate(system.numbers)}
     wanted = [part.strip() for part in arguments.order.split(",")]
     if sorted(wanted) != sorted(index):
-        raise InputError(f"--order: expected each of the modules' {len(index)} numbers once, got {len(wanted)}")
+        raise mph.InputError(f"--order: expected each of the modules' {len(index)} numbers once, got {len(wanted)}")
     return system[np.array([index[number] for number in wanted])]
 
 
@@ -125,7 +123,7 @@ def _moved(
 ) -> Scanner:
     """Modules of any kind with these changes, the chosen ones shifted."""
     if arguments.length is not None:
-        raise InputError("--length: only pinhole modules have a collimator")
+        raise mph.InputError("--length: only pinhole modules have a collimator")
     if arguments.move is not None:
         shifted = affine_matrix(np.eye(3), arguments.move) @ system.poses()
         for name, values in system.attributes_at(shifted).items():
@@ -134,12 +132,12 @@ def _moved(
 
 
 def _with_lengths(
-    system: PinholeSystem, arguments: argparse.Namespace, chosen: NDArray[np.bool_], changes: dict[str, Any]
-) -> PinholeSystem:
+    system: mph.PinholeSystem, arguments: argparse.Namespace, chosen: NDArray[np.bool_], changes: dict[str, Any]
+) -> mph.PinholeSystem:
     """Pinhole modules with these changes, and collimator lengths that follow or are given."""
     if arguments.move is not None:
         changes["centers"] = np.where(chosen[:, None], system.centers + arguments.move, system.centers)
-    length = PinholeSystem.columns["l"]
+    length = mph.PinholeSystem.columns["l"]
     follows = length.is_default(system)
     if arguments.length is not None:
         follows = np.where(chosen, arguments.length == "design", follows)
@@ -147,7 +145,7 @@ def _with_lengths(
         try:
             changes["collimator_length"] = np.where(chosen, float(arguments.length), system.collimator_length)
         except ValueError:
-            raise InputError(f"--length {arguments.length!r}: expected millimetres or 'design'") from None
+            raise mph.InputError(f"--length {arguments.length!r}: expected millimetres or 'design'") from None
     system = system.replace(**changes)
     # Lengths that are the formula's to 1e-9 stay as they are, to the last digit.
     others = follows & ~length.is_default(system)

@@ -7,9 +7,7 @@ import numpy as np
 
 from .... import core as mph
 from ...arrays import table_rows
-from ...errors import InputError
 from ...geometry.scanner import Scanner
-from ...geometry.system import PinholeSystem
 from ..options import output_path, print_answer
 from ..scanners import chosen_modules, kind_of, read_any
 from .arguments import add_action
@@ -33,7 +31,7 @@ def _run(arguments: argparse.Namespace) -> None:
         _write_columns(arguments)
         return
     system = read_any(arguments)
-    if not isinstance(system, PinholeSystem):
+    if not isinstance(system, mph.PinholeSystem):
         _show_columns(arguments, system)
         return
     chosen = set(chosen_modules(system, arguments.modules).numbers.tolist())
@@ -75,7 +73,7 @@ def _show_columns(arguments: argparse.Namespace, system: Scanner) -> None:
 def _write_columns(arguments: argparse.Namespace) -> None:
     path = output_path(arguments.write_columns, (".toml",))
     if arguments.columns is not None:
-        raise InputError("--write-columns writes what the headings say, expected it without --columns")
+        raise mph.InputError("--write-columns writes what the headings say, expected it without --columns")
     draft = mph.draft_column_map(arguments.workbook, kind_of(arguments))
     draft.write(path)
     then = f"check it, then: geometry show {arguments.workbook} --columns {path}"
@@ -84,7 +82,7 @@ def _write_columns(arguments: argparse.Namespace) -> None:
     print_answer(arguments, {"path": str(path), "open": draft.questions}, lines, notes)
 
 
-def _rows(system: PinholeSystem) -> list[dict[str, Any]]:
+def _rows(system: mph.PinholeSystem) -> list[dict[str, Any]]:
     positions = dict(zip("xyz", system.centers.T, strict=True))
     columns = {"number": system.numbers, "ring": system.rings() + 1, **positions}
     declared = system.columns
@@ -92,7 +90,7 @@ def _rows(system: PinholeSystem) -> list[dict[str, Any]]:
     return table_rows({**columns, **{name: declared[name].of(system) for name in names}})
 
 
-def _shown(system: PinholeSystem) -> dict[str, list[str]]:
+def _shown(system: mph.PinholeSystem) -> dict[str, list[str]]:
     """The texts of the columns that modules may have, and that some have: column -> a text for each module."""
     declared = system.columns
     more = [declared[name] for name in declared.optional if name != "l" and not declared[name].is_unused(system)]

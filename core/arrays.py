@@ -5,6 +5,7 @@ import sys
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike as ArrayLike
 from numpy.typing import NDArray
 
 from .errors import InputError
@@ -12,6 +13,10 @@ from .validation import batch_shape, real_array, real_numbers, require_finite, s
 
 Floats = NDArray[np.float64]
 Floats32 = NDArray[np.float32]
+Bools = NDArray[np.bool_]
+Indexes = NDArray[np.intp]
+Integers = NDArray[np.int64]
+Bytes = NDArray[np.uint8]
 Array = NDArray[Any]  # of any type
 ArrayOrTensor = Any  # a numpy array or a torch tensor; torch may not be installed
 

@@ -11,9 +11,8 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..arrays import Floats
+from ..arrays import Bools, Floats, Indexes
 from ..geometry.frames import cross_matrix, module_frames, rotations
 from ..geometry.system import PinholeSystem
 from .solvers import scipy_module
@@ -60,8 +59,8 @@ class Bundle:
     sd: Floats  # (P,), mm and rad: how far a module's numbers may be from the nominal ones
     places: Floats  # (K, M, 2), mm on the crystals: where the points are seen
     whitening: Floats  # (K, M, 2, 2): makes their errors ones of variance 1
-    used: NDArray[np.bool_]  # (K, M)
-    pairs: NDArray[np.intp]  # (D, 2): points whose distance is known
+    used: Bools  # (K, M)
+    pairs: Indexes  # (D, 2): points whose distance is known
     distances: Floats  # (D,), mm
     distance_sd: float
 
@@ -167,7 +166,7 @@ class Bundle:
         return of_modules[np.arange(n_m), :, np.arange(n_m)], leverages
 
 
-def _placed(values: Floats, first: NDArray[np.intp], n: int) -> Any:
+def _placed(values: Floats, first: Indexes, n: int) -> Any:
     """A sparse matrix (N R, n) of blocks `values` (N, R, C), one below the other, which begin at columns `first` (N,)."""
     rows, columns = np.arange(values[..., 0].size), first[:, None, None] + np.arange(values.shape[2])
     index = np.repeat(rows, values.shape[2]), np.broadcast_to(columns, values.shape).ravel()

@@ -7,9 +7,8 @@ from collections.abc import Collection
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
-from ..arrays import Floats
+from ..arrays import ArrayLike, Bools, Floats, Indexes
 from ..errors import InputError, several
 from ..geometry.system import PinholeSystem
 from ..geometry.views import Views
@@ -85,7 +84,7 @@ class Calibration:
     chi_square: Floats
     misfit: Floats
     misfitting: tuple[int, ...]
-    used: NDArray[np.bool_]
+    used: Bools
     names: tuple[str, ...]
     spread: Floats
     told: Floats
@@ -230,7 +229,7 @@ def _check_model(model: Emission, system: PinholeSystem, views: Views) -> None:
             raise InputError(f"calibrate: model: takes no {name}: a spot is a hole's shadow on the crystal's front")
 
 
-def _known_distances(distances: ArrayLike | None, n_k: int) -> tuple[NDArray[np.intp], Floats]:
+def _known_distances(distances: ArrayLike | None, n_k: int) -> tuple[Indexes, Floats]:
     """Pairs (D, 2) of points whose distances (D,), mm, are known."""
     table = np.full((n_k, n_k), np.nan) if distances is None else np.array(distances, np.float64)
     if table.shape != (n_k, n_k):
@@ -245,7 +244,7 @@ def _known_distances(distances: ArrayLike | None, n_k: int) -> tuple[NDArray[np.
     return pairs, lengths
 
 
-def _require_spots(seen: NDArray[np.bool_], modules: int) -> None:
+def _require_spots(seen: Bools, modules: int) -> None:
     for k in np.flatnonzero(seen.sum(axis=1) < modules)[:1]:
         found = f"acquisition {k + 1}: {seen[k].sum()} modules see a point source"
         raise InputError(f"calibrate: images: {found}, expected {modules} or more")
@@ -255,7 +254,7 @@ def _require_spots(seen: NDArray[np.bool_], modules: int) -> None:
         )
 
 
-def _triangulated(system: PinholeSystem, places: Floats, seen: NDArray[np.bool_]) -> Floats:
+def _triangulated(system: PinholeSystem, places: Floats, seen: Bools) -> Floats:
     """Points (K, 3) nearest to the nominal rays; those far from the others count little."""
     local = np.concatenate([places, np.broadcast_to(system.collimator_length[:, None], (*seen.shape, 1))], axis=2)
     rays = np.einsum("mij,kmi->kmj", system.frames(), local / np.linalg.norm(local, axis=2, keepdims=True))
@@ -324,7 +323,7 @@ def _result(views: Views, bundle: Bundle, x: Floats, spots: Spots, lattice: Latt
     )  # fmt: skip
 
 
-def _improbable(per_freedom: Floats, freedom: Floats) -> NDArray[np.bool_]:
+def _improbable(per_freedom: Floats, freedom: Floats) -> Bools:
     """Which modules' sums of squares are too large, beside those of the others, to be chance."""
     usual = max(1.0, float(np.nanmedian(per_freedom))) if np.isfinite(per_freedom).any() else 1.0
     values = np.nan_to_num(per_freedom) / usual

@@ -12,9 +12,8 @@ from itertools import pairwise
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..arrays import Floats
+from ..arrays import Floats, Indexes
 from ..geometry.checks import check_geometry
 from ..geometry.collimator import Construction, edge_slope
 from ..geometry.system import PinholeSystem
@@ -57,11 +56,11 @@ class Constraint:
         names = [f"module {system.numbers[own[0]]}" if len(own) == 1 else "all modules" for own in members]
         return [f"{name}: {self.words.format(x)}" for name, x in zip(names, short, strict=True) if x > 1e-6]
 
-    def _members(self, system: PinholeSystem) -> NDArray[np.intp]:
+    def _members(self, system: PinholeSystem) -> Indexes:
         """The modules (N, 1), or pairs of them (N, 2), that are looked at."""
         return np.arange(len(system))[:, None]
 
-    def _short(self, rows: Floats, members: NDArray[np.intp], system: PinholeSystem) -> Floats:
+    def _short(self, rows: Floats, members: Indexes, system: PinholeSystem) -> Floats:
         """What is missing (N, S), mm, of the modules' rows (N, 15), or those of pairs (N, 30)."""
         raise NotImplementedError
 
@@ -69,7 +68,7 @@ class Constraint:
 class FieldOfView(Constraint):
     """Every module sees its ROI whole: on all four sides as `PinholeSystem.roi_radius_seen`."""
 
-    def _short(self, rows: Floats, members: NDArray[np.intp], system: PinholeSystem) -> Floats:
+    def _short(self, rows: Floats, members: Indexes, system: PinholeSystem) -> Floats:
         centers, frames, d, l, side = parts_of(rows)
         u, v, h = -np.einsum("nij,nj->in", frames, centers)
         seen = (h * (side - d) - d * l - 2 * l * np.stack([u, -u, v, -v])) / np.hypot(2 * l, side - d)
@@ -82,14 +81,14 @@ class Overlap(Constraint):
     A module's hull is that of its collimator and its crystal together, which is a little more than both.
     """
 
-    def _members(self, system: PinholeSystem) -> NDArray[np.intp]:
+    def _members(self, system: PinholeSystem) -> Indexes:
         corners = _corners(rows_of(system), system.detector_thickness)
         middles = corners.mean(axis=1)
         radii = np.linalg.norm(corners - middles[:, None], axis=2).max(axis=1)
         apart = np.linalg.norm(middles[:, None] - middles, axis=2) - radii[:, None] - radii
         return np.argwhere(np.triu(apart < self.margin + 1.0, 1))
 
-    def _short(self, rows: Floats, members: NDArray[np.intp], system: PinholeSystem) -> Floats:
+    def _short(self, rows: Floats, members: Indexes, system: PinholeSystem) -> Floats:
         both = [(rows[:, 15 * i : 15 * i + 15], system.detector_thickness[members[:, i]]) for i in (0, 1)]
         axes = np.concatenate([_normals(*one) for one in both], axis=1)
         first, second = (axes @ _corners(*one).transpose(0, 2, 1) for one in both)  # (N, axes, corners)
@@ -101,7 +100,7 @@ class Overlap(Constraint):
 class Sight(Constraint):
     """No module stands between another one's pinhole and its ROI: in the cone around the ROI, or in the ROI."""
 
-    def _members(self, system: PinholeSystem) -> NDArray[np.intp]:
+    def _members(self, system: PinholeSystem) -> Indexes:
         rows, found = rows_of(system), []
         for i in range(len(system)):  # not all pairs' outlines at once
             pairs = np.array([(i, j) for j in range(len(system)) if j != i], np.intp).reshape(-1, 2)
@@ -109,7 +108,7 @@ class Sight(Constraint):
             found.append(pairs[near > -self.margin - 1.0])
         return np.concatenate(found)
 
-    def _short(self, rows: Floats, members: NDArray[np.intp], system: PinholeSystem) -> Floats:
+    def _short(self, rows: Floats, members: Indexes, system: PinholeSystem) -> Floats:
         pinhole, radius = rows[:, None, :3], system.roi_radius[members[:, :1]]
         points = _outline(rows[:, 15:], system.detector_thickness[members[:, 1]])
         b = np.linalg.norm(pinhole, axis=2)
@@ -130,7 +129,7 @@ class Clearance(Constraint):
 
     words = "reaches {:.3g} mm into the bore or the body"
 
-    def _short(self, rows: Floats, members: NDArray[np.intp], system: PinholeSystem) -> Floats:
+    def _short(self, rows: Floats, members: Indexes, system: PinholeSystem) -> Floats:
         points = _outline(rows, system.detector_thickness[members[:, 0]])
         axes, middle = np.broadcast_to(self.limit[:2], 2), self.limit[2:] or (0.0, 0.0)
         return axes.min() * (1 - np.hypot(*((points[..., :2] - middle) / axes).transpose(2, 0, 1)))
@@ -141,7 +140,7 @@ class SmallestHole(Constraint):
 
     words = "its hole is {:.3g} mm too narrow"
 
-    def _short(self, rows: Floats, members: NDArray[np.intp], system: PinholeSystem) -> Floats:
+    def _short(self, rows: Floats, members: Indexes, system: PinholeSystem) -> Floats:
         return self.limit - parts_of(rows)[2][:, None]
 
 
@@ -150,10 +149,10 @@ class CrystalArea(Constraint):
 
     words = "the side of a square as large as their crystals is {:.3g} mm too long"
 
-    def _members(self, system: PinholeSystem) -> NDArray[np.intp]:
+    def _members(self, system: PinholeSystem) -> Indexes:
         return np.arange(len(system))[None]
 
-    def _short(self, rows: Floats, members: NDArray[np.intp], system: PinholeSystem) -> Floats:
+    def _short(self, rows: Floats, members: Indexes, system: PinholeSystem) -> Floats:
         sides = rows.reshape(len(rows), -1, 15)[..., 14]
         return np.sqrt((sides**2).sum(axis=1, keepdims=True)) - self.limit
 
@@ -164,7 +163,7 @@ def faults(system: PinholeSystem, constraints: Sequence[Constraint]) -> tuple[st
     return (*check_geometry(system).messages(), *own)
 
 
-def _joined(rows: Floats, members: NDArray[np.intp]) -> Floats:
+def _joined(rows: Floats, members: Indexes) -> Floats:
     """The rows (N, 15) of modules, or (N, 30) of pairs."""
     return rows[members].reshape(len(members), members.shape[1] * rows.shape[1])
 

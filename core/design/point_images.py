@@ -13,9 +13,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from ..arrays import Floats
+from ..arrays import ArrayLike, Floats
 from ..geometry.views import Views
 from ..physics.crystal import gaussian_blur
 from ..physics.performance import sensitivity

@@ -10,9 +10,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..arrays import Array, Floats
+from ..arrays import Array, Bools, Floats
 from ..progress import Progress, tell
 from .point_images import Lattice, disc_shares
 from .solvers import scipy_module
@@ -27,7 +26,7 @@ _FLOOR = 1e-5  # least background of a pixel, as a share of one that the shadow 
 class Spots:
     """The spots of K acquisitions in M modules, by `find_spots`."""
 
-    seen: NDArray[np.bool_]  # (K, M): where there is one, whole
+    seen: Bools  # (K, M): where there is one, whole
     pixels: Floats  # (K, M, 2): column and row of their middles
     covariance: Floats  # (K, M, 2, 2), px^2
     radii: Floats  # (K, M), of the shadows, mm

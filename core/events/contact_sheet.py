@@ -5,9 +5,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..arrays import Floats, Floats32
+from ..arrays import Bytes, Floats, Floats32, Integers
 from ..errors import InputError
 from ..figures.page import LARGEST, Page, box
 from ..figures.parts import number
@@ -43,7 +42,7 @@ class ShownEvent:
     model: str = ""
     unit: str = ""
     images: Floats32 | None = None  # (M, n_v, n_u); None for none
-    rings: NDArray[np.int64] | None = None  # (M,), of the images
+    rings: Integers | None = None  # (M,), of the images
     radon: Floats32 | None = None  # (n, n_v, n_u); None for none
     radon_degrees: float = 180.0
 
@@ -110,7 +109,7 @@ def drawn(events: Sequence[ShownEvent], title: str = "", lines: str = "") -> Pag
 class _Panel:
     """A picture with words above and below."""
 
-    picture: NDArray[np.uint8]  # (h, w, 3)
+    picture: Bytes  # (h, w, 3)
     width: int  # pixels on the page
     height: int
     above: str = ""
@@ -192,7 +191,7 @@ def _share(images: Floats32) -> float:
     return next((share for share, part in parts if part >= _NEARLY_ALL * total), 1.0)
 
 
-def _mosaic(event: ShownEvent, images: Floats32, rings: NDArray[np.int64], share: float) -> _Panel:
+def _mosaic(event: ShownEvent, images: Floats32, rings: Integers, share: float) -> _Panel:
     """All images, ring by ring; a ring takes several rows where that suits the page."""
     whole = images.shape[1:]
     images = _middle(images, share)

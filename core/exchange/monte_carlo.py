@@ -12,9 +12,8 @@ from itertools import pairwise
 from typing import Any, Literal, NamedTuple, get_args, get_type_hints
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..arrays import Floats
+from ..arrays import Floats, Indexes
 from ..errors import InputError
 from ..geometry.collimator import Collimator, Construction, EdgePlace, angle_from_degrees
 from ..geometry.frames import checked_affine, euler_pose
@@ -174,7 +173,7 @@ class Setup(NamedTuple):
     """All that is simulated."""
 
     collimators: list[list[Placed]]  # kind by kind: the collimators, and the pieces of air in one of them
-    crystals: list[tuple[Placed, NDArray[np.intp]]]  # size by size: the crystals, and the indices of their modules
+    crystals: list[tuple[Placed, Indexes]]  # size by size: the crystals, and the indices of their modules
     phantom: Placed | None  # its body; None for a point
     rods: list[tuple[Placed, float]]  # sector by sector: the rods in the phantom, and their total activity, Bq
     world: float  # side of the surrounding cube of air, mm
@@ -215,8 +214,8 @@ def build_setup(system: PinholeSystem, simulation: Simulation) -> Setup:
     return Setup(collimators, crystals, phantom, rods, math.ceil(2 * (reach + _SPACE)))
 
 
-def _alike(*lengths: Floats) -> list[NDArray[np.intp]]:
-    """Indices of the modules with equal lengths, kind by kind, from the shortest."""
+def _alike(*lengths: Floats) -> list[Indexes]:
+    """Indexes of the modules with equal lengths, kind by kind, from the shortest."""
     _, kind = np.unique(np.round(np.stack(lengths, axis=1) / _SAME), axis=0, return_inverse=True)
     kind = kind.reshape(-1)
     return [np.flatnonzero(kind == i) for i in range(kind.max() + 1)]

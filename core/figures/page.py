@@ -7,9 +7,8 @@ from itertools import pairwise
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
-from ..arrays import Floats, Floats32
+from ..arrays import Array, ArrayLike, Bytes, Floats, Floats32
 from ..errors import InputError
 from ..files import AnyPath, require_ending, write_bytes
 from ..runs import letters
@@ -47,11 +46,11 @@ class Page:
         self._marks = [f'<rect width="{width}" height="{height}" fill="{paper}"/>']
 
     @property
-    def picture(self) -> NDArray[np.uint8]:
+    def picture(self) -> Bytes:
         """Colours (height, width, 3)."""
         return np.rint(self._pixels).clip(0, 255).astype(np.uint8)
 
-    def image(self, picture: NDArray[np.uint8], left: int, top: int, width: int, height: int) -> None:
+    def image(self, picture: Bytes, left: int, top: int, width: int, height: int) -> None:
         """Put colours (h, w, 3) into a rectangle; enlarged pixels stay squares."""
         rows, columns = max(1, height), max(1, width)
         self._pixels[top : top + rows, left : left + columns] = (
@@ -119,7 +118,7 @@ class Page:
         head = f'<svg xmlns="http://www.w3.org/2000/svg" {size} font-family="{_FONTS}" xml:space="preserve">'
         write_bytes(path, "\n".join([head, *self._marks, "</svg>\n"]).encode())
 
-    def _around(self, points: Floats, margin: float) -> tuple[int, int, NDArray, NDArray]:
+    def _around(self, points: Floats, margin: float) -> tuple[int, int, Array, Array]:
         """The part of the page that holds points: its first row and column, and its pixels' x and y."""
         low = np.maximum(np.floor(points.min(axis=0) - margin), 0).astype(int)
         high = np.minimum(np.ceil(points.max(axis=0) + margin), [self.width, self.height]).astype(int)
@@ -127,7 +126,7 @@ class Page:
         across, down = np.meshgrid(x, y)
         return int(low[1]), int(low[0]), across, down
 
-    def _covered_by_lines(self, lines: Sequence[Sequence[Point]], half: float) -> tuple[int, int, NDArray]:
+    def _covered_by_lines(self, lines: Sequence[Sequence[Point]], half: float) -> tuple[int, int, Array]:
         """How much of each pixel lines of half a width cover."""
         every = np.array([point for line in lines for point in line], float).reshape(-1, 2)
         top, left, x, y = self._around(every, half + 1.0)
@@ -143,7 +142,7 @@ class Page:
             covered[part] = np.maximum(covered[part], np.clip(half + 0.5 - away, 0.0, min(1.0, 2 * half)))
         return top, left, covered
 
-    def _ink(self, covered: tuple[int, int, NDArray], color: str) -> None:
+    def _ink(self, covered: tuple[int, int, Array], color: str) -> None:
         """Paint where `covered` (first row, first column, shares of pixels); what lies beside the page is left out."""
         top, left, share = covered
         share = share[max(-top, 0) :, max(-left, 0) :]

@@ -5,9 +5,8 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from ..arrays import Floats32
+from ..arrays import ArrayLike, Floats32
 from ..runs import letters
 from ..runs.display import DARK_DIVERGING, Display
 from ..volumes.resampling import resample

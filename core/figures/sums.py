@@ -1,9 +1,8 @@
 """Orthogonal sums of a volume: its line integrals along x, y and z."""
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..arrays import Floats, Floats32
+from ..arrays import Bytes, Floats, Floats32
 from ..runs.display import Display
 from ..volumes.volume import LINE_INTEGRALS, Volume, require_quantity
 from .page import Page
@@ -84,7 +83,7 @@ def _numbers(values: object) -> str:
     return ", ".join(number(round(float(value), 3) + 0.0) for value in np.asarray(values))
 
 
-def _panel(page: Page, panel: int, picture: NDArray[np.uint8], box: Floats, frame: _Frame) -> None:
+def _panel(page: Page, panel: int, picture: Bytes, box: Floats, frame: _Frame) -> None:
     """One sum with its title and axes."""
     em, (left, top, width, height) = page.em, frame
     axis, right, up = _PANELS[panel]

@@ -14,7 +14,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import Array, Floats
+from ..arrays import Array, Bools, Floats
 from ..errors import InputError
 from ..validation import one_for_all, radians, real_array, real_numbers
 
@@ -46,9 +46,9 @@ class Column:
     kind: Kind = "length"
     derived: Callable[[Any], Floats] | None = None
     """A function of the scanner that gives its values (M,), mm or rad, of a column that follows from the others."""
-    undefined: Callable[[Values], NDArray[np.bool_]] = lambda needed: np.zeros(len(next(iter(needed.values()))), bool)
+    undefined: Callable[[Values], Bools] = lambda needed: np.zeros(len(next(iter(needed.values()))), bool)
     """A function of the needed columns: where (M,) the formula divides by 0, and any value is right."""
-    unlike_formula: Callable[[Any], NDArray[np.bool_]] = lambda scanner: np.zeros(len(scanner), bool)
+    unlike_formula: Callable[[Any], Bools] = lambda scanner: np.zeros(len(scanner), bool)
     """A function of the scanner: where (M,) the formula does not give the value of a derived column."""
     headings: tuple[str, ...] = ()
     """The texts that head it. Texts of one letter are case-sensitive, others are not."""
@@ -144,7 +144,7 @@ class Column:
         """The values (M,) of an optional one where its cells are blank, by the `needed` ones, mm."""
         return self.blank(needed) if callable(self.blank) else np.full(len(next(iter(needed.values()))), self.blank)
 
-    def is_default(self, scanner: Any) -> NDArray[np.bool_]:
+    def is_default(self, scanner: Any) -> Bools:
         """Which modules (M,) have the value of a blank cell."""
         return self.same(self.default(scanner.columns.needed_values(scanner)), self.of(scanner))
 
@@ -152,11 +152,11 @@ class Column:
         """Whether all its cells may be blank: it is optional, has no formula, and no module has another value."""
         return self.has_constant_blank and bool(self.is_default(scanner).all())
 
-    def follows_formula(self, scanner: Any) -> NDArray[np.bool_]:
+    def follows_formula(self, scanner: Any) -> Bools:
         """Which modules (M,) have the value that its formula gives, if it has one."""
         return self.is_default(scanner) if self.derived is None else ~self.unlike_formula(scanner)
 
-    def same(self, one: Array, other: Array, within: float = AGREEING) -> NDArray[np.bool_]:
+    def same(self, one: Array, other: Array, within: float = AGREEING) -> Bools:
         """Where values (M,) are equal: numbers to `within`, relative, texts letter by letter."""
         if self.is_text:
             return np.asarray(one, np.str_) == other

@@ -3,9 +3,9 @@
 import math
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from ..arrays import Floats
+from ..arrays import ArrayLike, Floats
 from ..errors import InputError
 from ..validation import radians, real_array
 

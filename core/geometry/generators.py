@@ -8,9 +8,8 @@ from collections.abc import Sequence
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from ..arrays import Floats
+from ..arrays import ArrayLike, Floats
 from ..errors import InputError
 from ..validation import lengths, positive, radians, real_array, whole_number
 from .design_formulas import collimator_length as designed_length

@@ -6,9 +6,8 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from ..arrays import Floats
+from ..arrays import ArrayLike, Floats
 from ..validation import freeze, lengths, real_array, whole_shape
 from .frames import affine_matrix, checked_affine, moved
 

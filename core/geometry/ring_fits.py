@@ -5,9 +5,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..arrays import Floats
+from ..arrays import Floats, Indexes, Integers
 from ..errors import InputError
 from ..validation import instance
 from .ellipse import Ellipse, fit_ellipse
@@ -26,7 +25,7 @@ class RingFit:
     Lengths are in mm and angles in rad, as `ellipse_rings` takes them.
     """
 
-    numbers: NDArray[np.int64]  # (M,), in their order along the ring; an open ring begins at one end
+    numbers: Integers  # (M,), in their order along the ring; an open ring begins at one end
     semi_axes: Floats
     center: Floats
     rotation: float  # at most 45 degrees either way
@@ -63,8 +62,8 @@ def fit_rings(system: PinholeSystem) -> list[RingFit]:
     return [_fit(system, which) for which in _rings(system)]
 
 
-def ring_order(system: PinholeSystem) -> NDArray[np.intp]:
-    """Indices (M,) of the modules, ring by ring along +z, and along each ring in the direction that most already follow.
+def ring_order(system: PinholeSystem) -> Indexes:
+    """Indexes (M,) of the modules, ring by ring along +z, and along each ring in the direction that most already follow.
 
     An open ring begins at its gap, a closed one with the module that comes first in the system.
     ``system[ring_order(system)]`` is the system in that order; modules keep their numbers.
@@ -75,13 +74,13 @@ def ring_order(system: PinholeSystem) -> NDArray[np.intp]:
     return np.concatenate([_in_order(system, which, clockwise)[1] for which in rings])
 
 
-def _rings(system: PinholeSystem) -> list[NDArray[np.intp]]:
-    """Indices of the modules of each ring."""
+def _rings(system: PinholeSystem) -> list[Indexes]:
+    """Indexes of the modules of each ring."""
     ring_of = system.rings()
     return [np.flatnonzero(ring_of == ring) for ring in range(ring_of.max() + 1)]
 
 
-def _fit(system: PinholeSystem, which: NDArray[np.intp]) -> RingFit:
+def _fit(system: PinholeSystem, which: Indexes) -> RingFit:
     azimuths, which = _in_order(system, which, _run_clockwise(system, [which]))
     places, z = system.centers[which, :2], system.centers[which, 2]
     ellipse = fit_ellipse(places)
@@ -100,14 +99,14 @@ def _fit(system: PinholeSystem, which: NDArray[np.intp]) -> RingFit:
     return RingFit(system.numbers[which], *curve, azimuths, z, best, off_curve, deviations[best])
 
 
-def _run_clockwise(system: PinholeSystem, rings: Sequence[NDArray[np.intp]]) -> bool:
+def _run_clockwise(system: PinholeSystem, rings: Sequence[Indexes]) -> bool:
     """Whether azimuths decrease along most of the rings."""
     orders = [np.argsort(np.arctan2(*system.centers[which, 1::-1].T), kind="stable") for which in rings]
     falls = sum(np.count_nonzero(np.diff(order) < 0) for order in orders)
     return bool(2 * falls > sum(len(order) for order in orders))
 
 
-def _in_order(system: PinholeSystem, which: NDArray[np.intp], clockwise: bool) -> tuple[Floats, NDArray[np.intp]]:
+def _in_order(system: PinholeSystem, which: Indexes, clockwise: bool) -> tuple[Floats, Indexes]:
     """Azimuths without jumps of the modules `which`, and these modules, in their order along the ring."""
     azimuths = np.arctan2(*system.centers[which, 1::-1].T)
     order = np.argsort(azimuths, kind="stable")

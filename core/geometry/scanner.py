@@ -15,9 +15,8 @@ from inspect import signature
 from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
-from ..arrays import Array, Floats
+from ..arrays import Array, ArrayLike, Bools, Floats, Indexes, Integers
 from ..errors import InputError
 from ..system_source import SystemSource
 from ..validation import freeze, real_array
@@ -53,7 +52,7 @@ class Scanner(ABC):
     takes: ClassVar[tuple[str, ...]] = ("activity", "mu")
     """What of a body its images can be of: quantities of volumes."""
     columns: ClassVar[ColumnTable]
-    numbers: NDArray[np.int64]
+    numbers: Integers
     source: SystemSource | None
     more: Mapping[str, Any]
 
@@ -148,7 +147,7 @@ class Scanner(ABC):
         """
         yield from ()
 
-    def _refuse(self, bad: NDArray[np.bool_], message: str) -> None:
+    def _refuse(self, bad: Bools, message: str) -> None:
         """Refuse the first module that is `bad`; `message` is a template of its attributes."""
         for i in first(bad):
             own = {name: np.ravel(getattr(self, name))[i] for name in re.findall(r"{(\w+)", message)}
@@ -211,7 +210,7 @@ class Scanner(ABC):
         """
         raise InputError(f"there are no checks of a scanner of the kind {self.kind}")
 
-    def rings(self) -> NDArray[np.int64]:
+    def rings(self) -> Integers:
         """Index (M,) of each module's group, from 0; all are one by default."""
         return np.zeros(len(self), dtype=np.int64)
 
@@ -220,25 +219,25 @@ class Scanner(ABC):
         return float(np.linalg.norm(self.poses()[:, :3, 3], axis=1).min()) / 2
 
 
-def first(bad: NDArray[np.bool_]) -> list[int]:
+def first(bad: Bools) -> list[int]:
     """The first index that is bad, if any."""
     return [int(bad.argmax())] if bad.any() else []
 
 
-def repeated(rows: Array) -> NDArray[np.bool_]:
+def repeated(rows: Array) -> Bools:
     """Which rows (M,) of an array (M, ...) stand there before."""
     if len(rows) == 1:
         return np.zeros(1, bool)
     return first_equal(rows) != np.arange(len(rows))
 
 
-def first_equal(rows: Array) -> NDArray[np.intp]:
+def first_equal(rows: Array) -> Indexes:
     """The first row (M,) of an array (M, ...) that is equal to each."""
     _, places, inverse = np.unique(rows, axis=0, return_index=True, return_inverse=True)
     return places[inverse.reshape(-1)]
 
 
-def rings_along_z(z: Floats, gaps: ArrayLike) -> NDArray[np.int64]:
+def rings_along_z(z: Floats, gaps: ArrayLike) -> Integers:
     """Index (M,) of each one's ring, from 0 along +z: those that differ less in z than the gap, one or (M,), form a ring."""
     order = np.argsort(z, kind="stable")
     rings = np.empty(len(z), np.int64)

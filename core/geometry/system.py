@@ -5,9 +5,9 @@ from dataclasses import dataclass, field
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from ..arrays import Array, Floats
+from ..arrays import Array, ArrayLike, Floats, Integers
 from ..errors import InputError, naming, warn
 from ..system_source import SystemSource
 from ..validation import lengths, positive, real_array, whole_shape
@@ -53,7 +53,7 @@ class PinholeSystem(Scanner):
     detector_side: Floats  # Ld
     detector_thickness: Floats  # Td
     roi_radius: Floats  # R
-    numbers: NDArray[np.int64] = None  # type: ignore[assignment]  # always an array once made
+    numbers: Integers = None  # type: ignore[assignment]  # always an array once made
     source: SystemSource | None = None
     tilt: Floats = 0.0  # type: ignore[assignment]  # likewise
     crystal_material: NDArray[np.str_] = ""  # type: ignore[assignment]
@@ -175,7 +175,7 @@ class PinholeSystem(Scanner):
         """R, mm, the largest one."""
         return float(self.roi_radius.max())
 
-    def rings(self) -> NDArray[np.int64]:
+    def rings(self) -> Integers:
         """Index (M,) of each module's ring, from 0 along +z. Pinholes at about the same z form a ring."""
         return rings_along_z(self.centers[:, 2], _RING_GAP * self.detector_side)
 
@@ -235,7 +235,7 @@ def chosen_modules(system: AnyScanner, text: str | None, name: str = "--modules"
     """
     if text is None:
         return system
-    wanted: list[NDArray[np.int64]] = []
+    wanted: list[Integers] = []
     lowest, highest = int(system.numbers.min()), int(system.numbers.max())
     for part in text.split(","):
         first, dash, last = part.strip().partition("-")

@@ -4,9 +4,9 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from ..arrays import ArrayOrTensor, Floats, Floats32, checked, is_tensor, to_numpy
+from ..arrays import ArrayLike, ArrayOrTensor, Floats, Floats32, checked, is_tensor, to_numpy
 from ..errors import InputError
 from ..geometry.grid import Grid
 from ..geometry.views import Views

@@ -1,9 +1,8 @@
 """Points and lines under homogeneous transforms, such as those of `Views.perspective_matrices`."""
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from ..arrays import Floats
+from ..arrays import ArrayLike, Floats
 from ..validation import real_array
 
 

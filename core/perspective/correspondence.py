@@ -10,9 +10,8 @@ R. T. Collins, "A space-sweep approach to true multi-image matching", Proc. IEEE
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
-from ..arrays import Floats
+from ..arrays import ArrayLike, Bools, Floats, Indexes
 from ..errors import InputError
 from ..memory import require
 from ..progress import Progress, tell
@@ -28,12 +27,12 @@ _ROUNDING = 1e-6
 class Correspondences:
     """Where other views have what one view has at some pixels, by `find_correspondences`. NaN where nothing was found."""
 
-    others: NDArray[np.intp]  # (V,), the views that were compared
+    others: Indexes  # (V,), the views that were compared
     depths: Floats  # (…,), mm, at which they agree best with the pixels' view
     pixels: Floats  # (V, …, 2), column and row in each of the others at this depth
     scores: Floats  # (…,), the mean normalised cross-correlation there: 1 where they agree but for scale and offset
     curves: Floats  # (…, n_k), the scores at all planes
-    views_compared: NDArray[np.intp]  # (…, n_k), in how many views the whole patch is in the image
+    views_compared: Indexes  # (…, n_k), in how many views the whole patch is in the image
 
 
 def samples_along_rays(images: ArrayLike, grid: PerspectiveGrid, pixels: ArrayLike) -> Floats:
@@ -136,8 +135,8 @@ def find_correspondences(
 
 
 def _scores(
-    images: Floats, grid: PerspectiveGrid, pixel: Floats, others: NDArray[np.intp], half_width: int
-) -> tuple[Floats, NDArray[np.intp]]:
+    images: Floats, grid: PerspectiveGrid, pixel: Floats, others: Indexes, half_width: int
+) -> tuple[Floats, Indexes]:
     """Scores of one pixel at all planes, and how many views each is of: (n_k,) each."""
     around = np.arange(-half_width, half_width + 1, dtype=np.float64)
     square = pixel + np.stack(np.meshgrid(around, around), axis=-1).reshape(-1, 2)
@@ -156,7 +155,7 @@ def _scores(
     return np.where(count > 0, total / np.maximum(count, 1), np.nan), count
 
 
-def _normalised(values: Floats, image: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+def _normalised(values: Floats, image: Floats) -> tuple[Floats, Bools]:
     """Columns less their mean, of length 1, and which can be so: those that vary by more than rounding; others are 0."""
     away = values - values.mean(axis=0)
     length = np.linalg.norm(away, axis=0)

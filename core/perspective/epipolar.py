@@ -12,9 +12,8 @@ chapter 9.
 import math
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from ..arrays import Floats
+from ..arrays import ArrayLike, Floats
 from ..errors import InputError
 from ..geometry.frames import cross_matrix
 from ..geometry.views import Views

@@ -5,9 +5,8 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from ..arrays import ArrayOrTensor, Floats, cast_like, checked
+from ..arrays import ArrayLike, ArrayOrTensor, Floats, cast_like, checked
 from ..errors import InputError
 from ..geometry.grid import Grid
 from ..geometry.views import Views

@@ -11,9 +11,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
-from ..arrays import Floats
+from ..arrays import ArrayLike, Floats, Indexes
 from ..errors import InputError
 from ..geometry.views import Views
 from ..validation import freeze, real_array
@@ -33,7 +32,7 @@ _LEAST_ANGLE = 1e-7
 class MarkerFit:
     """A marker's place by `fit_marker`, and how its images fit. Arrays of N are in the order of `modules`."""
 
-    modules: NDArray[np.intp]  # (N,), the views' indices, from 0
+    modules: Indexes  # (N,), the views' indices, from 0
     point: Floats  # (3,), the most likely place, world mm
     covariance: Floats  # (3, 3), mm^2, of the place: the inverse of the Fisher information
     residuals: Floats  # (N, 2), the given pixels less those of the place: columns and rows
@@ -133,7 +132,7 @@ def fit_marker(views: Views, modules: Indices, pixels: ArrayLike, sigma: ArrayLi
 
 def _fitted(
     views: Views, modules: Indices, pixels: ArrayLike, sigma: ArrayLike
-) -> tuple[Floats, NDArray[np.intp], Floats, Floats, Floats]:
+) -> tuple[Floats, Indexes, Floats, Floats, Floats]:
     """Place, views, residuals (N, 2), matrices (N, 2, 2) that make their variance 1, and slopes (N, 2, 3) after these."""
     index = view_indices(views, modules, "triangulation")
     if index.ndim != 1 or len(index) < 2:
@@ -196,7 +195,7 @@ def _residuals(
     return np.einsum("nij,nj->ni", whitening, pixels - seen), whitening @ slopes
 
 
-def _nearest_to_rays(views: Views, index: NDArray[np.intp], pixels: Floats) -> Floats:
+def _nearest_to_rays(views: Views, index: Indexes, pixels: Floats) -> Floats:
     """The point with the smallest sum of squared distances from the pixels' rays."""
     starts, directions = rays_by_depth(views, index, pixels)
     directions = directions / np.linalg.norm(directions, axis=1, keepdims=True)

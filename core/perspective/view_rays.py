@@ -4,9 +4,9 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from ..arrays import Array, Floats
+from ..arrays import Array, ArrayLike, Floats, Indexes
 from ..errors import InputError
 from ..geometry.frames import cross_matrix
 from ..geometry.views import Views
@@ -15,7 +15,7 @@ from ..validation import instance, real_array
 Indices = int | Sequence[int] | NDArray[np.integer[Any]]
 
 
-def view_indices(views: Views, which: Indices, name: str) -> NDArray[np.intp]:
+def view_indices(views: Views, which: Indices, name: str) -> Indexes:
     """Indices of views as an array of indices from 0, or `InputError`; negative ones count from the end."""
     instance(views, Views, f"{name}: views")
     index = np.asarray(which)
@@ -107,7 +107,7 @@ def points_at_depths(views: Views, m: int, pixels: ArrayLike, depths: ArrayLike)
     return np.asarray(starts + steps * per_depth)
 
 
-def rays_by_depth(views: Views, m: int | NDArray[np.intp], pixels: Floats) -> tuple[Floats, Floats]:
+def rays_by_depth(views: Views, m: int | Indexes, pixels: Floats) -> tuple[Floats, Floats]:
     """For pixels (…, 2): where their rays begin, at depth 0, and how far they lead per mm of depth: (…, 3) each.
 
     m is the view of all pixels, or an array that broadcasts with them.
@@ -122,7 +122,7 @@ def rays_by_depth(views: Views, m: int | NDArray[np.intp], pixels: Floats) -> tu
     return sources, on_detector / np.einsum("...i,...i->...", on_detector, normal)[..., None]
 
 
-def lines_of_pixels(views: Views, m: NDArray[np.intp], origin: Floats) -> tuple[Floats, Floats]:
+def lines_of_pixels(views: Views, m: Indexes, origin: Floats) -> tuple[Floats, Floats]:
     """Matrices (…, 3, 3) from (column, row, 1) to the direction and the moment about `origin` (…, 3) of a pixel's ray.
 
     The direction is, in mm, the vector from the source to the pixel's place on the detector, and in parallel views, for all

@@ -15,14 +15,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import Array, Floats, Floats32
+from ..arrays import Array, Bools, Floats, Floats32, Integers
 from ..geometry.grid import Grid
 from ..memory import cores, require
 from ..progress import Progress, tell
 from .shapes import Shape
 
 Points = Floats
-Indices = NDArray[np.int64]
+Indices = Integers
 
 # Points of one call of a shape's `distance`: few enough that its temporaries stay in the processor's cache.
 _BLOCK = 1 << 15
@@ -63,7 +63,7 @@ class Layer:
         """mm^3 in the world."""
         return self.shape.volume * abs(float(np.linalg.det(self.pose[:3, :3])))
 
-    def contains(self, points: Points) -> NDArray[np.bool_]:
+    def contains(self, points: Points) -> Bools:
         """Which of the world `points` (3, N), mm, lie inside."""
         return self.shape.distance(_moved(self.from_world, points)) < 0
 
@@ -322,7 +322,7 @@ class _Sampled:
         distance, half = self.layer.shape.distance(self._centers(index, level)), self._half_diagonals[level]
         return np.subtract(distance < -half, distance > half, dtype=np.int8)
 
-    def inside(self, index: Indices) -> NDArray[np.bool_]:
+    def inside(self, index: Indices) -> Bools:
         """Which points of the last level's cells (3, n) are inside, (n, samples)."""
         # The factors are primes that seldom divide the number of stretches: neighbours along any axis take different ones.
         stretch = (np.array([1, 53, 211]) @ index) % self._offsets.shape[1]

@@ -8,9 +8,9 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from ..arrays import Floats, Floats32
+from ..arrays import ArrayLike, Floats, Floats32
 from ..errors import InputError, naming, warn
 from ..geometry.frames import checked_affine, moved
 from ..geometry.grid import Grid

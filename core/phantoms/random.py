@@ -1,9 +1,8 @@
 """Random poses, for training sets."""
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from ..arrays import Floats
+from ..arrays import ArrayLike, Floats
 from ..errors import InputError
 from ..geometry.frames import euler_pose
 from ..validation import real_array, seed_number

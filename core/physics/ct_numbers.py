@@ -8,9 +8,8 @@ Nucl. Sci. 50 (2003) 1510-1515).
 import math
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from ..arrays import ArrayOrTensor, Floats, checked, is_tensor, namespace
+from ..arrays import ArrayLike, ArrayOrTensor, Floats, checked, is_tensor, namespace
 from ..errors import InputError, warn
 from ..memory import require
 from ..validation import freeze, instance, real_array

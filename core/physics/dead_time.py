@@ -10,9 +10,8 @@ import math
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from ..arrays import Floats
+from ..arrays import ArrayLike, Floats
 from ..errors import InputError
 from ..validation import one_of, real_array
 

@@ -4,9 +4,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
-from ..arrays import Array, Floats
+from ..arrays import Array, ArrayLike, Floats, Integers
 from ..errors import InputError, warn
 from ..validation import at_least_0, freeze, one_of, real_array
 
@@ -27,11 +26,11 @@ class FloodEfficiency:
 
     efficiency: Floats
     """(M, n_v, n_u), of `Emission`: mean 1 over the living pixels of each module, 0 of dead and hot ones."""
-    dead: NDArray[np.int64]
+    dead: Integers
     """(n, 3): module, row and column, from 0, of pixels that count too little in modules that live."""
-    hot: NDArray[np.int64]
+    hot: Integers
     """(n, 3): of pixels that count too much, and are not to be trusted."""
-    dead_modules: NDArray[np.int64]
+    dead_modules: Integers
     """(n,): modules, from 0, that count nothing, or next to nothing."""
     spread: float
     """Relative standard deviation of the living pixels' efficiencies, without that of the counts."""

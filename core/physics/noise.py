@@ -1,9 +1,8 @@
 """Poisson noise of counts."""
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
-from ..arrays import Array
+from ..arrays import Array, ArrayLike, Integers
 from ..errors import InputError
 from ..validation import real_array, seed_number
 
@@ -11,7 +10,7 @@ from ..validation import real_array, seed_number
 _LARGEST_MEAN = 9e18
 
 
-def sample_counts(mean: ArrayLike, seed: int) -> NDArray[np.int64]:
+def sample_counts(mean: ArrayLike, seed: int) -> Integers:
     """Counts drawn from Poisson distributions with given means.
 
     `mean` is (M, n_v, n_u) or any array whose first axis is the views. Each view has its own random generator, made from

@@ -16,9 +16,8 @@ import functools
 import math
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
-from ..arrays import Floats
+from ..arrays import ArrayLike, Floats, Indexes
 from ..errors import InputError
 from ..geometry.system import PinholeSystem
 from ..validation import positive, real_array
@@ -99,7 +98,7 @@ def _patches() -> Floats:
     return np.concatenate([np.roll(face, axis, axis=2) for axis in range(3)])[None]
 
 
-def _bounds(patches: Floats, towards: Floats, point: NDArray[np.intp], best: Floats) -> Floats:
+def _bounds(patches: Floats, towards: Floats, point: Indexes, best: Floats) -> Floats:
     """Upper bounds (A, N) of the gaps in patches (A or 1, N, 3, 3) of points; raises `best` (P,) to the middles' gaps."""
     middles, sines = patches[:, :, 0], np.empty((len(point), patches.shape[1]))
     size = max(1, _NUMBERS // (patches.shape[1] * towards.shape[2]))

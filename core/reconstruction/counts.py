@@ -4,9 +4,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
-from ..arrays import Array
+from ..arrays import Array, ArrayLike, Integers
 from ..errors import InputError, warn
 from ..geometry.frames import affine_matrix
 from ..geometry.grid import Grid
@@ -64,7 +63,7 @@ class CountData:
         """The same data, with nothing in pixels that are dead in a projector's model: they then say nothing."""
         return CountData(*(np.where(A.living, data, np.float32(0)) for data in (self.counts, self.background)))
 
-    def __getitem__(self, which: NDArray[np.int64]) -> "CountData":
+    def __getitem__(self, which: Integers) -> "CountData":
         return CountData(self.counts[which], self.background[which])
 
     def ratio(self, images: Array) -> Array:

@@ -3,9 +3,8 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from ..arrays import Array
+from ..arrays import Array, ArrayLike
 from ..errors import InputError, warn
 from ..geometry.grid import Grid
 from ..geometry.views import Views

@@ -6,9 +6,8 @@ from collections.abc import Callable, Mapping
 from typing import Any, TypedDict
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from ..arrays import Array, is_tensor, to_numpy
+from ..arrays import Array, ArrayLike, is_tensor, to_numpy
 from ..errors import InputError, naming, warn
 from ..progress import Cancelled, Progress, part_of
 from ..projector import Projector

@@ -3,9 +3,8 @@
 from typing import Any, Unpack
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from ..arrays import Array
+from ..arrays import Array, ArrayLike
 from ..errors import InputError
 from ..progress import Progress, tell
 from ..projector import Projector

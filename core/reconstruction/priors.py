@@ -6,9 +6,8 @@ from itertools import product
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..arrays import Array
+from ..arrays import Array, Bools, Bytes
 from ..errors import InputError
 from ..geometry.grid import Grid
 from ..memory import require
@@ -28,7 +27,7 @@ class Pairs:
     first: tuple[slice, slice, slice]
     second: tuple[slice, slice, slice]
     closeness: float  # the smallest distance of two voxels by that of these
-    share: NDArray[np.uint8] | None  # how many of the two have chosen the other by anatomy
+    share: Bytes | None  # how many of the two have chosen the other by anatomy
 
     @property
     def weight(self) -> Any:
@@ -92,7 +91,7 @@ class Prior:
         if self.similar is not None and whole_number(self.similar, "prior: similar") > self.neighbors:
             raise InputError(f"prior: similar: expected at most the {self.neighbors} neighbors, got {self.similar}")
 
-    def on(self, grid: Grid, inside: NDArray[np.bool_] | None = None) -> "Penalty":
+    def on(self, grid: Grid, inside: Bools | None = None) -> "Penalty":
         """The penalty of a volume on a grid, of pairs of voxels `inside`. Raises InputError where `anatomy` has another."""
         return Penalty(self, grid, inside)
 
@@ -268,7 +267,7 @@ class Penalty:
     `inside`, as if the grid ended there: what is beyond, such as the zeros outside a mask, pulls at nothing.
     """
 
-    def __init__(self, prior: Prior, grid: Grid, inside: NDArray[np.bool_] | None = None) -> None:
+    def __init__(self, prior: Prior, grid: Grid, inside: Bools | None = None) -> None:
         self._prior, self._shape, self._threads = prior, grid.shape, thread_count(None)
         self._inside = None if inside is None or inside.all() else inside
         steps = _half_of_neighbors(prior.neighbors)
@@ -329,7 +328,7 @@ class Penalty:
             found.append(Pairs(one, other, self._closeness[number], share))
         return found
 
-    def _similarity(self, anatomy: Volume, grid: Grid) -> list[NDArray[np.uint8]]:
+    def _similarity(self, anatomy: Volume, grid: Grid) -> list[Bytes]:
         """For each step and voxel, how many of it and its neighbour have chosen the other: 0, 1 or 2."""
         if not same_lattice(anatomy.grid, grid):
             raise InputError("prior: anatomy's grid is not the reconstruction's: resample it (resample(volume, grid))")
@@ -353,7 +352,7 @@ class Penalty:
         return shares
 
 
-def penalty_of(prior: Prior | None, grid: Grid, inside: NDArray[np.bool_]) -> Penalty | None:
+def penalty_of(prior: Prior | None, grid: Grid, inside: Bools) -> Penalty | None:
     """The penalty of pairs of voxels inside; None without a prior or weight.
 
     Raises InputError where it is no prior, or not for the grid.

@@ -4,9 +4,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
-from ..arrays import Array
+from ..arrays import Array, ArrayLike, Bools
 from ..errors import InputError, warn
 from ..validation import positive, real_numbers
 
@@ -94,7 +93,7 @@ class StopWhen(StoppingRule):
         return None
 
 
-def inside(mask: ArrayLike, name: str, shape: tuple[int, ...]) -> NDArray[np.bool_]:
+def inside(mask: ArrayLike, name: str, shape: tuple[int, ...]) -> Bools:
     """`mask` as booleans of a volume's shape, or `InputError`."""
     found = real_numbers(mask, name)
     if found.shape != shape or found.dtype != bool:

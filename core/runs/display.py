@@ -3,9 +3,8 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
-from ..arrays import Floats32
+from ..arrays import ArrayLike, Bytes, Floats32
 from ..errors import InputError
 from ..validation import one_of
 
@@ -94,13 +93,13 @@ class Display:
             return float(low * (high / low) ** share) if 0 < low < high else high * share
         return low + (high - low) * (share**2 if self.scale == "sqrt" else share)
 
-    def colored(self, values: ArrayLike, window: tuple[float, float] | None = None) -> NDArray[np.uint8]:
+    def colored(self, values: ArrayLike, window: tuple[float, float] | None = None) -> Bytes:
         """Colours (..., 3), 8-bit sRGB, of `values` (...), in the window given or in their own."""
         shares = self.shares(values, self.window(values) if window is None else window)
         return _table(self.colors)[np.rint(shares * 255).astype(np.uint8)]
 
 
-def _table(colors: str) -> NDArray[np.uint8]:
+def _table(colors: str) -> Bytes:
     """256 colours (256, 3)."""
     anchors = np.array([list(bytes.fromhex(text)) for text in _COLORS[colors].split()], float)
     places = np.linspace(0, len(anchors) - 1, 256)

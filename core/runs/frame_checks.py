@@ -1,9 +1,8 @@
 """What frames of measured counts hardly are, by their numbers: warnings that name frame and pixel."""
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from ..arrays import Array
+from ..arrays import Array, ArrayLike
 from ..errors import warn
 
 _FEW = 10

@@ -12,9 +12,8 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from ..arrays import Array
+from ..arrays import Array, ArrayLike
 from ..errors import InputError, naming, warn
 from ..files import read_text
 from ..geometry.scanner import Detector, Scanner

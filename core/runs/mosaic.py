@@ -9,9 +9,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
-from ..arrays import Floats, Floats32
+from ..arrays import Array, ArrayLike, Bytes, Floats, Floats32, Integers
 from ..errors import InputError
 from ..files import AnyPath, write_bytes
 from ..validation import real_numbers
@@ -22,7 +21,7 @@ if TYPE_CHECKING:  # pages of figures read this file, and runs take a while
     from .run import ProjectionRun
 
 
-def as_seen(images: ArrayLike) -> NDArray:
+def as_seen(images: ArrayLike) -> Array:
     """Images (..., n_v, n_u) as pictures: row 0 at the top, +v up, and +u to the left as seen from the pinhole.
 
     (u, v, k) is right-handed and k points away from the pinhole into the scene, so whoever looks along k with +v up
@@ -41,7 +40,7 @@ _SMALL_TEXT = 11.0
 """The least size of text, pixels."""
 
 
-def mosaic(images: ArrayLike, columns: int = COLUMNS) -> NDArray:
+def mosaic(images: ArrayLike, columns: int = COLUMNS) -> Array:
     """Pictures of all images (M, n_v, n_u) in one (rows * n_v, columns * n_u), row 0 at the top; empty places are 0.
 
     They follow each other row by row from the top left: 80 modules in 4 rings and 20 columns show a ring a row.
@@ -62,9 +61,9 @@ def mosaic(images: ArrayLike, columns: int = COLUMNS) -> NDArray:
 class Sheet:
     """All projections of a run in one picture that says what it shows."""
 
-    picture: NDArray[np.uint8]
+    picture: Bytes
     """Colours (height, width, 3), row 0 at the top."""
-    corners: NDArray[np.int64]
+    corners: Integers
     """Row and column (M, 2) of each image's top left pixel."""
     tile: tuple[int, int]
     """Rows and columns of an image in it."""
@@ -155,7 +154,7 @@ def caption(run: ProjectionRun) -> str:
     return f"{counts}. Module (frame): {side}, +v at the top, +u at the left"
 
 
-def _captioned(picture: NDArray[np.uint8], text: str) -> NDArray[np.uint8]:
+def _captioned(picture: Bytes, text: str) -> Bytes:
     """A picture with a line of text below, as large as fits."""
     if not text:
         return picture
@@ -191,7 +190,7 @@ def _means(images: Floats32, side: int) -> Floats32:
     return blocks.mean(axis=(2, 4), dtype=np.float32)
 
 
-def places(rings: NDArray[np.int64], columns: int = COLUMNS) -> NDArray[np.int64]:
+def places(rings: Integers, columns: int = COLUMNS) -> Integers:
     """Row and column (M, 2) of each image, counted in images: a ring in a row, or in several of at most `columns`."""
     at = np.empty((len(rings), 2), np.int64)
     row = 0
@@ -203,7 +202,7 @@ def places(rings: NDArray[np.int64], columns: int = COLUMNS) -> NDArray[np.int64
     return at
 
 
-def _color_bar(display: Display, window: tuple[float, float], unit: str, height: int, size: float) -> NDArray[np.uint8]:
+def _color_bar(display: Display, window: tuple[float, float], unit: str, height: int, size: float) -> Bytes:
     """A colour bar (height, width, 3) with its numbers and, above, its unit."""
     unit = unit_text(unit)
     line, em = math.ceil(1.1 * size), round(size)
@@ -221,7 +220,7 @@ def _color_bar(display: Display, window: tuple[float, float], unit: str, height:
     return bar
 
 
-def _write(picture: NDArray[np.uint8], text: str, row: int, column: int, size: float, shade: float = 0.5) -> None:
+def _write(picture: Bytes, text: str, row: int, column: int, size: float, shade: float = 0.5) -> None:
     """Write a line of text in white, on what is there, `shade` times as bright."""
     ink, _ = letters.lettered(text, size)
     place = picture[row : row + ink.shape[0], column : column + ink.shape[1]]

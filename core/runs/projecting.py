@@ -5,9 +5,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from ..arrays import Array, Floats32
+from ..arrays import Array, ArrayLike, Floats32
 from ..errors import InputError, warn
 from ..geometry.scanner import Detector, Scanner
 from ..geometry.system import PinholeSystem

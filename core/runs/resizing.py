@@ -1,9 +1,8 @@
 """Pictures in other sizes."""
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from ..arrays import Floats, Floats32
+from ..arrays import ArrayLike, Floats, Floats32
 
 
 def resized(picture: ArrayLike, rows: int, columns: int) -> Floats32:

@@ -1,9 +1,8 @@
 """Changes that keep the voxels' values: crop, pad, reorient, move, and split by labels."""
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
-from ..arrays import Floats32
+from ..arrays import Array, ArrayLike, Floats32, Integers
 from ..errors import InputError
 from ..geometry.frames import moved
 from ..geometry.grid import Grid, same_grid
@@ -76,7 +75,7 @@ def centered(volume: Volume, point: ArrayLike = (0.0, 0.0, 0.0)) -> Volume:
     return Volume(volume.array, Grid(volume.grid.shape, affine), volume.quantity)
 
 
-def split_labels(volume: Volume, labels: Volume | NDArray) -> dict[int, Volume]:
+def split_labels(volume: Volume, labels: Volume | Array) -> dict[int, Volume]:
     """One volume for each label, with the values where `labels` has that label, and elsewhere 0, or -1000 for CT numbers.
 
     `labels` are whole numbers: a volume on the same grid, or an array of its shape. Label 0, usually the background, is
@@ -102,13 +101,13 @@ def split_labels(volume: Volume, labels: Volume | NDArray) -> dict[int, Volume]:
     }
 
 
-def _indices(value: ArrayLike, name: str) -> NDArray[np.int64]:
+def _indices(value: ArrayLike, name: str) -> Integers:
     numbers = one_for_all(value, name, 3)
     if not (numbers == np.floor(numbers)).all():
         raise InputError(f"{name}: expected whole numbers of voxels, got {numbers.tolist()}")
     return numbers.astype(np.int64)
 
 
-def _part(volume: Volume, array: Floats32, start: NDArray[np.int64]) -> Volume:
+def _part(volume: Volume, array: Floats32, start: Integers) -> Volume:
     """`array` as a volume whose first voxel has the index `start` in `volume`."""
     return Volume(array, volume.grid.box(start, array.shape), volume.quantity)

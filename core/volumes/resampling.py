@@ -3,9 +3,8 @@
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..arrays import Floats, Floats32
+from ..arrays import Floats, Floats32, Integers
 from ..errors import InputError
 from ..geometry.grid import Grid
 from ..memory import require
@@ -14,7 +13,7 @@ from ..validation import freeze, instance, real_array
 from .volume import Volume, outside_value
 
 # For n voxels of the new grid along an axis: indices of the old grid and their weights, (n, taps) each.
-_Taps = tuple[NDArray[np.int64], Floats32]
+_Taps = tuple[Integers, Floats32]
 
 _PARALLEL = 1e-9  # voxels per voxel: axes that deviate by less are parallel
 _SLAB = 1 << 20  # samples at once

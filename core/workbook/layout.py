@@ -7,9 +7,8 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..arrays import Array
+from ..arrays import Array, Bools
 from ..errors import InputError, warn
 from ..geometry.columns import ColumnTable
 from .agreement import text_of
@@ -82,7 +81,7 @@ class ColumnCells:
         """Sheet and cell of module index `i`."""
         return self.table.sheet.place(self.rows[i], self.column)
 
-    def values(self, optional: bool = False, ignored: NDArray[np.bool_] | None = None) -> Array:
+    def values(self, optional: bool = False, ignored: Bools | None = None) -> Array:
         """What the cells hold (M,), numbers in their unit; `InputError` if one holds something else.
 
         NaN, or "" for a text, where they are `ignored`, or where a cell is blank, or its formula cannot be computed here but
@@ -121,7 +120,7 @@ class ColumnCells:
         return values if self.declared.is_text else values / self.factor
 
 
-def absent(given: Array) -> NDArray[np.bool_]:
+def absent(given: Array) -> Bools:
     """Where (M,) a column's cells hold nothing."""
     return given == "" if given.dtype.kind == "U" else np.isnan(given)
 

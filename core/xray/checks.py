@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..arrays import Floats
 from ..errors import InputError, several
@@ -204,7 +203,7 @@ def _distance_from_axis(corners: Floats) -> float:
     return float(min(np.linalg.norm(a + _nearest(a, way) * way) for a, way in ends))
 
 
-def _nearest(start: Floats, way: Floats) -> float | NDArray[np.float64]:
+def _nearest(start: Floats, way: Floats) -> float | Floats:
     """Where on the way from `start`, from 0 to 1, the origin is nearest."""
     square = way @ way
     return 0.0 if square == 0 else np.clip(-(start @ way) / square, 0.0, 1.0)

@@ -6,9 +6,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from ..arrays import Floats
+from ..arrays import ArrayLike, Floats
 from ..errors import InputError, warn
 from ..geometry.frames import affine_matrix, rotations
 from ..geometry.grid import Grid

@@ -7,9 +7,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
-from ..arrays import Array, Floats, Floats32
+from ..arrays import Array, ArrayLike, Floats, Floats32, Indexes
 from ..errors import InputError, naming
 from ..geometry.grid import Grid
 from ..geometry.views import Views
@@ -139,8 +138,8 @@ class SpectralScan(Model):
 
     def transmissions(
         self, views: Views, materials: tuple[str, ...] = ()
-    ) -> Iterator[tuple[NDArray[np.intp], SpectralTransmission]]:
-        """Indices of the views of each spectrum, with its counts behind materials, by default the model's."""
+    ) -> Iterator[tuple[Indexes, SpectralTransmission]]:
+        """Indexes of the views of each spectrum, with its counts behind materials, by default the model's."""
         system, bins = self.system, _ALL if self.window is None else (self.window,)
         tubes = list(zip(system.kvp.tolist(), system.filters.tolist(), strict=True))
         blurs = panel_blur(system, self.intrinsic_fwhm)

@@ -7,9 +7,8 @@ from collections.abc import Sequence
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from ..arrays import Array, Floats
+from ..arrays import Array, ArrayLike, Floats
 from ..errors import InputError
 from ..geometry.views import Views
 from ..physics.crystal import gaussian_blur

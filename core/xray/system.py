@@ -7,9 +7,8 @@ from dataclasses import InitVar, dataclass, field
 from typing import Any, ClassVar, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
-from ..arrays import Array, Floats
+from ..arrays import Array, ArrayLike, Bools, Floats, Integers
 from ..errors import InputError
 from ..geometry.columns import Column, ColumnTable, Values
 from ..geometry.finding import Finding
@@ -89,14 +88,14 @@ def _unit(vectors: Floats) -> Floats:
     return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
 
 
-def _mirrored(sources: Floats, centers: Floats, u: Floats, v: Floats) -> NDArray[np.bool_]:
+def _mirrored(sources: Floats, centers: Floats, u: Floats, v: Floats) -> Bools:
     """Which panels (N,) are not right-handed: u, v, and the way from the source to them."""
     depths = np.sum(np.cross(u, v) * (centers - sources), axis=1)
     sizes = np.linalg.norm(u, axis=1) * np.linalg.norm(v, axis=1) * np.linalg.norm(centers - sources, axis=1)
     return ~(depths > 1e-9 * sizes)
 
 
-def _skew(u: Floats, v: Floats) -> NDArray[np.bool_]:
+def _skew(u: Floats, v: Floats) -> Bools:
     """Which panels (N,) have rows that are not at right angles to their columns."""
     cosines = np.sum(u * v, axis=1)
     return ~(np.abs(cosines) <= _SKEW * np.linalg.norm(u, axis=1) * np.linalg.norm(v, axis=1))
@@ -134,7 +133,7 @@ class XraySystem(Scanner):
     mas: Floats
     filters: Any = ""  # an array of texts once made
     focal_spot: Floats = 0.0  # type: ignore[assignment]  # likewise
-    numbers: NDArray[np.int64] = None  # type: ignore[assignment]
+    numbers: Integers = None  # type: ignore[assignment]
     source: SystemSource | None = None
     more: Mapping[str, Any] = field(default_factory=dict)
 

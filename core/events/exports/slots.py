@@ -11,9 +11,8 @@ import io
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ...arrays import Floats32
+from ...arrays import Bools, Floats32, Integers
 from ...errors import InputError
 from ...files import AnyPath, read_text
 from ...geometry.scanner import Scanner
@@ -28,9 +27,9 @@ _TRUE, _FALSE = ("1", "yes", "true"), ("0", "no", "false", "")
 class Slots:
     """Which module each slot shows."""
 
-    modules: NDArray[np.int64]
+    modules: Integers
     """Index (S,) of each slot's module among the scanner's."""
-    mirrored: NDArray[np.bool_]
+    mirrored: Bools
     """Whether each slot's image (S,) is flipped left to right."""
     columns: int
     """Slots in a row."""

@@ -11,9 +11,8 @@ more than the parts do: a ray that enters a collimator through its hole ends in 
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ...arrays import Floats
+from ...arrays import Bools, Floats, Indexes
 from ..frames import module_frames
 from ..system import PinholeSystem
 from .hulls import TOUCH, Hulls
@@ -111,7 +110,7 @@ def cone_directions(n: int, cosine: float) -> Floats:
     return np.stack([across * np.cos(angle), across * np.sin(angle), z], axis=1)
 
 
-def hits(hulls: Hulls, p: int, origin: Floats, directions: Floats, lengths: Floats) -> NDArray[np.bool_]:
+def hits(hulls: Hulls, p: int, origin: Floats, directions: Floats, lengths: Floats) -> Bools:
     """Which rays (N,) from `origin` along unit `directions` (N, 3), with `lengths` (N,), pass through hull `p`."""
     towards = hulls.normals[p] @ directions.T
     towards[towards == 0] = -np.finfo(np.float64).tiny  # parallel to a face
@@ -124,7 +123,7 @@ def hits(hulls: Hulls, p: int, origin: Floats, directions: Floats, lengths: Floa
     return leaves - enters > TOUCH
 
 
-def _candidates(hulls: Hulls, pinhole: Floats, axis: Floats, b: float, radius: float) -> NDArray[np.intp]:
+def _candidates(hulls: Hulls, pinhole: Floats, axis: Floats, b: float, radius: float) -> Indexes:
     """Parts with a corner in front of the pinhole, whose bounding sphere meets the cone of the ROI."""
     in_front = ((hulls.vertices - pinhole) @ axis).max(axis=1) > 0
     to = hulls.centers - pinhole

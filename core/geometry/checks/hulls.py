@@ -6,9 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ...arrays import Floats
+from ...arrays import Floats, Integers
 from ..frames import moved
 from ..module_parts import BOX_FACES, ModulePart
 from ..part_colors import PartKind
@@ -24,7 +23,7 @@ _EDGES = np.array([[0, 1], [0, 3], [0, 4], [1, 5], [2, 6], [3, 7]])  # one for e
 class Hulls:
     """Convex hulls of P parts, world mm. A point x is inside where ``normals @ x <= offsets`` for all faces."""
 
-    numbers: NDArray[np.int64]  # (P,), the modules'
+    numbers: Integers  # (P,), the modules'
     kinds: tuple[PartKind, ...]
     vertices: Floats  # (P, 8, 3)
     normals: Floats  # (P, 6, 3)

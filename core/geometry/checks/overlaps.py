@@ -10,9 +10,8 @@ from collections.abc import Sequence
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ...arrays import Floats
+from ...arrays import Floats, Indexes
 from ..collimator import Collimator
 from ..system import PinholeSystem
 from .hulls import TOUCH, Hulls
@@ -44,7 +43,7 @@ def find_overlaps(hulls: Hulls) -> tuple[Overlap, ...]:
     return tuple(found)
 
 
-def penetration_depths(hulls: Hulls, i: NDArray[np.intp], j: NDArray[np.intp]) -> Floats:
+def penetration_depths(hulls: Hulls, i: Indexes, j: Indexes) -> Floats:
     """Shortest translations (N,), mm, that separate hulls `i` from hulls `j`; 0 or less where they are apart."""
     across = np.cross(hulls.edges[i][:, :, None], hulls.edges[j][:, None]).reshape(len(i), -1, 3)
     axes = np.concatenate([hulls.normals[i], hulls.normals[j], across], axis=1)
@@ -57,7 +56,7 @@ def penetration_depths(hulls: Hulls, i: NDArray[np.intp], j: NDArray[np.intp]) -
     return np.where(parallel, np.inf, shared).min(axis=1)
 
 
-def _common_points(hulls: Hulls, i: NDArray[np.intp], j: NDArray[np.intp]) -> Floats:
+def _common_points(hulls: Hulls, i: Indexes, j: Indexes) -> Floats:
     """Points (N, 3) inside both hull `i` and hull `j`, which overlap: the mean corner of the intersection."""
     normals = np.concatenate([hulls.normals[i], hulls.normals[j]], axis=1)
     offsets = np.concatenate([hulls.offsets[i], hulls.offsets[j]], axis=1)

@@ -3,9 +3,8 @@
 from functools import cache
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from ...arrays import Floats
+from ...arrays import ArrayLike, Floats
 from ...errors import InputError
 
 _LEAST, _MANY = 1e-8, 50.0

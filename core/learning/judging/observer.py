@@ -4,9 +4,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from ...arrays import Floats
+from ...arrays import ArrayLike, Floats
 from ...errors import InputError
 from ...validation import positive, real_array, whole_number
 from ...volumes.resampling import values_at

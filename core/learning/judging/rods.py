@@ -1,9 +1,8 @@
 """Single rods: how much of its contrast a volume shows at a place where a rod is, or where one could be."""
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from ...arrays import Floats
+from ...arrays import ArrayLike, Floats
 from ...geometry.frames import moved
 from ...phantoms.derenzo import DerenzoPhantom
 from ...volumes.resampling import values_at

@@ -5,9 +5,8 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from ...arrays import Floats
+from ...arrays import ArrayLike, Floats
 from ...errors import InputError
 from ...validation import real_array
 

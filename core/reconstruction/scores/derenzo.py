@@ -4,9 +4,8 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
-from ...arrays import Floats
+from ...arrays import ArrayLike, Floats, Integers
 from ...errors import InputError
 from ...geometry.frames import checked_affine, moved
 from ...phantoms.derenzo import DerenzoRods
@@ -256,7 +255,7 @@ class _Sector:
         return np.concatenate([mine[:, 1:3], np.zeros((len(mine), 1))], axis=1)
 
     @cached_property
-    def _pairs(self) -> NDArray[np.int64]:
+    def _pairs(self) -> Integers:
         """Numbers (P, 2) of rods that are neighbours."""
         most = 2 * self.rods.rod_diameters[self.sector] * (1 + 1e-6)
         places = self._centers

@@ -4,9 +4,8 @@ from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
-from ...arrays import Floats
+from ...arrays import ArrayLike, Bools, Floats
 from ...errors import InputError
 from ...geometry.grid import same_grid
 from ...memory import require
@@ -204,7 +203,7 @@ def _require_fit(volume: Volume, truth: Volume, name: str) -> None:
         raise InputError(f"{name}: volume and truth are on different grids; {advice}")
 
 
-def _mask(mask: ArrayLike, shape: tuple[int, ...], name: str, least: int) -> NDArray[np.bool_]:
+def _mask(mask: ArrayLike, shape: tuple[int, ...], name: str, least: int) -> Bools:
     found = inside(mask, name, shape)
     if np.count_nonzero(found) < least:
         raise InputError(f"{name}: expected at least {least} voxels, got {np.count_nonzero(found)}")

@@ -4,9 +4,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from ...arrays import Floats
+from ...arrays import ArrayLike, Floats
 from ...errors import InputError
 from ...geometry.frames import checked_affine, moved
 from ...phantoms.nema import NemaBody, room, sphere_places

@@ -6,9 +6,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from ...arrays import Floats
+from ...arrays import ArrayLike, Floats
 from ...errors import InputError
 from ...geometry.frames import checked_affine
 from ...geometry.grid import same_grid

@@ -6,9 +6,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ...arrays import Floats
+from ...arrays import Floats, Integers
 from ...errors import InputError, reading
 from ...files import AnyPath, replacing, require_ending, require_file
 from ...validation import freeze, one_of, real_array
@@ -30,7 +29,7 @@ class Mesh:
     """
 
     vertices: Floats
-    faces: NDArray[np.int64]
+    faces: Integers
 
     def __post_init__(self) -> None:
         vertices = real_array(self.vertices, "mesh vertices", (None, 3))

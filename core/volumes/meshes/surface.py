@@ -8,9 +8,8 @@ tables of marching cubes do not guarantee. A compiled library would be faster, b
 from itertools import permutations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ...arrays import Floats, Floats32
+from ...arrays import Floats, Floats32, Integers
 from ...errors import InputError
 from ...geometry.frames import moved
 from ...memory import require
@@ -69,8 +68,8 @@ def _plane(array: Floats32, i: int, outside: float) -> Floats:
 
 
 def _triangles(
-    below: Floats, above: Floats, level: float, first: int, strides: NDArray[np.int64]
-) -> list[tuple[NDArray[np.int64], Floats]]:
+    below: Floats, above: Floats, level: float, first: int, strides: Integers
+) -> list[tuple[Integers, Floats]]:
     """Triangles between two planes: the edges (N, 3) on which their corners lie, and where on them (N, 3), 0 to 1.
 
     An edge is 8 times the flat index of its lower corner plus the corner of the cube that it points to.

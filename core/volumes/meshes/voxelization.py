@@ -13,9 +13,8 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
-from ...arrays import Floats, Floats32
+from ...arrays import ArrayLike, Bools, Floats, Floats32, Integers
 from ...errors import InputError
 from ...geometry.frames import moved
 from ...geometry.grid import Grid
@@ -114,9 +113,7 @@ def mesh_coverage(mesh: Mesh, grid: Grid, progress: Progress | None = None) -> F
     return coverage
 
 
-def _along_rays(
-    surface: Floats, shape: tuple[int, int, int], step: tuple[float, float]
-) -> tuple[Floats, NDArray[np.bool_]]:
+def _along_rays(surface: Floats, shape: tuple[int, int, int], step: tuple[float, float]) -> tuple[Floats, Bools]:
     """The shares of voxels inside the surface of polygons (N, V, 3), from rays along z, `step` voxels apart in x and y.
 
     Also the columns of voxels (n_x, n_y) in which there are winding numbers other than 0 and 1, or 0 and -1.
@@ -154,9 +151,7 @@ def _along_rays(
     return covered, (highest - lowest).reshape(n_x, n_y) > 1
 
 
-def _crossings(
-    triangles: Floats, seen: Floats, size: NDArray[np.int64]
-) -> tuple[NDArray[np.int64], Floats, NDArray[np.int64]]:
+def _crossings(triangles: Floats, seen: Floats, size: Integers) -> tuple[Integers, Floats, Integers]:
     """Where rays along z meet `triangles` (N, 3, 3): the ray's number, z, and 1 or -1 for the side of the triangle.
 
     The rays form a lattice of `size` (2,); `seen` (N, 3, 2) are the corners in lattice coordinates.
@@ -205,7 +200,7 @@ def _winding(surface: Floats, shape: tuple[int, int, int]) -> Floats:
     return np.cumsum(steps.reshape(n_x, n_y, n_z + 1), axis=2)[:, :, :n_z]
 
 
-def _split(pieces: Floats, cells: NDArray[np.int64], axis: int, n: int) -> tuple[Floats, NDArray[np.int64]]:
+def _split(pieces: Floats, cells: Integers, axis: int, n: int) -> tuple[Floats, Integers]:
     """The `pieces` (N, V, 3) cut at the whole numbers along `axis`, and `cells` (N, 3) with their index along it."""
     low = np.floor(pieces[:, :, axis].min(axis=1)).astype(np.int64).clip(0, n - 1)
     high = np.ceil(pieces[:, :, axis].max(axis=1)).astype(np.int64).clip(low + 1, n)

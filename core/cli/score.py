@@ -71,9 +71,7 @@ def _run(arguments: argparse.Namespace) -> None:
     print_answer(arguments, score.record, score.lines, score.notes)
 
 
-def _truth(
-    arguments: argparse.Namespace,
-) -> tuple[mph.Volume | mph.Phantom, Floats | None, mph.ProjectionRun | None]:
+def _truth(arguments: argparse.Namespace) -> tuple[mph.Volume | mph.Phantom, Floats | None, mph.ProjectionRun | None]:
     """The truth, the pose of a phantom, and the run that was simulated of it."""
     if arguments.make is not None:
         return arguments.make(arguments), read_pose(arguments), None

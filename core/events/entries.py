@@ -4,7 +4,6 @@ import functools
 from collections.abc import Collection, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -114,12 +113,12 @@ class PhantomEntry(DrawnValues):
 
     settings: Mapping[str, Any] = field(default_factory=dict)  # of its kind, as the recipe says them
 
-    @cached_property
+    @functools.cached_property
     def rows(self) -> Mapping[str, Setting]:
         """The settings that it may have."""
         return _rows(str(self.given.get("kind")))
 
-    @cached_property
+    @functools.cached_property
     def kind(self) -> Kind | None:
         """None where the phantom is a file."""
         return next((kind for kind in KINDS if kind.name == self.given.get("kind")), None)

@@ -6,7 +6,6 @@ import inspect
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -105,7 +104,7 @@ class TrainingRecipe(Values):
         """Devices of all nodes."""
         return int(self["training.devices"] * self["training.nodes"])
 
-    @cached_property
+    @functools.cached_property
     def grid(self) -> Grid:
         """The voxels of the network's volumes."""
         return grid_of(self, "grid")
@@ -120,7 +119,7 @@ class TrainingRecipe(Values):
         """A file or folder that the recipe names."""
         return Path(os.path.normpath(self.folder / self[key]))
 
-    @cached_property
+    @functools.cached_property
     def fingerprint(self) -> str:
         """SHA-256 of all that decides over the weights; comments and the number of threads do not count."""
         told = {key: value for key, value in self.given.items() if key != "training.threads"}

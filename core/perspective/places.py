@@ -141,14 +141,7 @@ def _corners(at: Array, share: Array, m: tuple[int, ...]) -> Any:
 
 
 def _gather_in_numpy(
-    points: Array,
-    planes: Array,
-    arrays: Array,
-    matrices: Floats,
-    how: int,
-    seen: Any,
-    exponents: Any,
-    **others: Any,
+    points: Array, planes: Array, arrays: Array, matrices: Floats, how: int, seen: Any, exponents: Any, **others: Any
 ) -> None:
     flat, by_depth, nearest = others["flat"], others["by_depth"], others["nearest"]
     for array, matrix in zip(arrays, matrices, strict=True):

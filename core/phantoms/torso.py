@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -33,7 +32,7 @@ _RV_WALL = 4.0  # mm
 _TRUNK = 4  # lungs, liver and spine, whose sizes are fixed
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class CardiacTorso(Phantom):
     """A torso of simple shapes around a heart, as for myocardial perfusion with Tc-99m sestamibi.
 

@@ -6,7 +6,6 @@ import dataclasses
 import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,7 @@ from .settings import SAMPLING, SETTINGS, TABLES, Setting, settings_with
 _PLACED = ("phantom.position", "phantom.euler_degrees")
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class Values(ABC):
     """Values of settings by their keys; those that are not given have their defaults.
 
@@ -55,7 +54,7 @@ class Values(ABC):
         return self.given[key] if key in self.given else self.rows[key].default
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class Recipe(Values):
     """What a projection run is made from: values of `settings.SETTINGS`, by their keys.
 

@@ -10,7 +10,6 @@ import functools
 import operator
 from collections.abc import Collection, Iterable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
 from inspect import Parameter
 from numbers import Integral, Real
 from pathlib import Path
@@ -33,7 +32,7 @@ Words = Mapping[str, tuple[str, str]]
 """The words that a setting may be, each with its label and description."""
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class Setting:
     """One setting of a run.
 
@@ -48,7 +47,7 @@ class Setting:
     text: str  # what it is, for help texts
     absent: str = ""  # what it means that none is given, where the default is None
     unit: str = ""  # such as "mm"
-    words: Words = field(default_factory=dict)  # that it may be, beside numbers if its kind is a number
+    words: Words = dataclasses.field(default_factory=dict)  # that it may be, beside numbers if its kind is a number
     least: float | None = None
     above: float | None = None  # it must exceed this
     most: float | None = None
@@ -135,7 +134,7 @@ class Setting:
         return value
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class OwnSetting(Setting):
     """A setting of one kind of phantoms, whose class checks its values."""
 

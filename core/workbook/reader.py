@@ -189,11 +189,7 @@ def _implausible(system: Scanner, cells: dict[str, ColumnCells]) -> Iterator[str
 
 
 def _differences(
-    column: ColumnCells,
-    given: Floats,
-    expected: Floats,
-    used: str,
-    slack: Floats | float = 0.0,
+    column: ColumnCells, given: Floats, expected: Floats, used: str, slack: Floats | float = 0.0
 ) -> Iterator[str]:
     """The first modules whose number `given` (M,) in the sheet, in its unit, is not as `expected` (M,), mm or rad.
 

@@ -113,8 +113,7 @@ class Event:
     @property
     def settings(self) -> dict[str, Any]:
         """All settings of the phantom, or the names of its files."""
-        settings: dict[str, Any] = json.loads(self.attributes["settings"])
-        return settings
+        return json.loads(self.attributes["settings"])
 
     @property
     def noise_seed(self) -> int:

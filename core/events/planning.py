@@ -83,8 +83,7 @@ class PlannedEvent:
     def placement(self) -> Floats:
         """The pose after mirroring and the factor of size: what the phantom's own frame is placed by, (4, 4), mm."""
         scale = np.diag([-self.size if self.mirror else self.size, self.size, self.size, 1.0])
-        placement: Floats = self.pose @ scale
-        return placement
+        return self.pose @ scale
 
     @property
     def phantom(self) -> Phantom | None:
@@ -102,8 +101,7 @@ class PlannedEvent:
         if kind is not None:
             names = setting_names(kind.phantom)
             given = {names[key]: _tuples(value) for key, value in self.settings.items()}
-            phantom: Phantom = kind.phantom(**{**kind.usual, **given})
-            return phantom
+            return kind.phantom(**{**kind.usual, **given})
         return None if self.entry.is_volume else read_phantom(self.recipe.input(str(self.file)).path)
 
     @property

@@ -22,8 +22,7 @@ class Program:
     @property
     def layout(self) -> type[Layout]:
         """Made of what is chosen, with the program's options as keyword-only parameters."""
-        found: type[Layout] = getattr(import_module(f".exports.{self.of.lower()}", __package__), self.of)
-        return found
+        return getattr(import_module(f".exports.{self.of.lower()}", __package__), self.of)
 
     @property
     def options(self) -> tuple[str, ...]:

@@ -173,8 +173,7 @@ class Samples(Dataset[Sample]):
 
     def record(self, index: int) -> NDArray[np.void]:
         """A sample's arrays by name, on the disk."""
-        found: NDArray[np.void] = np.load(_path(self.folder, self.draws[index]), mmap_mode="r")
-        return found
+        return np.load(_path(self.folder, self.draws[index]), mmap_mode="r")
 
     def __getitem__(self, index: int) -> Sample:
         record = self.record(index)

@@ -74,8 +74,7 @@ def live_shares(
         part = recorded * np.exp(x)
         off, slope = x - part, 1 - part
         x = x - np.divide(2 * off * slope, 2 * slope**2 + off * part, out=np.zeros_like(x), where=off != 0)
-    shares: Floats = np.exp(-np.clip(x, 0, 1))
-    return shares
+    return np.exp(-np.clip(x, 0, 1))
 
 
 def _checked(counts: ArrayLike, time: ArrayLike, dead_time: ArrayLike, kind: str) -> tuple[Floats, Floats, Floats]:

@@ -216,8 +216,7 @@ def panel_blur(system: XraySystem, fwhm: float = 0.0) -> Floats:
     instance(system, XraySystem, "panel_blur")
     before = np.linalg.norm(system.sources, axis=1)
     shadow = system.focal_spot * (np.linalg.norm(system.panel_centers - system.sources, axis=1) / before - 1)
-    blur: Floats = np.hypot(at_least_0(fwhm, "fwhm"), np.maximum(shadow, 0) * FWHM_PER_SIGMA / math.sqrt(12))
-    return blur
+    return np.hypot(at_least_0(fwhm, "fwhm"), np.maximum(shadow, 0) * FWHM_PER_SIGMA / math.sqrt(12))
 
 
 def _none_below_0(values: ArrayLike, name: str) -> Floats:

@@ -39,8 +39,7 @@ def expected_deviance(mean: ArrayLike) -> Floats:
 
 def _deviance(y: Floats, mean: Floats) -> Floats:
     logs = np.log(np.where(y > 0, y / mean, 1.0))
-    found: Floats = 2 * (y * logs - y + mean)
-    return found
+    return 2 * (y * logs - y + mean)
 
 
 @cache

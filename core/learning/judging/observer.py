@@ -57,8 +57,7 @@ def laguerre_gauss(distances: ArrayLike, width: float, channels: int = CHANNELS,
     for p in range(1, whole_number(channels, "channels")):
         rows.append(((2 * p + 1 + order - x) * rows[p] - (p + order) * rows[p - 1]) / (p + 1))
     found = np.exp(-x / 2)[:, None] * np.stack(rows[:channels], axis=1)
-    normed: Floats = found / np.linalg.norm(found, axis=0)
-    return normed
+    return found / np.linalg.norm(found, axis=0)
 
 
 def channel_outputs(volume: Volume, place: ArrayLike, width: float, channels: int = CHANNELS) -> Floats:

@@ -40,8 +40,7 @@ def read_json(path: Path) -> dict[str, Any]:
     if not path.exists():
         return {}
     with reading(path, "JSON"):
-        found: dict[str, Any] = json.loads(read_text(path))
-        return found
+        return json.loads(read_text(path))
 
 
 def write_json(path: Path, values: Any) -> None:

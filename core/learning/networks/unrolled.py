@@ -70,8 +70,7 @@ class Model(Network):
         return estimates
 
     def _of(self, net: nn.Module, features: Tensor) -> Tensor:
-        found: Tensor = checkpoint(net, features, use_reentrant=False) if self.save_memory else net(features)
-        return found
+        return checkpoint(net, features, use_reentrant=False) if self.save_memory else net(features)
 
     def _correction(self, k: int, found: Tensor, before: Tensor) -> Tensor:
         """What step k adds to the surpluses (B, M, n_v, n_u), view by view."""

@@ -60,12 +60,7 @@ def _slope(system: Any) -> Floats:
 PINHOLE_COLUMNS = ColumnTable(
     (
         *(
-            Column(
-                **_coordinate(f"{axis}1", _HOLES),
-                field="centers",
-                axis=i,
-                place=f"Coordinates!{'BCD'[i]}",
-            )
+            Column(**_coordinate(f"{axis}1", _HOLES), field="centers", axis=i, place=f"Coordinates!{'BCD'[i]}")
             for i, axis in enumerate("xyz")
         ),
         Column(
@@ -220,13 +215,5 @@ PINHOLE_COLUMNS = ColumnTable(
             help="material of the crystal; blank: that of the model for all",
         ),
     ),
-    unread=(
-        Column(
-            "slope",
-            derived=_slope,
-            headings=("S", "3D slope"),
-            place="Coordinates!F",
-            formula="={b}/{x1}",
-        ),
-    ),
+    unread=(Column("slope", derived=_slope, headings=("S", "3D slope"), place="Coordinates!F", formula="={b}/{x1}"),),
 )

@@ -42,6 +42,16 @@ def refusing(place: object, what: str) -> Iterator[None]:
 
 
 @contextmanager
+def expecting(refusal: str, *kinds: type[Exception]) -> Iterator[None]:
+    """Make errors of these kinds, by default a `ValueError` such as of a text that is no number, an input error."""
+    expected = kinds or (ValueError,)
+    try:
+        yield
+    except expected:
+        raise InputError(refusal) from None
+
+
+@contextmanager
 def naming(name: object) -> Iterator[None]:
     """Put a name, such as a file's, before the messages of input errors that do not begin with it."""
     try:

@@ -13,7 +13,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from .errors import InputError, refusing
+from .errors import InputError, expecting, refusing
 
 AnyPath = str | os.PathLike[str]
 
@@ -181,10 +181,8 @@ def read_bytes(path: AnyPath) -> bytes:
 
 def read_text(path: AnyPath, expected: str = "a text in UTF-8") -> str:
     """The text of a file, every line's end as it is; `InputError` with what is `expected` where it is none in UTF-8."""
-    try:
+    with expecting(f"{path}: expected {expected}", UnicodeDecodeError):
         return read_bytes(path).decode("utf-8-sig")
-    except UnicodeDecodeError:
-        raise InputError(f"{path}: expected {expected}") from None
 
 
 def _to_disk(path: Path) -> None:

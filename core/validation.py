@@ -150,20 +150,34 @@ def seed_number(value: Any, name: str = "seed", also: str = "") -> int:
     return int(value)
 
 
+def all_above_0(
+    value: Any, name: str, shape: tuple[int | None, ...] | None = None, unit: str = ""
+) -> NDArray[np.float64]:
+    """`value` as an array of finite numbers above 0, or `InputError`; `shape` as in `real_array`."""
+    array = real_array(value, name, shape)
+    if array.min(initial=np.inf) <= 0:
+        raise InputError(f"{name}: expected more than 0{' ' + unit if unit else ''}, got {array.min():g}")
+    return array
+
+
+def none_below_0(
+    value: Any, name: str, shape: tuple[int | None, ...] | None = None, unit: str = ""
+) -> NDArray[np.float64]:
+    """`value` as an array of finite numbers, each 0 or more, or `InputError`; `shape` as in `real_array`."""
+    array = real_array(value, name, shape)
+    if array.min(initial=0.0) < 0:
+        raise InputError(f"{name}: expected 0 or more{' ' + unit if unit else ''}, got {array.min():g}")
+    return array
+
+
 def positive(value: Any, name: str, unit: str = "") -> float:
     """`value` as a finite number above 0, or `InputError`."""
-    number = float(real_array(value, name, ()))
-    if number <= 0:
-        raise InputError(f"{name}: expected more than 0{' ' + unit if unit else ''}, got {number:g}")
-    return number
+    return float(all_above_0(value, name, (), unit))
 
 
 def at_least_0(value: Any, name: str, unit: str = "") -> float:
     """`value` as a finite number, 0 or more, or `InputError`."""
-    number = float(real_array(value, name, ()))
-    if number < 0:
-        raise InputError(f"{name}: expected 0 or more{' ' + unit if unit else ''}, got {number:g}")
-    return number
+    return float(none_below_0(value, name, (), unit))
 
 
 def one_for_all(value: ArrayLike, name: str, n: int) -> NDArray[np.float64]:
@@ -172,12 +186,9 @@ def one_for_all(value: ArrayLike, name: str, n: int) -> NDArray[np.float64]:
     return real_array(np.broadcast_to(value, n) if is_one else value, name, (n,))
 
 
-def lengths(value: ArrayLike, name: str, n: int) -> NDArray[np.float64]:
-    """`value` as `n` lengths above 0 mm, where one number stands for all, or `InputError`."""
-    array = one_for_all(value, name, n)
-    if array.min() <= 0:
-        raise InputError(f"{name}: expected more than 0 mm, got {array.min():g}")
-    return array
+def lengths(value: ArrayLike, name: str, n: int, unit: str = "mm") -> NDArray[np.float64]:
+    """`value` as `n` lengths above 0, where one number stands for all, or `InputError`."""
+    return all_above_0(one_for_all(value, name, n), name, (n,), unit)
 
 
 def freeze(array: NDArray[Any]) -> NDArray[Any]:

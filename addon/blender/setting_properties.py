@@ -5,7 +5,7 @@ from typing import Any
 
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, FloatVectorProperty, IntProperty, StringProperty
 
-from ...core.errors import InputError
+from ...core.errors import InputError, expecting
 from ...core.runs.recipe import is_met
 from ...core.runs.settings import Setting
 from . import choices, decimals, layouts, storage
@@ -186,10 +186,8 @@ def is_list(setting: Setting) -> bool:
 
 
 def _numbers(setting: Setting, text: str) -> tuple[float, ...] | None:
-    try:
+    with expecting(f"{setting.label}: expected numbers such as 10, 20, 30, got {text!r}"):
         return tuple(map(float, text.replace(",", " ").split())) or None
-    except ValueError:
-        raise InputError(f"{setting.label}: expected numbers such as 10, 20, 30, got {text!r}") from None
 
 
 def _is_vector(setting: Setting) -> bool:

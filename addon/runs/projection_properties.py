@@ -8,7 +8,7 @@ from typing import Any
 import bpy
 from bpy.props import BoolProperty, CollectionProperty, IntProperty, PointerProperty, StringProperty
 
-from ...core.errors import InputError
+from ...core.errors import InputError, expecting
 from ...core.physics.maps import MAPS
 from ...core.runs.presets import PRESETS
 from ...core.runs.recipe import Recipe, fitting_recipe
@@ -91,10 +91,8 @@ def set_panel(settings: ProjectionProperties, recipe: Recipe) -> None:
         raise InputError("frames.bins: the panel has one bin")
     text = recipe["system.modules"] or "-"
     first, dash, last = text.partition("-")
-    try:
+    with expecting(f"system.modules: the panel has one range of modules, not {text!r}"):
         modules = int(first or 0), int(last or 0) if dash else int(first)
-    except ValueError:
-        raise InputError(f"system.modules: the panel has one range of modules, not {text!r}") from None
     for name, setting in PROPERTIES.items():
         set_property(settings, PROPERTIES, name, recipe.given.get(setting.key))
     settings.fitted = ""  # the model is the recipe's, whatever the volume holds

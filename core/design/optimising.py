@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from ..arrays import Floats
-from ..errors import Cancelled, InputError, naming
+from ..errors import Cancelled, InputError, expecting, naming
 from ..files import AnyPath, read_text, write_bytes
 from ..geometry.system import PinholeSystem
 from ..progress import Progress, tell
@@ -228,10 +228,8 @@ class _Search:
             write_bytes(self._file, json.dumps(kept).encode())
 
     def _read(self, file: Path) -> None:
-        try:
+        with expecting(f"{file}: expected the state of a design", ValueError, KeyError, TypeError):
             kept = json.loads(read_text(file))
             recipe, self._merits, self._found = kept["recipe"], kept["merits"], [tuple(each) for each in kept["found"]]
-        except (ValueError, KeyError, TypeError):
-            raise InputError(f"{file}: expected the state of a design") from None
         if recipe != self._recipe.fingerprint:
             raise InputError(f"{file}: it is the state of another recipe; remove it, or name another file")

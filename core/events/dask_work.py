@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from ..errors import InputError, needing
+from ..errors import InputError, expecting, needing
 from .folders import SetFolder
 from .pool import threads_each
 from .writing import EventWriter, Written
@@ -48,12 +48,9 @@ def in_cluster(target: SetFolder, numbers: Sequence[int], address: str, workers:
         of = dict(zip((future.key for future in futures), numbers, strict=True))
         try:
             for future in as_completed(futures, loop=client.loop):
-                try:
+                refusal = f"event {of[future.key]}: its workers died again and again; see their logs"
+                with expecting(refusal, KilledWorker):
                     written = future.result()
-                except KilledWorker:
-                    raise InputError(
-                        f"event {of[future.key]}: its workers died again and again; see their logs"
-                    ) from None
                 yield Written(*written)
         finally:
             client.cancel(futures)

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from ..arrays import ArrayOrTensor, is_tensor, namespace, promote
-from ..errors import InputError
+from ..errors import InputError, expecting
 
 _NAMES = {
     "b": "b, the distance from pinhole to isocentre,",
@@ -45,11 +45,10 @@ def roi_radius_seen(
 
 def _numbers(limits: dict[str, str], **given: ArrayOrTensor) -> list[Any]:
     """The arguments as arrays or tensors; each must be finite and more than its limit, which is 0 or another argument."""
-    try:
+    refusal = f"{', '.join(given)}: expected real numbers, or arrays of them that broadcast"
+    with expecting(refusal, TypeError, ValueError):
         numbers = promote(*(x if is_tensor(x) else np.asarray(x, dtype=np.float64) for x in given.values()))
         np.broadcast_shapes(*(x.shape for x in numbers))
-    except (TypeError, ValueError):
-        raise InputError(f"{', '.join(given)}: expected real numbers, or arrays of them that broadcast") from None
     arrays = {name: x.detach().cpu().numpy() if is_tensor(x) else x for name, x in zip(given, numbers, strict=True)}
     for name, limit in limits.items():
         good = (arrays[name] > arrays.get(limit, 0.0)) & np.isfinite(arrays[name])

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import Array, ArrayLike, Floats, Integers
-from ..errors import InputError, naming, warn
+from ..errors import InputError, expecting, naming, warn
 from ..system_source import SystemSource
 from ..validation import lengths, positive, real_array, whole_shape
 from .collimator import Collimator, Construction
@@ -239,11 +239,9 @@ def chosen_modules(system: AnyScanner, text: str | None, name: str = "--modules"
     lowest, highest = int(system.numbers.min()), int(system.numbers.max())
     for part in text.split(","):
         first, dash, last = part.strip().partition("-")
-        try:
+        with expecting(f"{name} {text!r}: expected numbers such as 1-40 or 1-20,41"):
             low = int(first) if first or not dash else lowest
             high = int(last) if last else highest if dash else low
-        except ValueError:
-            raise InputError(f"{name} {text!r}: expected numbers such as 1-40 or 1-20,41") from None
         found = np.flatnonzero((system.numbers >= low) & (system.numbers <= high))
         if high < low:
             raise InputError(f"{name} {text!r}: {part.strip()} ends before it begins")

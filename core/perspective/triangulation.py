@@ -15,7 +15,7 @@ import numpy as np
 from ..arrays import ArrayLike, Floats, Indexes
 from ..errors import InputError
 from ..geometry.views import Views
-from ..validation import freeze, real_array
+from ..validation import freeze, lengths, real_array
 from .view_rays import Indices, rays_by_depth, view_indices
 
 _STEPS = 200
@@ -223,10 +223,7 @@ def _whitening(sigma: ArrayLike, n: int) -> Floats:
         if bad.any():
             raise InputError(f"sigma: expected covariances, symmetric and above 0; {int(bad.argmax())} is not")
         return np.linalg.inv(np.linalg.cholesky(covariances))
-    values = real_array(np.broadcast_to(sigma, n) if np.ndim(sigma) == 0 else sigma, "sigma", (n,))
-    if values.min() <= 0:
-        raise InputError(f"sigma: expected more than 0 px, got {values.min():g}")
-    return np.eye(2) / values[:, None, None]
+    return np.eye(2) / lengths(sigma, "sigma", n, "px")[:, None, None]
 
 
 def _chance(chi2: float, degrees: int) -> float:

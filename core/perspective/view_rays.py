@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import Array, ArrayLike, Floats, Indexes
-from ..errors import InputError
+from ..errors import InputError, expecting
 from ..geometry.frames import cross_matrix
 from ..geometry.views import Views
 from ..validation import instance, real_array
@@ -30,10 +30,8 @@ def view_indices(views: Views, which: Indices, name: str) -> Indexes:
 
 def broadcast(first: Array, second: Array, expected: str) -> tuple[Array, Array]:
     """Two arrays made of one shape, or `InputError` with what is `expected`."""
-    try:
+    with expecting(f"{expected}, or one for all, got {first.size} and {second.size}"):
         one, other = np.broadcast_arrays(first, second)
-    except ValueError:
-        raise InputError(f"{expected}, or one for all, got {first.size} and {second.size}") from None
     return one, other
 
 

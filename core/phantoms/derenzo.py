@@ -11,7 +11,7 @@ import numpy as np
 from ..arrays import Floats
 from ..errors import InputError, warn
 from ..physics.materials import WATER_MU
-from ..validation import at_least_0, freeze, positive, real_array
+from ..validation import at_least_0, freeze, none_below_0, positive
 from .intervals import Interval, Points, Real
 from .phantom import Phantom
 from .settings import count, setting
@@ -52,12 +52,10 @@ class DerenzoRods(Shape):
             self._set(name, positive(getattr(self, name), f"Derenzo {name}", "mm"))
         if isinstance(self.sectors, bool) or not isinstance(self.sectors, int) or self.sectors < 2:
             raise InputError(f"Derenzo sectors: expected a whole number of at least 2, got {self.sectors!r}")
-        diameters = real_array(self.rod_diameters, "Derenzo rod diameters", (None,))
+        diameters = none_below_0(self.rod_diameters, "Derenzo rod diameters", (None,), "mm")
         if len(diameters) != self.sectors:
             expected = f"one for each of {self.sectors} sectors (0: empty)"
             raise InputError(f"Derenzo rod diameters: expected {expected}, got {len(diameters)}")
-        if np.any(diameters < 0):
-            raise InputError(f"Derenzo rod diameters: expected 0 or more mm, got {diameters.min():g}")
         self._set("rod_diameters", tuple(diameters.tolist()))
         rows, within = [rows for _, rows in self._rows], f"a radius of {self.radius:g} mm"
         if sum(n * (n + 1) // 2 for n in rows) > _MOST_RODS:

@@ -3,9 +3,8 @@
 import numpy as np
 
 from ..arrays import ArrayLike, Floats
-from ..errors import InputError
 from ..geometry.frames import euler_pose
-from ..validation import real_array, seed_number
+from ..validation import none_below_0, real_array, seed_number
 
 
 def random_pose(
@@ -24,9 +23,7 @@ def random_pose(
     """
     rng = seed if isinstance(seed, np.random.Generator) else np.random.default_rng(seed_number(seed))
     one_side = isinstance(box, int | float | np.integer | np.floating)
-    sides = real_array(np.full(3, box) if one_side else box, "box of random poses", (3,))
-    if np.any(sides < 0):
-        raise InputError(f"box of random poses: expected 0 or more mm, got {sides.min():g}")
+    sides = none_below_0(np.full(3, box) if one_side else box, "box of random poses", (3,), "mm")
     middle = real_array(center, "centre of random poses", (3,))
     translation = middle + (rng.random(3) - 0.5) * sides
     phi, theta, psi = rng.uniform(0.0, 2 * np.pi, 3)

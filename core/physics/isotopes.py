@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..arrays import ArrayLike, Floats
-from ..errors import InputError
-from ..validation import one_of, positive, real_array
+from ..errors import expecting
+from ..validation import all_above_0, one_of, positive, real_array
 from .mass_attenuation import table_lines
 
 _SECONDS = {"min": 60.0, "h": 3600.0, "d": 24 * 3600.0}
@@ -39,9 +39,7 @@ class Isotope:
         """``exp(-lambda start) (1 - exp(-lambda t)) / lambda``, s: in this time the activity at 0 decays as often as from
         `start` on within the `duration` t, both s, numbers or arrays.
         """
-        rate, times = math.log(2) / self.half_life, real_array(duration, "duration", None)
-        if times.size and times.min() <= 0:
-            raise InputError(f"duration: expected more than 0 s, got {times.min():g}")
+        rate, times = math.log(2) / self.half_life, all_above_0(duration, "duration", unit="s")
         found = np.exp(-rate * real_array(start, "start", None)) * -np.expm1(-rate * times) / rate
         return found if found.ndim else float(found)
 
@@ -72,7 +70,5 @@ def photon_energy(value: float | str) -> float:
     """A photon energy, keV, from a number or its text, or from the name of an isotope: that of its strongest line."""
     if value in ISOTOPES:
         return max(ISOTOPES[str(value)].lines, key=lambda line: line[1])[0]
-    try:
+    with expecting(f"energy {value!r}: expected keV, or one of {', '.join(ISOTOPES)}"):
         return float(value)
-    except ValueError:
-        raise InputError(f"energy {value!r}: expected keV, or one of {', '.join(ISOTOPES)}") from None

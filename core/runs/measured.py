@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from ..arrays import Array, ArrayLike
-from ..errors import InputError, naming, warn
+from ..errors import InputError, expecting, naming, warn
 from ..files import read_text
 from ..geometry.scanner import Detector, Scanner
 from ..memory import require
@@ -227,10 +227,8 @@ def _parsed(text: str) -> list[int | None]:
 
 
 def _whole(values: Any) -> list[int | None]:
-    try:
+    with expecting(f"frames (--frames): expected the modules' numbers, got {values!r:.40}", TypeError):
         return [None if value is None else operator.index(value) for value in values]
-    except TypeError:
-        raise InputError(f"frames (--frames): expected the modules' numbers, got {values!r:.40}") from None
 
 
 def _times(time: Any, found: Counts, used: list[int], called: list[str]) -> float | list[float]:

@@ -8,7 +8,7 @@ import numpy as np
 
 from ..arrays import ArrayLike, Floats
 from ..errors import InputError, warn
-from ..validation import instance, real_array, whole_number
+from ..validation import instance, none_below_0, real_array, whole_number
 from .coefficients import attenuations
 from .spectral import SpectralTransmission
 
@@ -161,9 +161,7 @@ def correct_beam_hardening(counts: ArrayLike, m: SpectralTransmission, mAs: Arra
 
 
 def _checked_counts(counts: ArrayLike, m: SpectralTransmission) -> Floats:
-    values = real_array(counts, "counts", None)
+    values = none_below_0(counts, "counts")
     if not values.ndim or len(values) != len(m.weights):
         raise InputError(f"counts: expected a first axis of {len(m.weights)} bins, got shape {values.shape}")
-    if values.size and values.min() < 0:
-        raise InputError(f"counts: expected 0 or more, got {values.min():g}")
     return values

@@ -11,7 +11,7 @@ import numpy as np
 
 from ..arrays import ArrayLike, Floats
 from ..errors import InputError, naming
-from ..validation import at_least_0, freeze, positive, real_array
+from ..validation import at_least_0, freeze, none_below_0, positive, real_array
 from .coefficients import attenuations
 
 Bins = Sequence[tuple[float, float]]
@@ -56,10 +56,8 @@ class PhotonCounter:
         object.__setattr__(self, "thickness", positive(self.thickness, "detector: thickness", "mm"))
         object.__setattr__(self, "energy_fwhm", at_least_0(self.energy_fwhm, "detector: energy_fwhm", "keV"))
         if self.sharing is not None:
-            sharing = freeze(real_array(self.sharing, "detector: sharing", (None, None)))
-            if sharing.min() < 0:
-                raise InputError(f"detector: sharing: expected 0 or more, got {sharing.min():g}")
-            object.__setattr__(self, "sharing", sharing)
+            sharing = none_below_0(self.sharing, "detector: sharing", (None, None))
+            object.__setattr__(self, "sharing", freeze(sharing))
 
     def response(self, energies: Floats, bins: Bins | None) -> Floats:
         """Counts (bins, n) of a photon of each energy (n,), keV."""

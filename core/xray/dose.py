@@ -15,7 +15,7 @@ from ..geometry.grid import Grid
 from ..memory import require
 from ..physics.isotopes import isotope as isotope_of
 from ..progress import Progress, tell
-from ..validation import freeze, instance, one_of, positive, real_array
+from ..validation import all_above_0, freeze, instance, one_of, positive
 from ..volumes.volume import Volume, require_quantity
 from .coefficients import between, energy_absorption, photon_data, table_lines
 from .spectra import tube_spectrum
@@ -232,9 +232,7 @@ def convolved(values: Floats, kernel: Floats) -> Floats:
 
 
 def _densities(density: ArrayLike | None, grid: Grid) -> Floats:
-    values = real_array(1.0 if density is None else density, "density", None)
+    values = all_above_0(1.0 if density is None else density, "density", unit="g/cm^3")
     if values.shape not in ((), grid.shape):
         raise InputError(f"density: expected one number or an array of {grid.shape}, got {values.shape}")
-    if values.min() <= 0:
-        raise InputError(f"density: expected more than 0 g/cm^3, got {values.min():g}")
     return freeze(np.broadcast_to(values, grid.shape).copy())

@@ -15,7 +15,7 @@ from ..physics.crystal import gaussian_blur
 from ..physics.ct_numbers import CT_ENERGY
 from ..physics.energy_window import FWHM_PER_SIGMA
 from ..projector import Projector
-from ..validation import at_least_0, freeze, instance, real_array
+from ..validation import all_above_0, at_least_0, freeze, instance, none_below_0, real_array
 from ..volumes.volume import Volume, require_quantity
 from .coefficients import attenuations
 from .detectors import Bins, Detector, PhotonCounter
@@ -95,8 +95,8 @@ class SpectralTransmission:
         self.weights = freeze(weights)
         self.mu = freeze(np.array([attenuations(name, spectrum.energies) for name in self.materials]))
         self._pixels = None if self.views is None else _pixels(self.views)
-        self._blurs = _blurs(self.views, _none_below_0(blur, "blur")) if np.any(blur) else []
-        self.background = freeze(_none_below_0(background, "background"))
+        self._blurs = _blurs(self.views, none_below_0(blur, "blur")) if np.any(blur) else []
+        self.background = freeze(none_below_0(background, "background"))
 
     def expected(self, paths: ArrayLike, mAs: ArrayLike) -> Floats:
         """Expected counts (bins, ...) of rays with `paths` (materials, ...), mm of each material at its own density.
@@ -152,9 +152,7 @@ class SpectralTransmission:
 
     def scale(self, shape: tuple[int, ...], mAs: ArrayLike) -> Floats:
         """What turns `weights` into the counts of rays of a `shape`: mAs, and pixels' areas and distances."""
-        exposure = real_array(mAs, "mAs", None)
-        if exposure.size and exposure.min() <= 0:
-            raise InputError(f"mAs: expected more than 0, got {exposure.min():g}")
+        exposure = all_above_0(mAs, "mAs")
         if self._pixels is None:
             if exposure.ndim:
                 raise InputError("mAs: expected one number where there are no views")
@@ -217,13 +215,6 @@ def panel_blur(system: XraySystem, fwhm: float = 0.0) -> Floats:
     before = np.linalg.norm(system.sources, axis=1)
     shadow = system.focal_spot * (np.linalg.norm(system.panel_centers - system.sources, axis=1) / before - 1)
     return np.hypot(at_least_0(fwhm, "fwhm"), np.maximum(shadow, 0) * FWHM_PER_SIGMA / math.sqrt(12))
-
-
-def _none_below_0(values: ArrayLike, name: str) -> Floats:
-    array = real_array(values, name, None)
-    if array.min(initial=0.0) < 0:
-        raise InputError(f"{name}: expected 0 or more, got {array.min():g}")
-    return array
 
 
 def _blurs(views: Views | None, blur: Floats) -> list[tuple[Floats, Floats]]:

@@ -8,6 +8,7 @@ import numpy as np
 
 from .... import core as mph
 from ...arrays import Array, table_rows
+from ...errors import expecting
 from ...geometry.scanner import Scanner
 from ..options import print_answer
 from ..scanners import chosen_modules, read_any
@@ -125,12 +126,10 @@ def _print_point(
 def _pixel(system: Scanner, text: str) -> tuple[int, list[float]]:
     """Index of the module, and its column and row, of a ``MODULE:COLUMN,ROW``."""
     module, _, place = text.partition(":")
-    try:
+    with expecting(f"--pixel {text!r}: expected MODULE:COLUMN,ROW, such as 7:120,130.5"):
         number, (column, row) = int(module), map(float, place.split(","))
         if not (math.isfinite(column) and math.isfinite(row)):
             raise ValueError
-    except ValueError:
-        raise mph.InputError(f"--pixel {text!r}: expected MODULE:COLUMN,ROW, such as 7:120,130.5") from None
     index = np.flatnonzero(system.numbers == number)
     if not len(index):
         lowest, highest = system.numbers.min(), system.numbers.max()

@@ -7,6 +7,7 @@ from types import UnionType
 from typing import Any, Literal
 
 from .... import core as mph
+from ...errors import expecting
 from ...exchange import FORMATS, Format
 from ..options import add_run, output_path
 from ..scanners import add_workbook, chosen_modules, read_any
@@ -94,11 +95,9 @@ def _option(format: Format, text: str) -> tuple[str, Any]:
     type_, _ = options[name]
     if type_ is mph.Grid:
         return name, mph.read_volume(value).grid
-    try:
+    with expecting(f"--set {text!r}: expected {name}={_word(type_)}", KeyError, ValueError):
         if type_ is bool:
             return name, {"yes": True, "no": False}[value]
         if typing.get_origin(type_) is tuple:
             return name, tuple(float(part) for part in value.split(","))
         return name, value if typing.get_origin(type_) is Literal else type_(value)  # the format knows its choices
-    except (KeyError, ValueError):
-        raise mph.InputError(f"--set {text!r}: expected {name}={_word(type_)}") from None

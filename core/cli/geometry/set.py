@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .... import core as mph
+from ...errors import expecting
 from ...geometry.columns import ANGLE_UNITS, Column
 from ...geometry.frames import affine_matrix
 from ...geometry.scanner import Scanner
@@ -142,10 +143,8 @@ def _with_lengths(
     if arguments.length is not None:
         follows = np.where(chosen, arguments.length == "design", follows)
     if arguments.length not in (None, "design"):
-        try:
+        with expecting(f"--length {arguments.length!r}: expected millimetres or 'design'"):
             changes["collimator_length"] = np.where(chosen, float(arguments.length), system.collimator_length)
-        except ValueError:
-            raise mph.InputError(f"--length {arguments.length!r}: expected millimetres or 'design'") from None
     system = system.replace(**changes)
     # Lengths that are the formula's to 1e-9 stay as they are, to the last digit.
     others = follows & ~length.is_default(system)

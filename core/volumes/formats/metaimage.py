@@ -11,7 +11,7 @@ from typing import BinaryIO
 import numpy as np
 
 from ...arrays import Floats
-from ...errors import InputError
+from ...errors import InputError, expecting
 from ...files import require_file
 from ...geometry.frames import affine_matrix
 from .contents import RAS_FROM_LPS, Contents, refuse_several_files, require_voxels, warn_of_assumed
@@ -123,10 +123,8 @@ def _numbers(header: dict[str, str], keys: tuple[str, ...], default: Floats | No
         if default is None:
             raise InputError(f"it has no {keys[0]}")
         return default
-    try:
+    with expecting(f"{keys[0]} = {text}: expected numbers"):
         numbers = np.array(text.split(), np.float64)
-    except ValueError:
-        raise InputError(f"{keys[0]} = {text}: expected numbers") from None
     if default is not None and len(numbers) != len(default):
         raise InputError(f"{keys[0]} = {text}: expected {len(default)} numbers")
     return numbers

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ...arrays import Floats, Integers
-from ...errors import InputError, reading
+from ...errors import InputError, expecting, reading
 from ...files import AnyPath, replacing, require_ending, require_file
 from ...validation import freeze, one_of, real_array
 
@@ -87,10 +87,9 @@ def as_mesh(given: Any) -> Mesh:
         given = given.to_mesh()
     if hasattr(given, "vertices") and hasattr(given, "faces"):
         return Mesh(given.vertices, given.faces)
-    try:
+    refusal = f"mesh: expected a mesh, vertices and faces, or a path, got {type(given).__name__}"
+    with expecting(refusal, TypeError, ValueError):
         vertices, faces = given
-    except (TypeError, ValueError):
-        raise InputError(f"mesh: expected a mesh, vertices and faces, or a path, got {type(given).__name__}") from None
     return Mesh(vertices, faces)
 
 

@@ -67,7 +67,7 @@ def trace_rays(
     ------
     InputError
         Not a volume, or one whose line integrals mean nothing (CT numbers, maps); the points' shapes do not fit, or a
-        coordinate is not finite; mu is negative; no such backend.
+        coordinate, or a voxel that a ray meets, is not finite; mu is negative; no such backend.
 
     Examples
     --------

@@ -493,7 +493,8 @@ def _pose_gradient(case: Case, integrate: Callable[[int, Any], Any]) -> Call:
             motion = torch.zeros(6, requires_grad=True)
             pose = se3_exp(scale * motion) @ poses[m]
             image = integrate(m, (pose[:3, 3], pose[:3, :3], distances[m], pitches[m]))
-            (weights[m] * image).sum().backward()
+            # Not a product and a sum in torch, whose threads would then wait, busily, beside the contender's.
+            image.backward(weights[m])
             gradients.append(motion.grad.numpy())  # type: ignore[union-attr]
         return np.stack(gradients)
 

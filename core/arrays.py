@@ -38,11 +38,12 @@ def is_double(value: object) -> bool:
 
 
 def checked(
-    value: ArrayOrTensor, name: str, shape: tuple[int, ...], float64: bool, batch: bool = False
+    value: ArrayOrTensor, name: str, shape: tuple[int, ...], float64: bool, batch: bool = False, finite: bool = False
 ) -> ArrayOrTensor:
     """`value` as float32 or float64 numbers, still an array or still a tensor on its device; not copied without need.
 
-    A float64 tensor stays float64. Of a `batch`, any axes may come before those of `shape`.
+    A float64 tensor stays float64. Of a `batch`, any axes may come before those of `shape`. If `finite`, the caller sees to
+    it that a tensor's numbers are.
     """
     if is_tensor(value):
         import torch
@@ -53,7 +54,7 @@ def checked(
             raise InputError(f"{name}: expected shape {shape_text(wanted)}, got {shape_text(value.shape)}")
         if value.dtype != torch.float64:
             value = value.to(torch.float64 if float64 else torch.float32)
-        if not bool(torch.isfinite(value.detach().sum())):
+        if not finite and not bool(torch.isfinite(value.detach().sum())):
             require_finite(value.detach().cpu().numpy(), name)
         return value
     dtype = np.float64 if float64 else np.float32

@@ -6,9 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from ..arrays import ArrayOrTensor, Floats, cast_like, to_caller, zeros
+from ..arrays import Array, ArrayOrTensor, Floats, cast_like, to_caller, zeros
 from ..geometry.grid import Grid
 from ..memory import available
+from . import ray_gradients
 from .backends import Backend
 from .bundles import Bundles, Part
 from .lattices import Lattices, filled_lattices
@@ -83,17 +84,20 @@ class Execution:
                 yield from task.result
 
     def derivatives(
-        self, volume: ArrayOrTensor, bundles: Bundles, mu: ArrayOrTensor = None
+        self, volume: ArrayOrTensor, bundles: Bundles, mu: ArrayOrTensor, images: Array
     ) -> list[tuple[Part, Floats]]:
-        """The backend's derivatives, part by part, (7 or 14, rays)."""
+        """The backend's derivatives, part by part, (7 or 14, rays); the integrals are added to `images`."""
         lattices = self._lattices(volume, mu, bundles)
         derivatives = self.backend.functions.derivatives
 
         def run(task: _Task) -> list[tuple[Part, Floats]]:
-            return [
+            results = [
                 (part, to_caller(derivatives(lattices.volume, *part.in_index_space(lattices)), np.empty(0)).T)
                 for part in self._parts(task, bundles)
             ]
+            for part, own in results:
+                part.add_to(images, 0, ray_gradients.integrals(part, own))
+            return results
 
         tasks = self._tasks(bundles, lattices, self.workers)
         return [result for results in in_order(run, tasks, self.workers) for result in results]

@@ -37,14 +37,12 @@ def by_geometry(
     list of (int, array)
         By source, corner, row step and column step of a fan, (4, 3); by starts and ends, (2, rays, 3).
     """
-    result, start = [], 0
-    for (number, _), (along, lengths) in zip(part.images, _rays(part), strict=True):
-        own = derivatives[:, start : start + len(lengths)]
-        values = part.pixels(gradient[number]).reshape(-1)
-        by = _by_ends if isinstance(part.rays, Ends) else _by_fan
-        result.append((number, by(part, values, own, along, lengths, grid, mu_grid)))
-        start += len(lengths)
-    return result
+    by = _by_ends if isinstance(part.rays, Ends) else _by_fan
+    each = zip(part.images, np.split(derivatives, len(part.images), axis=1), _rays(part), strict=True)
+    return [
+        (number, by(part, part.pixels(gradient[number]).reshape(-1), own, *rays, grid, mu_grid))
+        for (number, _), own, rays in each
+    ]
 
 
 def _by_ends(
@@ -92,22 +90,18 @@ def _by_length(values: Floats, lengths: Floats, derivatives: Floats) -> Floats:
 def _rays(part: Part) -> list[tuple[Floats, Floats]]:
     """Source to target of the rays of every fan, (3, n), and their lengths (n,), world mm."""
     if isinstance(part.rays, Ends):
-        each = [(part.rays.ends - part.rays.starts).T]
+        each = (part.rays.ends - part.rays.starts).T[None]
     else:
         rows, columns = map(np.arange, part.shape)
-        each = []
-        for source, corner, row_step, column_step in part.rays:
-            firsts = (corner - source)[:, None] + np.outer(row_step, rows)
-            each.append((firsts[:, :, None] + np.outer(column_step, columns)[:, None]).reshape(3, -1))
+        source, corner, row_step, column_step = part.rays.swapaxes(0, 1)[..., None, None]
+        each = (corner - source + row_step * rows[:, None] + column_step * columns).reshape(len(source), 3, -1)
     return [(along, np.sqrt(np.einsum("in,in->n", along, along))) for along in each]
 
 
 def _numbers(part: Part) -> Floats:
     """For each ray of a fan: 1, the row's number and the column's, (3, n), counted from the part's corner."""
-    rows, columns = part.shape
-    numbers = np.ones((3, rows, columns))
-    numbers[1], numbers[2] = np.arange(rows)[:, None], np.arange(columns)
-    return numbers.reshape(3, -1)
+    rows, columns = np.indices(part.shape, float).reshape(2, -1)
+    return np.stack([np.ones_like(rows), rows, columns])
 
 
 def _linear(grid: Grid) -> Floats:

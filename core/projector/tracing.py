@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from ..arrays import ArrayOrTensor, Floats, checked, is_double, is_tensor, namespace, promote, to_caller
 from ..errors import InputError
 from ..geometry.grid import Grid
-from ..validation import instance, shape_text, whole_shape
+from ..validation import instance, require_finite, shape_text, whole_shape
 from ..volumes.volume import LINE_INTEGRALS, Volume, require_quantity
 from . import backends, ray_gradients
 from .bundles import Beam, Bundle, Bundles, Part
@@ -67,7 +67,7 @@ def trace_rays(
     ------
     InputError
         Not a volume, or one whose line integrals mean nothing (CT numbers, maps); the points' shapes do not fit, or a
-        coordinate is not finite; mu is negative; no such backend.
+        coordinate, or a voxel that a ray meets, is not finite; mu is negative; no such backend.
 
     Examples
     --------
@@ -170,7 +170,8 @@ def _field(value: Volume | ArrayOrTensor, name: str, grid: Grid | None, float64:
     if grid is None:
         raise InputError(f"{name}: expected a Volume, or also a grid, got {type(value).__name__}")
     instance(grid, Grid, f"grid of {name}")
-    return checked(value, name, grid.shape, float64), grid
+    # Reading all of a large tensor takes as long as tracing it: a volume that is not finite shows in its integrals.
+    return checked(value, name, grid.shape, float64, finite=name == "volume"), grid
 
 
 def _numbers(value: Any, name: str, last: tuple[int, ...], in_torch: bool) -> Any:
@@ -197,15 +198,15 @@ def _traced(
     volume: Any, mu: Any, geometry: Any, bundles_of: Callable[[Floats], Bundles], execution: Execution
 ) -> ArrayOrTensor:
     """Line integrals (images, rows, columns) of the rays that ``bundles_of(geometry)`` makes, a step of torch's graph if
-    the geometry is a tensor; float32, or float64 of the reference and in torch.
+    the geometry is a tensor; float32, or float64 where the execution is.
     """
+    kind = np.float64 if execution.float64 else np.float32
 
-    def images(bundles: Bundles, volume: Any, mu: Any) -> list[Floats]:
-        return [to_caller(image, np.empty(0)) for image in execution.images(volume, bundles, mu)]
+    def images(bundles: Bundles, volume: Any, mu: Any) -> Floats:
+        return np.array([to_caller(image, np.empty(0)) for image in execution.images(volume, bundles, mu)], kind)
 
     if not is_tensor(geometry):
-        kind = np.float64 if execution.backend.always_float64 else np.float32
-        return np.array(images(bundles_of(geometry), volume, mu), kind)
+        return images(bundles_of(geometry), volume, mu)
     import torch
 
     from . import autograd
@@ -216,12 +217,12 @@ def _traced(
     def run(needs: Any) -> Any:
         parts: list[tuple[Part, Floats]] = []
         if needs[2]:
-            parts = execution.derivatives(volume_data, bundles, mu_data)
-            integrals = np.zeros((len(bundles), *bundles.image_shape))
-            for part, derivatives in parts:
-                part.add_to(integrals, 0, ray_gradients.integrals(part, derivatives))
+            integrals = np.zeros((len(bundles), *bundles.image_shape), kind)
+            parts = execution.derivatives(volume_data, bundles, mu_data, integrals)
         else:
-            integrals = np.array(images(bundles, volume_data, mu_data), np.float64)
+            integrals = images(bundles, volume_data, mu_data)
+        if not np.isfinite(integrals).all():
+            require_finite(to_caller(volume_data, integrals), "volume")
 
         def gradients(gradient: Tensor, needs: Any) -> list[Tensor | None]:
             found: list[Tensor | None] = [None, None, None]
@@ -258,9 +259,9 @@ def _by_geometry(gradient: Floats, parts: list[tuple[Part, Floats]], bundles: Bu
 
 def gradient_by_fans(execution: Execution, bundles: Bundles, volume: Floats, mu: Floats | None) -> Floats:
     """The gradient (4, 3), by its source, corner, row step and column step, of the sum of a fan's integrals."""
-    parts = execution.derivatives(volume, bundles, mu)
-    gradient: Floats = _by_geometry(np.ones((1, *bundles.image_shape)), parts, bundles, execution)[0]
-    return gradient
+    ones = np.ones((1, *bundles.image_shape))
+    parts = execution.derivatives(volume, bundles, mu, np.zeros_like(ones))
+    return _by_geometry(ones, parts, bundles, execution).reshape(4, 3)
 
 
 def _of_kind(integrals: ArrayOrTensor, volume: Any, *geometry: Any) -> ArrayOrTensor:

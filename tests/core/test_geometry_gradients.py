@@ -264,6 +264,7 @@ def test_bad_input_is_one_clear_line():
     for call, word in (
         (lambda: trace_rays(ones, point, point), "grid"),
         (lambda: trace_rays(ones, point, point, grid=3), "int"),
+        (lambda: trace_rays(ones * np.nan, point, point + 9, grid=grid), "volume: nan"),
         (lambda: trace_rays(torch.ones(3, 3, 3), point, point, grid=grid), "5 x 4 x 3"),
         (lambda: trace_rays(ones, torch.zeros(2), point, grid=grid), "sources"),
         (lambda: trace_rays(ones, torch.zeros((2, 3)), torch.zeros((4, 3)), grid=grid), "2 sources"),

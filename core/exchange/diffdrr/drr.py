@@ -3,6 +3,7 @@
 import inspect
 from collections.abc import Callable
 from dataclasses import replace
+from functools import reduce
 from typing import Any
 
 import numpy as np
@@ -186,8 +187,9 @@ class DRR(torch.nn.Module):
         if mask_to_channels:
             channels = [density * (self.mask == label) for label in range(int(self.mask.max()) + 1)]
         fans = _whole_lines(self.grid, vectors) if self.whole_line else [vectors]
-        images = [sum(self._traced(channel, fan) for fan in fans) for channel in channels]
-        return torch.stack(images, dim=1).to(self.density)
+        images = [reduce(torch.add, [self._traced(channel, fan) for fan in fans]) for channel in channels]
+        # Steps of torch on so many numbers are on threads, which afterwards wait busily beside ours.
+        return (torch.stack(images, dim=1) if images[1:] else images[0][:, None]).to(self.density)
 
     def _traced(self, density: Tensor, vectors: Tensor) -> Tensor:
         """Integrals (B, N) along the rays of fans (B, 4, 3), or of some of their rays."""

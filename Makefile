@@ -1,5 +1,5 @@
 # make demo    the whole main path on the real workbook, into out/
-# make test    linters, types and tests (tests/core, tests/blender)
+# make test    linters, types and tests (tests/core, tests/blender); TESTS=--once: laws of numbers in one case each
 # make test-long   the tests that take minutes: long property runs, workbooks through LibreOffice
 # make bench   speed, accuracy and memory beside other projectors, into docs/; BENCH=--quick: a minute or two, into out/
 # make bench-events   event sets beside the usual pipeline with DiffDRR, into docs/; BENCH=--quick: a minute, into out/
@@ -24,6 +24,7 @@ VENV = .venv
 TORCH = torch==2.13.0
 PLATFORM =
 OUTPUT = out
+TESTS =
 CT = $(wildcard ../shared/data/chest_ct_3mm.nii.gz)
 
 BIN = $(VENV)/bin
@@ -44,7 +45,7 @@ gallery: env-dev
 	$(BIN)/python examples/gallery.py docs/images $(CT)
 
 test: lint
-	$(BIN)/python -m pytest -n auto --dist worksteal
+	$(BIN)/python -m pytest -n auto --dist worksteal $(TESTS)
 
 test-long: env-dev
 	$(BIN)/python -m pytest -m long -n auto --dist worksteal

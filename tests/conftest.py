@@ -25,6 +25,22 @@ gc.disable()
 _file: Path | None = None
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    text = "of what needs neither Blender nor files, each test in its first case: for a second Python"
+    parser.addoption("--once", action="store_true", help=text)
+
+
+@pytest.hookimpl(trylast=True)  # after the long ones are left out
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    if not config.getoption("--once"):
+        return
+    first = {item.nodeid.partition("[")[0]: item for item in reversed(items)}
+    every = [item for item in items if not {"scene", "tmp_path"}.isdisjoint(item.fixturenames)]  # type: ignore[attr-defined]
+    kept = {*every, *first.values()}
+    config.hook.pytest_deselected(items=[item for item in items if item not in kept])
+    items[:] = [item for item in items if item in kept]
+
+
 def pytest_collection_finish() -> None:
     gc.freeze()
     gc.enable()

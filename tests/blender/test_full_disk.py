@@ -59,11 +59,8 @@ def test_a_blend_on_a_full_disk_is_one_line(disk):
 def test_a_figure_on_a_full_disk_is_one_line_and_status_1(disk, small_workbook, capsys):
     from mphdrr.__main__ import main
 
-    assert (
-        main(
-            ["figure", "scanner", str(small_workbook), "--size", "800x600", "--samples", "1", "-o", str(disk / "a.png")]
-        )
-        == 1
-    )
+    (disk / "other").write_bytes(bytes(SIZE))
+    words = ["figure", "scanner", str(small_workbook), "--size", "120x120", "--samples", "1", "-o", str(disk / "a.png")]
+    assert main(words) == 1
     assert "No space left on device" in capsys.readouterr().err
-    assert list(disk.iterdir()) == []
+    assert [path.name for path in disk.iterdir()] == ["other"]

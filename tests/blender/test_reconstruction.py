@@ -267,6 +267,7 @@ def test_continue_goes_on_as_if_there_had_been_no_break(render, scene, monkeypat
         jobs.run(job, cancel)
     assert scene.mphdrr_reconstruction.record == record and reconstructed() == first
     np.testing.assert_array_equal(volumes.volume_from_object(first).array, array)
+    monkeypatch.undo()
     assert bpy.ops.mphdrr.continue_reconstruction() == {"FINISHED"}
     assert reconstructed() == first and scene.mphdrr_reconstruction.known["title"] == "OSEM, 13 iterations"
     bpy.ops.mphdrr.reconstruct(**SMALL | {"iterations": 13})

@@ -55,8 +55,7 @@ def test_output_that_cannot_be_written_is_one_line_of_every_command(monkeypatch,
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no /dev/full")
 def test_nothing_more_is_said_when_python_ends():
-    words = f"geometry show {WORKBOOK} --json".split()
-    for unbuffered in ("", "1"):
+    for unbuffered, words in (("", ["geometry", "show", str(WORKBOOK), "--json"]), ("1", ["events", "new"])):
         said = run_python(
             f"import os, sys; os.dup2(os.open('/dev/full', os.O_WRONLY), 1)\n"
             f"from mphdrr.addon.cli import main; sys.exit(main({words}))",

@@ -75,8 +75,8 @@ def test_it_agrees_with_rays(rng):
     grid = mph.Grid.centered((12, 12, 12), 6.0)
     x = rng.random(grid.shape) ** 8
     given = {"edge": "path", "aperture_mu": TUNGSTEN, "within_crystal": True, **DEEP}
-    A = mph.Projector(grid, SYSTEM.views((24, 24)), mph.Emission(SYSTEM, **given))
-    rays = mph.Emission(SYSTEM, hole="rays", aperture_points=37, pixel_points=8, tolerance=1e9, **given)
+    A = mph.Projector(grid, SYSTEM[1:].views((24, 24)), mph.Emission(SYSTEM[1:], **given))
+    rays = mph.Emission(SYSTEM[1:], hole="rays", aperture_points=37, pixel_points=8, tolerance=1e9, **given)
     assert misplaced(A(x), mph.Projector(grid, A.views, rays)(x)) < 0.012
 
 

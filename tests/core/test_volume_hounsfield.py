@@ -14,7 +14,7 @@ GRID = mph.Grid((7, 1, 1), np.eye(4))
 
 
 def converted(hu, **options) -> np.ndarray:
-    grid = mph.Grid((len(hu), 1, 1), np.eye(4))
+    grid = mph.Grid((1, 1, len(hu)), np.eye(4))
     return mph.hu_to_mu(mph.Volume(np.reshape(hu, grid.shape), grid, "hu"), **options).array.ravel()
 
 

@@ -407,3 +407,8 @@ def test_tutorial(window, work_folder, monkeypatch):
     with contextlib.redirect_stdout(io.StringIO()) as output:
         exec(code, {})
     assert output.getvalue() == printed
+
+
+def test_how_tall_the_tab_is_with_everything_open(window):
+    seen = window("panels")
+    assert 2000 < seen["height"] <= 3500

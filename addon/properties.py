@@ -181,6 +181,9 @@ class GeometryProperties(bpy.types.PropertyGroup):
     active_index: IntProperty(
         name="Active Module", description="Its index among the scanner's objects", update=on_edit("active_module")
     )
+    all_at_once: BoolProperty(
+        name="All Modules", description="Show and change all modules at once, not the active one alone"
+    )
     first: IntProperty(name="First", description="First module number of the range", default=1)
     last: IntProperty(name="Last", description="Last module number of the range", default=40)
     # What `sight_lines.py` draws in the 3D views.

@@ -9,6 +9,7 @@ from ..addon.runs import runs
 from .render_projections import ShowPicture
 
 _DONE: Need = (lambda _: ids.RECONSTRUCTION in bpy.data.images, "No reconstruction yet: reconstruct a run first")
+_NOTHING = "Nothing to go on from: its method has no iterations, or the file of the last one is not beside its voxels"
 _RUN: Need = (lambda context: runs.shown(context.scene) is not None, "No run yet: render the projections first")
 
 
@@ -41,7 +42,7 @@ class MPHDRR_OT_reconstruct(reconstruction_properties.ReconstructionSettings, jo
 class MPHDRR_OT_continue_reconstruction(jobs.JobOperator, bpy.types.Operator):
     """Do ten more iterations of the last reconstruction, of the same run with the same settings, in the same volume"""
 
-    poll = needs((reconstructions.kept, "Nothing to continue: reconstruct first, in this session, by iterations"))
+    poll = needs(_DONE, (reconstructions.resumable, _NOTHING))
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
         return reconstructions.continuing(context)

@@ -17,7 +17,7 @@ _ANYWHERE = np.ones((1, 3))  # mm
 
 
 class MPHDRR_PT_design(ScannerPanel, bpy.types.Panel):
-    """The active module."""
+    """The active module, or all at once, with checks and exports."""
 
     def draw_scanner(self, context: bpy.types.Context, collection: bpy.types.Collection) -> None:
         layout = self.layout
@@ -33,10 +33,17 @@ class MPHDRR_PT_design(ScannerPanel, bpy.types.Panel):
                 box, f"Lens or sensor edited of {edited} camera{'s' * (edited > 1)}: not what the projections show"
             )
             box.operator("mphdrr.reset_cameras", icon="CAMERA_DATA")
-        camera = selection.active_module(context)
-        if camera is None:
-            layout.label(text="Select a module's camera", icon="INFO")
+        camera, state = selection.active_module(context), context.scene.mphdrr_geometry
+        row = layout.row(align=True)
+        if camera is None and not state.all_at_once:
+            row.label(text="Select a module", icon="INFO")
         else:
+            row.label(text=(collection if state.all_at_once or camera is None else camera).name, translate=False)
+        row.prop(state, "all_at_once", toggle=True)
+        if state.all_at_once:
+            _draw_all(layout, collection)
+            return
+        if camera is not None:
             _draw_module(layout, camera, module_values.kind_of(collection))
         row = layouts.invoking(layout.row(align=True))
         row.operator("mphdrr.duplicate_modules", text="Duplicate", icon="DUPLICATE")
@@ -53,40 +60,32 @@ class MPHDRR_PT_design(ScannerPanel, bpy.types.Panel):
             draw_text(column, text, icon="ERROR" if "not fit" in text else "DOT")
 
 
-class MPHDRR_PT_scanner_design(ScannerPanel, bpy.types.Panel):
-    """All modules at once, checks and exports."""
-
-    bl_label = "All Modules"
-
-    def draw_scanner(self, context: bpy.types.Context, collection: bpy.types.Collection) -> None:
-        layout = self.layout
-        properties = collection.mphdrr_scanner
-        kind = module_values.kind_of(collection)
-        column = _draw_values(layout, properties, kind, properties.mixed.split())
-        if pinholes.has_pinholes(kind):
-            _draw_pinholes(layout, column, properties)
-        row = layout.row(align=True)
-        row.operator_menu_enum("mphdrr.renumber_modules", "order", text="Renumber", icon="LINENUMBERS_ON")
-        row.operator("mphdrr.check_geometry", text="Check", icon="CHECKMARK")
-        if not pinholes.has_pinholes(kind):
-            layout.prop(properties, "bore", text="Bore (mm)")
-        if properties.findings:
-            findings = json.loads(properties.findings)
-            if not findings:
-                layout.label(text="Nothing found", icon="CHECKMARK")
-            for text in findings[:_MOST_FINDINGS]:
-                draw_text(layout, text)
-            if len(findings) > _MOST_FINDINGS:
-                more = iface("... and {count} more").format(count=len(findings) - _MOST_FINDINGS)
-                layout.label(text=more, icon="BLANK1")
-        column = layouts.invoking(layout.column(align=True))
-        if pinholes.has_pinholes(kind):
-            column.operator_menu_enum("mphdrr.add_map", "quantity", text="Add Map", icon="OUTLINER_DATA_VOLUME")
-        column = layouts.invoking(layout.column(align=True))
-        row = column.row(align=True)
-        row.operator("mphdrr.export_geometry", text="Export Workbook", icon="EXPORT")
-        row.operator("mphdrr.remove_scanner", text="", icon="TRASH")
-        column.operator("mphdrr.export_for_program", text="Export for a Program", icon="EXPORT")
+def _draw_all(layout: bpy.types.UILayout, collection: bpy.types.Collection) -> None:
+    properties, kind = collection.mphdrr_scanner, module_values.kind_of(collection)
+    column = _draw_values(layout, properties, kind, properties.mixed.split())
+    if pinholes.has_pinholes(kind):
+        _draw_pinholes(layout, column, properties)
+    row = layout.row(align=True)
+    row.operator_menu_enum("mphdrr.renumber_modules", "order", text="Renumber", icon="LINENUMBERS_ON")
+    row.operator("mphdrr.check_geometry", text="Check", icon="CHECKMARK")
+    if not pinholes.has_pinholes(kind):
+        layout.prop(properties, "bore", text="Bore (mm)")
+    if properties.findings:
+        findings = json.loads(properties.findings)
+        if not findings:
+            layout.label(text="Nothing found", icon="CHECKMARK")
+        for text in findings[:_MOST_FINDINGS]:
+            draw_text(layout, text)
+        if len(findings) > _MOST_FINDINGS:
+            more = iface("... and {count} more").format(count=len(findings) - _MOST_FINDINGS)
+            layout.label(text=more, icon="BLANK1")
+    column = layouts.invoking(layout.column(align=True))
+    if pinholes.has_pinholes(kind):
+        column.operator_menu_enum("mphdrr.add_map", "quantity", text="Add Map", icon="OUTLINER_DATA_VOLUME")
+    row = column.row(align=True)
+    row.operator("mphdrr.export_geometry", text="Export Workbook", icon="EXPORT")
+    row.operator("mphdrr.remove_scanner", text="", icon="TRASH")
+    column.operator("mphdrr.export_for_program", text="Export for a Program", icon="EXPORT")
 
 
 def _draw_pinholes(layout: bpy.types.UILayout, column: bpy.types.UILayout, properties: bpy.types.PropertyGroup) -> None:
@@ -107,7 +106,6 @@ def _draw_pinholes(layout: bpy.types.UILayout, column: bpy.types.UILayout, prope
 
 def _draw_module(layout: bpy.types.UILayout, camera: bpy.types.Object, kind: module_values.Kind) -> None:
     module = camera.mphdrr_module
-    layout.label(text=camera.name, icon="OUTLINER_OB_CAMERA")
     _draw_values(layout, module, kind, mixed=())
     for text in (module.problem, module.finding):
         if text:
@@ -120,8 +118,7 @@ def _draw_module(layout: bpy.types.UILayout, camera: bpy.types.Object, kind: mod
             ("Sensitivity", f"{module.sensitivity:.2f} cps/MBq"),
             ("Resolution", f"{module.resolution:.2f} mm FWHM"),
             ("Magnif. l / b", f"{module.magnification:.3f}"),
-            ("Radius seen", f"{module.roi_seen:.2f} mm"),
-            ("ROI", "seen whole" if module.sees_roi else "not seen whole"),
+            ("Radius seen", f"{module.roi_seen:.2f} mm, {'all' if module.sees_roi else 'not all'}"),
         ]
     draw_facts(layout.box().split(factor=0.42), *facts)
 

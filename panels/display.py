@@ -19,15 +19,14 @@ class _Display:
     def draw(self, context: bpy.types.Context) -> None:
         layout = layouts.labelled(self.layout)  # type: ignore[attr-defined]
         settings = context.scene.mphdrr_display
-        layouts.draw_all(layout, settings, "colors", "scale")
-        layout.prop(settings, "automatic", text="Automatic Window")
         column = layout.column(align=True)
-        column.active = not settings.automatic
-        for name, text in (("low", "Low"), ("high", "High")):
+        layouts.draw_all(column, settings, "colors", "scale")
+        column.prop(settings, "automatic", text="Automatic Window")
+        for name, text in () if settings.automatic else (("low", "Low"), ("high", "High")):
             row = column.row(align=True)
             row.prop(settings, name, text=text)
             row.operator("mphdrr.pick_window", text="", icon="EYEDROPPER").end = name.upper()
-        layout.prop(settings, "half")
+        column.prop(settings, "half")
         if settings.problem:
             layout.label(text=settings.problem, icon="ERROR")
         _draw_totals(layout, context)
@@ -54,14 +53,13 @@ class MPHDRR_PT_display(_Display, Folded, bpy.types.Panel):
     def draw(self, context: bpy.types.Context) -> None:
         _Display.draw(self, context)
         layout, settings = self.layout, context.scene.mphdrr_display
-        layout.prop(settings, "planes")
-        column = layout.column()
-        column.active = settings.planes != "NONE"
-        column.prop(settings, "plane_at_detector")
-        distance = column.row()
-        distance.active = not settings.plane_at_detector
-        distance.prop(settings, "plane_distance")
-        layouts.draw_all(layout, settings, "backgrounds", "plane_opacity")
+        column = layout.column(align=True)
+        column.prop(settings, "planes")
+        if settings.planes != "NONE":
+            column.prop(settings, "plane_at_detector")
+        if settings.planes != "NONE" and not settings.plane_at_detector:
+            column.prop(settings, "plane_distance")
+        layouts.draw_all(column, settings, "backgrounds", "plane_opacity")
 
 
 class MPHDRR_PT_display_of_images(_Display, ImagesSidebar, bpy.types.Panel):

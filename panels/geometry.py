@@ -67,7 +67,6 @@ class MPHDRR_PT_geometry(Folded, bpy.types.Panel):
         n_rings = sum(c.mphdrr_scanner.is_ring for c in collection.children)
         draw_facts(
             layout.split(factor=0.34),
-            ("Scanner", collection.name),
             ("Workbook", bpy.path.basename(properties.workbook) or "none"),
             (
                 "Modules",

@@ -54,10 +54,9 @@ def _draw_numbers(layout: bpy.types.UILayout, item: bpy.types.Object) -> None:
     draw_facts(
         layout.split(factor=0.34),
         ("Volume", item.name),
-        ("Holds", f"{settings.quantity}, {settings.unit}"),
         ("Voxels", " × ".join(map(str, settings.shape))),
         ("Size", " × ".join(f"{s:.3g}" for s in settings.spacing) + " mm"),
-        ("Values", f"{settings.minimum:.4g} to {settings.maximum:.4g}"),
+        ("Values", f"{settings.minimum:.4g} to {settings.maximum:.4g} {settings.unit}".removesuffix(" 1")),
         *([("State", volumes.state_text(item))] if item.data.is_sequence else []),
         ("File", volumes.file_state(item)),
     )
@@ -93,7 +92,6 @@ class MPHDRR_PT_look(_OfVolume, bpy.types.Panel):
 
     def draw_volume(self, layout: bpy.types.UILayout, item: bpy.types.Object) -> None:
         _draw_display(layout, item)
-        layout.operator("mphdrr.clean_volume_files", icon="TRASH")
 
 
 class MPHDRR_PT_phantom_settings(_OfVolume, bpy.types.Panel):

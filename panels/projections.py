@@ -8,7 +8,7 @@ from ..addon.runs import preview, rendering, runs
 from ..addon.runs.projection_properties import drawn, makes_counts
 from ..addon.scanner import scanner
 from ..addon.volumes import volumes
-from .sidebar import Folded, draw_text
+from .sidebar import Folded, Popover, draw_text
 
 _MAIN = ("model", "time", "hole", "height", "width")
 """A beginner's settings, which the panel itself shows."""
@@ -28,7 +28,7 @@ class MPHDRR_PT_projections(Folded, bpy.types.Panel):
     def draw(self, context: bpy.types.Context) -> None:
         layout = layouts.labelled(self.layout)
         settings = context.scene.mphdrr_projections
-        column = layout.column()
+        column = layout.column(align=True)
         column.prop(settings, "volume", placeholder="Active volume")
         layouts.draw_settings(column, settings, (each for each in drawn(settings, "model") if each[0] in _MAIN))
         collection = scanner.active_scanner(context.scene)
@@ -54,8 +54,10 @@ class MPHDRR_PT_projections(Folded, bpy.types.Panel):
             column.label(text=iface("{size} of voxels kept in memory").format(size=session.kept))
         if rendering.integrates_activity(context):
             draw_text(layout, "Line integrals of activity: for counts choose the model SPECT Counts.", icon="INFO")
+        row = layout.row(align=True)
+        row.popover("MPHDRR_PT_advanced", icon="PREFERENCES")
         if settings.run_file:
-            layout.operator("mphdrr.show_projections", text="Show Mosaic", icon="IMAGE_DATA")
+            row.operator("mphdrr.show_projections", text="Show Mosaic", icon="IMAGE_DATA")
 
 
 def _can_render(context: bpy.types.Context) -> bool:
@@ -86,11 +88,8 @@ class MPHDRR_PT_physics(Folded, bpy.types.Panel):
         seed.prop(settings, "seed")
 
 
-class MPHDRR_PT_advanced(Folded, bpy.types.Panel):
+class MPHDRR_PT_advanced(Popover, bpy.types.Panel):
     """What few change: the hole's edge, rays, the virtual detector, which modules, what computes."""
-
-    bl_parent_id = "MPHDRR_PT_projections"
-    bl_order = 1  # after the others
 
     def draw(self, context: bpy.types.Context) -> None:
         layout = layouts.labelled(self.layout)
@@ -121,8 +120,8 @@ class MPHDRR_PT_export(Folded, bpy.types.Panel):
         row.operator("mphdrr.export_dataset", text="Export Dataset", icon="EXPORT")
         both.operator("mphdrr.export_figure", text="Export Figure", icon="IMAGE_DATA")
         both = layout.row(align=True)
-        both.operator("mphdrr.render_picture", icon="RENDER_STILL")
-        both.operator("mphdrr.render_animation", icon="RENDER_ANIMATION")
+        both.operator("mphdrr.render_picture")
+        both.operator("mphdrr.render_animation")
         if run_file:
             kept = run_file if run_file.startswith("//") else iface("Kept when the .blend is saved")
             layout.label(text=kept, translate=False, icon="FILE")

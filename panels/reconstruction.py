@@ -6,13 +6,13 @@ from bpy.app.translations import pgettext_iface as iface
 from ..addon.blender import ids, layouts, plots
 from ..addon.reconstruction.reconstruction_properties import drawn
 from ..addon.runs import runs
-from .sidebar import Folded, draw_text
+from .sidebar import Folded, Popover, draw_text
 
 _MAIN = ("method", "iterations", "voxels")
 """A beginner's settings, which the panel itself shows; the others stand under Advanced."""
 _DOTS = {"green": "NODE_SOCKET_SHADER", "amber": "NODE_SOCKET_OBJECT", "red": "NODE_SOCKET_MATERIAL"}
 """Blender's icons that are dots in the colours of rods' lights."""
-_PLOT = 4.0  # of a button's heights
+_PLOT = 3.0  # of a button's heights
 
 
 class MPHDRR_PT_reconstruction(Folded, bpy.types.Panel):
@@ -26,10 +26,14 @@ class MPHDRR_PT_reconstruction(Folded, bpy.types.Panel):
         run = runs.shown(context.scene)
         if run is not None:  # the scene may have changed since poll
             layout.label(text=iface("Of {run}").format(run=run.name), translate=False, icon="RENDER_STILL")
-        layouts.draw_settings(layout.column(), settings, (each for each in drawn(settings) if each[0] in _MAIN))
+        main = layout.column(align=True)
+        layouts.draw_settings(main, settings, (each for each in drawn(settings) if each[0] in _MAIN))
         row = layouts.invoking(layout.row())
         row.scale_y = 1.4
         row.operator("mphdrr.reconstruct", text="Reconstruct", icon="OUTLINER_OB_VOLUME")
+        row = layout.row(align=True)
+        row.popover("MPHDRR_PT_backprojection")
+        row.popover("MPHDRR_PT_reconstruction_model", icon="PREFERENCES")
         known = settings.known
         if known and settings.volume is not None:
             _draw_result(layout, settings, known)
@@ -69,10 +73,8 @@ def _draw_result(layout: bpy.types.UILayout, settings: bpy.types.PropertyGroup, 
     row.operator("mphdrr.show_reconstruction", text="Show Slices", icon="IMAGE_DATA")
 
 
-class MPHDRR_PT_reconstruction_model(Folded, bpy.types.Panel):
+class MPHDRR_PT_reconstruction_model(Popover, bpy.types.Panel):
     bl_label = "Advanced"
-    bl_order = 1  # after the other
-    bl_parent_id = "MPHDRR_PT_reconstruction"
 
     def draw(self, context: bpy.types.Context) -> None:
         settings = context.scene.mphdrr_reconstruction
@@ -83,9 +85,8 @@ class MPHDRR_PT_reconstruction_model(Folded, bpy.types.Panel):
         layouts.draw_settings(column, settings, others)
 
 
-class MPHDRR_PT_backprojection(Folded, bpy.types.Panel):
+class MPHDRR_PT_backprojection(Popover, bpy.types.Panel):
     bl_label = "Back-Projection"
-    bl_parent_id = "MPHDRR_PT_reconstruction"
 
     def draw(self, context: bpy.types.Context) -> None:
         layout = layouts.invoking(layouts.labelled(self.layout))

@@ -23,6 +23,12 @@ class Folded(Sidebar):
     bl_options = {"DEFAULT_CLOSED"}
 
 
+class Popover(Sidebar):
+    """Mixed into panels that a button opens: what few change."""
+
+    bl_options = {"INSTANCED"}
+
+
 class ImagesSidebar(Sidebar):
     """Mixed into panels of the Image Editor, beside the pictures."""
 

@@ -23,7 +23,7 @@ from ...core.files import ensure_folder, replacing
 from ...core.memory import readable_size
 from . import ids
 
-_OUR_VOLUME = re.compile(r"[a-z]+-[0-9a-f]{16}(\.preview)?(_\d{4})?\.vdb")
+_OUR_VOLUME = re.compile(r"[a-z]+-[0-9a-f]{16}(\.preview)?(_\d{4})?\.(vdb|h5)")
 """Names of the files that `stored_volumes` writes, made from their content."""
 _OUR_RUN = re.compile(r".*-projections-[0-9a-f]{8}\.h5")  # names of the files of runs
 _ENDING = re.compile(r"\.[A-Za-z]\w*$")  # of files, not of folders, nor of numbers in place of a file
@@ -78,6 +78,11 @@ def absolute(path: str) -> Path:
 def full_resolution(path: Path) -> Path:
     """The .vdb with every voxel that belongs to the one that Blender shows (which may be a coarser copy)."""
     return path.with_name(path.name.replace(ids.PREVIEW, "", 1))
+
+
+def resumable(path: Path) -> Path:
+    """The file beside a reconstruction's .vdb from which it goes on."""
+    return full_resolution(path).with_suffix(".h5")
 
 
 def of_frame(path: Path, number: int) -> Path:
@@ -138,7 +143,7 @@ def _name(path: str | Path) -> str:
 
 def unused_volumes() -> list[Path]:
     """Files of voxels and of runs in this .blend's folder that none of its volumes and lists of runs needs."""
-    used = {path.name for data in bpy.data.volumes for path in _files_of(data)}
+    used = {path.name for data in bpy.data.volumes for path in _all_of(data)}
     used |= {absolute(run.file).name for scene in bpy.data.scenes for run in scene.mphdrr_projections.runs}
     ours = [p for p in _folder().glob("*") if _OUR_VOLUME.fullmatch(p.name) or _OUR_RUN.fullmatch(p.name)]
     return sorted(path for path in ours if path.is_file() and path.name not in used)
@@ -170,6 +175,12 @@ def files_of_states(data: bpy.types.Volume) -> list[Path]:
 def _files_of(data: bpy.types.Volume) -> set[Path]:
     """The files that a volume needs: of every state, the one that is shown and the one with every voxel."""
     return {*files_of_states(data), *_of_states(data, absolute(data.filepath))}
+
+
+def _all_of(data: bpy.types.Volume) -> set[Path]:
+    """The files that a volume needs, and, of a reconstruction, that from which it goes on, if there is one."""
+    needed = _files_of(data)
+    return needed | set(filter(Path.is_file, map(resumable, needed)))
 
 
 def _of_states(data: bpy.types.Volume, path: Path) -> list[Path]:
@@ -229,7 +240,7 @@ def _keep_together(target: Path, is_wanted: Callable[[str, Path], bool]) -> _Kep
     for owner, name in references():
         old = getattr(owner, name)
         path = absolute(old)
-        files = _files_of(owner) if isinstance(owner, bpy.types.Volume) else {path}
+        files = _all_of(owner) if isinstance(owner, bpy.types.Volume) else {path}
         sizes = {file: file.stat().st_size for file in files if file.is_file()}
         if sizes.keys() < files and _ENDING.search(path.name):
             kept.missing.append(path.name)

@@ -27,9 +27,10 @@ from ...core.figures.parts import bar_width, color_bar, heading, heading_height
 from ...core.figures.subject import Subject, require
 from ...core.runs.display import Display
 from ...core.runs.resizing import resized
-from ..blender import ids, jobs, storage, timers
+from ..blender import ids, jobs, storage, timers, windows
 from ..blender.choices import items
 from ..phantoms import phantoms
+from ..pictures import images
 from ..scanner import pinholes, scanner, selection
 from ..volumes import slices, volume_materials, volumes
 from . import engine
@@ -128,6 +129,8 @@ def figure_job(
 
     def finish(subject: Subject) -> Generator[Step, None, str]:
         yield from drawing(page, subject, kind, item, paths, given, reel)
+        if windows.has_window() and paths[0].suffix == ".png":
+            images.show_file(paths[0], bpy.context)
         return f"Wrote {', '.join(map(str, paths))}"
 
     def left() -> str:

@@ -7,6 +7,7 @@ Each module has two: one holds the exact float32 numbers in R, G and B, the othe
 from collections.abc import Callable, Generator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import bpy
@@ -20,7 +21,7 @@ from ...core.runs.exr import exr_bytes
 from ...core.runs.mosaic import Sheet, as_seen, labels, png, sheet, smaller
 from ..blender import ids, jobs, reports, windows
 
-_KEY = "mphdrr_projection"  # custom property: marks the images that a new run replaces
+_KEY = "mphdrr_projection"  # custom property: marks the images that a new run replaces; False of those of no run
 _ARRAYS = ("sources", "detector_centers", "u_steps", "v_steps")
 _PIXELS = 2.2e7
 """About as many all pictures have together: larger images are shown smaller, since drawing a picture takes memory again."""
@@ -263,7 +264,7 @@ def difference_text() -> str:
 
 def is_ours(image: bpy.types.Image | None) -> bool:
     """Whether an image is of a run."""
-    return image is not None and _KEY in image
+    return image is not None and bool(image.get(_KEY))
 
 
 def clear() -> None:
@@ -295,6 +296,16 @@ def show(image: bpy.types.Image, context: bpy.types.Context) -> bool:
         area.spaces.active.image = image
         _fit(window, area)
     return bool(chosen)
+
+
+def show_file(path: Path, context: bpy.types.Context) -> None:
+    """Show a picture that was written to a file, until other projections are shown."""
+    known = set(bpy.data.images)
+    image = bpy.data.images.load(str(path), check_existing=True)
+    image.reload()  # the file may be newer
+    if image not in known:
+        image[_KEY] = False
+    show_below(image, context)
 
 
 def _editors(context: bpy.types.Context) -> list[tuple[bpy.types.Window, bpy.types.Area]]:

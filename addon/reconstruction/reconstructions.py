@@ -13,13 +13,24 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core import InputError, ProjectionRun, Recipe, Reconstruction, Volume, read_run, score_volume
+from ...core import (
+    InputError,
+    ProjectionRun,
+    Recipe,
+    Reconstruction,
+    Volume,
+    read_reconstruction,
+    read_run,
+    score_volume,
+    write_reconstruction,
+)
 from ...core.figures.page import DARK, SMALLEST, Page
 from ...core.figures.reconstructions import SIZE, SIZE_BESIDE_TRUTH, draw
 from ...core.progress import Progress, stages_of
 from ...core.reconstruction.methods import method_of
 from ...core.reconstruction.result import iterations_text
 from ...core.runs.mosaic import png
+from ...core.runs.recipe import recipe_of_tables
 from ...core.runs.reconstructing import reconstruct_run, reconstruction_grid, voxels_text
 from ...core.runs.run_recipe import truth_of_run
 from ...core.volumes.sights import bright_value, full_slices
@@ -45,25 +56,19 @@ class _Shown:
 
 
 @dataclass(frozen=True)
-class _Kept:
-    """The last reconstruction of this session, to go on with."""
+class _Last:
+    """A reconstruction to go on with."""
 
     item: int  # its object's `session_uid`
     found: Reconstruction
-    recipe: Recipe
-    path: Path  # of the run
-    name: str  # of the run
-    shown: _Shown
+    stored: stored_volumes.StoredVolume
 
 
-_kept: _Kept | None = None
-
-
-def kept(context: bpy.types.Context) -> _Kept | None:
-    """What Continue goes on with: the panel's reconstruction, if it was made in this session by iterations."""
+def resumable(context: bpy.types.Context) -> Path | None:
+    """The file from which Continue goes on: of the panel's reconstruction, if it was made by iterations."""
     item = context.scene.mphdrr_reconstruction.volume
-    goes = _kept is not None and item is not None and item.session_uid == _kept.item and _kept.found.iterations
-    return _kept if goes else None
+    path = None if item is None else storage.resumable(volumes.file_of(item))
+    return path if path is not None and path.is_file() else None
 
 
 def reconstructing(context: bpy.types.Context, recipe: Recipe) -> jobs.Job:
@@ -77,15 +82,25 @@ def reconstructing(context: bpy.types.Context, recipe: Recipe) -> jobs.Job:
 
 def continuing(context: bpy.types.Context) -> jobs.Job:
     """The job that does some more iterations of the reconstruction in the panel, in the same object; raises InputError."""
-    last = kept(context)
-    if last is None:
-        raise InputError("nothing to continue: reconstruct first, in this session")
-    recipe = last.recipe.updated({"reconstruction.iterations": MORE})
-    return _reconstructing(context, recipe, last.path, last.name, last)
+    settings, path = context.scene.mphdrr_reconstruction, resumable(context)
+    if path is None:
+        raise InputError("nothing to continue: reconstruct first, by iterations")
+    item, file, found = settings.volume, settings.known["run"], read_reconstruction(path)
+    run = next((run for run in context.scene.mphdrr_projections.runs if storage.absolute(run.file).name == file), None)
+    if run is None:
+        raise InputError(f"the run that it is of ({file}) has left the list of runs: reconstruct again")
+    values, extent = found.volume.array, item.mphdrr_volume.extent
+    before = stored_volumes.StoredVolume(
+        (found.volume,), volumes.pose_of_object(item), storage.absolute(item.data.filepath),
+        float(values.min()), float(values.max()), extent,
+    )  # fmt: skip
+    recipe = recipe_of_tables(found.settings["recipe"]).updated({"reconstruction.iterations": MORE})
+    last = _Last(item.session_uid, found, before)
+    return _reconstructing(context, recipe, rendering.file_of(run.file), run.name, last)
 
 
 def _reconstructing(
-    context: bpy.types.Context, recipe: Recipe, path: Path, name: str, last: _Kept | None = None
+    context: bpy.types.Context, recipe: Recipe, path: Path, name: str, last: _Last | None = None
 ) -> jobs.Job:
     scene, folder = context.scene, storage.folder()
     method = method_of(recipe["reconstruction.method"])
@@ -128,10 +143,13 @@ def _reconstructing(
         mu = _mu(run, recipe, readers, own_mu)
         found = reconstruct_run(run, recipe, mu, last.found if last else None, watch, stages, method)
         scores = _scores(run, found.volume, stages("scoring"))
-        return shown_of(found.volume.array, found.objective.tolist(), scores, found.settings["flatters"]), found
+        shown = shown_of(found.volume.array, found.objective.tolist(), scores, found.settings["flatters"])
+        if found.iterations:
+            shelf.files.append(storage.resumable(shown.stored.path))
+            write_reconstruction(found, shelf.files[-1])
+        return shown, found
 
     def finish(result: tuple[_Shown, Reconstruction]) -> str:
-        global _kept
         jobs.scene_again(uid, "the reconstruction is")  # or an error
         shown, found = result
         item = shelf.show(shown)
@@ -139,7 +157,6 @@ def _reconstructing(
         slices.add_slices(item, full_slices(found.volume.array).tolist())
         images.show_below(bpy.data.images[ids.RECONSTRUCTION], bpy.context)
         shelf.tidy()
-        _kept = _Kept(item.session_uid, found, recipe, path, name, shown)
         seconds = time.perf_counter() - start
         return f"Reconstructed {item.name!r}: {shown.record['title']}, {shown.record['voxels']}, in {seconds:.1f} s"
 
@@ -149,7 +166,7 @@ def _reconstructing(
 class _Shelf:
     """What a running reconstruction has put into the scene and on the disk, to be replaced, or taken back."""
 
-    def __init__(self, context: bpy.types.Context, name: str, last: _Kept | None) -> None:
+    def __init__(self, context: bpy.types.Context, name: str, last: _Last | None) -> None:
         self.name, self.enough, self._last = name, threading.Event(), last
         self.files: list[Path] = []
         self.latest: _Shown | None = None  # made by the thread
@@ -215,7 +232,7 @@ class _Shelf:
         for hidden in filter(None, (jobs.found_again(bpy.data.objects, uid) for uid in self._hidden)):
             hidden.hide_set(False)
         if item is not None and self._last is not None:
-            volumes.replace_stored(item, self._last.shown.stored)
+            volumes.replace_stored(item, self._last.stored)
         elif item is not None:
             materials = list(item.data.materials)
             objects.remove_objects([item, *item.children])

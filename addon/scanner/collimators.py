@@ -59,6 +59,8 @@ def new_sphere(name: str, radius: float, material: bpy.types.Material) -> bpy.ty
 
 def resize_sphere(mesh: bpy.types.Mesh, radius: float) -> None:
     """Give a sphere around the origin another radius, mm, in place."""
+    if len(mesh.vertices) and abs(mesh.vertices[0].co.length - radius) <= 1e-6 * radius:
+        return  # as nearly always
     points = np.empty(3 * len(mesh.vertices), np.float32)
     mesh.vertices.foreach_get("co", points)
     norms = np.linalg.norm(points.reshape(-1, 3), axis=1)

@@ -6,6 +6,7 @@ Blender has stored an undo step, and undo expects the datablocks that it stored.
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from operator import attrgetter, itemgetter
 
 import bpy
 import numpy as np
@@ -45,8 +46,8 @@ def is_writing() -> bool:
 
 def modules(collection: bpy.types.Collection) -> list[bpy.types.Object]:
     """A scanner's camera objects, in the order of `read_scanner`'s system."""
-    found = [o for o in collection.all_objects if o.mphdrr_module.is_module]
-    return sorted(found, key=lambda o: (o.mphdrr_module.index, o.mphdrr_module.number, o.name))
+    found = [(m.index, m.number, o.name, o) for o in collection.all_objects if (m := o.mphdrr_module).is_module]
+    return [item for *_, item in sorted(found, key=itemgetter(0, 1, 2))]
 
 
 def parts_of(collection: bpy.types.Collection, found: Sequence[bpy.types.Object]) -> _Parts:
@@ -235,9 +236,12 @@ def _update_totals(kind: Kind, scanner: bpy.types.PropertyGroup, modules: Sequen
     """Write the readouts of all modules together, and the values that they share."""
     scanner.count, scanner.findings = len(modules), ""
     pinholes.write_totals(scanner, [module for module in modules if not module.problem])
-    mixed = []
-    for name in (*kind.columns.scalars, "length_mode") if modules else ():
-        setattr(scanner, name, getattr(modules[0], name))
-        if len({getattr(module, name) for module in modules}) > 1:
+    names, mixed = (*kind.columns.scalars, "length_mode"), []
+    for name, values in zip(
+        names, zip(*map(attrgetter(*names), modules), strict=True), strict=False
+    ):  # none without modules
+        if getattr(scanner, name) != values[0]:  # writing has the scene calculated again
+            setattr(scanner, name, values[0])
+        if len(set(values)) > 1:
             mixed.append(name)
     scanner.mixed = " ".join(mixed)

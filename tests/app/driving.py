@@ -67,7 +67,7 @@ def panels() -> list:
 def only(*names: str) -> None:
     """Only these panels are there, open, so that all of them is on the screen."""
     for cls in reversed(panels()):
-        if cls.__name__ not in names:
+        if cls.__name__ not in names and "INSTANCED" not in getattr(cls, "bl_options", ()):
             bpy.utils.unregister_class(cls)
     opened(*names)
 
@@ -79,7 +79,7 @@ def opened(*names: str, but_closed: tuple[str, ...] = ()) -> None:
     for cls in reversed(known):
         bpy.utils.unregister_class(cls)
     for cls in known:  # all of them: a panel that is registered again forgets those in it
-        if cls.__name__ in (*to_open, *but_closed):
+        if cls.__name__ in (*to_open, *but_closed) and "INSTANCED" not in getattr(cls, "bl_options", ()):
             cls.bl_options = {"DEFAULT_CLOSED"} if cls.__name__ in but_closed else set()
         bpy.utils.register_class(cls)
 

@@ -360,6 +360,8 @@ def test_window_and_command_draw_the_same_figures(blender, blender_script, windo
     assert seen["scenes"] == 1 and seen["display"] == ["WINDOW", "WINDOW"]
     assert seen["ticks"] > 3, "the window was alive while the figure was rendered"
     assert seen["film"] == 2 == len(list((work_folder / "film-frames").iterdir()))
+    assert seen["asked"] and seen["shown"] == "picture.png"
+    assert list((work_folder / "cut-frames").iterdir()) and not (work_folder / "cut.mp4").exists(), "cancelled"
     for kind in ("cut-away", "sums"):
         path = work_folder / f"{kind}-command.png"
         blender("--command", "mphdrr", "figure", kind, blend, "--size", SIZE, "--samples", "8", "-o", path)
@@ -405,3 +407,8 @@ def test_tutorial(window, work_folder, monkeypatch):
     with contextlib.redirect_stdout(io.StringIO()) as output:
         exec(code, {})
     assert output.getvalue() == printed
+
+
+def test_how_tall_the_tab_is_with_everything_open(window):
+    seen = window("panels")
+    assert 2000 < seen["height"] <= 3500

@@ -110,7 +110,7 @@ def steps():
 
 def show() -> None:
     """The scanner, and the Design panels open."""
-    opened("MPHDRR_PT_design", "MPHDRR_PT_scanner_design")
+    opened("MPHDRR_PT_design")
     space = editor()[1].spaces.active
     space.show_region_ui = True
     view = space.region_3d

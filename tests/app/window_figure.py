@@ -5,7 +5,7 @@ import sys
 import time
 
 import bpy
-from driving import WORKBOOK, folder, is_idle, press, run, seen
+from driving import WORKBOOK, editor, folder, idle, is_idle, keys, ours, picture, press, run, seen
 
 
 def steps():
@@ -28,6 +28,21 @@ def steps():
     while not is_idle() or bpy.app.is_job_running("RENDER"):
         yield 0.05
     seen["film"] = bpy.data.movieclips.load(str(folder / "film.mp4")).frame_duration
+    film |= {"figure": "LIGHT_UP", "seconds": 60}
+    press(bpy.ops.mphdrr.render_animation, filepath=str(folder / "cut.mp4"), **film)
+    while not list(folder.glob("cut-frames/*.png")):
+        yield 0.05
+    keys("Escape")  # asks whether to keep or to discard
+    yield 1.0
+    seen["asked"] = ours("addon.blender.jobs").is_running()
+    keys("Escape")
+    bpy.ops.mphdrr.cancel_job()
+    yield from idle()
+    press(bpy.ops.mphdrr.render_picture, filepath=str(folder / "picture.png"), width=480, height=300, samples=8)
+    yield from idle()
+    yield 2.0
+    seen["shown"] = editor("IMAGE_EDITOR")[1].spaces.active.image.name
+    picture("shown")
     seen.update(scenes=len(bpy.data.scenes), display=[shown_in, bpy.context.preferences.view.render_display_type])
     # Blender's own Render, as F12 starts it; what is said goes to standard error, which is kept.
     rendered, sys.stderr, scene = time.monotonic(), io.StringIO(), bpy.context.scene

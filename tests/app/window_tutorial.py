@@ -42,6 +42,7 @@ def scroll(down: int):
     middle = editor()[0].height - region.y - region.height / 2
     mouse(region.x + 0.4 * region.width, middle, *([5 if down > 0 else 4] * abs(down)))
     yield lambda: region.view2d.region_to_view(0, 0)[1] != top
+    mouse(region.x - 40, middle)  # no tooltip covers it
 
 
 def totals() -> dict[int, float]:
@@ -99,7 +100,7 @@ def change():
     view, kept = editor("VIEW_3D")[1].spaces.active.region_3d, seen.pop("view")
     view.view_perspective, view.view_distance = "PERSP", kept[0]
     view.view_location, view.view_rotation = kept[1:4], kept[4:]
-    yield from scroll(4)
+    yield from scroll(7)
     numbers = module(55).mphdrr_module
     before = [
         f"{numbers.sensitivity:.2f} cps/MBq",
@@ -120,7 +121,7 @@ def render():
     yield 1
     yield is_idle
     counts = totals()
-    yield from scroll(18)
+    yield from scroll(12)
     return [f"{counts[55] / counts[54]:.1f} times", "SPECT Counts", "60", "128"]
 
 
@@ -131,7 +132,7 @@ def display():
     settings.colors, settings.scale = "VIRIDIS", "SQRT"
     yield 2
     assert totals() == before, "the numbers stay"
-    yield from scroll(3)
+    yield from scroll(6)
     return ["Viridis", "Square Root"]
 
 

@@ -75,6 +75,9 @@ class Layout:
     def menu(self, name: str, text: str = "", icon: str = "NONE") -> None:
         self._leaf("button", text, icon, explained=True, name=name)
 
+    def popover(self, name: str, text: str | None = None, icon: str = "NONE") -> None:
+        self._leaf("button", getattr(bpy.types, name).bl_label if text is None else text, icon, name=name, more=ICON)
+
     def prop(
         self, owner: Any, name: str, text: str | None = None, icon: str = "NONE", expand: bool = False, **_: Any
     ) -> None:
@@ -134,14 +137,21 @@ def _needed(item: dict[str, Any]) -> float:
     return blf.dimensions(0, item["text"])[0] + MARGIN + ICON * item["icon"] + item.get("more", 0)
 
 
+def is_popover(cls: type) -> bool:
+    return "INSTANCED" in getattr(cls, "bl_options", ())
+
+
 def drawn(is_open: bool = False) -> dict[str, Layout]:
     """The panels that are drawn, by their classes' names: those in sight to begin with, or all of them, open."""
     blf.size(0, LETTERS)
     seen: dict[str, Layout] = {}
-    for cls in sorted(PANELS, key=lambda cls: hasattr(cls, "bl_parent_id")):
+    for cls in sorted(PANELS, key=lambda cls: (is_popover(cls), hasattr(cls, "bl_parent_id"))):
         parent = getattr(cls, "bl_parent_id", None)
-        if (hasattr(cls, "poll") and not cls.poll(bpy.context)) or (
-            parent and not (parent in seen and seen[parent].is_open)
+        is_hidden = is_popover(cls) and cls.__name__ not in names(seen, "button")
+        if (
+            is_hidden
+            or (hasattr(cls, "poll") and not cls.poll(bpy.context))
+            or (parent and not (parent in seen and seen[parent].is_open))
         ):
             continue
         seen[cls.__name__] = layout = Layout(is_open=is_open or "DEFAULT_CLOSED" not in getattr(cls, "bl_options", ()))
@@ -189,7 +199,8 @@ def test_a_beginner_sees_little(worked):
     assert len(seen) <= 8
     assert len(names(seen, "button")) <= 14 and len(names(seen, "property", "name")) <= 12
     for name, layout in drawn(is_open=True).items():
-        if not hasattr(getattr(bpy.types, name), "bl_parent_id"):
+        cls = getattr(bpy.types, name)
+        if not hasattr(cls, "bl_parent_id") and not is_popover(cls):
             assert (
                 len(names({name: layout}, "button")) <= 14 and len(names({name: layout}, "property", "name")) <= 12
             ), name

@@ -77,7 +77,7 @@ def test_save_as_makes_a_pair_of_its_own_that_opens_elsewhere(study, tmp_path, c
     bpy.ops.wm.save_as_mainfile(filepath=str(new))
     is_whole(new.parent, expected)
     said = capfd.readouterr().out
-    assert "mphDRR: Copied 5 files (" in said and ") into other_mphdrr; 1 file (" in said
+    assert "mphDRR: Copied 6 files (" in said and ") into other_mphdrr; 1 file (" in said
     assert "elsewhere: Collect Files copies them" in said
     assert contents(study.parent) == before, "the old pair"
     shutil.move(new.parent, tmp_path / "c")
@@ -109,12 +109,12 @@ def test_files_can_be_shared_and_are_when_they_are_large(study, tmp_path, monkey
     capfd.readouterr()
     monkeypatch.setattr(storage, "copies", False)
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "b" / "b.blend"))
-    assert "mphDRR: Shares 5 files (" in capfd.readouterr().out and not (tmp_path / "b" / "b_mphdrr").exists()
+    assert "mphDRR: Shares 6 files (" in capfd.readouterr().out and not (tmp_path / "b" / "b_mphdrr").exists()
     is_whole(study.parent, expected)
     monkeypatch.setattr(storage, "copies", True)
     monkeypatch.setattr(storage, "_is_too_large", lambda path, size, target: path.suffix == ".h5")
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "c.blend"))
-    assert "Copied 4 files (" in (said := capfd.readouterr().out) and "shares 1 file (" in said
+    assert "Copied 5 files (" in (said := capfd.readouterr().out) and "shares 1 file (" in said
     assert (
         storage.absolute(bpy.context.scene.mphdrr_projections.run_file).resolve().parent
         == study.parent / "study_mphdrr"
@@ -145,7 +145,7 @@ def test_collect_files_brings_workbook_pictures_and_what_is_shared(study, tmp_pa
     capfd.readouterr()
     assert bpy.ops.mphdrr.collect_files() == {"FINISHED"}
     said = capfd.readouterr().out
-    assert "Copied 8 files (" in said and "missing: net.pt\n" in said and "stay" not in said
+    assert "Copied 9 files (" in said and "missing: net.pt\n" in said and "stay" not in said
     scene.mphdrr_reconstruction.method_file = ""
     bpy.ops.wm.save_mainfile()
     shutil.move(tmp_path / "b", tmp_path / "c")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from unittest.mock import MagicMock
 
 import bpy
@@ -244,7 +245,7 @@ def test_finish_now_keeps_what_there_is(render, scene, monkeypatch):
 
     text = jobs.run(job, progress)
     assert "OSEM, 2 iterations" in text and len(scene.mphdrr_reconstruction.known["objective"]) == 2
-    assert len(set(storage.folder().iterdir()) - files) == 1, "files of states that were shown meanwhile are gone"
+    assert len(set(storage.folder().iterdir()) - files) == 2, "files of states that were shown meanwhile are gone"
     assert len([item for item in volumes.volume_objects(scene) if "OSEM" in item.name]) == 1
 
 
@@ -274,6 +275,26 @@ def test_continue_goes_on_as_if_there_had_been_no_break(render, scene, monkeypat
     assert first.hide_get() and reconstructed() != first
     both = [volumes.volume_from_object(item).array for item in (first, reconstructed())]
     np.testing.assert_allclose(*both, rtol=1e-5)
+
+
+def test_continue_goes_on_after_files_were_moved_and_opened_again(render, scene, tmp_path):
+    bpy.ops.mphdrr.reconstruct(**SMALL)
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "first.blend"))
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "second.blend"))
+    shutil.rmtree(tmp_path / "first_mphdrr")
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "second.blend"))
+    kept = reconstructions.resumable(bpy.context)
+    assert kept.parent.name == "second_mphdrr" and kept not in storage.unused_volumes()
+    assert bpy.ops.mphdrr.continue_reconstruction() == {"FINISHED"}
+    first = reconstructed()
+    assert bpy.context.scene.mphdrr_reconstruction.known["title"] == "OSEM, 13 iterations"
+    assert kept in storage.unused_volumes()
+    bpy.ops.mphdrr.reconstruct(**SMALL | {"iterations": 13})
+    both = [volumes.volume_from_object(item).array for item in (first, reconstructed())]
+    np.testing.assert_allclose(*both, rtol=1e-5)
+    reconstructions.resumable(bpy.context).unlink()
+    with pytest.raises(RuntimeError, match="poll"):
+        bpy.ops.mphdrr.continue_reconstruction()
 
 
 def test_a_second_one_stands_beside_the_first(render, scene):

@@ -60,10 +60,11 @@ def test_they_are_properties_with_their_limits_and_words(collection):
 
 def test_they_are_drawn(collection):
     module = scanner.module(collection, 1).mphdrr_module
-    for panel, owner in (("MPHDRR_PT_design", module), ("MPHDRR_PT_scanner_design", collection.mphdrr_scanner)):
-        found = drawn(panel)
+    for all_at_once, owner in ((False, module), (True, collection.mphdrr_scanner)):
+        bpy.context.scene.mphdrr_geometry.all_at_once = all_at_once
+        found = drawn("MPHDRR_PT_design")
         for name in ("shim_thickness", "hole_coating", "crystal_batch", "crystal_material", "pinhole_diameter"):
-            assert found[name] == owner, (panel, name)
+            assert found[name] == owner, name
 
 
 def test_they_are_read_exactly_edited_and_kept(collection, tmp_path):

@@ -330,8 +330,9 @@ INLINE int64_t tall_of(const DepthJob *job, int64_t i) {
     return MIN(job->taps[0] + (NODE_ROWS - 1) * job->step[0], job->rows - i * job->step[0]);
 }
 
-// Mix the taps, and find where in each row of cells any of the rows of pixels has some.
-INLINE void mix(const DepthJob *job, int64_t number, int64_t i, int64_t node) {
+// Mix the taps, and find where in each row of cells any of the rows of pixels has some. Mixed are also those that are up to `beside`
+// columns beside these.
+INLINE void mix(const DepthJob *job, int64_t number, int64_t i, int64_t node, int64_t beside) {
     const int64_t step = job->step[0], rows = job->taps[0] + 2 * step, *taps = job->taps;
     const REAL *kernels[NODE_ROWS];
     REAL shares[NODE_ROWS];
@@ -350,12 +351,15 @@ INLINE void mix(const DepthJob *job, int64_t number, int64_t i, int64_t node) {
             low = MIN(low, bounds[r][2 * row]), high = MAX(high, bounds[r][2 * row + 1]);
         }
         job->room_bounds[2 * a] = low, job->room_bounds[2 * a + 1] = high;
+        low = MAX(low - beside, (int64_t)0), high = MIN(high + beside, taps[1]);
         for (int r = 0; r < NODE_ROWS; r++) {
             const int64_t row = a - r * step;
             REAL *const mixed = (REAL *)job->room + (a * NODE_ROWS + r) * taps[1];
             const REAL *const one = kernels[r] + row * taps[1], *const next = one + job->nodes[1] * rows * taps[1], share = shares[r];
-            if (row < 0 || row >= taps[0]) for (int64_t b = low; b < high; b++) mixed[b] = 0;
-            else for (int64_t b = low; b < high; b++) mixed[b] = one[b] + share * (next[b] - one[b]);
+            const int is_there = row >= 0 && row < taps[0];
+            for (int64_t b = low; b < high; b += LANES) { // whole vectors: what comes after `high` is written anew, or not used
+                *(Run *)(mixed + b) = is_there ? *(const Run *)(one + b) + share * (*(const Run *)(next + b) - *(const Run *)(one + b)) : (Run)0;
+            }
         }
     }
 }
@@ -373,25 +377,21 @@ INLINE void sum_for_node(const DepthJob *job, const Plane *of, int64_t i, int64_
     const int64_t *taps = job->taps, *step = job->step, tall = tall_of(job, i);
     F sums[2][NODE_ROWS][WIDE] = {0};
     for (int64_t a = 0; a < tall; a++) {
-        const int64_t low = job->room_bounds[2 * a], high = job->room_bounds[2 * a + 1];
-        const int64_t pixel = (uint32_t)low / (uint32_t)step[1], rest = low - pixel * step[1]; // a division is dear
-        for (int64_t place = 0; place < step[1]; place++) {
-            const int64_t from = pixel + (place < rest);
-            const REAL *cells = of->cells + (i * step[0] + a) * job->columns + place * of->together + j + from;
-            const REAL *tap = (const REAL *)job->room + a * NODE_ROWS * taps[1], *const end = tap + high;
-            tap += place + from * step[1];
-#define ADD(chain, k)                                                                       \
+        const REAL *const cells = of->cells + (i * step[0] + a) * job->columns + j;
+        const REAL *const tap = (const REAL *)job->room + a * NODE_ROWS * taps[1];
+        int64_t b = job->room_bounds[2 * a];
+        const int64_t end = job->room_bounds[2 * a + 1];
+#define ADD(chain, b)                                                                       \
     UNROLLED for (int w = 0; w < wide; w++) {                                               \
-        const F some = *(const Run *)(cells + k + w * LANES);                               \
-        UNROLLED for (int r = 0; r < NODE_ROWS; r++) sums[chain][r][w] += tap[k * step[1] + r * taps[1]] * some; \
+        const F some = *(const Run *)(cells + job->columns_of[b] + w * LANES);              \
+        UNROLLED for (int r = 0; r < NODE_ROWS; r++) sums[chain][r][w] += tap[b + r * taps[1]] * some; \
     }
-            for (; tap + step[1] < end; tap += 2 * step[1], cells += 2) {
-                ADD(0, 0)
-                ADD(1, 1)
-            }
-            if (tap < end) ADD(0, 0)
-#undef ADD
+        for (; b + 1 < end; b += 2) {
+            ADD(0, b)
+            ADD(1, b + 1)
         }
+        if (b < end) ADD(0, b)
+#undef ADD
     }
     for (int64_t r = 0; r < MIN((int64_t)NODE_ROWS, job->pixels[0] - i); r++) {
         UNROLLED for (int w = 0; w < wide; w++) sums[0][r][w] += sums[1][r][w];
@@ -401,25 +401,33 @@ INLINE void sum_for_node(const DepthJob *job, const Plane *of, int64_t i, int64_
     }
 }
 
-// The adjoint: `pixels` are those rows, `apart`, by the node's share. Neighbouring rows of cells follow each other: what was just
-// stored, a processor cannot read again a column farther on.
+// The adjoint: `pixels` are those rows, `apart`, by the node's share, with a zero before each. Two taps that are neighbours at a place are
+// given together, so that a cell is read and stored once for both. Neighbouring rows of cells follow each other: what was just stored,
+// a processor cannot read again a column farther on. What lies beyond the node's pixels is 0, and may be added anywhere.
+INLINE void give_taps(const DepthJob *job, REAL *cells, const F some[2][NODE_ROWS][WIDE], int64_t b, int64_t tall, const int taps, const int wide) {
+    const int64_t step = job->step[1], width = job->taps[1];
+    for (int64_t a = 0; a < tall; a++, cells += job->columns) {
+        if (b + (taps - 1) * step < job->room_bounds[2 * a] || b >= job->room_bounds[2 * a + 1]) continue;
+        const REAL *tap = (const REAL *)job->room + a * NODE_ROWS * width + b;
+        UNROLLED for (int w = 0; w < wide; w++) {
+            F sum = *(const Run *)(cells + w * LANES);
+            UNROLLED for (int r = 0; r < NODE_ROWS; r++) UNROLLED for (int k = 0; k < taps; k++) sum += tap[r * width + k * step] * some[k][r][w];
+            *(Run *)(cells + w * LANES) = sum;
+        }
+    }
+}
+
 INLINE void give_for_node(const DepthJob *job, const Plane *of, const REAL *pixels, int64_t apart, int64_t i, int64_t j, const int wide) {
     const int64_t *taps = job->taps, *step = job->step, tall = tall_of(job, i);
-    F some[NODE_ROWS][WIDE];
-    UNROLLED for (int r = 0; r < NODE_ROWS; r++) UNROLLED for (int w = 0; w < wide; w++) some[r][w] = *(const Run *)(pixels + r * apart + j + w * LANES);
-    for (int64_t place = 0; place < step[1]; place++) for (int64_t b = place, at = j; b < taps[1]; b += step[1], at++) {
-        REAL *cells = of->cells + i * step[0] * job->columns + place * of->together + at;
-        const int64_t room = of->together - at; // a row of cells ends there
-        for (int64_t a = 0; a < tall; a++, cells += job->columns) {
-            if (b < job->room_bounds[2 * a] || b >= job->room_bounds[2 * a + 1]) continue;
-            const REAL *tap = (const REAL *)job->room + a * NODE_ROWS * taps[1] + b;
-            UNROLLED for (int w = 0; w < wide; w++) {
-                F sum = tap[0] * some[0][w];
-                UNROLLED for (int r = 1; r < NODE_ROWS; r++) sum += tap[r * taps[1]] * some[r][w];
-                if ((w + 1) * (int64_t)LANES <= room) *(Run *)(cells + w * LANES) += sum;
-                else for (int64_t k = w * LANES; k < room; k++) cells[k] += sum[k - w * LANES];
-            }
-        }
+    F some[2][NODE_ROWS][WIDE];
+    UNROLLED for (int k = 0; k < 2; k++) UNROLLED for (int r = 0; r < NODE_ROWS; r++) UNROLLED for (int w = 0; w < wide; w++) {
+        some[k][r][w] = *(const Run *)(pixels + r * apart + j + w * LANES + 1 - k);
+    }
+    for (int64_t place = 0; place < step[1]; place++) {
+        REAL *cells = of->cells + i * step[0] * job->columns + place * of->together + j;
+        int64_t b = place;
+        for (; b + step[1] < taps[1]; b += 2 * step[1], cells += 2) give_taps(job, cells, some, b, tall, 2, wide);
+        if (b < taps[1]) give_taps(job, cells, some, b, tall, 1, wide);
     }
 }
 
@@ -427,7 +435,7 @@ INLINE void sum_for_nodes(const DepthJob *job) {
     for (int64_t number = 0; number < job->planes; number++) for (int64_t i = 0; i < job->pixels[0]; i += NODE_ROWS) {
         const Plane plane = plane_of(job, number);
         for (int64_t node = 0, first, last; node < job->nodes[1]; node++) {
-            mix(job, number, i, node);
+            mix(job, number, i, node, 0);
             find_columns(job, node, &first, &last);
 #define SUM(wide) sum_for_node(job, &plane, i, j, node, wide)
             EACH_RUN(j, first, last, SUM);
@@ -443,15 +451,15 @@ INLINE void give_for_nodes(const DepthJob *job) {
     for (int64_t number = 0; number < job->planes; number++) for (int64_t i = 0; i < job->pixels[0]; i += NODE_ROWS) {
         const Plane plane = plane_of(job, number);
         for (int64_t node = 0, first, last; node < job->nodes[1]; node++) {
-            mix(job, number, i, node);
+            mix(job, number, i, node, job->step[1]);
             find_columns(job, node, &first, &last);
             for (int64_t r = 0; r < MIN((int64_t)NODE_ROWS, job->pixels[0] - i); r++) for (int64_t j = first; j < last; j++) {
-                some[r * apart + j] = ((const REAL *)job->image)[(i + r) * job->row + j] * of_node(job->node_columns[j], node);
+                some[r * apart + j + 1] = ((const REAL *)job->image)[(i + r) * job->row + j] * of_node(job->node_columns[j], node);
             }
 #define GIVE(wide) give_for_node(job, &plane, some, apart, i, j, wide)
-            EACH_RUN(j, first, last, GIVE);
+            EACH_RUN(j, first, last + 1, GIVE);
 #undef GIVE
-            for (int r = 0; r < NODE_ROWS; r++) for (int64_t j = first; j < last; j++) some[r * apart + j] = 0;
+            for (int r = 0; r < NODE_ROWS; r++) for (int64_t j = first; j < last; j++) some[r * apart + j + 1] = 0;
         }
     }
 }

@@ -14,6 +14,7 @@
 #include <stdint.h>
 
 #define NODE_ROWS 4
+#define GIVEN_ROWS 16
 #define CONTRACT 10 // counted up with every change of this file: cpu.py takes no other
 
 // Voxels (n[0], n[1], n[2]) in C order, of a job's kind of number.
@@ -91,9 +92,8 @@ typedef struct {
     // of the nodes; the bounds of a node are also those of the next node's taps along the first axis.
     int64_t nodes[2];              // at least 2 along either axis
     const double *node_rows, *node_columns;
-    void *room;                    // (taps[0] + (NODE_ROWS - 1) step[0], NODE_ROWS, taps[1]) numbers; and zeros, as many as NODE_ROWS rows of
-                                   // pixels, each with 31 more
-    int64_t *room_bounds;          // (taps[0] + (NODE_ROWS - 1) step[0], 2)
+    void *room;                    // (GIVEN_ROWS, NODE_ROWS, taps[1]) numbers and 16; and zeros, as many as NODE_ROWS rows of pixels, each with
+                                   // 31 more, and 16
     const int64_t *columns_of;     // (taps[1]): the numbers of a pixel's cells in a sorted row, less that of its first
     double *gradient;              // what derivatives are added to: (planes, taps[0], taps[1]), or by `line` (3), and for each piece (4, 3): by
                                    // its `shifts`, and the same times x, y and z of the voxels

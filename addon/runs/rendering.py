@@ -136,8 +136,8 @@ def load_recipe(scene: bpy.types.Scene, path: Path) -> None:
     _set_physics(scene, recipe)
     known = {item.name: item for item in volumes.volume_objects(scene)}
     settings.volume, settings.mu = known.get(recipe["volume.object"]), known.get(recipe["attenuation.object"])
-    name = recipe["attenuation.object"] or recipe["attenuation.file"]
-    if name is not None and settings.mu is None:
+    name = recipe["attenuation.object"] or ", ".join(recipe["attenuation.file"] or ())
+    if name and settings.mu is None:
         warn(f"the recipe's attenuation, {name}, is not chosen: import it if it is not here, and choose it in Physics")
 
 

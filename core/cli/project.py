@@ -6,6 +6,7 @@ Every setting of `runs.settings` is an option; the help lists the most used ones
 from __future__ import annotations
 
 import argparse
+import itertools
 from pathlib import Path
 from typing import Any
 
@@ -144,10 +145,10 @@ def _run(arguments: argparse.Namespace) -> None:
     path = output_path(arguments.output, FORMATS)
     picture = output_path(arguments.mosaic) if arguments.mosaic else None
     recipe, kept = _chosen(arguments)
-    states, count = recipe["volume.states"] or (), len(frames_of(recipe))
+    count = len(frames_of(recipe))
     outputs = {numbered_path(path, number, count).resolve() for number in range(1, count + 1)}
-    counts = recipe["counts.files"] or ()
-    for file in (*states, *counts, recipe["volume.file"], recipe["attenuation.file"]):
+    several = (recipe[key] or () for key in ("volume.states", "counts.files", "attenuation.file"))
+    for file in (*itertools.chain(*several), recipe["volume.file"]):
         if file is not None and Path(file).resolve() in outputs:
             raise mph.InputError(
                 f"{file}: the projections would replace what they are made from; choose another --output"

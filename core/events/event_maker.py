@@ -20,7 +20,7 @@ from ..projector.backends import choose
 from ..recording import Remembered, recorded_warnings, remembered
 from ..runs.projecting import Imaging, warn_of_energy
 from ..runs.recipe import Recipe
-from ..runs.run_recipe import recipe_imaging, recipe_system, recipe_views, require_mu
+from ..runs.run_recipe import mu_of_files, recipe_imaging, recipe_model, recipe_system, recipe_views, require_mu
 from ..validation import freeze
 from ..volumes.rearranging import centered
 from ..volumes.resampling import resample
@@ -168,14 +168,11 @@ class EventMaker:
         return found
 
     def _imaging_of(self, recipe: Recipe) -> Imaging:
-        grid, file = self.recipe.grid, recipe["attenuation.file"]
-        mu = None if file is None else self.recipe.input(file).volume()
+        grid, placed = self.recipe.grid, self.recipe.placed(recipe)
+        mu = mu_of_files(recipe, recipe_model(placed, self.system), lambda file: self.recipe.input(file).volume())
         if recipe["attenuation.of_phantom"]:  # each event has its own: here, to say on which grid
             mu = Volume(freeze(np.zeros(grid.shape, np.float32)), grid, "mu")
-        placed = self.recipe.placed(recipe)
-        imaging = recipe_imaging(placed, self.system, self.views, grid, mu, threads=self.threads)
-        warn_of_energy(imaging.model, recipe["attenuation.energy"], Path(file or "").name)
-        return imaging
+        return recipe_imaging(placed, self.system, self.views, grid, mu, threads=self.threads)
 
     @cached_property
     def _radon(self) -> Remembered[dict[int, Projector]]:

@@ -252,10 +252,12 @@ class Event:
     def _record(self, model: Recipe) -> Recipe | None:
         """The recipe of a run of a model's images; None where none can say what attenuates."""
         planned, recipe = self.planned, self._folder.recipe
-        files = {key: model[key] for key in ("system.file", "system.columns", "attenuation.file")}
+        files = {key: model[key] for key in ("system.file", "system.columns")}
         changes: dict[str, Any] = {key: str(recipe.input(name).path) for key, name in files.items() if name is not None}
-        if "attenuation.file" in changes and model["attenuation.energy"] != LINES:
-            changes |= {"attenuation.energy": None}  # the set's copy holds mu
+        if (of_mu := model["attenuation.file"]) is not None:
+            changes["attenuation.file"] = [str(recipe.input(name).path) for name in of_mu]
+            if model["attenuation.energy"] != LINES:
+                changes |= {"attenuation.energy": None}  # the set's copy holds mu
         record = recorded_recipe(recipe.placed(model.updated(changes)))
         if planned.phantom is not None and planned.entry["gates"] == 1 and planned.activity_factor == 1:
             own: dict[str, Any] = {"phantom.voxels": recipe.grid.shape, "phantom.spacing": recipe.grid.spacing.tolist()}

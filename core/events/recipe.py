@@ -287,8 +287,9 @@ class EventRecipe:
                         entry[key], "copy" if is_text(entry[key]) else _what(quantity, checked["energy"])
                     )
         for name, model in self.models.items():
-            if (file := model["attenuation.file"]) is not None:
-                values["models"][name]["attenuation"] = change(file, _what("mu", model["attenuation.energy"]))
+            if (files := model["attenuation.file"]) is not None:
+                found = [change(file, _what("mu", model["attenuation.energy"])) for file in files]
+                values["models"][name]["attenuation"] = found if len(found) > 1 else found[0]
             if isinstance(file := model["model.efficiency"], str):
                 values["models"][name]["efficiency"] = change(file, "copy")
         return values

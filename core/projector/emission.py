@@ -29,7 +29,7 @@ from .hole_nodes import Passage
 from .hole_response import WholeHoles
 from .models import Model, checked_background, checked_times
 from .module_views import require_views_of
-from .photon_lines import checked_mu, checked_photons, models_of_lines
+from .photon_lines import checked_mu, checked_photons, each_mu, models_of_lines
 from .pixel_points import TOLERANCE, expected_error, lattices, offsets, points_needed, require_points, shadow_edges
 from .rays import Fan, view_rays
 from .wall_penetration import models_with_walls
@@ -278,8 +278,8 @@ class Emission(Model):
         for name, value in settings.items():
             if isinstance(value, np.ndarray):
                 settings[name] = value.tolist() if value.ndim == 1 else "images"
-        volumes: Any = self.mu if isinstance(self.mu, tuple) else [self.mu]
-        grids = [{"shape": list(mu.grid.shape), "affine": mu.grid.affine.tolist()} for mu in volumes if mu is not None]
+        volumes = each_mu(self.mu)  # type: ignore[arg-type]  # a tuple, once made
+        grids = [{"shape": list(mu.grid.shape), "affine": mu.grid.affine.tolist()} for mu in volumes]
         if grids:
             settings["mu"] = grids if isinstance(self.mu, tuple) else grids[0]
         return settings

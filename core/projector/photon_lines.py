@@ -15,6 +15,8 @@ from ..volumes.volume import Volume, require_quantity
 
 Lines = Sequence[tuple[float, float]]
 """Energies, keV, and photons per decay that are counted, in order of energy."""
+Mu = Volume | tuple[Volume, ...]
+"""What attenuates all photons, or those of each line."""
 
 
 def checked_photons(model: Any) -> dict[str, Any]:
@@ -37,15 +39,34 @@ def checked_photons(model: Any) -> dict[str, Any]:
     return {"isotope": known, "window": (low, high), "energy_fwhm": share, "photon_lines": lines}
 
 
-def checked_mu(mu: Any, lines: Lines) -> Volume | tuple[Volume, ...] | None:
+def each_mu(mu: Mu | None) -> tuple[Volume, ...]:
+    """The volumes of mu, in order."""
+    return tuple(mu) if isinstance(mu, list | tuple) else () if mu is None else (mu,)
+
+
+def mu_of(volumes: Sequence[Volume]) -> Mu | None:
+    """What attenuates: nothing, one volume, or one for each line."""
+    return tuple(volumes) if len(volumes) > 1 else next(iter(volumes), None)
+
+
+def require_each(count: int, lines: Lines, what: str, kind: str = "volume") -> None:
+    """Refuse so many volumes of mu, or other `kind` of such, unless there is one for each line."""
+    if count != len(lines):
+        energies = ", ".join(f"{energy:g}" for energy, _ in lines)
+        s = "s" * (len(lines) > 1)
+        of_lines = f"{len(lines)} {kind}{s}, of the line{s} at {energies} keV"
+        expected = of_lines if lines else f"one {kind} without an isotope"
+        raise InputError(f"{what}: expected {expected}, got {count}")
+
+
+def checked_mu(mu: Any, lines: Lines) -> Mu | None:
     """What attenuates photons of these lines: of mu one volume, or one for each line; or of CT numbers one.
 
     Of a single line it is its volume of mu.
     """
     if mu is None:
         return None
-    is_one = not isinstance(mu, list | tuple)
-    volumes = [mu] if is_one else list(mu)
+    is_one, volumes = not isinstance(mu, list | tuple), each_mu(mu)
     for volume in volumes:
         if not isinstance(volume, Volume):
             hint = "; tensors of it go to the projector, A(x, mu=...)" if is_tensor(volume) else ""
@@ -53,12 +74,10 @@ def checked_mu(mu: Any, lines: Lines) -> Volume | tuple[Volume, ...] | None:
         require_quantity(volume.quantity, ("mu", "hu") if is_one and lines else ("mu",), "emission: mu")
         if volume.quantity == "mu" and volume.array.min() < 0:
             raise InputError(f"emission: mu must not be negative, got {volume.array.min():g} 1/mm")
-    if not is_one and len(volumes) != len(lines):
-        energies = ", ".join(f"{energy:g}" for energy, _ in lines)
-        expected = f"{len(lines)} volumes, of the lines at {energies} keV" if lines else "one volume without an isotope"
-        raise InputError(f"emission: mu: expected {expected}, got {len(volumes)}")
+    if not is_one:
+        require_each(len(volumes), lines, "emission: mu")
     if len(lines) > 1:
-        return mu if is_one else tuple(volumes)
+        return mu if is_one else volumes
     return hu_to_mu(volumes[0], lines[0][0]) if volumes[0].quantity == "hu" else volumes[0]
 
 

@@ -16,6 +16,7 @@ from ..phantoms.derenzo import DerenzoRods
 from ..physics.performance import resolution
 from ..progress import Stages
 from ..projector.backends import choose
+from ..projector.photon_lines import Mu
 from ..reconstruction.methods import METHODS, PRIORS, Choice, Method, method_of
 from ..reconstruction.result import Reconstruction
 from ..reconstruction.stopping import StoppingRule, StopWhen
@@ -41,7 +42,7 @@ _POINTS = 7
 def reconstruct_run(
     run: ProjectionRun,
     recipe: Recipe | None = None,
-    mu: Volume | None = None,
+    mu: Mu | None = None,
     start: Volume | Reconstruction | None = None,
     watch: Watch | None = None,
     stages: Stages = lambda stage: None,
@@ -57,7 +58,7 @@ def reconstruct_run(
         Its tables `HOW_TABLES` say how; by default the run's own. What is modelled is what made the run, unless the settings
         of the reconstruction say otherwise: another model of the hole, no attenuation, no blur. For a run without a recipe,
         as those of version 0.1.0, it needs the whole model, ``model.kind`` and all that this takes.
-    mu : Volume
+    mu : Volume, or a tuple of those of the isotope's lines
         What attenuates, instead of what the recipe says.
     start : Volume or Reconstruction
         Begin with this volume, on the same grid; a reconstruction by the same method goes on.

@@ -24,6 +24,7 @@ from ..physics.isotopes import photon_energy
 from ..progress import Progress, Stages
 from ..projector import Emission, InverseSquareSum, Model, Projector, Transmission
 from ..projector.models import each_pixel
+from ..projector.photon_lines import Mu, each_mu, mu_of, require_each
 from ..volumes.rearranging import centered
 from ..volumes.volume import Volume
 from ..volumes.volume_files import read_volume, read_volume_of
@@ -44,7 +45,7 @@ _MU_ADVICE = "; of mu, give the energy at which it holds (--energy)"
 _MOST_MU = 500.0
 """1/mm: more than any material of the tables attenuates photons of 10 keV or more."""
 
-_Source = tuple[Volume, Volume | None, Recipe]
+_Source = tuple[Volume, Mu | None, Recipe]
 """What is projected, what attenuates it, and what to record of it."""
 
 
@@ -52,7 +53,7 @@ def run_recipe(
     recipe: Recipe,
     system: Scanner | None = None,
     volume: Volume | None = None,
-    mu: Volume | None = None,
+    mu: Mu | None = None,
     stages: Stages = lambda stage: None,
 ) -> Iterator[ProjectionRun]:
     """Make what a recipe asks for: one run, or one for each of ``volume.states`` and frames; of counts, the run of these.
@@ -62,7 +63,7 @@ def run_recipe(
     recipe
         What to do.
     system, volume, mu
-        Instead of those that the recipe names; of `system` the recipe chooses modules.
+        Instead of those that the recipe names; of `system` the recipe chooses modules. `mu` may be a tuple, of the lines.
     stages
         Begins each stage: reading, voxelizing, projecting.
 
@@ -165,7 +166,7 @@ def _detector(recipe: Recipe) -> dict[str, Any]:
     return {"shape": shape, "detector": recipe["detector.plane"], **given}
 
 
-def recipe_model(recipe: Recipe, system: Scanner, mu: Volume | None = None, run: ProjectionRun | None = None) -> Model:
+def recipe_model(recipe: Recipe, system: Scanner, mu: Mu | None = None, run: ProjectionRun | None = None) -> Model:
     """The model that a recipe asks for; `mu` is what attenuates. `InputError` where the settings do not go together.
 
     Of a `run` it has the efficiencies, if they are the recipe's, and what dead time has left of its photons is, as a part
@@ -186,13 +187,18 @@ def recipe_model(recipe: Recipe, system: Scanner, mu: Volume | None = None, run:
         if run is not None and recipe["model.dead_time"]:
             shares = live_shares_of(recipe, run.projections, run.settings)
             given |= {name: scaled(given.get(name, 0.0), shares) for name in ("background", "efficiency")}
-    return cls(**given) if cls is Transmission else cls(system, **given)
+    model: Model = cls(**given) if cls is Transmission else cls(system, **given)
+    if isinstance(model, Emission) and len(files := recipe["attenuation.file"] or ()) > 1:
+        require_each(len(files), model.photon_lines, "attenuation.file", "file")
+        if recipe["attenuation.energy"] is not None:
+            raise InputError("attenuation.energy: it is for one file of CT numbers; a file for each line holds mu")
+    return model
 
 
 def projector_of_run(
     run: ProjectionRun,
     grid: Grid,
-    mu: Volume | None = None,
+    mu: Mu | None = None,
     recipe: Recipe | None = None,
     backend: str = "auto",
     threads: int | None = None,
@@ -207,8 +213,8 @@ def projector_of_run(
     grid
         The voxels of the volumes.
     mu
-        What attenuates (1/mm), on any grid, instead of the recipe's: a file, which is read again, or the phantom,
-        which is voxelized on `grid`.
+        What attenuates (1/mm), on any grid, instead of the recipe's: files, which are read again, or the phantom,
+        which is voxelized on `grid`. A tuple is of the isotope's lines.
     recipe
         Instead of the run's own, such as ``run.recipe.updated({"model.aperture_points": 19})``.
     backend, threads
@@ -243,7 +249,7 @@ def projector_of_run(
 
 
 def recipe_imaging(
-    recipe: Recipe, system: Scanner, views: Views, grid: Grid, mu: Volume | None = None, backend: str = "auto",
+    recipe: Recipe, system: Scanner, views: Views, grid: Grid, mu: Mu | None = None, backend: str = "auto",
     threads: int | None = None,
 ) -> Imaging:  # fmt: skip
     """What makes a recipe's images of volumes on a grid; `mu` is what attenuates."""
@@ -259,18 +265,26 @@ def _volume_name(record: Recipe) -> str:
     return f"{record['phantom.kind'].capitalize()} phantom" if "phantom.kind" in record.given else ""
 
 
-def _attenuation(recipe: Recipe, model: Model, stages: Stages) -> Volume | None:
+def _attenuation(recipe: Recipe, model: Model, stages: Stages) -> Mu | None:
     """The attenuation that the recipe names, but for that of its phantom."""
-    name, path, energy = (recipe[f"attenuation.{name}"] for name in ("object", "file", "energy"))
+    name, energy = recipe["attenuation.object"], recipe["attenuation.energy"]
     if name is not None:
         raise InputError(f"attenuation.object: {name!r} is in a Blender scene; give --mu FILE instead")
-    if path is None:
-        return None
-    warn_of_energy(model, energy, Path(path).name)
-    return read_mu(path, energy, recipe["attenuation.series"], stages("reading"))
+    return mu_of_files(
+        recipe, model, lambda path: read_mu(path, energy, recipe["attenuation.series"], stages("reading"))
+    )
 
 
-def _from_files(recipe: Recipe, record: Recipe, model: Model, mu: Volume | None, stages: Stages) -> Iterator[_Source]:
+def mu_of_files(recipe: Recipe, model: Model, read: Callable[[str], Volume]) -> Mu | None:
+    """What `read` gives of the files of attenuation that a recipe names; a warning says where it holds for other photons."""
+    found = []
+    for path in recipe["attenuation.file"] or ():
+        warn_of_energy(model, recipe["attenuation.energy"], Path(path).name)
+        found.append(read(path))
+    return mu_of(found)
+
+
+def _from_files(recipe: Recipe, record: Recipe, model: Model, mu: Mu | None, stages: Stages) -> Iterator[_Source]:
     """The volumes of the files, one at a time; ``volume.center`` moves all of them, and mu, as far as the first."""
     middle = None
     states = recipe["volume.states"]
@@ -279,7 +293,7 @@ def _from_files(recipe: Recipe, record: Recipe, model: Model, mu: Volume | None,
         if recipe["volume.center"]:
             if middle is None:
                 middle = volume.grid.center
-                mu = None if mu is None else centered(mu, mu.grid.center - middle)
+                mu = mu_of([centered(one, one.grid.center - middle) for one in each_mu(mu)])
             volume = centered(volume, volume.grid.center - middle)
         yield volume, mu, record if states is None else record.updated({"volume.states": [file]})
 
@@ -337,7 +351,7 @@ def read_mu(
     return volume
 
 
-def _from_phantom(recipe: Recipe, record: Recipe, model: Model, mu: Volume | None, stages: Stages) -> Iterator[_Source]:
+def _from_phantom(recipe: Recipe, record: Recipe, model: Model, mu: Mu | None, stages: Stages) -> Iterator[_Source]:
     if recipe["volume.object"] is not None and not any(key.startswith("phantom.") for key in recipe.given):
         name = recipe["volume.object"]
         raise InputError(f"volume.object: {name!r} is in a Blender scene; give --volume FILE instead")

@@ -241,7 +241,8 @@ _DECLARED = (
             sizes=(1, 3), needs=_PHANTOM),
     Setting("phantom.turn_grid", bool, False, "Turn the grid with the phantom", needs=_PHANTOM),
     Setting("attenuation.file", str, None, "Attenuation coefficients, 1/mm, on any grid, or CT numbers (a DICOM folder, "
-            "too)", "nothing attenuates", is_path=True, needs=(_COUNTS, "no attenuation.of_phantom"), option="--mu"),
+            "too); or a file of coefficients for each of the isotope's lines, by energy", "nothing attenuates", is_path=True,
+            sizes=(), needs=(_COUNTS, "no attenuation.of_phantom"), option="--mu"),
     Setting("attenuation.object", str, None, "Name of its object in a Blender scene",
             needs=(_COUNTS, "no attenuation.file", "no attenuation.of_phantom"), option="--mu-object"),
     Setting("attenuation.series", str, None, _SERIES, needs=("attenuation.file",), option="--mu-series"),

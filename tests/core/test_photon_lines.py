@@ -10,8 +10,9 @@ import pytest
 
 import mphdrr.core as mph
 from mphdrr.core import events
+from mphdrr.core.cli import main
 
-from .conftest import BACKENDS, refused
+from .conftest import BACKENDS, WORKBOOK, refused
 from .small_events import WORKBOOK as FEWER_MODULES
 
 DEPTH = 50.0  # mm of water before the source
@@ -249,8 +250,51 @@ def test_recipes_take_ct_numbers_at_each_line(system, ct, tmp_path):
     assert len(mph.projector_of_run(apart, volume.grid).model.parts()) == 2
 
 
-def test_event_sets_keep_ct_numbers_for_the_lines(ct, tmp_path):
+@pytest.fixture
+def mu_files(ct, tmp_path):
+    """Files of mu for the two lines of In-111 that are counted, and what is in them."""
+    files = [tmp_path / f"{energy}.nii.gz" for energy in (171, 245)]
+    for file, energy in zip(files, (171.3, 245.4), strict=True):
+        mph.write_volume(mph.hu_to_mu(ct, energy), file)
+    return [str(file) for file in files], [mph.read_volume(file) for file in files]
+
+
+def test_recipes_and_options_take_a_file_of_mu_for_each_line(system, mu_files, tmp_path):
+    files, mu = mu_files
+    volume = mph.Volume(np.ones((4, 4, 4)), mph.Grid.centered(4, 15.0), "activity")
+    counted = {"isotope": "In-111", "window": (150, 270), "energy_fwhm": 0.1}
+    recipe = mph.Recipe(
+        {"model.kind": "emission", "attenuation.file": files, "detector.rows": 6, "detector.columns": 6}
+        | {f"model.{name}": value for name, value in counted.items()}
+    )
+    (run,) = mph.run_recipe(recipe, system, volume)
+    A = mph.Projector(volume.grid, run.views, mph.Emission(system, mu, **counted))
+    np.testing.assert_allclose(run.projections, A(volume), rtol=1e-6)
+    mph.write_recipe(recipe.updated({"system.file": str(WORKBOOK)}), tmp_path / "recipe.toml")
+    mph.write_volume(volume, tmp_path / "volume.nii.gz")
+    words = ["project", str(tmp_path / "recipe.toml"), "--volume", str(tmp_path / "volume.nii.gz"), "--modules", "1,48"]
+    assert main([*words, "--mu", *reversed(files), "-o", str(tmp_path / "run.h5")]) == 0
+    other = mph.read_run(tmp_path / "run.h5")
+    swapped = mph.Projector(volume.grid, other.views, mph.Emission(other.system, mu[::-1], **counted))
+    np.testing.assert_allclose(other.projections, swapped(volume), rtol=1e-6)
+    np.testing.assert_allclose(mph.projector_of_run(other, volume.grid)(volume), other.projections, rtol=1e-6)
+
+    def assert_refused(wrong, *words):
+        refused(lambda: next(mph.run_recipe(wrong, system, volume)), *words)
+
+    for number in (2, 3):
+        window = (150, 270) if number == 3 else (160, 180)
+        wrong = {"attenuation.file": files[:1] * number, "model.window": window, "model.energy_fwhm": None}
+        assert_refused(recipe.updated(wrong), "attenuation.file", f"got {number}")
+    assert_refused(recipe.updated({"attenuation.energy": 171.3}), "attenuation.energy", "one file")
+
+
+@pytest.mark.parametrize("each", [False, True])
+def test_event_sets_keep_what_attenuates_each_line(each, ct, mu_files, tmp_path):
     mph.write_volume(ct, tmp_path / "ct.nii.gz")
+    given = 'attenuation = ["171.nii.gz", "245.nii.gz"]'
+    if not each:
+        given = 'attenuation = "ct.nii.gz"\nattenuation_energy = "lines"'
     text = f"""
 version = 1
 [system]
@@ -268,13 +312,12 @@ kind = "derenzo"
 kind = "emission"
 isotope = "In-111"
 window = [150, 270]
-attenuation = "ct.nii.gz"
-attenuation_energy = "lines"
+{given}
 """
     (tmp_path / "recipe.toml").write_text(text)
     events.make(events.read_recipe(tmp_path / "recipe.toml"), tmp_path / "set", 1)
     event = events.EventSet(tmp_path / "set")[0]
     run = event.run("counts")
     A = mph.projector_of_run(run, event.truth.grid)
-    assert len(A.model.parts()) == 2 and A.model.mu.quantity == "hu"
+    assert len(A.model.parts()) == 2 and isinstance(A.model.mu, tuple) == each
     np.testing.assert_allclose(A(event.truth), event.images("counts"), rtol=1e-5)

@@ -23,12 +23,12 @@ from ..rays import Attenuation, IndexFans, IndexRays, Rays
 LEVEL_VARIABLE = "MPHDRR_CPU_LEVEL"
 """Environment variable that names a lower level of processor, `levels`, than this one's."""
 
-_CONTRACT = 9
+_CONTRACT = 10
 _NAMES = {"win32": "siddon.dll", "darwin": "libsiddon.dylib"}
 _MOST_VOXELS = 2**31 - 1  # their indices are of 32 bits
 _PRODUCT = 2  # in kernels.h
 _MOST_PLACES_ALONG = 2**16  # where float32 knows a place to 1/256 of an element; beyond 2^24 it would miss whole ones
-_NODE_ROWS = 4  # in kernels.h
+_NODE_ROWS, _GIVEN_ROWS = 4, 16  # in kernels.h
 _READ_ON = 16  # numbers that kernels read beyond the last of what they use
 _MOST_ALONG = 2**12  # where float32 knows the length of a segment to 0.1 %
 
@@ -70,7 +70,7 @@ class _DepthJob(Structure):
         ("rows", c_int64), ("columns", c_int64), ("kernel", c_void_p), ("bounds", c_void_p),
         ("taps", c_int64 * 2), ("step", c_int64 * 2), ("image", c_void_p), ("row", c_int64), ("pixels", c_int64 * 2),
         ("nodes", c_int64 * 2), ("node_rows", c_void_p), ("node_columns", c_void_p), ("room", c_void_p),
-        ("room_bounds", c_void_p), ("gradient", c_void_p),
+        ("columns_of", c_void_p), ("gradient", c_void_p),
     ]  # fmt: skip
 
 
@@ -402,14 +402,17 @@ def _run_pixels(
 ) -> None:
     """Run a kernel between the sorted cells and the pixels of one view."""
     taps = np.ascontiguousarray(of.padded, image.dtype)
+    if taps.shape[-1] * of.steps[0] < _READ_ON:
+        taps = np.append(taps, np.zeros(_READ_ON, image.dtype))[: taps.size].reshape(taps.shape)
     nodes: dict[str, Any] = {}
     if of.places is not None:
         rows, columns = (np.ascontiguousarray(each) for each in of.places)
-        tall = of.kernel.shape[-2] + (_NODE_ROWS - 1) * of.steps[0]
-        room = np.zeros(_NODE_ROWS * (tall * taps.shape[-1] + of.after.shape[1] + 2 * _READ_ON), image.dtype)
-        bounds = np.empty((tall, 2), np.int64)
+        of_pixels = of.after.shape[1] + 2 * _READ_ON
+        room = np.zeros(_NODE_ROWS * (_GIVEN_ROWS * taps.shape[-1] + of_pixels) + 2 * _READ_ON, image.dtype)
+        columns_of = np.arange(taps.shape[-1]) % of.steps[1] * (of.shape[2] // of.steps[1])
+        columns_of += np.arange(taps.shape[-1]) // of.steps[1]
         nodes = {"nodes": taps.shape[1:3], "node_rows": rows.ctypes.data, "node_columns": columns.ctypes.data,
-                 "room": room.ctypes.data, "room_bounds": bounds.ctypes.data}  # fmt: skip
+                 "room": room.ctypes.data, "columns_of": columns_of.ctypes.data}  # fmt: skip
     job = _DepthJob(
         is_double=image.dtype == np.float64,
         cells=sorted_cells.ctypes.data, planes=of.shape[0], rows=of.shape[1], columns=of.shape[2],

@@ -320,7 +320,8 @@ INLINE void sum_pixels(const Plane *of, int64_t r, int64_t place, int64_t j, con
     }
 
 // Where pixels have kernels of their own, NODE_ROWS rows of them from row i on are done together, for one column of nodes and its shares
-// of the pixels. In the job's room are, for each row of cells from row i's first on, the taps of each of these rows.
+// of the pixels. For each row of cells from row i's first on, the taps of each of these rows are mixed in the job's room, which has place
+// for GIVEN_ROWS rows of cells.
 
 // A node's weight in a pixel along one axis.
 INLINE REAL of_node(double place, int64_t node) { return (REAL)MAX(1 - __builtin_fabs(place - node), 0.0); }
@@ -330,32 +331,43 @@ INLINE int64_t tall_of(const DepthJob *job, int64_t i) {
     return MIN(job->taps[0] + (NODE_ROWS - 1) * job->step[0], job->rows - i * job->step[0]);
 }
 
-// Mix the taps, and find where in each row of cells any of the rows of pixels has some.
-INLINE void mix(const DepthJob *job, int64_t number, int64_t i, int64_t node) {
-    const int64_t step = job->step[0], rows = job->taps[0] + 2 * step, *taps = job->taps;
+// The nodes before NODE_ROWS rows of pixels: their taps, what share the next ones have, and where taps are that are not 0.
+typedef struct {
     const REAL *kernels[NODE_ROWS];
     REAL shares[NODE_ROWS];
-    const int64_t *bounds[NODE_ROWS];
+    const int64_t (*bounds[NODE_ROWS])[2];
+} Nodes;
+
+INLINE Nodes nodes_of(const DepthJob *job, int64_t number, int64_t i, int64_t node) {
+    Nodes nodes;
     for (int r = 0; r < NODE_ROWS; r++) {
         const double place = job->node_rows[MIN(i + r, job->pixels[0] - 1)];
-        const int64_t before = MIN((int64_t)place, job->nodes[0] - 2), first = ((number * job->nodes[0] + before) * job->nodes[1] + node) * rows + step;
-        kernels[r] = (const REAL *)job->kernel + first * taps[1], shares[r] = (REAL)(place - before);
-        bounds[r] = (const int64_t *)job->bounds + 2 * first;
+        const int64_t before = MIN((int64_t)place, job->nodes[0] - 2);
+        const int64_t first = ((number * job->nodes[0] + before) * job->nodes[1] + node) * (job->taps[0] + 2 * job->step[0]) + job->step[0];
+        nodes.kernels[r] = (const REAL *)job->kernel + first * job->taps[1], nodes.shares[r] = (REAL)(place - before);
+        nodes.bounds[r] = (const int64_t (*)[2])job->bounds + first;
     }
-    for (int64_t a = 0; a < tall_of(job, i); a++) {
-        int64_t low = taps[1], high = 0;
-        for (int r = 0; r < NODE_ROWS; r++) {
-            const int64_t row = a - r * step;
-            if (row < 0 || row >= taps[0] || !bounds[r][2 * row + 1]) continue;
-            low = MIN(low, bounds[r][2 * row]), high = MAX(high, bounds[r][2 * row + 1]);
-        }
-        job->room_bounds[2 * a] = low, job->room_bounds[2 * a + 1] = high;
-        for (int r = 0; r < NODE_ROWS; r++) {
-            const int64_t row = a - r * step;
-            REAL *const mixed = (REAL *)job->room + (a * NODE_ROWS + r) * taps[1];
-            const REAL *const one = kernels[r] + row * taps[1], *const next = one + job->nodes[1] * rows * taps[1], share = shares[r];
-            if (row < 0 || row >= taps[0]) for (int64_t b = low; b < high; b++) mixed[b] = 0;
-            else for (int64_t b = low; b < high; b++) mixed[b] = one[b] + share * (next[b] - one[b]);
+    return nodes;
+}
+
+// Mix the taps at row a of the cells from *low on, to before *high, where any of the rows of pixels has some, and up to `beside` beside.
+INLINE void mix(const DepthJob *job, const Nodes *nodes, int64_t a, int64_t beside, REAL *room, int64_t *low, int64_t *high) {
+    const int64_t *taps = job->taps, next = job->nodes[1] * (taps[0] + 2 * job->step[0]) * taps[1];
+    *low = taps[1], *high = 0;
+    UNROLLED for (int r = 0; r < NODE_ROWS; r++) {
+        const int64_t row = a - r * job->step[0];
+        if (row < 0 || row >= taps[0] || !nodes->bounds[r][row][1]) continue;
+        *low = MIN(*low, nodes->bounds[r][row][0]), *high = MAX(*high, nodes->bounds[r][row][1]);
+    }
+    if (!*high) return;
+    const int64_t first = MAX(*low - beside, (int64_t)0), last = MIN(*high + beside, taps[1]);
+    UNROLLED for (int r = 0; r < NODE_ROWS; r++) {
+        const int64_t row = a - r * job->step[0];
+        const int is_there = row >= 0 && row < taps[0];
+        const REAL *const one = nodes->kernels[r] + row * taps[1], share = nodes->shares[r];
+        REAL *const mixed = room + r * taps[1];
+        for (int64_t b = first; b < last; b += LANES) { // whole vectors: what comes after `last` is written anew, or not used
+            *(Run *)(mixed + b) = is_there ? *(const Run *)(one + b) + share * (*(const Run *)(one + next + b) - *(const Run *)(one + b)) : (Run)0;
         }
     }
 }
@@ -369,29 +381,25 @@ INLINE void find_columns(const DepthJob *job, int64_t node, int64_t *first, int6
     *last = j;
 }
 
-INLINE void sum_for_node(const DepthJob *job, const Plane *of, int64_t i, int64_t j, int64_t node, const int wide) {
-    const int64_t *taps = job->taps, *step = job->step, tall = tall_of(job, i);
+INLINE void sum_for_node(const DepthJob *job, const Plane *of, const Nodes *nodes, int64_t i, int64_t j, int64_t node, const int wide) {
+    const int64_t *taps = job->taps, *step = job->step;
+    REAL *const tap = job->room;
     F sums[2][NODE_ROWS][WIDE] = {0};
-    for (int64_t a = 0; a < tall; a++) {
-        const int64_t low = job->room_bounds[2 * a], high = job->room_bounds[2 * a + 1];
-        const int64_t pixel = (uint32_t)low / (uint32_t)step[1], rest = low - pixel * step[1]; // a division is dear
-        for (int64_t place = 0; place < step[1]; place++) {
-            const int64_t from = pixel + (place < rest);
-            const REAL *cells = of->cells + (i * step[0] + a) * job->columns + place * of->together + j + from;
-            const REAL *tap = (const REAL *)job->room + a * NODE_ROWS * taps[1], *const end = tap + high;
-            tap += place + from * step[1];
-#define ADD(chain, k)                                                                       \
+    for (int64_t a = 0; a < tall_of(job, i); a++) {
+        const REAL *const cells = of->cells + (i * step[0] + a) * job->columns + j;
+        int64_t b, end;
+        mix(job, nodes, a, 0, tap, &b, &end);
+#define ADD(chain, b)                                                                       \
     UNROLLED for (int w = 0; w < wide; w++) {                                               \
-        const F some = *(const Run *)(cells + k + w * LANES);                               \
-        UNROLLED for (int r = 0; r < NODE_ROWS; r++) sums[chain][r][w] += tap[k * step[1] + r * taps[1]] * some; \
+        const F some = *(const Run *)(cells + job->columns_of[b] + w * LANES);              \
+        UNROLLED for (int r = 0; r < NODE_ROWS; r++) sums[chain][r][w] += tap[b + r * taps[1]] * some; \
     }
-            for (; tap + step[1] < end; tap += 2 * step[1], cells += 2) {
-                ADD(0, 0)
-                ADD(1, 1)
-            }
-            if (tap < end) ADD(0, 0)
-#undef ADD
+        for (; b + 1 < end; b += 2) {
+            ADD(0, b)
+            ADD(1, b + 1)
         }
+        if (b < end) ADD(0, b)
+#undef ADD
     }
     for (int64_t r = 0; r < MIN((int64_t)NODE_ROWS, job->pixels[0] - i); r++) {
         UNROLLED for (int w = 0; w < wide; w++) sums[0][r][w] += sums[1][r][w];
@@ -401,24 +409,41 @@ INLINE void sum_for_node(const DepthJob *job, const Plane *of, int64_t i, int64_
     }
 }
 
-// The adjoint: `pixels` are those rows, `apart`, by the node's share. Neighbouring rows of cells follow each other: what was just
-// stored, a processor cannot read again a column farther on.
-INLINE void give_for_node(const DepthJob *job, const Plane *of, const REAL *pixels, int64_t apart, int64_t i, int64_t j, const int wide) {
+// The adjoint: `pixels` are those rows, `apart`, by the node's share, with a zero before each. Two taps that are neighbours at a place are
+// given together, so that a cell is read and stored once for both. Neighbouring rows of cells follow each other: what was just stored,
+// a processor cannot read again a column farther on. What lies beyond the node's pixels is 0, and may be added anywhere.
+INLINE void give_for_node(const DepthJob *job, const Plane *of, const Nodes *nodes, const REAL *pixels, int64_t apart, int64_t i, int64_t j, const int wide) {
     const int64_t *taps = job->taps, *step = job->step, tall = tall_of(job, i);
-    F some[NODE_ROWS][WIDE];
-    UNROLLED for (int r = 0; r < NODE_ROWS; r++) UNROLLED for (int w = 0; w < wide; w++) some[r][w] = *(const Run *)(pixels + r * apart + j + w * LANES);
-    for (int64_t place = 0; place < step[1]; place++) for (int64_t b = place, at = j; b < taps[1]; b += step[1], at++) {
-        REAL *cells = of->cells + i * step[0] * job->columns + place * of->together + at;
-        const int64_t room = of->together - at; // a row of cells ends there
-        for (int64_t a = 0; a < tall; a++, cells += job->columns) {
-            if (b < job->room_bounds[2 * a] || b >= job->room_bounds[2 * a + 1]) continue;
-            const REAL *tap = (const REAL *)job->room + a * NODE_ROWS * taps[1] + b;
-            UNROLLED for (int w = 0; w < wide; w++) {
-                F sum = tap[0] * some[0][w];
-                UNROLLED for (int r = 1; r < NODE_ROWS; r++) sum += tap[r * taps[1]] * some[r][w];
-                if ((w + 1) * (int64_t)LANES <= room) *(Run *)(cells + w * LANES) += sum;
-                else for (int64_t k = w * LANES; k < room; k++) cells[k] += sum[k - w * LANES];
-            }
+    REAL *const room = job->room;
+    F some[2][NODE_ROWS][WIDE];
+    UNROLLED for (int k = 0; k < 2; k++) UNROLLED for (int r = 0; r < NODE_ROWS; r++) UNROLLED for (int w = 0; w < wide; w++) {
+        some[k][r][w] = *(const Run *)(pixels + r * apart + j + w * LANES + 1 - k);
+    }
+    for (int64_t first = 0; first < tall; first += GIVEN_ROWS) {
+        const int64_t n = MIN((int64_t)GIVEN_ROWS, tall - first);
+        int64_t low[GIVEN_ROWS], high[GIVEN_ROWS], least = taps[1], most = 0;
+        for (int64_t a = 0; a < n; a++) {
+            mix(job, nodes, first + a, step[1], room + a * NODE_ROWS * taps[1], &low[a], &high[a]);
+            least = MIN(least, low[a]), most = MAX(most, high[a]);
+        }
+        for (int64_t pair = 0; pair < most; pair += 2 * step[1]) for (int64_t b = pair; b < MIN(pair + step[1], most); b++) {
+            if (b + step[1] < least) continue;
+            REAL *cells = of->cells + (i * step[0] + first) * job->columns + j + job->columns_of[b];
+            const REAL *tap = room + b;
+#define GIVE(both)                                                                            \
+    for (int64_t a = 0; a < n; a++, cells += job->columns, tap += NODE_ROWS * taps[1]) {      \
+        if (b + both * step[1] < low[a] || b >= high[a]) continue;                            \
+        UNROLLED for (int w = 0; w < wide; w++) {                                             \
+            F sum = *(const Run *)(cells + w * LANES);                                        \
+            UNROLLED for (int r = 0; r < NODE_ROWS; r++) {                                    \
+                sum += tap[r * taps[1]] * some[0][r][w];                                      \
+                if (both) sum += tap[r * taps[1] + step[1]] * some[1][r][w];                  \
+            }                                                                                 \
+            *(Run *)(cells + w * LANES) = sum;                                                \
+        }                                                                                     \
+    }
+            if (b + step[1] < taps[1]) GIVE(1) else GIVE(0)
+#undef GIVE
         }
     }
 }
@@ -427,9 +452,9 @@ INLINE void sum_for_nodes(const DepthJob *job) {
     for (int64_t number = 0; number < job->planes; number++) for (int64_t i = 0; i < job->pixels[0]; i += NODE_ROWS) {
         const Plane plane = plane_of(job, number);
         for (int64_t node = 0, first, last; node < job->nodes[1]; node++) {
-            mix(job, number, i, node);
+            const Nodes nodes = nodes_of(job, number, i, node);
             find_columns(job, node, &first, &last);
-#define SUM(wide) sum_for_node(job, &plane, i, j, node, wide)
+#define SUM(wide) sum_for_node(job, &plane, &nodes, i, j, node, wide)
             EACH_RUN(j, first, last, SUM);
 #undef SUM
         }
@@ -439,19 +464,19 @@ INLINE void sum_for_nodes(const DepthJob *job) {
 // The cells are 0 before.
 INLINE void give_for_nodes(const DepthJob *job) {
     const int64_t apart = (job->pixels[1] + 31) / 16 * 16;
-    REAL *const some = (REAL *)job->room + NODE_ROWS * (job->taps[0] + (NODE_ROWS - 1) * job->step[0]) * job->taps[1];
+    REAL *const some = (REAL *)job->room + GIVEN_ROWS * NODE_ROWS * job->taps[1] + 16;
     for (int64_t number = 0; number < job->planes; number++) for (int64_t i = 0; i < job->pixels[0]; i += NODE_ROWS) {
         const Plane plane = plane_of(job, number);
         for (int64_t node = 0, first, last; node < job->nodes[1]; node++) {
-            mix(job, number, i, node);
+            const Nodes nodes = nodes_of(job, number, i, node);
             find_columns(job, node, &first, &last);
             for (int64_t r = 0; r < MIN((int64_t)NODE_ROWS, job->pixels[0] - i); r++) for (int64_t j = first; j < last; j++) {
-                some[r * apart + j] = ((const REAL *)job->image)[(i + r) * job->row + j] * of_node(job->node_columns[j], node);
+                some[r * apart + j + 1] = ((const REAL *)job->image)[(i + r) * job->row + j] * of_node(job->node_columns[j], node);
             }
-#define GIVE(wide) give_for_node(job, &plane, some, apart, i, j, wide)
-            EACH_RUN(j, first, last, GIVE);
-#undef GIVE
-            for (int r = 0; r < NODE_ROWS; r++) for (int64_t j = first; j < last; j++) some[r * apart + j] = 0;
+#define GIVE_RUN(wide) give_for_node(job, &plane, &nodes, some, apart, i, j, wide)
+            EACH_RUN(j, first, last + 1, GIVE_RUN);
+#undef GIVE_RUN
+            for (int r = 0; r < NODE_ROWS; r++) for (int64_t j = first; j < last; j++) some[r * apart + j + 1] = 0;
         }
     }
 }

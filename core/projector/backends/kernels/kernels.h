@@ -14,7 +14,8 @@
 #include <stdint.h>
 
 #define NODE_ROWS 4
-#define CONTRACT 9 // counted up with every change of this file: cpu.py takes no other
+#define GIVEN_ROWS 16
+#define CONTRACT 10 // counted up with every change of this file: cpu.py takes no other
 
 // Voxels (n[0], n[1], n[2]) in C order, of a job's kind of number.
 typedef struct {
@@ -63,7 +64,7 @@ typedef struct {
 // their cells if s <= of_pair, else as 2 + floor(s parts_per_cell); more than one have its variance.
 //
 // Between cells and pixels, a row's cells lie sorted by their place in a pixel: column c is number (c mod step[1]) (columns / step[1])
-// + c / step[1]. Up to 15 numbers after the last cell are read and not used.
+// + c / step[1]. Up to 16 numbers after the last cell are read and not used, or 0 is added to them.
 typedef struct {
     int64_t is_double;
     Lattice volume;
@@ -78,7 +79,7 @@ typedef struct {
     void *cells;                   // (planes, rows, columns), columns a multiple of step[1]
     int64_t planes, rows, columns; // at least 2 planes
     const void *kernel;            // (planes, taps[0] + 2 step[0], taps[1]): what a pixel counts of the cells from its first on; step[0] rows
-                                   // of 0 come before and after
+                                   // of 0 come before and after; where there are nodes, up to 15 numbers after the last are read and not used
     const void *bounds;            // (planes, taps[0] + 2 step[0], 2), of int64_t: each row's first tap that is not 0, and the one after the last; or 0, 0
     int64_t taps[2];
     int64_t step[2];               // cells from a pixel's first to its neighbour's, along rows and columns
@@ -91,9 +92,9 @@ typedef struct {
     // of the nodes; the bounds of a node are also those of the next node's taps along the first axis.
     int64_t nodes[2];              // at least 2 along either axis
     const double *node_rows, *node_columns;
-    void *room;                    // (taps[0] + (NODE_ROWS - 1) step[0], NODE_ROWS, taps[1]) numbers; and zeros, as many as NODE_ROWS rows of
-                                   // pixels, each with 31 more
-    int64_t *room_bounds;          // (taps[0] + (NODE_ROWS - 1) step[0], 2)
+    void *room;                    // (GIVEN_ROWS, NODE_ROWS, taps[1]) numbers and 16; and zeros, as many as NODE_ROWS rows of pixels, each with
+                                   // 31 more, and 16
+    const int64_t *columns_of;     // (taps[1]): the numbers of a pixel's cells in a sorted row, less that of its first
     double *gradient;              // what derivatives are added to: (planes, taps[0], taps[1]), or by `line` (3), and for each piece (4, 3): by
                                    // its `shifts`, and the same times x, y and z of the voxels
 } DepthJob;

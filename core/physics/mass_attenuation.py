@@ -12,6 +12,7 @@ Point = tuple[float, float]
 """An energy, keV, and the coefficient there, cm^2/g."""
 
 
+@cache
 def mass_attenuation(symbol: str, energy: float) -> float:
     """Mass attenuation coefficient of an element, cm^2/g, at an energy, keV.
 

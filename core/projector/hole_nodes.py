@@ -25,8 +25,8 @@ from .hole_kernel import KernelNumbers, Spectra, disc_transform, half_taps, of_p
 _MOST_PASSED, _DEPTHS = 7.5, 32
 # Slopes up to which the edge is a cone's, by the cone's own: steeper lines count nothing.
 _STEEPEST = 0.98
-# Taps that are this small, by those inside the shadow, are left out: tails are wide. So are rows and columns at the rim where
-# no tap is more than this, by the largest: ripples of the transform.
+# Taps that are this small, by those inside the shadow, are left out: tails are wide. So are rows and columns at the rim
+# where no tap is more than this, by the largest: ripples of the transform.
 _LEAST, _STRAY = 3e-3, 3e-4
 
 

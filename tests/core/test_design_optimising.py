@@ -251,7 +251,7 @@ def test_a_front_is_a_table_and_a_plot(tmp_path):
 @pytest.mark.long
 def test_the_gain_is_judged_by_draws_of_noise():
     """Where hardly anything is counted, wider holes are better, and no scanner gains on itself."""
-    evaluation = {"body": BODY, "draws": 5, "iterations": 1, "subsets": 2}
+    evaluation = {"body": BODY, "draws": 12, "iterations": 1, "subsets": 2}
     recipe = small_design(evaluation=evaluation, model={"time": 0.02})
     start = recipe.parameters.build(recipe.parameters.start)
     wider = replace(start, pinhole_diameter=start.pinhole_diameter * 2)

@@ -54,9 +54,14 @@ class Beside:
         return self.ours / self.theirs
 
 
+def in_one_run() -> bool:
+    """Whether this is a part of a run of all, whose own parts before it are the machine's load."""
+    return _FILE in os.environ
+
+
 def tell(chapter: str, work: str, ours: float, peer: str, theirs: float, note: str = "") -> None:
     """Keep a comparison for the table; nothing where no table is made."""
-    if _FILE in os.environ:
+    if in_one_run():
         with open(os.environ[_FILE], "a", encoding="utf-8") as file:
             print(json.dumps(asdict(Beside(chapter, work, ours, peer, theirs, note))), file=file)
 

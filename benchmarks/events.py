@@ -23,7 +23,7 @@ from typing import Any
 
 import numpy as np
 import report
-from beside import tell
+from beside import in_one_run, tell
 from case import Case
 from peers import PEERS, cores
 
@@ -191,7 +191,7 @@ def section(
     head = ["images", "made by", "events", "s an event", "events a minute", "MB an event", "largest MB",
             "1000 events: minutes", "GB"]  # fmt: skip
     busy = ""
-    if load > 0.5:
+    if load > 0.5 and not in_one_run():
         busy = (
             f"\n\n**The machine was busy with other work** (load {load:.1f} before the run): times are too long, and all\n"
             "comparisons less certain than their digits suggest: the company changed from one to the next."

@@ -145,7 +145,7 @@ def ratios(results: Results) -> str:
         other = results.rows.get((name, results.threads))
         if other is not None and "forward" in other.seconds:
             lines.append([f"forward / {other.label}'s", *_ratio(ours, "forward", other, "forward"), wanted])
-    for task, wanted in (("adjoint", "at most 2"), ("emission", "at most 2.5"), ("pose_gradient", "at most 3")):
+    for task, wanted in (("adjoint", "at most 1.5"), ("emission", "at most 2.5"), ("pose_gradient", "at most 2")):
         if task in ours.seconds:
             lines.append([f"{TITLES[task]} / own forward", *_ratio(ours, task, ours, "forward"), wanted])
     one = results.rows.get(("cpu", 1))

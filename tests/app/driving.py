@@ -172,6 +172,14 @@ def idle() -> Iterator[float]:
         yield 0.3
 
 
+def escape_asks() -> Iterator[float]:
+    """Escape asks whether to keep or to discard what the job has made, and it goes on; the question is closed unanswered."""
+    keys("Escape")
+    yield 1.0
+    seen["asked"] = ours("addon.blender.jobs").is_running()
+    keys("Escape")
+
+
 beats: list[float] = []
 
 

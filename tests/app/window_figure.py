@@ -5,7 +5,7 @@ import sys
 import time
 
 import bpy
-from driving import WORKBOOK, editor, folder, idle, is_idle, keys, ours, picture, press, run, seen
+from driving import WORKBOOK, editor, escape_asks, folder, idle, is_idle, picture, press, run, seen
 
 
 def steps():
@@ -32,10 +32,7 @@ def steps():
     press(bpy.ops.mphdrr.render_animation, filepath=str(folder / "cut.mp4"), **film)
     while not list(folder.glob("cut-frames/*.png")):
         yield 0.05
-    keys("Escape")  # asks whether to keep or to discard
-    yield 1.0
-    seen["asked"] = ours("addon.blender.jobs").is_running()
-    keys("Escape")
+    yield from escape_asks()
     bpy.ops.mphdrr.cancel_job()
     yield from idle()
     press(bpy.ops.mphdrr.render_picture, filepath=str(folder / "picture.png"), width=480, height=300, samples=8)

@@ -1,7 +1,7 @@
 """Counts of a few modules are reconstructed in the window: what is seen while it runs, then finished early."""
 
 import bpy
-from driving import WORKBOOK, editor, idle, keys, only, open_tab, ours, press, run, seen
+from driving import WORKBOOK, editor, escape_asks, idle, only, open_tab, ours, press, run, seen
 
 seen |= {"iterations": []}
 
@@ -32,10 +32,7 @@ def steps():
         if known and len(known["objective"]) not in seen["iterations"]:
             seen["iterations"].append(len(known["objective"]))
             seen["while"] = bpy.context.scene.mphdrr_reconstruction.volume.name
-    keys("Escape")  # asks whether to keep or to discard
-    yield 1.0
-    seen["asked"] = ours("addon.blender.jobs").is_running()
-    keys("Escape")
+    yield from escape_asks()
     bpy.ops.mphdrr.finish_job()
     yield from idle()
     scene = bpy.context.scene

@@ -33,6 +33,10 @@ ANY_PYTHON = $$(for p in "$(PYTHON)" python3 python3.11 python3.13; do "$$p" -c 
 ENVIRONMENT = @p=$(ANY_PYTHON); [ -n "$$p" ] || { echo "no Python found; name one: make PYTHON=/path/to/python3.11"; exit 1; }; \
 	"$$p" tools/environment.py $(VENV) --python "$(PYTHON)"
 
+# Tests in several processes: each leaves the other cores to the others; BLAS and torch would wait for theirs, busily. They
+# are told here, since a plugin of pytest's loads them before any file of ours.
+PYTESTS = OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist worksteal
+
 # Python keeps what it has compiled: else each process of the tests compiles everything anew.
 unexport PYTHONDONTWRITEBYTECODE
 
@@ -45,10 +49,10 @@ gallery: env-dev
 	$(BIN)/python examples/gallery.py docs/images $(CT)
 
 test: lint
-	$(BIN)/python -m pytest -n auto --dist worksteal $(TESTS)
+	$(PYTESTS) $(TESTS)
 
 test-long: env-dev
-	$(BIN)/python -m pytest -m long -n auto --dist worksteal
+	$(PYTESTS) -m long
 
 lint: env-dev
 	@$(BIN)/ruff check -q
@@ -89,7 +93,7 @@ test-app: env-dev
 	$(BIN)/python -m pytest tests/app -m alone
 
 test-kernels: env-dev
-	$(BIN)/python -m pytest tests/kernels -n auto --dist worksteal
+	$(PYTESTS) tests/kernels
 	@# make test runs at the highest level
 	@for level in $$($(BIN)/python -c "from mphdrr.core.projector.backends import cpu; print(*cpu.levels()[:-1])"); do \
 		echo "accuracy of $$level"; MPHDRR_CPU_LEVEL=$$level $(BIN)/python -m pytest -k cpu tests/core/test_projector.py \

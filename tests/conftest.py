@@ -10,10 +10,6 @@ from pathlib import Path
 
 import pytest
 
-# Each of several processes leaves the other cores to the others; BLAS and torch would wait for theirs, busily.
-if "PYTEST_XDIST_WORKER" in os.environ:
-    os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-
 from mphdrr.core.workbook import reader
 
 # No test cuts the power: to wait until each small file is on the disk would be most of what some of them take.

@@ -19,7 +19,7 @@ from ..progress import Progress, part_of, tell
 from ..recording import recorded_warnings
 from ..validation import freeze, shape_text
 from ..volumes.images import Images
-from ..volumes.volume import Volume
+from ..volumes.volume import AIR_HU, CONVERT, Volume
 from . import backends
 from .bundles import Bundle, Bundles
 from .doubts import doubts
@@ -30,6 +30,8 @@ from .models import Model, Transmission, each_pixel
 from .parallel import thread_count
 from .subsets import balanced_subsets
 from .transmittance import Field
+
+_PADDING = (-1024.0, -2000.0, -2048.0, -3024.0)  # what CT scanners write outside of what they scanned
 
 
 class Projector(LinearOperator):
@@ -235,8 +237,13 @@ class Projector(LinearOperator):
                     f"volume: its grid ({_describe(x.grid)}) is not the projector's ({_describe(self.grid)})"
                 )
             self.model.check_volume(x)
-            return x.array
-        return checked(x, "volume", self.shape_in, self._float64, batch)
+        array = x.array if isinstance(x, Volume) else checked(x, "volume", self.shape_in, self._float64, batch)
+        # A thousand voxels or so: to look at all would take as long as an image.
+        some = to_numpy(array[..., *(slice(n // 20, None, 1 + n // 10) for n in self.shape_in)], np.float32)
+        air = np.isin(some, _PADDING) | (abs(some - AIR_HU) < 50)
+        if np.count_nonzero(air) > 0.05 * air.size:
+            warn(f"volume: {np.mean(air):.0%} of its values are those of air in CT numbers{CONVERT}", 4)
+        return array
 
     def _run_one(
         self, x: ArrayOrTensor, progress: Progress | None = None, mu: ArrayOrTensor | None = None

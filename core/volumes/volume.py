@@ -31,7 +31,7 @@ AIR_HU = -1000.0
 LINE_INTEGRALS = ("activity", "mu")
 """Quantities whose line integrals have a meaning. CT numbers have none, because air is -1000, nor have maps."""
 
-_CONVERT = (
+CONVERT = (
     "; convert its CT numbers first: hu_to_mu(volume, energy), `mphdrr volume convert FILE --to-mu --energy KEV`, or "
     "CT to Attenuation in Blender's Phantom panel"
 )
@@ -72,7 +72,7 @@ class Volume:
 def require_quantity(quantity: str, taken: Sequence[str], name: str) -> None:
     """Refuse a `quantity` that is none of those `taken` by `name`; for CT numbers the message says how to convert them."""
     if quantity not in taken:
-        advice = _CONVERT if quantity == "hu" and "mu" in taken else ""
+        advice = CONVERT if quantity == "hu" and "mu" in taken else ""
         raise InputError(f"{name}: expected a volume of {' or '.join(taken)}, got {quantity}{advice}")
 
 

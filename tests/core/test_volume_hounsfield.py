@@ -88,3 +88,20 @@ def test_density_is_the_same_for_tensors(rng):
 
     hu = rng.uniform(-1000, 3000, (3, 4, 5)).astype(np.float32)
     assert np.allclose(hu_to_density(torch.tensor(hu), 3.0).numpy(), mph.diffdrr_density(hu, 3.0), atol=1e-6)
+
+
+@pytest.mark.parametrize("outside", [-1000.0, -1024.0, -3024.0])
+def test_ct_numbers_that_are_projected_are_warned_of(system, outside):
+    grid = mph.Grid.centered((20, 30, 9), 5.0)
+    numbers = np.full(grid.shape, outside)
+    numbers[4:16, 6:24] = 40.0
+    A = mph.Projector(grid, system[:2].views(shape=(2, 2)))
+    for project in (A, lambda x: A(x[None]), lambda x: A(mph.Volume(x, grid, "mu"))):
+        with pytest.warns(mph.InputWarning, match="those of air in CT numbers; convert its CT numbers first") as said:
+            project(numbers)
+        assert said[0].filename == __file__
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        A(np.random.default_rng(0).normal(0, 1000, grid.shape))
+        A(-numbers)
+        A(np.zeros((0, *grid.shape)))

@@ -239,7 +239,8 @@ class Projector(LinearOperator):
             self.model.check_volume(x)
         array = x.array if isinstance(x, Volume) else checked(x, "volume", self.shape_in, self._float64, batch)
         # A thousand voxels or so: to look at all would take as long as an image.
-        some = to_numpy(array[..., *(slice(n // 20, None, 1 + n // 10) for n in self.shape_in)], np.float32)
+        few: Any = (..., *(slice(n // 20, None, 1 + n // 10) for n in self.shape_in))
+        some = to_numpy(array[few], np.float32)
         air = np.isin(some, _PADDING) | (abs(some - AIR_HU) < 50)
         if np.count_nonzero(air) > 0.05 * air.size:
             warn(f"volume: {np.mean(air):.0%} of its values are those of air in CT numbers{CONVERT}", 4)

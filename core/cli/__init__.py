@@ -18,24 +18,7 @@ from typing import Any, NoReturn
 from ..errors import InputError, InputWarning
 from ..progress import Cancelled
 from ..version import VERSION
-from .options import NotingStore, say
-
-COMMANDS = {
-    "geometry": "work on a geometry workbook",
-    "phantom": "make a phantom volume",
-    "volume": "look at volumes and convert them",
-    "project": "project a volume, or a phantom, into every module; or take measured counts for the projections",
-    "counts": "find dead and hot pixels in measured counts",
-    "reconstruct": "reconstruct the volume that a run's images are of",
-    "backproject": "put together what a run's views say of each voxel: sum, geometric mean or minimum",
-    "score": "score a reconstructed volume beside the truth: what a run was simulated of, a phantom, or a volume",
-    "xray": "motion seen by X rays, kerma of a CT, absorbed dose",
-    "events": "make sets of training events from a recipe",
-    "learn": "train networks that reconstruct",
-    "design": "design a scanner by gradients",
-    "export": "write a projection run in another format",
-}
-"""What they do, by their modules here; those modules are imported when their options are wanted."""
+from .options import COMMANDS, NotingStore, say
 
 OK, INPUT_ERROR, USAGE, INTERRUPTED = 0, 1, 2, 130
 

@@ -3,15 +3,13 @@
 import argparse
 
 from ..runs.formats import FORMATS
-from . import COMMANDS
-from .options import add_command, add_run, output_path, print_answer
+from .options import add_actions, add_run, output_path, print_answer
 
 
 def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     """Add the command."""
-    example = "mphdrr counts flood flood.h5 -o efficiency.npy"
-    counts = add_command(subparsers, "counts", COMMANDS["counts"], example)
-    flood = add_run(counts.add_subparsers(metavar="ACTION", required=True), "flood", _run)
+    actions = add_actions(subparsers, "counts", "mphdrr counts flood flood.h5 -o efficiency.npy")
+    flood = add_run(actions, "flood", _run)
     text = f"run of measured counts of an even source ({', '.join(FORMATS)}), or images of modules (.npy)"
     flood.add_argument("file", metavar="FLOOD", help=text)
     flood.add_argument("--order", type=int, default=2, metavar="N", help="largest power of the trend's polynomial")

@@ -4,15 +4,13 @@ import argparse
 
 from ... import core as mph
 from ..files import read_text
-from . import COMMANDS
-from .options import add_command, add_run, give_recipe, output_path, print_answer, progress_bar, say
+from .options import add_actions, add_run, give_recipe, output_path, print_answer, progress_bar, say
 
 
 def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     """Add the command."""
     example = "mphdrr design new -o design.toml\nexample: mphdrr design optimize design.toml -o new.xlsx"
-    parser = add_command(subparsers, "design", COMMANDS["design"], example)
-    actions = parser.add_subparsers(metavar="ACTION", required=True)
+    actions = add_actions(subparsers, "design", example)
     new = add_run(actions, "new", _new)
     new.add_argument("-o", "--output", metavar="FILE", help="a new file (.toml); default: standard output")
     for name, run, ending in (("optimize", _optimize, "the scanner (.xlsx)"), ("pareto", _pareto, "table and plot")):

@@ -6,15 +6,13 @@ from .. import learning
 from ..errors import InputError
 from ..learning.networks import NETWORKS
 from ..progress import Progress
-from . import COMMANDS
-from .options import add_command, add_run, give_recipe, output_path, progress_bar, say
+from .options import add_actions, add_run, give_recipe, output_path, progress_bar, say
 
 
 def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     """Add the command."""
     example = "mphdrr learn new -o training.toml\nexample: mphdrr learn train training.toml -o model.pt"
-    parser = add_command(subparsers, "learn", COMMANDS["learn"], example)
-    actions = parser.add_subparsers(metavar="ACTION", required=True)
+    actions = add_actions(subparsers, "learn", example)
     new = add_run(actions, "new", _new)
     names = "\n".join(f"  {name:<13}{kind.label}: {kind.text}" for name, kind in NETWORKS.items())
     new.epilog = f"networks:\n{names}\n{new.epilog}"

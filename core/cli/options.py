@@ -18,6 +18,23 @@ from ..progress import Progress
 if TYPE_CHECKING:  # the parser of all commands reads this file, and numpy takes a while
     from ..volumes.volume import Volume
 
+COMMANDS = {
+    "geometry": "work on a geometry workbook",
+    "phantom": "make a phantom volume",
+    "volume": "look at volumes and convert them",
+    "project": "project a volume, or a phantom, into every module; or take measured counts for the projections",
+    "counts": "find dead and hot pixels in measured counts",
+    "reconstruct": "reconstruct the volume that a run's images are of",
+    "backproject": "put together what a run's views say of each voxel: sum, geometric mean or minimum",
+    "score": "score a reconstructed volume beside the truth: what a run was simulated of, a phantom, or a volume",
+    "xray": "motion seen by X rays, kerma of a CT, absorbed dose",
+    "events": "make sets of training events from a recipe",
+    "learn": "train networks that reconstruct",
+    "design": "design a scanner by gradients",
+    "export": "write a projection run in another format",
+}
+"""What the commands do, by their modules here; those modules are imported when their options are wanted."""
+
 _HANGING = 15 * " "  # under the second column of lists in descriptions
 
 
@@ -75,6 +92,11 @@ def add_command(subparsers, name: str, summary: str, example: str, run: Any = No
     parser = subparsers.add_parser(name, help=summary, **words, formatter_class=_HelpFormatter)
     parser.set_defaults(run=run)
     return parser
+
+
+def add_actions(subparsers: Any, name: str, example: str, metavar: str = "ACTION") -> Any:
+    """The subparsers of a command of `COMMANDS` that consists of actions."""
+    return add_command(subparsers, name, COMMANDS[name], example).add_subparsers(metavar=metavar, required=True)
 
 
 def described(volume: "Volume") -> str:

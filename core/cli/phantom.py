@@ -16,8 +16,7 @@ from ..phantoms.phantom import QUANTITIES
 from ..validation import seed_number, shape_text, whole_shape
 from ..volumes.volume import UNITS
 from ..volumes.volume_files import VOLUME_FORMATS
-from . import COMMANDS
-from .options import add_command, numbered_path, one_or_three, output_path, progress_bar, refuse
+from .options import add_actions, add_command, numbered_path, one_or_three, output_path, progress_bar, refuse
 
 _DEST = "of_phantom_"  # before the name of a phantom's setting: the voxels have a spacing, too
 
@@ -35,8 +34,7 @@ _SHAPES = (
 
 def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     """Add the command."""
-    phantom = add_command(subparsers, "phantom", COMMANDS["phantom"], "mphdrr phantom derenzo -o derenzo.nii.gz")
-    kinds = phantom.add_subparsers(metavar="KIND", required=True)
+    kinds = add_actions(subparsers, "phantom", "mphdrr phantom derenzo -o derenzo.nii.gz", "KIND")
 
     def finish(parser: argparse.ArgumentParser, make: Make, beats: bool) -> None:
         if beats:

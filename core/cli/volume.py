@@ -12,8 +12,7 @@ from ..validation import positive, real_array, shape_text
 from ..volumes.meshes.mesh import MESH_FORMATS, MILLIMETRES
 from ..volumes.volume import UNITS
 from ..volumes.volume_files import VOLUME_FORMATS
-from . import COMMANDS
-from .options import add_command, add_run, described, one_or_three, output_path, print_answer, progress_bar
+from .options import add_actions, add_run, described, one_or_three, output_path, print_answer, progress_bar
 
 _MESH_UNIT: dict[str, Any] = {
     "choices": tuple(MILLIMETRES),
@@ -23,8 +22,7 @@ _MESH_UNIT: dict[str, Any] = {
 
 def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     """Add the command."""
-    volume = add_command(subparsers, "volume", COMMANDS["volume"], "mphdrr volume info ct.nii.gz")
-    actions = volume.add_subparsers(metavar="ACTION", required=True)
+    actions = add_actions(subparsers, "volume", "mphdrr volume info ct.nii.gz")
 
     info = add_run(actions, "info", _info)
     _add_input(info)

@@ -7,8 +7,7 @@ import numpy as np
 from ... import core as mph
 from ..volumes.volume_files import VOLUME_FORMATS
 from ..xray.dose import decays
-from . import COMMANDS
-from .options import add_command, add_run, described, output_path, print_answer
+from .options import add_actions, add_run, described, output_path, print_answer
 from .scanners import add_workbook
 
 _LEAST_DENSITY = 0.05
@@ -17,8 +16,7 @@ _LEAST_DENSITY = 0.05
 
 def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     """Add the command."""
-    xray = add_command(subparsers, "xray", COMMANDS["xray"], "mphdrr xray kerma both.xlsx")
-    actions = xray.add_subparsers(metavar="ACTION", required=True)
+    actions = add_actions(subparsers, "xray", "mphdrr xray kerma both.xlsx")
 
     motion = add_run(actions, "motion", _motion)
     add = motion.add_argument

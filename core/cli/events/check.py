@@ -1,7 +1,5 @@
 """``mphdrr events check SET``."""
 
-from __future__ import annotations
-
 import argparse
 import time
 from dataclasses import asdict

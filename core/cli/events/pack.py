@@ -1,7 +1,5 @@
 """``mphdrr events pack SET`` and ``mphdrr events unpack SET``."""
 
-from __future__ import annotations
-
 import argparse
 from typing import TYPE_CHECKING
 
@@ -40,7 +38,7 @@ def _unpack(arguments: argparse.Namespace) -> None:
     print_answer(arguments, {"unpacked": done}, [f"{arguments.folder}: {done} events have files of their own again"])
 
 
-def _set(arguments: argparse.Namespace) -> SetFolder:
+def _set(arguments: argparse.Namespace) -> "SetFolder":
     from ...events.folders import SetFolder
 
     folder = SetFolder(arguments.folder)

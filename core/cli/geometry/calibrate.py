@@ -33,7 +33,6 @@ def _run(arguments: argparse.Namespace) -> None:
     mphdrr geometry calibrate points.toml -o calibrated.xlsx
     """
     from ...design.calibration_recipe import run_calibration  # takes a while, as for --help
-    from ...design.residuals import residual_sheet
 
     path = output_path(arguments.output, (".xlsx", ".xlsm"))
     found = run_calibration(arguments.recipe, progress_bar("finding spots"))
@@ -41,7 +40,7 @@ def _run(arguments: argparse.Namespace) -> None:
     mph.write_system(found.system, path, None if source is None else source.path)
     record = _record(found)
     write_bytes(path.with_suffix(".json"), json.dumps(record, indent=1).encode())
-    write_png(residual_sheet(found).picture, path.with_suffix(".png"))
+    write_png(found.residual_sheet().picture, path.with_suffix(".png"))
     print_answer(arguments, record, _lines(found, record, path))
 
 

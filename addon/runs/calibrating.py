@@ -8,7 +8,6 @@ import numpy as np
 
 from ...core.design.calibration import Calibration
 from ...core.design.calibration_recipe import run_calibration
-from ...core.design.residuals import residual_sheet
 from ...core.errors import InputError
 from ...core.progress import Progress
 from ...core.runs.mosaic import png
@@ -32,7 +31,7 @@ def calibrating(context: bpy.types.Context, path: Path, apply: bool = True, exag
 
     def work(progress: Progress) -> tuple[Calibration, bytes]:
         found = run_calibration(path, progress)
-        return found, png(residual_sheet(found).picture)
+        return found, png(found.residual_sheet().picture)
 
     def finish(result: tuple[Calibration, bytes]) -> str:
         found, picture = result

@@ -4,8 +4,6 @@ Reference: B. Triggs, P. McLauchlan, R. Hartley, A. Fitzgibbon, "Bundle adjustme
 Theory and Practice, Lecture Notes in Computer Science 1883 (2000) 298-372; on gauges its section 9.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -19,11 +17,8 @@ from .solvers import scipy_module
 
 LENGTH, OFFSET = "collimator_length", "detector_offset"
 FARTHEST = 6.0  # standard deviations that a module's numbers may be from the nominal ones
-_LOSSES = (
-    300.0,
-    30.0,
-    3.0,
-)  # standard deviations above which robust fits count residuals by their size, one after the other
+_LOSSES = (300.0, 30.0, 3.0)
+"""Standard deviations above which robust fits count residuals by their size, one after the other."""
 _GAUGE_SD = 5e-3  # mm that the pinholes, as a whole, may be away from the nominal ones
 
 

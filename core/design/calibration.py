@@ -1,7 +1,5 @@
 """Calibration: where the modules of a scanner are, from images of point sources."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Collection
 from dataclasses import dataclass, replace
@@ -15,6 +13,8 @@ from ..geometry.views import Views
 from ..progress import Progress, stages_of
 from ..projector.emission import Emission
 from ..projector.models import each_pixel
+from ..runs.display import DIVERGING, Display
+from ..runs.mosaic import Sheet, sheet
 from ..validation import instance, one_of, positive, real_array, shape_text
 from .bundle import LENGTH, OFFSET, Bundle, Moved
 from .point_images import Lattice
@@ -32,6 +32,7 @@ _ROUNDS = 20
 _CHANCE = 1e-3  # that any module of a right model is said not to fit
 _STAYS = 1e-6  # mm, degrees: rounding
 _TOLD = 0.75  # of a number's variance that images must take away
+_MOST = 5.0  # standard deviations at the ends of the colours of residuals
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,13 +99,15 @@ class Calibration:
         for name, told in zip(self.names, self.told.T, strict=True):
             numbers = self.system.numbers[told < _TOLD].tolist()
             if numbers:
-                which = (
-                    "all modules"
-                    if len(numbers) == len(told)
-                    else f"module{'s' * (len(numbers) > 1)} {several(numbers, 12)}"
-                )
-                weak.setdefault(which, []).append(name)
+                some = f"module{'s' * (len(numbers) > 1)} {several(numbers, 12)}"
+                weak.setdefault("all modules" if len(numbers) == len(told) else some, []).append(name)
         return [f"{which}: {', '.join(names)}" for which, names in weak.items()]
+
+    def residual_sheet(self) -> Sheet:
+        """The residuals of all modules, drawn ring by ring: noise without a pattern where the geometry fits."""
+        display = Display(colors=DIVERGING, low=-_MOST, high=_MOST)
+        residuals = self.residuals.astype(np.float32)
+        return sheet(residuals, self.system.numbers, self.system.rings(), "standard deviations", display)
 
     def summary(self) -> list[str]:
         """How far modules are from their nominal places and tilts, what does not fit and what is not told, in lines."""
@@ -276,9 +279,8 @@ def _without_outliers(bundle: Bundle) -> tuple[Bundle, Floats]:
         x, used = bundle.solved(x, robust), bundle.used
         off = used * bundle.off(x)
         usual = max(1.0, float(np.median(off[used])) / math.sqrt(2 * math.log(2)))  # the median of two normal numbers
-        bad = used & (np.abs(bundle.of_modules(x)) > _FAR).any(
-            axis=1
-        )  # would be another module's images, or upside down
+        # They would be another module's images, or upside down.
+        bad = used & (np.abs(bundle.of_modules(x)) > _FAR).any(axis=1)
         if not bad.any():  # the worst only: they draw others away
             bad = off > max(_OUTLYING * usual, float(off.max()) / 2)
             bad |= used & bad.any(axis=0) & ((used & ~bad).sum(axis=0) <= _FEWEST)  # which anything fits
@@ -300,10 +302,8 @@ def _result(views: Views, bundle: Bundle, x: Floats, spots: Spots, lattice: Latt
     covariance, leverages = bundle.covariance(x)
     told = np.clip(1 - np.diagonal(covariance, axis1=1, axis2=2), 0, 1)
     units = np.broadcast_to(np.eye(len(bundle.sd)) * bundle.sd, covariance.shape).copy()
-    units[:, :3] = 0.0
-    units[:, :3, :3] = (
-        now.frames @ nominal.frames().swapaxes(1, 2) * bundle.sd[:3]
-    )  # shifts along the module's own axes
+    # Shifts along the module's own axes.
+    units[:, :3, :3] = now.frames @ nominal.frames().swapaxes(1, 2) * bundle.sd[:3]
     covariance = units @ covariance @ units.swapaxes(1, 2)
     off, (pearson, freedom) = bundle.off(x) ** 2, spots.pearson(lattice)
     of_middles, of_pixels = (2 * used - leverages).sum(axis=0), (seen * (freedom + 2) - leverages).sum(axis=0)
@@ -340,6 +340,5 @@ def _moved_views(views: Views, nominal: PinholeSystem, now: Moved) -> Views:
     )
     middle[:, :2] -= (middle[:, 2] / nominal.collimator_length)[:, None] * now.offset
     middle[:, 2] *= now.length / nominal.collimator_length
-    turned = (np.einsum("mij,mj->mi", back, each) for each in (middle, u_steps, v_steps))
-    middle, u_steps, v_steps = turned
+    middle, u_steps, v_steps = (np.einsum("mij,mj->mi", back, each) for each in (middle, u_steps, v_steps))
     return Views(now.centers, now.centers + middle, u_steps, v_steps, views.shape)

@@ -1,8 +1,5 @@
 """Recipes of calibrations (TOML): the runs of which sources, what is fitted, what is thought beforehand."""
 
-from __future__ import annotations
-
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -42,9 +39,7 @@ _SOURCES = ("points", "distances")
 
 
 class _Values(Values):
-    @property
-    def rows(self) -> Mapping[str, Setting]:
-        return _ROWS
+    rows = _ROWS  # type: ignore[assignment]
 
 
 def run_calibration(path: AnyPath, progress: Progress | None = None) -> Calibration:

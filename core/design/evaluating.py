@@ -1,7 +1,5 @@
 """What a design gains: reconstructions of independent noise by the scanner that it began with, and by itself."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

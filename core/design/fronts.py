@@ -1,7 +1,5 @@
 """Designs for several values of one entry of a recipe: what one merit costs of another, as a table and as a plot."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -3,8 +3,6 @@
 An objective is called with a system and gives its value and the gradient (M, 15) by the rows of `numbers`.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The search for the best numbers of a design: several starts, coarse to fine, and penalties that grow harder."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress

@@ -4,8 +4,6 @@ A constraint says by how many mm something is too short. Where that is more than
 is done is judged by `faults`: `check_geometry`, exactly, and these same numbers without a margin.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise

@@ -7,8 +7,6 @@ pixel's corners. The law of the total is that of `sensitivity`; within the disc 
 angles differ by d / h only.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 
@@ -34,7 +32,7 @@ class Lattice(NamedTuple):
     sigma: Floats  # (M,), mm, of the crystal's blur
 
     @classmethod
-    def of(cls, model: Emission, views: Views) -> Lattice:
+    def of(cls, model: Emission, views: Views) -> "Lattice":
         """That of the views of a model's modules."""
         frames = model.system.frames()
         middle = np.einsum("mij,mj->mi", frames, views.detector_centers - views.sources)

@@ -1,7 +1,5 @@
 """Recipes of designs: which numbers are free, what is wanted, what must hold, and how the gain is judged, in TOML."""
 
-from __future__ import annotations
-
 import hashlib
 import os
 from collections.abc import Mapping, Sequence
@@ -132,11 +130,9 @@ class DesignRecipe(Values):
         given = dict(self.generator)
         kind = given.pop("kind", "ellipse")
         if kind == "workbook":
-            file, modules = (
-                required(given.pop("file", None), "generator.file", "name the workbook"),
-                given.pop("modules", None),
-            )
-            given = workbook(chosen_modules(read_system(self.folder / file), modules, "generator.modules"), **given)
+            file = required(given.pop("file", None), "generator.file", "name the workbook")
+            system = chosen_modules(read_system(self.folder / file), given.pop("modules", None), "generator.modules")
+            given = workbook(system, **given)
         return parameters(kind, given, self.free)
 
     @property
@@ -185,7 +181,7 @@ class DesignRecipe(Values):
             return Sensitivity(self.model, points, own["resolution"])
         return Detail(self.model, points, own["size"], own["hole"])
 
-    def changed(self, entry: str, value: float) -> DesignRecipe:
+    def changed(self, entry: str, value: float) -> "DesignRecipe":
         """The recipe with another number in an entry TABLE.NAME; of objectives in all that have it."""
         first, _, name = entry.partition(".")
         number = int(value) if float(value).is_integer() else value

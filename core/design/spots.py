@@ -5,8 +5,6 @@ even background are free in each image. So middles and their covariances are all
 activity, nor the hole's diameter, nor the crystal's efficiency decide over a module's place.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

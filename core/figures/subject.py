@@ -1,7 +1,5 @@
 """What a figure is of."""
 
-from __future__ import annotations
-
 from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
@@ -36,7 +34,7 @@ class Subject:
     construction: Construction = field(default_factory=Construction)
     """How the scanner's collimators are built."""
     volume: Volume | None = None
-    run: ProjectionRun | None = None
+    run: "ProjectionRun | None" = None
     name: str = ""
     """What the volume is called."""
     pose: Floats | None = None

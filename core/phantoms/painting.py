@@ -4,8 +4,6 @@ Each shape changes what the shapes before it left only inside itself. A voxel's 
 shapes, of the mean of that change, and each shape is sampled as finely as its own size asks.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -72,7 +70,7 @@ class Layer:
         value = values.dtype.type(self.value)
         return values + value if self.adds else np.full_like(values, value)
 
-    def relation(self, other: Layer) -> int:
+    def relation(self, other: "Layer") -> int:
         """1 if the shape certainly contains the other's, -1 if they certainly do not touch, 0 otherwise."""
         from_other = self.from_world @ other.pose
         radius = other.shape.ball_radius * float(np.linalg.norm(from_other[:3, :3], 2))

@@ -1,7 +1,5 @@
 """A cardiac torso for this scanner: the left ventricle at the isocentre, beating, with a perfusion defect if wanted."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Sequence
@@ -102,7 +100,7 @@ class CardiacTorso(Phantom):
                 )
                 raise InputError(f"{self.title}: {settings}: the {organ.name} reaches out of the body")
 
-    def beating(self, frames: int) -> list[CardiacTorso]:
+    def beating(self, frames: int) -> "list[CardiacTorso]":
         """The torso at as many phases, evenly spaced over the cycle, the first at end-diastole."""
         count = whole_number(frames, "frames of the cycle")
         return [dataclasses.replace(self, phase=i / count) for i in range(count)]

@@ -1,7 +1,5 @@
 """Pictures of projections: upright, as seen from the pinhole, alone or all in one with numbers and a colour bar."""
 
-from __future__ import annotations
-
 import math
 import struct
 import zlib
@@ -128,20 +126,20 @@ def sheet(
     return Sheet(whole, corners, (n_v, n_u), window, word, values, shown.max(axis=(1, 2)), display.half, share)
 
 
-def write_sheet(run: ProjectionRun, path: AnyPath, display: Display | None = None) -> None:
+def write_sheet(run: "ProjectionRun", path: AnyPath, display: Display | None = None) -> None:
     """Write all images of a run in one picture, a PNG; see `sheet`."""
     drawn = sheet(run.projections, labels(run), run.system.rings(), run.unit, display)
     write_png(_captioned(drawn.picture, caption(run)), path)
 
 
-def labels(run: ProjectionRun) -> list[str]:
+def labels(run: "ProjectionRun") -> list[str]:
     """What each image of a run is called in a sheet: its module's number, and that of its frame of measured counts."""
     numbers = run.system.numbers.tolist()
     frames = {number: k for k, number in enumerate(run.settings.get("frames") or (), 1)}
     return [f"{number} ({frames[number]})" if number in frames else str(number) for number in numbers]
 
 
-def caption(run: ProjectionRun) -> str:
+def caption(run: "ProjectionRun") -> str:
     """A line about measured counts and how a sheet shows them; empty for other runs."""
     if not run.is_measured:
         return ""

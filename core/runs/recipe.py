@@ -1,7 +1,5 @@
 """Recipes: what a projection run was, or is to be, made from, and the TOML files that hold them."""
 
-from __future__ import annotations
-
 import dataclasses
 import os
 from abc import ABC, abstractmethod
@@ -74,7 +72,7 @@ class Recipe(Values):
         """All settings, with those of the phantom's kind."""
         return _rows(self.given)
 
-    def updated(self, changes: Mapping[str, Any]) -> Recipe:
+    def updated(self, changes: Mapping[str, Any]) -> "Recipe":
         """This recipe with other values, None to take one away; entries without an effect beside the new ones are dropped.
 
         So are the numbers of another kind of phantom, and the other description of a phantom's pose: a matrix replaces

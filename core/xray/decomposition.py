@@ -1,7 +1,5 @@
 """From counts back to materials: decomposition ray by ray, images at one energy, correction of beam hardening."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

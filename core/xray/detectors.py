@@ -1,7 +1,5 @@
 """What detectors make of photons: counts in energy bins, or energy absorbed."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Absorbed dose of activity in the body: electrons where they are set free, photons by a point kernel of water."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Motion and change since a reference volume, from few views: where the body is now, and what in it is not as it was."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

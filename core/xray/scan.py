@@ -1,7 +1,5 @@
 """The model "spectral" of recipes: what an X-ray system's panels make of its tubes' photons behind a body."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """Spectra of X-ray tubes: tungsten anodes, filters, half-value layers, air kerma."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
@@ -56,7 +54,7 @@ class Spectrum:
         """Air kerma at 1 m, µGy per mAs; at other distances it falls with their square."""
         return self._kerma(self.photons)
 
-    def filtered(self, filters: Mapping[str, float]) -> Spectrum:
+    def filtered(self, filters: Mapping[str, float]) -> "Spectrum":
         """The spectrum behind filters: thicknesses, mm, by element ("Al", "Cu", "W" …) or name of `MATERIALS`."""
         photons = self.photons
         for material, thickness in filters.items():
@@ -65,7 +63,7 @@ class Spectrum:
             photons = photons * np.exp(-depth)
         return Spectrum(self.energies, photons)
 
-    def coarser(self, step: float) -> Spectrum:
+    def coarser(self, step: float) -> "Spectrum":
         """The spectrum in steps of `step` keV from 0 on, each at the mean energy of its photons: quicker to compute with."""
         which = np.floor(self.energies / positive(step, "step", "keV") + 1e-9).astype(int)
         which -= which[0]

@@ -1,7 +1,5 @@
 """Counts of a spectrum behind materials, and their derivatives by the materials' paths."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Protocol

@@ -1,7 +1,5 @@
 """`XraySystem`: stationary X-ray sources, each with its panel, as the second kind of scanner."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import InitVar, dataclass, field
 from typing import Any, ClassVar, Self

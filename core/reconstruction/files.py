@@ -1,13 +1,12 @@
 """Reconstructions in files, from which they can be resumed."""
 
 import json
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ..errors import InputError, reading
-from ..files import AnyPath, write_bytes
+from ..files import AnyPath, require_ending, write_bytes
 from ..hdf5 import numbers, opened, pack
 from ..validation import instance, require_finite
 from ..volumes.formats import hdf5
@@ -25,7 +24,7 @@ def write_reconstruction(result: Reconstruction, path: AnyPath) -> None:
     `read_volume` reads the volume of such a file. Raises InputError for another ending, or where it cannot be written: an
     older file then stays.
     """
-    path = _named(path)
+    require_ending(path, _ENDINGS)
     instance(result, Reconstruction, "write_reconstruction")
 
     def fill(file: Any) -> None:
@@ -43,7 +42,7 @@ def read_reconstruction(path: AnyPath) -> Reconstruction:
     """Read a file of `write_reconstruction`; InputError where there is none, or no whole reconstruction in it."""
     import h5py
 
-    path = _named(path)
+    require_ending(path, _ENDINGS)
     volume = read_volume(path)
     with reading(path, "a reconstruction"), opened(path, whole=True) as file:
         group = file.get(_GROUP)
@@ -58,10 +57,3 @@ def read_reconstruction(path: AnyPath) -> Reconstruction:
         for name, array in (("objective", objective), *state.items()):
             require_finite(array, name)
         return Reconstruction(volume, objective, json.loads(group.attrs["settings"]), state)
-
-
-def _named(path: AnyPath) -> Path:
-    path = Path(path)
-    if path.suffix.lower() not in _ENDINGS:
-        raise InputError(f"{path}: expected a name ending in {' or '.join(_ENDINGS)}")
-    return path

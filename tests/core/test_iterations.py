@@ -275,7 +275,7 @@ def test_files_that_hold_no_reconstruction_are_refused(problem, tmp_path):
     path.write_bytes(b"no HDF5")
     with pytest.raises(mph.InputError, match=r"volume\.h5: cannot be read as"):
         mph.read_reconstruction(path)
-    with pytest.raises(mph.InputError, match=r"ending in \.h5 or \.hdf5"):
+    with pytest.raises(mph.InputError, match=r"ending in \.h5, \.hdf5"):
         mph.read_reconstruction(tmp_path / "volume.nii")
     found = mph.mlem(A, counts, 1)
     with pytest.raises(mph.InputError, match="no such folder"):

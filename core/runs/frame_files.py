@@ -96,6 +96,7 @@ def read_counts(
     shape: tuple[int, int, int] | None = None,
     type: str | None = None,
     big_endian: bool = False,
+    progress: Progress | None = None,
 ) -> Counts:
     """Read frames of counts (frames, rows, columns) as they are in a file, or in several, one after the other.
 
@@ -108,6 +109,8 @@ def read_counts(
         Name of the array in .npz and .h5, where they hold several of three axes.
     shape, type, big_endian
         Of raw files: (frames, rows, columns), one of uint8, int8, … float64, and the order of the bytes.
+    progress
+        Counts files.
 
     Returns
     -------
@@ -115,15 +118,7 @@ def read_counts(
         An array of three axes, frames, rows and columns, of the file's own type. `counts_run` checks its numbers, and
         compares its arguments with the exposure, pixel size and energy windows in the file.
     """
-    return read_frames(path, Layout(dataset, shape, type, big_endian))
-
-
-def read_frames(
-    path: AnyPath | Sequence[AnyPath],
-    layout: Layout = Layout(),
-    progress: Progress | None = None,
-) -> Counts:
-    """The frames of one or several files; `progress` counts files. See `read_counts`."""
+    layout = Layout(dataset, shape, type, big_endian)
     paths = [Path(path)] if isinstance(path, str | os.PathLike) else list(map(Path, path))
     if not paths:
         raise InputError("counts: expected a file, or several")
@@ -197,13 +192,11 @@ def _require_memory(shape: Sequence[int], itemsize: int) -> None:
 
 def _raw(path: Path, layout: Layout) -> Array:
     if layout.shape is None or layout.type is None:
-        missing = (
-            "shape (--raw-shape FRAMES ROWS COLUMNS)" if layout.shape is None else "type (--raw-type, uint16 or so)"
-        )
-        raise InputError(f"raw numbers need their {missing}")
+        shape, kind = "shape (--raw-shape FRAMES ROWS COLUMNS)", "type (--raw-type, uint16 or so)"
+        raise InputError(f"raw numbers need their {shape if layout.shape is None else kind}")
     one_of(layout.type, RAW_TYPES, "raw type")
-    kind = np.dtype(layout.type).newbyteorder(">" if layout.big_endian else "<")
-    return _numbers(path, kind, whole_shape(layout.shape, "raw shape (--raw-shape)", 3))
+    type_ = np.dtype(layout.type).newbyteorder(">" if layout.big_endian else "<")
+    return _numbers(path, type_, whole_shape(layout.shape, "raw shape (--raw-shape)", 3))
 
 
 def _numbers(path: Path, kind: np.dtype[Any], shape: tuple[int, ...], skip: int = 0) -> Array:

@@ -23,7 +23,7 @@ from ..projector.models import checked_background, checked_times, each_pixel
 from ..validation import instance, one_of, real_numbers, require_finite, shape_text
 from .counting import live_shares_of, recipe_efficiency, scaled
 from .frame_checks import warn_of_frames
-from .frame_files import Counts, Layout, differs, read_frames
+from .frame_files import Counts, differs, read_counts
 from .orientations import ORIENTATIONS, on_crystal
 from .recipe import Recipe, recorded_recipe
 from .run import ProjectionRun
@@ -148,8 +148,8 @@ def counts_run(
 
 def recipe_counts(recipe: Recipe, system: Scanner, stages: Stages = lambda stage: None) -> ProjectionRun:
     """The run of the measured counts that a recipe names; warns where a file has another pixel size."""
-    layout = Layout(*(recipe[f"counts.{name}"] for name in ("dataset", "raw_shape", "raw_type", "raw_big_endian")))
-    found = read_frames(recipe["counts.files"], layout, stages("reading"))
+    raw: Any = {name: recipe[f"counts.raw_{name}"] for name in ("shape", "type", "big_endian")}
+    found = read_counts(recipe["counts.files"], dataset=recipe["counts.dataset"], **raw, progress=stages("reading"))
     frames, orientation = recipe["counts.frames"], recipe["counts.orientation"]
     if recipe["counts.frames_file"] is not None:
         frames = read_text(recipe["counts.frames_file"])
@@ -324,7 +324,8 @@ def _require_size(recipe: Recipe, run: ProjectionRun, names: str) -> None:
 def _warn_of_others(found: Counts, used: list[int], words: list[str], run: ProjectionRun) -> None:
     """Warn where the files say another pixel size of the frames `used`, or that they are of several windows."""
     if len(windows := np.unique(found.about[used, 3])) > 1 and np.isfinite(windows).all():
-        what = f"frames of the energy windows {_and(windows.tolist())} are used"
+        several = " and ".join(f"{number:g}" for number in windows.tolist())
+        what = f"frames of the energy windows {several} are used"
         warn(f"{found.name}: {what}; say none (--frames) for those that are not meant")
     steps = np.linalg.norm([run.views.u_steps, run.views.v_steps], axis=2) / run.settings["magnification"]
     for k, along_u, along_v in zip(used, *steps, strict=True):
@@ -336,10 +337,6 @@ def _warn_of_others(found: Counts, used: list[int], words: list[str], run: Proje
             why = covering if run.settings["pitch_mm"] is None else "as given"
             warn(f"{found.name}: the file says pixels of {recorded} mm; taken as {taken} mm, {why}")
             return
-
-
-def _and(numbers: Sequence[float]) -> str:
-    return " and ".join(f"{number:g}" for number in numbers)
 
 
 def _listed(numbers: Sequence[int]) -> str:

@@ -92,11 +92,9 @@ def run_recipe(
         sources = _from_phantom(recipe, recorded, model, mu, stages)
     frames = frames_of(recipe)
     energy = recipe["volume.energy"] or recipe["attenuation.energy"]
-    converted = (
-        {}
-        if energy in (None, LINES) or isinstance(model, SpectralScan)
-        else {"ct_converted_at_kev": photon_energy(energy)}
-    )
+    converted = {}
+    if energy not in (None, LINES) and not isinstance(model, SpectralScan):
+        converted["ct_converted_at_kev"] = photon_energy(energy)
     for number, ((source, mu_of_it, record), times) in enumerate(_in_frames(sources, frames)):
         record, seed = record.updated(times), recipe["noise.seed"]
         if seed is not None:  # noise of its own for each

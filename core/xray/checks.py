@@ -13,7 +13,7 @@ import numpy as np
 
 from ..arrays import Floats
 from ..errors import InputError, several
-from ..geometry.checks.field_of_view import find_blocked, hits
+from ..geometry.checks.field_of_view import find_blocked, hits, in_cone
 from ..geometry.checks.hulls import TOUCH, Hulls
 from ..geometry.checks.overlaps import penetration_depths
 from ..geometry.finding import Finding
@@ -130,8 +130,11 @@ def _shadow(
     ways = targets - source
     lengths = np.linalg.norm(ways, axis=1)
     directions = ways / lengths[:, None]
+    axis = directions.mean(axis=0)
+    axis /= np.linalg.norm(axis)
+    half = np.arccos(np.clip((directions @ axis).min(), -1, 1))
     blocked, shares = np.zeros(len(ways), bool), dict[str, float]()
-    for p in _candidates(hulls, source, directions, lengths.max()):
+    for p in np.flatnonzero(in_cone(hulls, source, axis, half, lengths.max())).tolist():
         own = p == m or (p < len(system) and p in depths)
         if not own and (hit := hits(hulls, p, source, directions, lengths)).any():
             blocked |= hit
@@ -139,19 +142,6 @@ def _shadow(
     if shares:
         largest_first = tuple(sorted(shares.items(), key=lambda item: -item[1]))
         yield ShadowedCone(int(system.numbers[m]), float(blocked.mean()), largest_first)
-
-
-def _candidates(hulls: Hulls, source: Floats, directions: Floats, farthest: float) -> list[int]:
-    """The hulls whose bounding spheres meet the cone around all rays from a source."""
-    axis = directions.mean(axis=0)
-    axis /= np.linalg.norm(axis)
-    half = np.arccos(np.clip((directions @ axis).min(), -1, 1))
-    to = hulls.centers - source
-    distance = np.linalg.norm(to, axis=1)
-    width = np.arcsin(np.minimum(hulls.radii / np.maximum(distance, TOUCH), 1.0))
-    angle = np.arccos(np.clip(to @ axis / np.maximum(distance, TOUCH), -1, 1))
-    meets = (distance <= hulls.radii) | ((angle < half + width) & (distance - hulls.radii < farthest))
-    return np.flatnonzero(meets).tolist()
 
 
 def _depths(hulls: Hulls, m: int) -> dict[int, float]:

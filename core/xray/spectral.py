@@ -2,12 +2,12 @@
 
 import math
 from collections.abc import Sequence
-from typing import Protocol
 
 import numpy as np
 
 from ..arrays import Array, ArrayLike, Floats
 from ..errors import InputError
+from ..geometry.scanner import Scanner
 from ..geometry.views import Views
 from ..physics.crystal import gaussian_blur
 from ..physics.ct_numbers import CT_ENERGY
@@ -23,13 +23,6 @@ from .system import XraySystem
 _BINS = ((20.0, 60.0), (60.0, 120.0))
 _RAYS = 8192  # computed at once
 _METER = 1000.0  # mm
-
-
-class HasViews(Protocol):
-    """A scanner, whose views are asked for."""
-
-    def views(self) -> Views:
-        """Its views."""
 
 
 class SpectralTransmission:
@@ -70,7 +63,7 @@ class SpectralTransmission:
 
     def __init__(
         self,
-        views: Views | HasViews | None,
+        views: Views | Scanner | None,
         spectrum: Spectrum,
         materials: Sequence[str] = ("water", "bone"),
         bins: Bins | None = _BINS,
@@ -79,7 +72,9 @@ class SpectralTransmission:
         background: ArrayLike = 0.0,
     ) -> None:
         instance(spectrum, Spectrum, "spectrum")
-        self.views = views if views is None or isinstance(views, Views) else _views_of(views)
+        if not isinstance(views, Views | Scanner | None):
+            raise InputError(f"views: expected Views, a scanner or None, got {type(views).__name__}")
+        self.views = views.views() if isinstance(views, Scanner) else views
         self.spectrum = spectrum
         self.materials = (materials,) if isinstance(materials, str) else tuple(materials)
         if not self.materials or len(set(self.materials)) < len(self.materials):
@@ -195,12 +190,6 @@ class SpectralTransmission:
             )
         arrays = (volume.array if isinstance(volume, Volume) else volume for volume in volumes)
         return np.stack([np.asarray(A(array), np.float64) for array in arrays])
-
-
-def _views_of(scanner: HasViews) -> Views:
-    if not callable(getattr(scanner, "views", None)):
-        raise InputError(f"views: expected Views, a scanner or None, got {type(scanner).__name__}")
-    return scanner.views()
 
 
 def panel_blur(system: XraySystem, fwhm: float = 0.0) -> Floats:

@@ -126,11 +126,13 @@ def hits(hulls: Hulls, p: int, origin: Floats, directions: Floats, lengths: Floa
 def _candidates(hulls: Hulls, pinhole: Floats, axis: Floats, b: float, radius: float) -> Indexes:
     """Parts with a corner in front of the pinhole, whose bounding sphere meets the cone of the ROI."""
     in_front = ((hulls.vertices - pinhole) @ axis).max(axis=1) > 0
-    to = hulls.centers - pinhole
+    return np.flatnonzero(in_front & in_cone(hulls, pinhole, axis, np.arcsin(radius / b), b + radius))
+
+
+def in_cone(hulls: Hulls, tip: Floats, axis: Floats, half: float, length: float) -> Bools:
+    """Which bounding spheres meet a cone of half-angle `half` around a unit `axis`, within `length` of its tip."""
+    to = hulls.centers - tip
     distance = np.linalg.norm(to, axis=1)
-    near = distance - hulls.radii < b + radius
-    around = distance <= hulls.radii
-    with np.errstate(divide="ignore", invalid="ignore"):
-        angle = np.arccos(np.clip(to @ axis / distance, -1, 1))
-        width = np.arcsin(np.minimum(hulls.radii / distance, 1.0))
-    return np.flatnonzero(in_front & near & (around | (angle < np.arcsin(radius / b) + width)))
+    width = np.arcsin(np.minimum(hulls.radii / np.maximum(distance, TOUCH), 1.0))
+    angle = np.arccos(np.clip(to @ axis / np.maximum(distance, TOUCH), -1, 1))
+    return (distance <= hulls.radii) | ((angle < half + width) & (distance - hulls.radii < length))

@@ -12,9 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from ... import errors
 from ...arrays import Array, Floats
-from ...errors import InputError
+from ...errors import InputError, warn
 from ...geometry.grid import Grid
 from ...memory import require
 from ...validation import freeze
@@ -65,12 +64,7 @@ def refuse_several_files(field: str, where: str) -> None:
         raise InputError(f"{field} {where}: voxels in several files are not read; convert them to one")
 
 
-def warn(path: Path, text: str) -> None:
-    """Warn about a file."""
-    errors.warn(f"{path}: {text}")
-
-
 def warn_of_assumed(path: Path, assumed: Sequence[str]) -> None:
     """Warn of what was `assumed` about the volume's place because the header does not say it, if anything."""
     if assumed:
-        warn(path, f"it does not say how it lies; taken as: {'; '.join(assumed)}")
+        warn(f"{path}: it does not say how it lies; taken as: {'; '.join(assumed)}")

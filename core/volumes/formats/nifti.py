@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from ...errors import InputError, first_line
+from ...errors import InputError, first_line, warn
 from ...files import require_file
 from ...geometry.frames import moved
 from ..volume import UNITS, Volume
-from .contents import Contents, require_voxels, warn
+from .contents import Contents, require_voxels
 
 _MILLIMETRES = {"unknown": 1.0, "mm": 1.0, "meter": 1000.0, "micron": 0.001}
 _ANALYZE_MILLIMETRES = {"": 1.0, "mm": 1.0, "cm": 10.0, "m": 1000.0, "um": 0.001}
@@ -57,19 +57,19 @@ def _contents(image: Any, path: Path) -> Contents:
     require_voxels(image.shape, image.get_data_dtype())
     affine, header = np.array(image.affine, np.float64), image.header
     if not isinstance(image, nibabel.Nifti1Pair):
-        warn(path, "Analyze files do not say where the patient lies: taken as centred, x from right to left")
+        warn(f"{path}: Analyze files do not say where the patient lies: taken as centred, x from right to left")
         length = bytes(header["vox_units"].item()).decode("latin-1").strip("\0 ").lower()
         if length not in _ANALYZE_MILLIMETRES:
             raise InputError(f"vox_units {length!r}: expected mm, cm, m or um")
         affine[:3] *= _ANALYZE_MILLIMETRES[length]
         return Contents(image.get_fdata(dtype=np.float32, caching="unchanged"), affine)
     if header["qform_code"] == header["sform_code"] == 0:
-        warn(path, "it does not say where the patient lies: taken as centred, x from right to left")
+        warn(f"{path}: it does not say where the patient lies: taken as centred, x from right to left")
     elif header["qform_code"] > 0 and header["sform_code"] > 0:
         corners = np.array(list(np.ndindex(2, 2, 2))) * (np.array(image.shape) - 1)
         apart = np.linalg.norm(moved(affine - header.get_qform(), corners), axis=1).max() / min(header.get_zooms())
         if apart > _APART:
-            warn(path, f"its sform and qform lie up to {apart:.3g} voxels apart: taken by the sform")
+            warn(f"{path}: its sform and qform lie up to {apart:.3g} voxels apart: taken by the sform")
     affine[:3] *= _MILLIMETRES[header.get_xyzt_units()[0]]
     named = header.get_intent()[2]
     unit: str | None = None

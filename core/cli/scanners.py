@@ -12,12 +12,8 @@ def add_workbook(parser: argparse.ArgumentParser, name: str = "workbook", defaul
     """The geometry workbook, for `read_workbook`; `name` may be that of an option, with a default."""
     option = {} if name == "workbook" else {"default": default, "dest": "workbook"}
     parser.add_argument(name, metavar="FILE", help="geometry workbook (.xlsx, .xlsm)", **option)  # type: ignore[arg-type]
-    parser.add_argument(
-        "--columns",
-        metavar="MAP",
-        help="column map (.toml): which cells hold what, where the headings do not say it; geometry show --write-columns "
-        "makes a draft",
-    )
+    text = "which cells hold what, where the headings do not say it; geometry show --write-columns makes a draft"
+    parser.add_argument("--columns", metavar="MAP", help=f"column map (.toml): {text}")
     kinds = "kind of the scanner, of a workbook that holds several; default: the first that it holds"
     parser.add_argument("--scanner-kind", choices=SCANNERS, metavar="KIND", help=f"{kinds}, of {', '.join(SCANNERS)}")
 
@@ -37,7 +33,6 @@ def read_workbook(arguments: argparse.Namespace) -> mph.PinholeSystem:
     """The pinholes of the workbook of `add_workbook`; `InputError` of another kind of scanner."""
     system = read_any(arguments)
     if not isinstance(system, mph.PinholeSystem):
-        raise mph.InputError(
-            f"{arguments.workbook}: its scanner is of the kind {system.kind}, expected one with pinholes"
-        )
+        found = f"its scanner is of the kind {system.kind}"
+        raise mph.InputError(f"{arguments.workbook}: {found}, expected one with pinholes")
     return system

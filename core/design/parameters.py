@@ -59,16 +59,15 @@ def moved_modules(
     longer: Any,
 ) -> PinholeSystem:
     """The modules of a system, moved, tilted and with other holes and lengths: see `workbook`."""
-    out, around, up, wider, lengthened = (
-        np.broadcast_to(x, group.max() + 1)[group] for x in (radial, along, z, diameter, longer)
-    )
+    n, numbers = group.max() + 1, (radial, along, z, diameter, longer)
+    out, around, up, wider, lengthened = (np.broadcast_to(each, n)[group] for each in numbers)
     angle = np.arctan2(system.centers[:, 1], system.centers[:, 0])
     x, y = out * np.cos(angle) - around * np.sin(angle), out * np.sin(angle) + around * np.cos(angle)
     centers, d = system.centers + np.column_stack([x, y, up]), system.pinhole_diameter * wider
     l = system.collimator_length * lengthened
     if length == "formula":
         l = designed_length(np.linalg.norm(centers, axis=1), d, system.detector_side, system.roi_radius)
-    turned = system.tilt + np.broadcast_to(tilt, (group.max() + 1, 3))[group]
+    turned = system.tilt + np.broadcast_to(tilt, (n, 3))[group]
     return replace(system, centers=centers, tilt=turned, pinhole_diameter=d, collimator_length=l, source=None)
 
 

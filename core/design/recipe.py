@@ -196,9 +196,8 @@ class DesignRecipe(Values):
     @cached_property
     def fingerprint(self) -> str:
         """SHA-256 of all that decides over the design, with the contents of the files that it names."""
-        own = sorted(
-            (key, value) for key, value in self.given.items() if not key.startswith(("pareto.", "evaluation."))
-        )
+        others = ("pareto.", "evaluation.")
+        own = sorted((key, value) for key, value in self.given.items() if not key.startswith(others))
         bodies = [
             text for goal in self.goals.values() if "parts" in goal.rows for text in (*goal["body"], goal["parts"])
         ]

@@ -55,10 +55,9 @@ def draw(page: Page, score: VolumeScore, name: str = "") -> None:
     bar = bar_width(page, display, window, score.volume.unit)
     left, gap, names = round(2.5 * em), round(1.0 * em), 1.7 * em
     width, height = round(0.5 * page.width) - left - bar - 2 * gap, page.height - top - round(em)
-    scale = min(
-        (width - gap) / 2 / max(size[0] for size in sizes), (height - 3 * names) / sum(size[1] for size in sizes)
-    )
-    step = round(max(size[0] for size in sizes) * scale) + gap
+    widest, tall = max(size[0] for size in sizes), sum(size[1] for size in sizes)
+    scale = min((width - gap) / 2 / widest, (height - 3 * names) / tall)
+    step = round(widest * scale) + gap
     y = top
     for (right, up), size in zip(_PLANES, sizes, strict=True):
         across, down = max(1, round(size[0] * scale)), max(1, round(size[1] * scale))

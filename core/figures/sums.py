@@ -56,10 +56,8 @@ def draw(page: Page, subject: Subject) -> None:
     for panel, ((x, y), (across, tall)) in enumerate(zip(places, sizes, strict=True)):
         frame = round(x), round(y), max(1, round(across * pixels)), max(1, round(tall * pixels))
         _panel(page, panel, display.colored(sums[panel][0].T[::-1], window), box, frame)
-    first, last = (
-        min(y for _, y in places),
-        max(y + size[1] * pixels for (_, y), size in zip(places, sizes, strict=True)),
-    )
+    first = min(y for _, y in places)
+    last = max(y + size[1] * pixels for (_, y), size in zip(places, sizes, strict=True))
     color_bar(page, display, window, unit, round(room[2] + 1.5 * em), round(first), round(last - first))
 
 

@@ -65,10 +65,8 @@ class MixturePhantom(Phantom):
         common: dict[str, Any] = {"position": place, "mu": self.mu}
         if self.look == "lumps":
             return Ellipsoid(radii=[radii[0]] * 3, activity=activity, mode="add", **common)
-        common |= {
-            "euler": tuple(map(math.radians, degrees)),  # which text in degrees gives back
-            "activity": 0.0 if is_cold else activity,
-        }
+        # Angles are those that text in degrees gives back.
+        common |= {"euler": tuple(map(math.radians, degrees)), "activity": 0.0 if is_cold else activity}
         if kind == "ellipsoid":
             return Ellipsoid(radii=radii, **common)
         if kind == "cylinder":

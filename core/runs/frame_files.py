@@ -292,13 +292,10 @@ def _interfile(path: Path, layout: Layout) -> Counts:
     pixel = [float(text(f"scaling factor (mm/pixel) [{i}]", "nan")) for i in (1, 2)]
     kind = f"{windows} energy windows" if windows > 1 else ""
     frames = _numbers(data, type_, (count, rows, columns), skip)
-    low, high = (
-        [float(text(f"energy window {word} level [{i}]", "nan")) for i in range(1, windows + 1)]
-        for word in ("lower", "upper")
-    )
-    return _counts(
-        frames, kind, time=times, pixel=pixel, window=range(1, windows + 1), start=starts, low=low, high=high
-    )
+    of_windows: Any = {"window": range(1, windows + 1)}
+    for name, word in (("low", "lower"), ("high", "upper")):
+        of_windows[name] = [float(text(f"energy window {word} level [{i}]", "nan")) for i in of_windows["window"]]
+    return _counts(frames, kind, time=times, pixel=pixel, start=starts, **of_windows)
 
 
 def _seconds_of_day(text: str) -> float:

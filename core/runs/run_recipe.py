@@ -231,9 +231,8 @@ def projector_of_run(
         if recipe["attenuation.of_phantom"]:
             mu = _mu_of_phantom(recipe_phantom(recipe), phantom_pose(recipe), grid, model, stages)
         elif recipe["volume.center"] and recipe["attenuation.file"] is not None:
-            raise InputError(
-                "attenuation.file: it was moved with the volume (volume.center); give mu where it was then"
-            )
+            moved = "it was moved with the volume (volume.center)"
+            raise InputError(f"attenuation.file: {moved}; give mu where it was then")
         else:
             mu = _attenuation(recipe, model, stages)
     model = recipe_model(recipe, run.system, mu, run)
@@ -268,9 +267,8 @@ def _attenuation(recipe: Recipe, model: Model, stages: Stages) -> Mu | None:
     name, energy = recipe["attenuation.object"], recipe["attenuation.energy"]
     if name is not None:
         raise InputError(f"attenuation.object: {name!r} is in a Blender scene; give --mu FILE instead")
-    return mu_of_files(
-        recipe, model, lambda path: read_mu(path, energy, recipe["attenuation.series"], stages("reading"))
-    )
+    series = recipe["attenuation.series"]
+    return mu_of_files(recipe, model, lambda path: read_mu(path, energy, series, stages("reading")))
 
 
 def mu_of_files(recipe: Recipe, model: Model, read: Callable[[str], Volume]) -> Mu | None:

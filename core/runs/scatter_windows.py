@@ -43,9 +43,8 @@ class ScatterWindows:
 
     def __post_init__(self) -> None:
         if self.lower_frames is None and self.upper_frames is None:
-            raise InputError(
-                "scatter: expected lower_frames (--lower-frames) or upper_frames (--upper-frames), or both"
-            )
+            expected = "lower_frames (--lower-frames) or upper_frames (--upper-frames), or both"
+            raise InputError(f"scatter: expected {expected}")
         if self.widths is not None and len(self.widths) != 3:
             raise InputError(f"scatter: expected widths of three windows, got {len(self.widths)}")
 
@@ -88,18 +87,16 @@ class ScatterWindows:
         """The energies between which the frames of a window are, keV."""
         low, high = found.about[used[0], -2:].tolist()
         if not (np.isfinite(low + high) and (found.about[used, -2:] == found.about[used[0], -2:]).all()):
-            raise InputError(
-                f"{found.name}: the peak's tails need the {word} window's energies, the same of all frames"
-            )
+            needed = f"the {word} window's energies, the same of all frames"
+            raise InputError(f"{found.name}: the peak's tails need {needed}")
         return low, high
 
     def _width(self, word: str, used: Sequence[int], found: Counts) -> float:
         """The width of a window, keV: what is given, unless a file contradicts it, or what the files say."""
         given = None if self.widths is None else float(self.widths[_WORDS.index(word)])
         said = {round(high - low, 3) for low, high in found.about[used, -2:] if np.isfinite(low + high)}
-        text = (
-            f"{found.name}: the file says a {word} window of {' and '.join(f'{width:g}' for width in sorted(said))} keV"
-        )
+        widths = " and ".join(f"{width:g}" for width in sorted(said))
+        text = f"{found.name}: the file says a {word} window of {widths} keV"
         if len(said) > 1:
             raise InputError(f"{text}; expected frames of one width")
         if given is None and not said:

@@ -1,6 +1,6 @@
 """Motion and change since a reference volume, from few views: where the body is now, and what in it is not as it was."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -99,9 +99,8 @@ class MotionFinder:
                 of_each = 1 / np.maximum(variances + unexplained, _EXACT)
                 information = (slopes * of_each) @ slopes.T
                 if not np.linalg.cond(information) < _BLIND:
-                    raise InputError(
-                        "find_motion: these images do not show all of a motion: expected more or other views"
-                    )
+                    unseen = "these images do not show all of a motion"
+                    raise InputError(f"find_motion: {unseen}: expected more or other views")
                 inverse = np.linalg.inv(information)
                 step = inverse @ (slopes @ (of_each * left))
                 motion = motion + self._steps * step
@@ -135,9 +134,8 @@ class MotionFinder:
     def _project(self, motion: Floats, level: int) -> Floats:
         """Images (M, n_v, n_u) of the moved reference, of pixels `level` times as large."""
         grid = _moved(self.reference.grid, _pose(motion, self._center))
-        return np.asarray(
-            Projector(grid, _coarser(self.views, level), backend=self._backend)(self.reference.array), float
-        )
+        A = Projector(grid, _coarser(self.views, level), backend=self._backend)
+        return np.asarray(A(self.reference.array), float)
 
 
 def find_motion(
@@ -220,9 +218,7 @@ def _moved(grid: Grid, pose: Floats) -> Grid:
 def _coarser(views: Views, level: int) -> Views:
     n_v, n_u = views.shape
     size = n_v // level, n_u // level
-    return Views(
-        views.sources, views.detector_centers, level * views.u_steps, level * views.v_steps, size, views.parallel
-    )
+    return replace(views, u_steps=level * views.u_steps, v_steps=level * views.v_steps, shape=size)
 
 
 def _joined(images: Floats, level: int) -> Floats:

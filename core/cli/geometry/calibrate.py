@@ -49,13 +49,9 @@ def _record(found: mph.Calibration) -> dict[str, Any]:
     names = ("points", "covariance", "chi_square", "misfit", "used", "spread", "told", "detector_offset")
     record = {name: _plain(getattr(found, name).tolist()) for name in names}
     record |= {name: list(getattr(found, name)) for name in ("names", "misfitting", "gauge")}
-    geometry = {
-        "centers": found.system.centers,
-        "tilt": found.system.tilt,
-        "collimator_length": found.system.collimator_length,
-    }
-    numbers = {"numbers": found.system.numbers.tolist(), **{name: x.tolist() for name, x in geometry.items()}}
-    return {**numbers, **record, "untold": found.untold(), "units": "mm, rad"}
+    of_modules = ("numbers", "centers", "tilt", "collimator_length")
+    geometry = {name: getattr(found.system, name).tolist() for name in of_modules}
+    return {**geometry, **record, "untold": found.untold(), "units": "mm, rad"}
 
 
 def _plain(value: Any) -> Any:

@@ -66,10 +66,8 @@ def _print_ray(arguments: argparse.Namespace, system: Scanner, views: mph.Views,
         at = mph.epipole(views, m, n)
         place = at[:2] / at[2] if at[2] > 0 else np.full(2, np.nan)
         inside = (place >= -0.5).all() and (place <= [n_u - 0.5, n_v - 0.5]).all()
-        rows[-1] |= {
-            "line": _listed(mph.epipolar_lines(views, m, n, pixel)),
-            "epipole": _listed(place) if inside else None,
-        }
+        line = _listed(mph.epipolar_lines(views, m, n, pixel))
+        rows[-1] |= {"line": line, "epipole": _listed(place) if inside else None}
     number = int(system.numbers[m])
     record = {"module": number, "pixel": pixel, "depths": [near, far], "points": ends.tolist(), "modules": rows}
     text = f"module {number}, pixel ({pixel[0]:g}, {pixel[1]:g})"

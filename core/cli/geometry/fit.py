@@ -38,10 +38,8 @@ def _lines(rings: list[dict[str, Any]]) -> Iterator[str]:
         yield f"  z           from {min(z):.4f} to {max(z):.4f} mm"
         verdict = "" if ring["curve_deviation"] <= _FOLLOWS else ": these modules follow no ellipse"
         yield f"  deviation   {ring['curve_deviation']:.2g} mm at most from the ellipse{verdict}"
-        yield (
-            f"              {ring['even_deviation']:.2g} mm at most if at equal steps of {ring['spacing']} and at one z, "
-            f"{np.mean(z):.4f} mm"
-        )
+        even = f"if at equal steps of {ring['spacing']} and at one z, {np.mean(z):.4f} mm"
+        yield f"              {ring['even_deviation']:.2g} mm at most {even}"
 
 
 def _record(fit: RingFit) -> dict[str, Any]:

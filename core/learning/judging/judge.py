@@ -194,9 +194,8 @@ class _Tested:
             self.events = recipe.events(test)
             if test["believed"] is not None:
                 own, self.file = self.events.recipe.system, str(recipe.folder / test["believed"])
-                self.system = chosen_modules(
-                    read_scanner(self.file, own["system.kind"]), own["system.modules"], self.file
-                )
+                scanner = read_scanner(self.file, own["system.kind"])
+                self.system = chosen_modules(scanner, own["system.modules"], self.file)
             self.defect = defect_of(self.events) if test["scoring"] == "defect" else {}
 
     @cached_property

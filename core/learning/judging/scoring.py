@@ -82,11 +82,8 @@ class Case:
         if not same_grid(volume.grid, self.grid):
             raise InputError(f"a method gave {volume.grid.shape} voxels on another grid than the judge's: {self.grid}")
         A = self.projector
-        expected = A(volume.array) + A.background
-        found: Scores = {
-            "nrmse": nrmse(volume, self.truth),
-            "deviance": relative_deviance(self.run.projections, expected),
-        }
+        deviance = relative_deviance(self.run.projections, A(volume.array) + A.background)
+        found: Scores = {"nrmse": nrmse(volume, self.truth), "deviance": deviance}
         if min(self.grid.shape) >= 11:  # the window's side
             found["ssim"] = ssim(volume, self.truth)
         return found | SCORINGS[scoring](volume, self)

@@ -95,16 +95,14 @@ def nema_score(volume: Volume, phantom: NemaBody, pose: ArrayLike | None = None)
     if not phantom.background or phantom.background == phantom.sphere_activity:
         found = f"{phantom.sphere_activity:g} kBq/mL in the spheres, {phantom.background:g} around them"
         raise InputError(f"nema_score: expected spheres in a background of another activity, got {found}")
-    spheres = [
-        (diameter, (x, y, 0.0))
-        for diameter, (x, y) in zip(phantom.sphere_diameters, sphere_places(), strict=True)
-        if diameter
-    ]
     places = _background_places(phantom)
     around = np.array([(x, y, z) for z in _SLICES for x, y in places])
     true_contrast = phantom.sphere_activity / phantom.background - 1
     rows = []
-    for diameter, place in spheres:
+    for diameter, (x, y) in zip(phantom.sphere_diameters, sphere_places(), strict=True):
+        if not diameter:
+            continue
+        place = (x, y, 0.0)
         background = _means(volume, world, around, diameter, "background regions")
         level = _level(background)
         sphere = float(_means(volume, world, np.array([place]), diameter, f"spheres of {diameter:g} mm")[0])

@@ -308,10 +308,8 @@ def decoded(data: Any) -> Array:
         syntax = data.file_meta.TransferSyntaxUID
         what = f"cannot be read ({first_line(error)})"
         if syntax.is_compressed:
-            what = (
-                f"are compressed ({syntax.name}), which cannot be decoded here; install pylibjpeg with its plugins, or "
-            )
-            what += "save the series without compression"
+            advice = "install pylibjpeg with its plugins, or save the series without compression"
+            what = f"are compressed ({syntax.name}), which cannot be decoded here; {advice}"
         raise InputError(f"its pixels {what}") from error
 
 
@@ -368,11 +366,9 @@ def _spacing(header: Any) -> float:
     if header.get("SpacingBetweenSlices") not in (None, ""):
         return float(_numbers(header, "SpacingBetweenSlices", 1)[0])
     thickness = float(_numbers(header, "SliceThickness", 1)[0])
-    text = (
-        f"{Path(header.filename).name}: it has no SpacingBetweenSlices: its SliceThickness, {thickness:g} mm, was taken, "
-        "along the normal; check that head and feet are not exchanged"
-    )
-    warn(text)
+    taken = f"its SliceThickness, {thickness:g} mm, was taken, along the normal"
+    missing = f"{Path(header.filename).name}: it has no SpacingBetweenSlices"
+    warn(f"{missing}: {taken}; check that head and feet are not exchanged")
     return thickness
 
 

@@ -22,17 +22,16 @@ def read(path: Path) -> Contents:
                 found = ", ".join(place) or "nothing"
                 raise InputError(f"expected the datasets array and affine; {name} not found (there are: {found})")
         require_voxels(array.shape, array.dtype)
-        texts = (
-            affine.attrs.get("unit"),
-            array.attrs.get("quantity", file.attrs.get("volume_quantity")),
-            array.attrs.get("unit"),
-        )
-        length, quantity, unit = (
-            text.decode() if isinstance(text, bytes) else None if text is None else str(text) for text in texts
-        )
+        quantity = _text(array.attrs.get("quantity", file.attrs.get("volume_quantity")))
+        length, unit = (_text(dataset.attrs.get("unit")) for dataset in (affine, array))
         if length not in (None, "mm"):
             raise InputError(f"its affine is in {length}: expected mm")
         return Contents(numbers(array), numbers(affine), quantity, unit)
+
+
+def _text(attribute: Any) -> str | None:
+    """The text of an attribute, as any program writes it; None where there is none."""
+    return attribute.decode() if isinstance(attribute, bytes) else None if attribute is None else str(attribute)
 
 
 def write(volume: Volume, temporary: Path) -> None:

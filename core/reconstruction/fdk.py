@@ -104,9 +104,8 @@ def fdk(
 class _Orbit:
     """The circle on which the sources lie."""
 
-    center: Array  # (3,), mm
     axis: Array  # (3,)
-    towards: Array  # (M, 3): unit vectors in the plane, from the centre to the sources
+    towards: Array  # (M, 3): unit vectors in the plane, from the circle's centre to the sources
     angles: Array  # (M,): of the sources on the circle, from the arc's beginning if there is one
     steps: Array  # (M, 3): the way of the source for which each view stands, mm
     arc: float  # the angle that all views stand for; 2 pi for a circle
@@ -123,7 +122,6 @@ class _Orbit:
         flat = np.stack([(sources - mean) @ first, (sources - mean) @ second], axis=1)
         # |x|^2 = 2 c x + (r^2 - |c|^2), linear in c and the rest (Kasa's fit).
         solution = np.linalg.lstsq(np.insert(2 * flat, 2, 1.0, axis=1), (flat**2).sum(axis=1), rcond=None)[0]
-        center = mean + solution[0] * first + solution[1] * second
         radius = float(np.sqrt(max(solution[2] + solution[0] ** 2 + solution[1] ** 2, 0.0)))
         if radius < _LEAST_RADIUS * np.linalg.norm(views.detector_centers - sources, axis=1).max():
             raise InputError("fdk: expected sources on a circle around the object, got all at one place")
@@ -143,7 +141,7 @@ class _Orbit:
         # From the first view's half share on.
         first_share = shares[angles.argmin()] / 2
         arc = float(shares.sum()) if gap else 2 * np.pi
-        return cls(center, axis, towards, angles + first_share, steps, arc)
+        return cls(axis, towards, angles + first_share, steps, arc)
 
     def fan_angles(self, m: int, rays: Array) -> Array:
         """Angles (N,) in the plane between view m's rays and its ray to the centre, growing with the source's angle."""

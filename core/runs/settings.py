@@ -223,23 +223,20 @@ _DECLARED = (
             words=_ISOTOPES, above=0, needs=(f"{_FILE} or {_XRAYS}", "no model.kind=emission")),
     Setting("volume.center", bool, False, "Move the volume's centre to the isocentre, and other states and the "
             "attenuation with it", needs=(_FILE,)),
-    Setting("phantom.kind", str, "derenzo", "Kind of the phantom", needs=(*_PHANTOM, *_NO_PHANTOM[1:]),
+    Setting("phantom.kind", str, "derenzo", "Kind of the phantom", needs=_NO_PHANTOM[1:],
             words={kind.name: (kind.label, kind.summary) for kind in KINDS}, option="--phantom-kind"),
     Setting("phantom.file", str, None, "A phantom's shapes (.toml), or a kind of phantom", is_path=True,
-            needs=(*_PHANTOM, "no phantom.kind", "no phantom.text"), option="--phantom"),
+            needs=("no phantom.kind", "no phantom.text"), option="--phantom"),
     Setting("phantom.text", str, None, "A phantom's shapes: the contents of such a file",
-            needs=(*_PHANTOM, "no phantom.kind", "no phantom.file"), option="--phantom-text"),
-    Setting("phantom.position", float, (0.0, 0.0, 0.0), "Middle of the phantom, x y z", unit="mm", sizes=(3,),
-            needs=_PHANTOM),
+            needs=("no phantom.kind", "no phantom.file"), option="--phantom-text"),
+    Setting("phantom.position", float, (0.0, 0.0, 0.0), "Middle of the phantom, x y z", unit="mm", sizes=(3,)),
     Setting("phantom.euler_degrees", float, (0.0, 0.0, 0.0), "Angles phi theta psi: psi about its own axis, then theta "
-            "about y, then phi about z", unit="degrees", sizes=(3,), needs=_PHANTOM),
-    Setting("phantom.matrix", list, None, "World-from-phantom matrix, 4 rows", "that of position and angles", unit="mm",
-            needs=_PHANTOM),
-    Setting("phantom.voxels", int, (256,), "Voxels along x y z, or one number for all", least=1, sizes=(1, 3),
-            needs=_PHANTOM),
+            "about y, then phi about z", unit="degrees", sizes=(3,)),
+    Setting("phantom.matrix", list, None, "World-from-phantom matrix, 4 rows", "that of position and angles", unit="mm"),
+    Setting("phantom.voxels", int, (256,), "Voxels along x y z, or one number for all", least=1, sizes=(1, 3)),
     Setting("phantom.spacing", float, None, "Voxel size, one or three", "so that the phantom fits", unit="mm", above=0,
-            sizes=(1, 3), needs=_PHANTOM),
-    Setting("phantom.turn_grid", bool, False, "Turn the grid with the phantom", needs=_PHANTOM),
+            sizes=(1, 3)),
+    Setting("phantom.turn_grid", bool, False, "Turn the grid with the phantom"),
     Setting("attenuation.file", str, None, "Attenuation coefficients, 1/mm, on any grid, or CT numbers (a DICOM folder, "
             "too); or a file of coefficients for each of the isotope's lines, by energy", "nothing attenuates", is_path=True,
             sizes=(), needs=(_COUNTS, "no attenuation.of_phantom"), option="--mu"),
@@ -255,33 +252,25 @@ _DECLARED = (
             "another simulator's scanner (.npy, .npz, .h5, DICOM, .mhd, Interfile's .hdr, raw numbers)", is_path=True,
             sizes=(), needs=(_COUNTS, "no volume.file", "no volume.states", *_NO_PHANTOM), option="--counts"),
     Setting("counts.frames", str, None, "Which module each frame is of: the modules' numbers in the frames' order, such as "
-            "1-80, 80-1 or 3,1,2; none for one that is not used", needs=("counts.files", "no counts.frames_file"),
-            option="--frames"),
-    Setting("counts.frames_file", str, None, "Text file with these numbers", is_path=True, needs=("counts.files",
-            "no counts.frames")),
+            "1-80, 80-1 or 3,1,2; none for one that is not used", needs=("no counts.frames_file",), option="--frames"),
+    Setting("counts.frames_file", str, None, "Text file with these numbers", is_path=True, needs=("no counts.frames",)),
     Setting("counts.orientation", str, None, "How a frame, as a picture with row 0 at the top, lies on the crystal: seen "
             "from the front (the pinhole) or from the back, with which of the module's axes at the top; one word, or one "
-            "for each frame", words=ORIENTATIONS, sizes=(), needs=("counts.files",)),
-    Setting("counts.expected", bool, False, "The numbers are expected means, which may be fractions",
-            needs=("counts.files",)),
-    Setting("counts.dataset", str, None, "Name of the array in .npz and .h5", "the only one of three axes",
-            needs=("counts.files",)),
-    Setting("counts.raw_shape", int, None, "Frames, rows and columns of a raw file", least=1, sizes=(3,),
-            needs=("counts.files",)),
-    Setting("counts.raw_type", str, None, "Type of a raw file's numbers", words=named(RAW_TYPES, ""),
-            needs=("counts.files",)),
-    Setting("counts.raw_big_endian", bool, False, "The most significant byte of a raw file's numbers comes first",
-            needs=("counts.files",)),
+            "for each frame", words=ORIENTATIONS, sizes=()),
+    Setting("counts.expected", bool, False, "The numbers are expected means, which may be fractions"),
+    Setting("counts.dataset", str, None, "Name of the array in .npz and .h5", "the only one of three axes"),
+    Setting("counts.raw_shape", int, None, "Frames, rows and columns of a raw file", least=1, sizes=(3,)),
+    Setting("counts.raw_type", str, None, "Type of a raw file's numbers", words=named(RAW_TYPES, "")),
+    Setting("counts.raw_big_endian", bool, False, "The most significant byte of a raw file's numbers comes first"),
     Setting("counts.lower_frames", str, None, "Frames of the energy window below the peak's, from which scatter is "
-            "estimated: which module each is of, as in counts.frames", needs=("counts.files",)),
-    Setting("counts.upper_frames", str, None, "Frames of the energy window above the peak's, likewise",
-            needs=("counts.files",)),
+            "estimated: which module each is of, as in counts.frames"),
+    Setting("counts.upper_frames", str, None, "Frames of the energy window above the peak's, likewise"),
     Setting("counts.window_widths", float, None, "Widths of the lower, the peak and the upper energy window", "what the "
-            "file says", unit="keV", above=0, sizes=(3,), needs=("counts.files", _SCATTER)),
+            "file says", unit="keV", above=0, sizes=(3,), needs=(_SCATTER,)),
     Setting("counts.scatter_fwhm", float, None, "FWHM of the Gaussian that smooths the estimate of scatter", "it is not "
-            "smoothed", unit="pixels", above=0, needs=("counts.files", _SCATTER)),
+            "smoothed", unit="pixels", above=0, needs=(_SCATTER,)),
     Setting("counts.scatter_tails", bool, False, "The photopeak's tails in those windows, by the energy resolution, are no "
-            "scatter", needs=("counts.files", _SCATTER, "model.isotope", "model.energy_fwhm")),
+            "scatter", needs=(_SCATTER, "model.isotope", "model.energy_fwhm")),
     Setting("model.kind", str, "transmission", "What a pixel holds", label="Model", option="--model", words={
         "transmission": ("Radiograph", "Line integrals of the volume"),
         "emission": ("SPECT Counts", "Photons of a volume of activity that the crystal counts"),
@@ -458,7 +447,17 @@ _DECLARED = (
             needs=tuple(f"no compute.backend={b.name}" for b in BACKENDS.values() if b.own_threads)),
 )  # fmt: skip
 
-SETTINGS: Mapping[str, Setting] = MappingProxyType({setting.key: setting for setting in _DECLARED})
+_NEEDED = {"phantom": _PHANTOM, "counts": ("counts.files",)}
+"""What all settings of a table need, but for that which is needed itself."""
+
+
+def _with_needs(row: Setting) -> Setting:
+    """A setting that also needs what all of its table need."""
+    needed = _NEEDED.get(row.key.partition(".")[0], ())
+    return row if row.key in needed else dataclasses.replace(row, needs=(*needed, *row.needs))
+
+
+SETTINGS: Mapping[str, Setting] = MappingProxyType({row.key: _with_needs(row) for row in _DECLARED})
 """Every setting by its key, table by table; `settings_with` has those of a kind of phantoms, too."""
 
 

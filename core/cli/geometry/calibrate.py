@@ -41,7 +41,7 @@ def _run(arguments: argparse.Namespace) -> None:
     record = _record(found)
     write_bytes(path.with_suffix(".json"), json.dumps(record, indent=1).encode())
     write_png(found.residual_sheet().picture, path.with_suffix(".png"))
-    print_answer(arguments, record, _lines(found, record, path))
+    print_answer(arguments, record, _lines(found, path))
 
 
 def _record(found: mph.Calibration) -> dict[str, Any]:
@@ -58,7 +58,7 @@ def _plain(value: Any) -> Any:
     return [_plain(each) for each in value] if isinstance(value, list) else None if value != value else value
 
 
-def _lines(found: mph.Calibration, record: dict[str, Any], path: Path) -> Iterator[str]:
+def _lines(found: mph.Calibration, path: Path) -> Iterator[str]:
     unit = np.where([name.startswith("tilt") for name in found.names], np.degrees(1.0), 1.0)
     spread = np.sqrt((found.spread**2).mean(axis=0)) * unit
     images = f"{found.used.sum()} of {found.used.size} images"

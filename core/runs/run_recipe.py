@@ -246,11 +246,10 @@ def projector_of_run(
 
 
 def recipe_imaging(
-    recipe: Recipe, system: Scanner, views: Views, grid: Grid, mu: Mu | None = None, backend: str = "auto",
-    threads: int | None = None,
-) -> Imaging:  # fmt: skip
+    recipe: Recipe, system: Scanner, views: Views, grid: Grid, mu: Mu | None, *, threads: int | None
+) -> Imaging:
     """What makes a recipe's images of volumes on a grid; `mu` is what attenuates."""
-    projector = Projector(grid, views, recipe_model(recipe, system, mu), backend, threads)
+    projector = Projector(grid, views, recipe_model(recipe, system, mu), threads=threads)
     return Imaging(projector, recipe["model.photons"], dead_time_of(recipe))
 
 

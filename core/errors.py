@@ -1,8 +1,9 @@
 """Errors and warnings about the user's input, and the exception of cancelled work."""
 
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from itertools import pairwise
 from typing import Any
 
 
@@ -99,6 +100,13 @@ def first_line(error: BaseException) -> str:
     """A library's error message, as one line."""
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     return lines[0] if lines else type(error).__name__
+
+
+def number_ranges(numbers: Sequence[int]) -> list[str]:
+    """Whole numbers in rising order as texts, such as "1-3" and "7"."""
+    cuts = [0, *(i for i in range(1, len(numbers)) if numbers[i] != numbers[i - 1] + 1), len(numbers)]
+    parts = [(numbers[a], numbers[b - 1]) for a, b in pairwise(cuts)]
+    return [f"{a}-{b}" if b > a else str(a) for a, b in parts]
 
 
 def several(things: Iterable[object], shown: int = 3) -> str:

@@ -157,6 +157,12 @@ def box(left: float, top: float, width: float, height: float) -> list[Point]:
     return [(left, top), (left + width, top), (left + width, top + height), (left, top + height)]
 
 
+def circle(x: float, y: float, radius: float, corners: int = 24) -> list[Point]:
+    """The corners of a polygon that stands for a circle around (x, y)."""
+    turns = np.linspace(0, 2 * np.pi, corners, endpoint=False)
+    return [(x + radius * np.cos(turn), y + radius * np.sin(turn)) for turn in turns]
+
+
 def _dashes(points: Sequence[Point], dash: float) -> Iterator[list[Point]]:
     """The dashes of a line."""
     corners = np.asarray(points, float)

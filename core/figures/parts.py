@@ -12,6 +12,8 @@ from .page import Page, Point, box
 
 INK, FAINT = "#20262d", "#6b7480"
 """Colours of text and lines, and of notes."""
+PLANES = ((2, 0, 1), (1, 0, 2), (0, 1, 2))
+"""The axis across, and those to the right and upward, of what is seen from the head, from the front and from the left."""
 _STEPS = (1.0, 2.0, 2.5, 5.0, 10.0)
 
 

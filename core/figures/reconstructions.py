@@ -12,17 +12,14 @@ from ..runs.display import DARK_DIVERGING, Display
 from ..volumes.resampling import resample
 from ..volumes.sights import bright_value, full_slices
 from ..volumes.volume import Volume
-from .page import Page
-from .parts import Axes, arranged, bar_width, color_bar, number, ticks
+from .page import Page, circle
+from .parts import PLANES, Axes, arranged, bar_width, color_bar, number, ticks
 
 SIZE, SIZE_BESIDE_TRUTH = (1600, 500), (1600, 850)
 """Width and height, pixels, that suit a reconstruction alone, and one beside the truth."""
 LIGHTS = {"green": "#4fb35a", "amber": "#e8a13a", "red": "#d9534a"}
 """Colours of the dots that say whether rods are resolved."""
 
-# The axis across a slice, and those to the right and upward: seen from the head, from the front and from the left.
-_SLICES = ((2, 0, 1), (1, 0, 2), (0, 1, 2))
-_NAMES = "xyz"
 _CURVE = "#e0604a"
 _SEEN, _MARGIN = 0.05, 0.06  # of the last colour's value, and of the volume's sides: what slices show, and around it
 _TEXTS = 25.0  # of the size of text: the width of what is written beside the slices
@@ -54,7 +51,7 @@ def draw(
     box = _box(first, rows[0].window[1])
     extent = [float(grid.spacing[axis]) * (box[axis].stop - box[axis].start) for axis in range(3)]
     # Along rods a volume changes least: across them it shows them all.
-    best = sorted(_SLICES, key=lambda plane: float(np.abs(np.diff(first, axis=plane[0])).sum()))
+    best = sorted(PLANES, key=lambda plane: float(np.abs(np.diff(first, axis=plane[0])).sum()))
     for count in (3, 2, 1):
         shown = [(plane, row) for plane in best[:count] for row in rows]
         sizes = [(extent[across], extent[up]) for (_, across, up), _ in shown]
@@ -66,7 +63,7 @@ def draw(
     at = np.clip(full_slices(first), [part.start for part in box], [part.stop - 1 for part in box])
     for i, ((x, y), (width, height), ((axis, _, _), row)) in enumerate(zip(places, sizes, shown, strict=True)):
         place = grid.center[axis] + (at[axis] - (grid.shape[axis] - 1) / 2) * grid.spacing[axis]
-        where = "" if i % kinds else f"{_NAMES[axis]} = {number(round(float(place), 2) + 0.0)} mm"
+        where = "" if i % kinds else f"{'xyz'[axis]} = {number(round(float(place), 2) + 0.0)} mm"
         text = ", ".join(filter(None, (row.name if i < kinds else "", where)))  # once is enough
         size = 0.9 * em * min(1.0, width * pixels / letters.width(text or " ", 0.9 * em))
         page.text(text, x, y - 0.4 * em, size, page.ink)
@@ -130,7 +127,7 @@ def _draw_texts(
     for size, light, *score in table:
         row += step
         if light:
-            page.area(_disc(left + 0.5 * em, row - 0.32 * em, 0.36 * em), LIGHTS[light])
+            page.area(circle(left + 0.5 * em, row - 0.32 * em, 0.36 * em), LIGHTS[light])
         for x, cell in zip(columns, (size, *score), strict=True):
             fits = min(1.0, (page.width - x - 0.3 * em) / letters.width(cell or " ", 0.9 * em))
             page.text(cell, x, row, 0.9 * em * fits, page.ink if light else page.faint)
@@ -154,11 +151,6 @@ def _box(values: ArrayLike, high: float) -> tuple[slice, slice, slice]:
         start, stop = (seen[0], seen[-1] + 1) if len(seen) else (0, size)
         box.append(slice(max(int(start) - margin, 0), min(int(stop) + margin, size)))
     return box[0], box[1], box[2]
-
-
-def _disc(x: float, y: float, radius: float) -> list[tuple[float, float]]:
-    angles = np.linspace(0, 2 * np.pi, 24, endpoint=False)
-    return [(x + radius * math.cos(a), y + radius * math.sin(a)) for a in angles]
 
 
 def draw_objective(

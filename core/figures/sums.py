@@ -6,13 +6,10 @@ from ..arrays import Bytes, Floats, Floats32
 from ..runs.display import Display
 from ..volumes.volume import LINE_INTEGRALS, Volume, require_quantity
 from .page import Page
-from .parts import INK, Axes, arranged, bar_width, color_bar, heading, number, ticks
+from .parts import INK, PLANES, Axes, arranged, bar_width, color_bar, heading, number, ticks
 from .subject import Subject
 
-# The axis summed along, and those to the right and upward: seen from the head, from the front and from the left.
-_PANELS = ((2, 0, 1), (1, 0, 2), (0, 1, 2))
 _ARRANGED = (((0, 1, 2),), ((0,), (1, 2)), ((0,), (1,), (2,)))
-_NAMES = "xyz"
 _Frame = tuple[int, int, int, int]  # left, top, width, height
 
 
@@ -41,7 +38,7 @@ def draw(page: Page, subject: Subject) -> None:
     """The three sums in one window of colours, with axes in mm, and the phantom's translation and rotation."""
     volume = subject.volume
     assert volume is not None
-    sums = [orthogonal_sum(volume, axis) for axis, _, _ in _PANELS]
+    sums = [orthogonal_sum(volume, axis) for axis, _, _ in PLANES]
     display = Display("inferno" if volume.quantity == "activity" else "grey")
     window = display.window(np.concatenate([values.ravel() for values, _ in sums]))
     unit = f"{volume.unit} mm"
@@ -51,7 +48,7 @@ def draw(page: Page, subject: Subject) -> None:
     room = 0.0, float(top), page.width - round(4.0 * em) - bar, page.height - top - round(0.5 * em)
     box = sums[0][1]
     extent = (box[1] - box[0]).tolist()
-    sizes = [(extent[right], extent[up]) for _, right, up in _PANELS]
+    sizes = [(extent[right], extent[up]) for _, right, up in PLANES]
     pixels, places = arranged(sizes, (4.2 * em, 1.9 * em, 1.2 * em, 3.8 * em), room, *_ARRANGED)
     for panel, ((x, y), (across, tall)) in enumerate(zip(places, sizes, strict=True)):
         frame = round(x), round(y), max(1, round(across * pixels)), max(1, round(tall * pixels))
@@ -84,9 +81,9 @@ def _numbers(values: object) -> str:
 def _panel(page: Page, panel: int, picture: Bytes, box: Floats, frame: _Frame) -> None:
     """One sum with its title and axes."""
     em, (left, top, width, height) = page.em, frame
-    axis, right, up = _PANELS[panel]
+    axis, right, up = PLANES[panel]
     page.image(picture, left, top, width, height)
     axes = Axes(page, frame, tuple(box[:, right]), tuple(box[:, up]), em)
     xs, ys = ticks(*axes.x, min(6, int(width / (3.5 * em)))), ticks(*axes.y, min(6, int(height / (2.5 * em))))
-    axes.draw(xs, ys, f"Sum along {_NAMES[axis]}", f"{_NAMES[right]}, mm")
-    page.text(f"{_NAMES[up]}, mm", left - 2.9 * em, top + height / 2, 0.85 * em, INK, "middle", upward=True)
+    axes.draw(xs, ys, f"Sum along {'xyz'[axis]}", f"{'xyz'[right]}, mm")
+    page.text(f"{'xyz'[up]}, mm", left - 2.9 * em, top + height / 2, 0.85 * em, INK, "middle", upward=True)

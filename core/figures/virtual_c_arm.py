@@ -15,7 +15,7 @@ from ..geometry.presets import c_arm_views
 from ..geometry.system import PinholeSystem
 from ..geometry.views import Views
 from ..runs import letters
-from .page import Anchor, Page, Point, box
+from .page import Anchor, Page, Point, box, circle
 from .parts import FAINT, INK, arranged, heading, number
 from .subject import Subject
 
@@ -41,15 +41,12 @@ class _Drawing(NamedTuple):
         self.page.area([self.to(*p) for p in points], color, opacity)
 
     def circle(self, along: float, radius: float, color: str, opacity: float) -> None:
-        turns = np.linspace(0, 2 * np.pi, 97)
-        points = [(along + radius * np.cos(t), radius * np.sin(t)) for t in turns]
-        self.area(points[:-1], color, opacity)
-        self.line(points, color, 0.09)
+        points = circle(along, 0.0, radius, 96)
+        self.area(points, color, opacity)
+        self.line([*points, points[0]], color, 0.09)
 
     def dot(self, along: float, radius: float, color: str) -> None:
-        turns = np.linspace(0, 2 * np.pi, 24, endpoint=False)
-        size = radius * self.page.em / self.pixels
-        self.area([(along + size * np.cos(t), size * np.sin(t)) for t in turns], color)
+        self.area(circle(along, 0.0, radius * self.page.em / self.pixels), color)
 
     def text(self, text: str, along: float, across: float, down: float, anchor: Anchor = "middle") -> None:
         """Write text at a place, or `down` times the page's size of text below."""

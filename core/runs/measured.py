@@ -8,13 +8,12 @@ import math
 import operator
 import re
 from collections.abc import Mapping, Sequence
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
 from ..arrays import Array, ArrayLike
-from ..errors import InputError, expecting, naming, warn
+from ..errors import InputError, expecting, naming, number_ranges, warn
 from ..files import read_text
 from ..geometry.scanner import Detector, Scanner
 from ..memory import require
@@ -341,7 +340,5 @@ def _warn_of_others(found: Counts, used: list[int], words: list[str], run: Proje
 
 def _listed(numbers: Sequence[int]) -> str:
     """Numbers as ranges: "1-3, 7"."""
-    cuts = [0, *(i for i in range(1, len(numbers)) if numbers[i] != numbers[i - 1] + 1), len(numbers)]
-    parts = [(numbers[a], numbers[b - 1]) for a, b in pairwise(cuts)]
-    texts = [f"{a}-{b}" if b > a else str(a) for a, b in parts]
+    texts = number_ranges(numbers)
     return ", ".join(texts if len(texts) <= 6 else [*texts[:5], "…"])

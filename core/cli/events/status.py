@@ -4,6 +4,7 @@ import argparse
 from dataclasses import asdict
 
 from ... import events
+from ...errors import number_ranges
 from ...memory import readable_size
 from ..options import counted, print_answer
 from .action import add_action
@@ -36,11 +37,5 @@ def _run(arguments: argparse.Namespace) -> None:
 
 def numbers_text(numbers: list[int]) -> str:
     """Whole numbers in order, such as "0-7, 12, 30-99"."""
-    parts: list[list[int]] = []
-    for number in numbers:
-        if parts and number == parts[-1][-1] + 1:
-            parts[-1][1:] = [number]
-        else:
-            parts.append([number])
-    texts = ["-".join(map(str, part)) for part in parts]
+    texts = number_ranges(numbers)
     return ", ".join(texts if len(texts) <= 10 else [*texts[:10], f"… ({len(numbers)} in all)"])

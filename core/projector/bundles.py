@@ -11,7 +11,7 @@ import numpy as np
 from ..arrays import ArrayOrTensor, Floats, cast_like, is_tensor
 from ..geometry.grid import Grid
 from .lattices import Lattices
-from .rays import Attenuation, Ends, Fan, Rays
+from .rays import Attenuation, Ends, Fan, Rays, index_fans, index_rays
 
 KEPT_BYTES = 2**27
 """What a projector keeps of its rays and their weights from call to call takes at most this much memory."""
@@ -91,8 +91,8 @@ class Part:
     def in_index_space(self, lattices: Lattices) -> tuple[Rays, Attenuation | None]:
         """The rays as a backend takes them, and what attenuates them."""
         if isinstance(self.rays, Ends):
-            return lattices.between(self.rays)
-        return lattices.fans(self.rays, self.shape, self.parallel)
+            return lattices.mapped(index_rays, self.rays.starts, self.rays.ends)
+        return lattices.mapped(index_fans, self.rays, self.shape, self.parallel)
 
     def pixels(self, image: ArrayOrTensor) -> ArrayOrTensor:
         """The part of an image that the rays belong to, (rows, columns), as a view."""

@@ -145,14 +145,6 @@ def _whole_holes(
 
 def _by_cameras(model: WholeHoles, volume: Any, weights: Any, functions: Any, threads: int) -> list[Any]:
     """Derivatives by positions, rotations, lengths, effective diameters, pitches and offsets."""
-    found = list(model.gradient(volume[None], weights[None], functions, threads))
-    first, pitch = (np.array([getattr(numbers, name) for *_, numbers in found]) for name in ("first", "pitch"))
-    pitch = pitch - (np.array(model.pixels) - 1) / 2 * first
-    return [
-        np.array([center for center, *_ in found]),
-        np.array([frame for _, frame, _ in found]).transpose(0, 2, 1),
-        np.array([numbers.length for *_, numbers in found]),
-        np.array([numbers.diameter for *_, numbers in found]),
-        pitch[:, ::-1].copy(),
-        first[:, ::-1].copy(),
-    ]
+    centers, frames, by = model.gradient(volume[None], weights[None], functions, threads)
+    pitch, first = (by[name][:, ::-1].copy() for name in ("pitch", "first"))
+    return [centers, frames.transpose(0, 2, 1), by["length"], by["diameter"], pitch, first]

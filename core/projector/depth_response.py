@@ -113,9 +113,8 @@ class DepthResponse:
         if depth.min() <= self.nearest / 2:  # seen from among the voxels, they may be anywhere
             return replace(self, matrix=matrix), (slice(None), slice(None))
         pixels, cells = [], []
-        for at, taps, step, n, size in zip(
-            (row, column), self.kernel.shape[-2:], self.steps, self.after.shape, self.before.shape, strict=True
-        ):
+        sizes = self.kernel.shape[-2:], self.steps, self.after.shape, self.before.shape
+        for at, taps, step, n, size in zip((row, column), *sizes, strict=True):
             low, high = float((at / depth).min()) - 2, float((at / depth).max()) + 2
             start = min(max(math.floor((low - taps) / step) + 1, 0), n - 1)
             stop = max(start, min(math.floor(high / step), n - 1)) + 1

@@ -72,15 +72,11 @@ class FrameProjector(LinearOperator):
     def _of_frame(self, f: int) -> Emission:
         return replace(self._model, time=self.times[f], start=self.starts[f])
 
-    def _run_one(
-        self, x: ArrayOrTensor, progress: Progress | None = None, mu: ArrayOrTensor | None = None
-    ) -> ArrayOrTensor:
+    def _run_one(self, x: ArrayOrTensor, progress: Progress | None = None, mu: ArrayOrTensor = None) -> ArrayOrTensor:
         images = self._A._run(x, progress, mu)
         return images * cast_like(self._shares, images)
 
-    def _run_back(
-        self, y: ArrayOrTensor, progress: Progress | None = None, mu: ArrayOrTensor | None = None
-    ) -> ArrayOrTensor:
+    def _run_back(self, y: ArrayOrTensor, progress: Progress | None = None, mu: ArrayOrTensor = None) -> ArrayOrTensor:
         return self._A.T._run(y * cast_like(self._shares, y), progress, mu)
 
 

@@ -89,20 +89,17 @@ def geometry_gradient(A: Projector, volume: Volume | Floats | Floats32, images: 
         raise InputError(f"geometry gradient: {len(array)} volumes, but images of {len(given)}")
     volumes, functions, threads = A._depth_arguments(array)
     responded = np.stack([np.asarray(A._responded(each.astype(volumes.dtype, copy=False))) for each in given])
-    each = list(holes.gradient(volumes, responded, functions, threads))
-    numbers = [own for *_, own in each]
-    first, pitch = (np.array([getattr(own, name) for own in numbers]) for name in ("first", "pitch"))
-    # The image's middle is half its pixels from its first; along a real detector, steps go backwards.
-    pitch -= (np.array(A.views.shape) - 1) / 2 * first
+    centers, frames, by = holes.gradient(volumes, responded, functions, threads)
     u, v, _ = model.system.frames().transpose(1, 0, 2)
+    # Along a real detector, steps go backwards.
     signs = np.sign([np.einsum("mi,mi->m", s, a) for s, a in ((A.views.v_steps, v), (A.views.u_steps, u))]).T
     return GeometryGradient(
-        np.array([center for center, *_ in each]),
-        np.array([frame for _, frame, _ in each]),
-        np.array([own.length for own in numbers]),
-        np.array([own.diameter for own in numbers]) * _effective_rise(model),
-        (pitch * signs)[:, ::-1] + sum(map(partial(_by_blur, A), volumes, given)),
-        (first * signs)[:, ::-1],
+        centers,
+        frames,
+        by["length"],
+        by["diameter"] * _effective_rise(model),
+        (by["pitch"] * signs)[:, ::-1] + sum(map(partial(_by_blur, A), volumes, given)),
+        (by["first"] * signs)[:, ::-1],
     )
 
 
@@ -111,8 +108,7 @@ def _effective_rise(model: Emission) -> Floats:
     d = model.system.pinhole_diameter
     optics = replace(model.optics, edge="paix", plate_thickness=None)
     more, less = (optics.effective_diameter(d * scale) for scale in (1 + _STEP, 1 - _STEP))
-    rise: Floats = (more - less) / (2 * _STEP * d)
-    return rise
+    return np.asarray((more - less) / (2 * _STEP * d))
 
 
 def _by_blur(A: Projector, volume: Array, images: Array) -> Array:
@@ -121,15 +117,12 @@ def _by_blur(A: Projector, volume: Array, images: Array) -> Array:
     images = images * each_pixel(model.efficiency)
     if holes is None or not isinstance(model, Emission) or model.response(views, 0) is None:
         return by
-    wide, narrow = (
-        replace(views, u_steps=a * views.u_steps, v_steps=a * views.v_steps) for a in (1 + _STEP, 1 - _STEP)
-    )
+    scales = 1 + _STEP, 1 - _STEP
+    wide, narrow = (replace(views, u_steps=a * views.u_steps, v_steps=a * views.v_steps) for a in scales)
     for m, image in enumerate(holes.images(volume, *A._depth_arguments(volume)[1:])):
         (v, u), more, less = (model.response(each, m) for each in (views, wide, narrow))  # type: ignore[misc]
         rise_v, rise_u = ((a - b) / (2 * _STEP) for a, b in zip(more, less, strict=True))  # type: ignore[arg-type]
         pitch = model.crystal_pitch(views, m)
-        by[m] = (
-            (images[m] * (v @ image @ rise_u.T)).sum() / pitch[0],
-            (images[m] * (rise_v @ image @ u.T)).sum() / pitch[1],
-        )
+        by[m, 0] = (images[m] * (v @ image @ rise_u.T)).sum() / pitch[0]
+        by[m, 1] = (images[m] * (rise_v @ image @ u.T)).sum() / pitch[1]
     return by

@@ -33,44 +33,17 @@ def kernels(numbers: KernelNumbers, steps: tuple[int, int]) -> Array:
     In Fourier space the exact image, by what the spline has blurred; and `bend` more. It may not be negative anywhere, or
     expected counts would be. All counts of a cell go to the pixels.
     """
-    half = half_taps(numbers, steps)
-    return of_pixels(_images(numbers, steps, half)[0], numbers, steps, half)[0]
+    spectra = Spectra(numbers, steps, half_taps(numbers, steps))
+    return spectra.of_pixels(spectra.images())[0]
 
 
 def kernels_gradient(numbers: KernelNumbers, steps: tuple[int, int], by_kernels: Array) -> tuple[Array, KernelNumbers]:
     """The kernels, and a function's derivatives by `numbers` from those by the kernels."""
-    half = half_taps(numbers, steps)
-    image, images = _images(numbers, steps, half)
-    found = of_pixels(image, numbers, steps, half)
-    by_image, by_bend, _ = of_pixels_gradient(by_kernels, image, found, numbers, steps, half)
-    return found[0], images.gradient(by_image)._replace(bend=by_bend)
-
-
-def of_pixels_gradient(
-    by_kernels: Array,
-    image: Array,
-    found: tuple[Array, Array, Array],
-    numbers: KernelNumbers,
-    steps: tuple[int, int],
-    half: tuple[int, int],
-) -> tuple[Array, Array, Array]:
-    """Derivatives by what `of_pixels` has found its kernels from: the image, `bend`, and (planes,) `least`."""
-    kernel, shares, is_used = found
-    by = np.empty_like(kernel)
-    for phase in _phases(steps, half):  # of what is divided by its sum
-        mean = (by_kernels[phase] * kernel[phase]).sum(axis=(1, 2), keepdims=True)
-        by[phase] = by_kernels[phase] - mean
-    by *= is_used / shares
-    by_least = -by.sum(axis=(1, 2))
-    away = _away(half)
-    plain = by * _means(image)
-    by_bend = np.array([(plain * away[0][:, None]).sum(), (plain * away[1]).sum()])
-    by *= 1 + numbers.bend[0] * away[0][:, None] + numbers.bend[1] * away[1]
-    by_image = np.zeros_like(image)
-    by_image[1:-1] += by * (7 / 6)
-    by_image[2:] -= by / 12
-    by_image[:-2] -= by / 12
-    return by_image, by_bend, by_least
+    spectra = Spectra(numbers, steps, half_taps(numbers, steps))
+    image = spectra.images()
+    found = spectra.of_pixels(image)
+    by_image, by_bend, _ = spectra.of_pixels_gradient(by_kernels, image, found)
+    return found[0], spectra.gradient(by_image)._replace(bend=by_bend)
 
 
 def half_taps(numbers: KernelNumbers, steps: tuple[int, int], more: ArrayLike = 0.0) -> tuple[int, int]:
@@ -80,47 +53,18 @@ def half_taps(numbers: KernelNumbers, steps: tuple[int, int], more: ArrayLike = 
     return tuple(math.ceil(each) + 1 for each in reach)  # type: ignore[return-value]
 
 
-def _away(half: tuple[int, int]) -> list[Array]:
-    return [np.arange(-h, h + 1.0) ** 2 for h in half]
-
-
-def _phases(steps: tuple[int, int], half: tuple[int, int]) -> list[tuple[slice, ...]]:
-    """The taps of one cell's place in a pixel, for each place."""
-    starts = [[(h - a) % step for a in range(step)] for h, step in zip(half, steps, strict=True)]
-    return [(slice(None), slice(a, None, steps[0]), slice(b, None, steps[1])) for a in starts[0] for b in starts[1]]
-
-
 def _means(image: Array) -> Array:
     """Between planes there are straight lines: on the mean over depths they are right, not at the planes."""
     return image[1:-1] - (image[2:] - 2 * image[1:-1] + image[:-2]) / 12
 
 
-def of_pixels(
-    image: Array, numbers: KernelNumbers, steps: tuple[int, int], half: tuple[int, int], least: Array | None = None
-) -> tuple[Array, Array, Array]:
-    """The kernels of images, with the sums that taps of one place were divided by, and which taps are used.
-
-    Taps up to `least`, (planes,), are left out, and it is taken from the others.
-    """
-    away = _away(half)
-    kernel = _means(image) * (1 + numbers.bend[0] * away[0][:, None] + numbers.bend[1] * away[1])
-    kernel -= _LEAST / kernel[0].size if least is None else least[:, None, None]
-    is_used = kernel > 0
-    kernel *= is_used
-    shares = np.empty_like(kernel)
-    for phase in _phases(steps, half):
-        shares[phase] = kernel[phase].sum(axis=(1, 2), keepdims=True)
-    kernel /= shares
-    return kernel, shares, is_used
-
-
 class Spectra:
-    """The spectra of images, factor by factor, for their derivatives."""
+    """The spectra of images, factor by factor, for their derivatives, and the kernels that are made of images."""
 
     def __init__(self, numbers: KernelNumbers, steps: tuple[int, int], half: tuple[int, int]) -> None:
         first, last = numbers.slopes[:2], numbers.slopes[-2:]
         slopes = np.concatenate([[2 * first[0] - first[1]], numbers.slopes, [2 * last[1] - last[0]]])
-        self.numbers, self.half = numbers, half
+        self.numbers, self.steps, self.half = numbers, steps, half
         self.slopes = slopes[:, None, None]
         self.n = [_fast_length(2 * h + 8) for h in half]
         self.f = np.fft.fftfreq(self.n[0])[:, None], np.fft.rfftfreq(self.n[1])[None]
@@ -131,11 +75,15 @@ class Spectra:
         self.waves = [edge[0] * f_v + edge[1] * f_u for edge in numbers.edges.T]
         self.sincs = [np.sinc(self.slopes * wave) for wave in self.waves]
 
+    @property
+    def least(self) -> Array | float:
+        """Taps up to this are left out, and it is taken from the others."""
+        return _LEAST / math.prod(2 * h + 1 for h in self.half)
+
     @functools.cached_property
     def common(self) -> Array:
         """The factors of the pixel and the voxel."""
-        factors: Array = self.pixel * self.sincs[0] * self.sincs[1] * self.sincs[2]
-        return factors
+        return np.asarray(self.pixel * self.sincs[0] * self.sincs[1] * self.sincs[2])
 
     @functools.cached_property
     def _discs(self) -> tuple[Array, Array]:
@@ -178,10 +126,52 @@ class Spectra:
         by_slopes[-3:-1] += np.array([-1, 2]) * by_slopes[-1]
         return KernelNumbers(by_hole, by_slopes[1:-1], by_edges, np.zeros(2))
 
+    def of_pixels(self, image: Array) -> tuple[Array, Array, Array]:
+        """The kernels of images, with the sums that taps of one place were divided by, and which taps are used."""
+        kernel: Array = _means(image) * self._bent()
+        kernel -= self.least
+        is_used = kernel > 0
+        kernel *= is_used
+        shares = np.empty_like(kernel)
+        for phase in self._phases():
+            shares[phase] = kernel[phase].sum(axis=(1, 2), keepdims=True)
+        kernel /= shares
+        return kernel, shares, is_used
 
-def _images(numbers: KernelNumbers, steps: tuple[int, int], half: tuple[int, int]) -> tuple[Array, Spectra]:
-    spectra = Spectra(numbers, steps, half)
-    return spectra.images(), spectra
+    def of_pixels_gradient(
+        self, by_kernels: Array, image: Array, found: tuple[Array, Array, Array]
+    ) -> tuple[Array, Array, Array]:
+        """Derivatives by what `of_pixels` has found its kernels from: the image, `bend`, and (planes,) `least`."""
+        kernel, shares, is_used = found
+        by = np.empty_like(kernel)
+        for phase in self._phases():  # of what is divided by its sum
+            mean = (by_kernels[phase] * kernel[phase]).sum(axis=(1, 2), keepdims=True)
+            by[phase] = by_kernels[phase] - mean
+        by *= is_used / shares
+        by_least = -by.sum(axis=(1, 2))
+        away = self._away()
+        plain = by * _means(image)
+        by_bend = np.array([(plain * away[0][:, None]).sum(), (plain * away[1]).sum()])
+        by *= self._bent()
+        by_image = np.zeros_like(image)
+        by_image[1:-1] += by * (7 / 6)
+        by_image[2:] -= by / 12
+        by_image[:-2] -= by / 12
+        return by_image, by_bend, by_least
+
+    def _away(self) -> list[Array]:
+        return [np.arange(-h, h + 1.0) ** 2 for h in self.half]
+
+    def _bent(self) -> Array:
+        """The factors of the taps by `bend`."""
+        along_v, along_u = self._away()
+        return 1 + self.numbers.bend[0] * along_v[:, None] + self.numbers.bend[1] * along_u
+
+    def _phases(self) -> list[tuple[slice, ...]]:
+        """The taps of one cell's place in a pixel, for each place."""
+        starts = [[(h - a) % step for a in range(step)] for h, step in zip(self.half, self.steps, strict=True)]
+        along = [[slice(start, None, step) for start in own] for own, step in zip(starts, self.steps, strict=True)]
+        return [(slice(None), *places) for places in itertools.product(*along)]
 
 
 def _fast_length(n: int) -> int:
@@ -193,9 +183,8 @@ def _sinc_rise(x: Array) -> Array:
     """The derivative of ``numpy.sinc``."""
     is_small = np.abs(x) < 1e-3
     safe = np.where(is_small, 1.0, x)
-    return np.where(
-        is_small, -(np.pi**2) / 3 * x * (1 - (np.pi * x) ** 2 / 10), (np.cos(np.pi * x) - np.sinc(x)) / safe
-    )
+    series = -(np.pi**2) / 3 * x * (1 - (np.pi * x) ** 2 / 10)
+    return np.where(is_small, series, (np.cos(np.pi * x) - np.sinc(x)) / safe)
 
 
 def disc_transform(x: Array) -> tuple[Array, Array]:

@@ -19,7 +19,7 @@ from ..arrays import Array
 from ..physics.aperture import KnifeEdge
 from ..physics.crystal import recorded_depths
 from ..physics.optics import Optics
-from .hole_kernel import KernelNumbers, Spectra, disc_transform, half_taps, of_pixels, of_pixels_gradient
+from .hole_kernel import KernelNumbers, Spectra, disc_transform, half_taps
 
 # Attenuation in the edge beyond which what passes is not counted; nodes of Gauss in the crystal.
 _MOST_PASSED, _DEPTHS = 7.5, 32
@@ -108,14 +108,12 @@ def slanted(
     parts, across, along, off = np.ones(1), np.full(1, diameter / 2), np.full(1, diameter / 2), np.zeros(1)
     if passage.knife is not None:
         soft = passage.decay / float(np.abs(sizes * steps).min())
-        parts, depths = _layers(
-            passage.knife, min(steep, _STEEPEST * passage.knife.tangent), min(round(6 + 10 * soft), 32)
-        )
+        slope_of_edge = min(steep, _STEEPEST * passage.knife.tangent)
+        parts, depths = _layers(passage.knife, slope_of_edge, min(round(6 + 10 * soft), 32))
         along, off, across = _ellipses(passage.knife, depths, steep, length)
     shares = parts * along * across / (diameter / 2) ** 2
-    forms = 4 * (across**2)[:, None, None] * np.eye(2) + 4 * (along**2 - across**2)[:, None, None] * np.outer(
-        axis, axis
-    )
+    longer = along**2 - across**2
+    forms = 4 * (across**2)[:, None, None] * np.eye(2) + 4 * longer[:, None, None] * np.outer(axis, axis)
     forms = forms / np.outer(sizes, sizes)
     shifts, nearer, weights, mixed = np.zeros((1, 2)), np.zeros(1), np.ones(1), np.zeros(2)
     if passage.crystal_mu:
@@ -173,11 +171,10 @@ def _gauss(n: int) -> tuple[Array, Array]:
 def node_kernels(numbers: KernelNumbers, steps: tuple[int, int], each: list[Slanted], shape: tuple[int, int]) -> Array:
     """The kernels (planes, nodes along v, along u, taps, taps) of a lattice of nodes of a `shape`, row by row."""
     half = _half(numbers, steps, each)
-    spectra, least = SlantedSpectra(numbers, steps, half, each, shape), _least(numbers, steps, each)
-    kernels = []
+    spectra, kernels = SlantedSpectra(numbers, steps, half, each, shape), []
     for spectrum in spectra.of_nodes():
         image = spectra.spatial(spectrum * spectra.common)
-        kernels.append(_moved(of_pixels(image, numbers, steps, half, least)[0], image[1:-1]))
+        kernels.append(_moved(spectra.of_pixels(image)[0], image[1:-1]))
     found = np.stack(kernels, axis=1)
     found *= spectra.totals[:, None, None]
     inside, is_used = [], (found > _STRAY * found.max()).any(axis=(0, 1))
@@ -187,12 +184,6 @@ def node_kernels(numbers: KernelNumbers, steps: tuple[int, int], each: list[Slan
         inside.append(slice(h - reach, h + reach + 1))
     found = found[:, :, inside[0], inside[1]]
     return found.reshape(len(found), *shape, *found.shape[2:])
-
-
-def _least(numbers: KernelNumbers, steps: tuple[int, int], each: list[Slanted]) -> Array:
-    """By what a tap would be if those in the widest shadow and a pixel were alike."""
-    least: Array = _LEAST / (np.pi / 4 * _widest(each).prod() * (1 + numbers.slopes) ** 2 + math.prod(steps))
-    return least
 
 
 class NodesGradient:
@@ -206,7 +197,7 @@ class NodesGradient:
     ) -> None:
         half = _half(numbers, steps, each)
         self._given = steps, half
-        spectra, least = SlantedSpectra(numbers, steps, half, each, shape), _least(numbers, steps, each)
+        spectra = SlantedSpectra(numbers, steps, half, each, shape)
         self._common = spectra.common
         more = [(0, 0), *((h - n // 2,) * 2 for h, n in zip(half, by.shape[-2:], strict=True))]
         self._waves, totals = [], []
@@ -214,10 +205,10 @@ class NodesGradient:
         of_each = by.reshape(len(by), len(each), *by.shape[-2:]).swapaxes(0, 1)
         for given, spectrum, total in zip(of_each, spectra.of_nodes(), spectra.totals, strict=True):
             own, image = np.pad(given, more), spectra.spatial(spectrum * spectra.common)
-            found = of_pixels(image, numbers, steps, half, least)
+            found = spectra.of_pixels(image)
             totals.append(np.vdot(own, _moved(found[0], image[1:-1])))
             by_kernel, by_inner = _moved_gradient(own * total, found[0], image[1:-1])
-            by_image, by_bend, by_least = of_pixels_gradient(by_kernel, image, found, numbers, steps, half)
+            by_image, by_bend, by_least = spectra.of_pixels_gradient(by_kernel, image, found)
             by_image[1:-1] += by_inner
             wave = spectra.by_spectra(by_image)
             self._by_common += (wave.conj() * spectrum).real
@@ -234,7 +225,7 @@ class NodesGradient:
         """The form."""
         spectra = SlantedSpectra(numbers, *self._given, each, shape)
         total = self._by_totals @ spectra.totals + self._by_bend @ numbers.bend
-        total += self._by_least @ _least(numbers, self._given[0], each)
+        total += self._by_least @ spectra.least.ravel()
         for wave, spectrum in zip(self._waves, spectra.of_nodes(), strict=True):
             total += np.vdot(wave, spectrum * spectra.common).real
         return float(total)
@@ -256,13 +247,11 @@ def _moved(kernel: Array, image: Array) -> Array:
         off = taps - mean
         missing = (wanted * taps).sum(axis=1, keepdims=True) - mean
         tilt += np.expand_dims(missing * off / (along * off**2).sum(axis=1, keepdims=True), other)
-    moved: Array = kernel * tilt.clip(min=0)
-    return moved
+    return np.asarray(kernel * tilt.clip(min=0))
 
 
 def _mean(of: Array, values: Array) -> Array:
-    found: Array = (of * values).sum(axis=(1, 2), keepdims=True) / of.sum(axis=(1, 2), keepdims=True)
-    return found
+    return np.asarray((of * values).sum(axis=(1, 2), keepdims=True) / of.sum(axis=(1, 2), keepdims=True))
 
 
 def _moved_gradient(by: Array, kernel: Array, image: Array) -> tuple[Array, Array]:
@@ -311,6 +300,12 @@ class SlantedSpectra(Spectra):
         self.passed = self.bases[0] @ passed[np.ix_(*chosen)] @ self.bases[1].T
         exact = passed - sum(_second_difference(passed, axis) / 12 for axis in (0, 1))
         self.totals = exact.ravel() * [own.weights.sum() for own in each]
+
+    @property
+    def least(self) -> Array:
+        """(planes, 1, 1): by what a tap would be if those in the widest shadow and a pixel were alike."""
+        shadow = np.pi / 4 * _widest(self.each).prod() * (1 + self.numbers.slopes) ** 2
+        return np.asarray(_LEAST / (shadow + math.prod(self.steps)))[:, None, None]
 
     def _hole(self, own: Slanted) -> Array:
         """What passes the hole; and with depths, how that grows with the shadow's part that is not l / h."""
@@ -369,9 +364,6 @@ def _quadratic(n: int) -> tuple[list[int], Array]:
     if n < 3:
         return list(range(n)), np.eye(n)
     chosen = [0, (n - 1) // 2, n - 1]
-    others = [[b for b in chosen if b != a] for a in chosen]
-    bases = np.stack(
-        [np.prod([(np.arange(n) - b) / (a - b) for b in own], axis=0) for a, own in zip(chosen, others, strict=True)],
-        axis=-1,
-    )
+    each = [np.prod([(np.arange(n) - b) / (a - b) for b in chosen if b != a], axis=0) for a in chosen]
+    bases = np.stack(each, axis=-1)
     return chosen, bases - np.diff(bases[:3], 2, axis=0) / 12

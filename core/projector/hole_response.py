@@ -19,6 +19,7 @@ discs. M. Unser, A. Aldroubi, M. Eden, "B-spline signal processing", IEEE Transa
 import itertools
 import math
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from types import ModuleType
 from typing import Any
 
@@ -70,12 +71,13 @@ _KEPT = 2**30
 _MOST_RATIO, _ZONE_RATIO = 2.5, 1.4
 
 
+@dataclass(eq=False)
 class WholeHoles:
     """What views count of a volume through the whole holes of their modules.
 
     Each view has a response for every zone of depth, made when first needed.
 
-    Parameters
+    Attributes
     ----------
     views, grid
         The views, and the volume's grid.
@@ -96,32 +98,28 @@ class WholeHoles:
         The modules' edges and crystals where kernels depend on the photons' direction.
     """
 
-    def __init__(
-        self,
-        views: Views,
-        grid: Grid,
-        frames: Array,
-        lengths: Array,
-        diameters: Array,
-        sides: Array,
-        weigh: Weigh,
-        mu: Volume | Field | None,
-        is_strict: bool,
-        passages: Sequence[Passage] | None = None,
-    ) -> None:
-        self.n, self.pixels, self.grid, self.mu = len(views), views.shape, grid, mu
+    views: Views
+    grid: Grid
+    frames: Array
+    lengths: Array
+    diameters: Array
+    sides: Array
+    weigh: Weigh
+    mu: Volume | Field | None
+    is_strict: bool
+    passages: Sequence[Passage] | None = None
+
+    def __post_init__(self) -> None:
         self._made: dict[tuple[int, float, type], DepthResponse] = {}
         self._zones: dict[int, list[tuple[float, float]]] = {}
         self._parts: dict[tuple[int, Index, Index, type], list[Part]] = {}
         self._passing: dict[int, tuple[Index, Array]] = {}
         self._room = _KEPT
-        self._views, self._frames, self._lengths, self._diameters = views, frames, lengths, diameters
-        self._sides, self._weigh, self._is_strict, self._passages = sides, weigh, is_strict, passages
 
     def _module(self, m: int) -> tuple[Array, Array, float, float]:
         """Module m's pinhole, mm, its frame u, v, k, the collimator's length and the hole's diameter, mm."""
-        l, d = float(self._lengths[m]), float(self._diameters[m])
-        return self._views.sources[m], self._frames[m], l, d
+        l, d = float(self.lengths[m]), float(self.diameters[m])
+        return self.views.sources[m], self.frames[m], l, d
 
     def images(self, volume: Array, functions: ModuleType, workers: int, mu: Field | None = None) -> Iterator[Array]:
         """The images of `volume` one by one; `mu` may attenuate in place of the usual."""
@@ -129,22 +127,17 @@ class WholeHoles:
         filled, kind = np.ascontiguousarray(filled), volume.dtype.type
 
         def image(m: int) -> Array:
-            image, parts = np.zeros(self.pixels, volume.dtype), self._of_part(m, origin, filled.shape, kind)
+            image, parts = np.zeros(self.views.shape, volume.dtype), self._of_part(m, origin, filled.shape, kind)
             passes = self._passes(m, origin, filled, mu) if parts else None
             for of, pixels in parts:
                 cells = functions.voxels_to_cells(filled, of, passes)
                 image[pixels] += functions.cells_to_pixels(cells, of)
             return image
 
-        return in_order(image, range(self.n), workers)
+        return in_order(image, range(len(self.views)), workers)
 
     def backproject(
-        self,
-        images: Array,
-        functions: ModuleType,
-        workers: int,
-        report: Callable[[int], None],
-        mu: Field | None = None,
+        self, images: Array, functions: ModuleType, workers: int, report: Callable[[int], None], mu: Field | None = None
     ) -> Array:
         """The adjoint. Each thread has a slab of the volume, so the result does not depend on their number."""
         volume = np.zeros(self.grid.shape, images.dtype)
@@ -174,10 +167,11 @@ class WholeHoles:
 
     def gradient(
         self, volumes: Array, images: Array, functions: ModuleType, workers: int
-    ) -> Iterator[tuple[Array, Array, ViewNumbers]]:
-        """Of the sum of `images` (n, M, n_v, n_u) times those of n `volumes`, of one type, the derivatives by each view.
+    ) -> tuple[Array, Array, dict[str, Array]]:
+        """Of the sum of `images` (n, M, n_v, n_u) times those of n `volumes`, of one type, the derivatives by the views.
 
-        They are those by the pinhole's place (3,), by the module's frame (3, 3), and by the rest of the view's numbers.
+        They are those by the pinholes' places (M, 3), by the modules' frames (M, 3, 3), and by the length, the diameter, the
+        first pixel's place and the pitch of `ViewNumbers`; the pitch changes around the image's middle.
         """
         filled, origin = cropped(*volumes)
         kind = images.dtype.type
@@ -213,7 +207,10 @@ class WholeHoles:
                 center = center + self._rays(m, self.mu, origin, filled[0]).gradient(by_passing)
             return center, by_frame, numbers
 
-        return in_order(of_view, range(self.n), workers)
+        centers, frames, each = zip(*in_order(of_view, range(len(self.views)), workers), strict=True)
+        by = {name: np.array([getattr(own, name) for own in each]) for name in ("length", "diameter", "first", "pitch")}
+        by["pitch"] -= (np.array(self.views.shape) - 1) / 2 * by["first"]
+        return np.array(centers), np.array(frames), by
 
     def mu_gradient(self, volume: Array, images: Array, functions: ModuleType, workers: int, mu: Field) -> Array:
         """Of the sum of `images` times those of `volume`, the derivatives by `mu`, on its grid."""
@@ -228,7 +225,7 @@ class WholeHoles:
             return self._rays(m, mu, origin, filled).mu_gradient(by_passing * filled)
 
         total = np.zeros(mu.array.shape, volume.dtype)
-        for own in in_order(of_view, range(self.n), workers):
+        for own in in_order(of_view, range(len(self.views)), workers):
             total += own
         return total
 
@@ -241,7 +238,7 @@ class WholeHoles:
         found = self._parts.get(key)
         if found is None:
             found = [self._response(m, *zone, kind).of_part(origin, shape) for zone in self._reached(m, origin, shape)]
-            if len(self._parts) >= _PARTS_OF_VIEW * self.n:
+            if len(self._parts) >= _PARTS_OF_VIEW * len(self.views):
                 self._parts.clear()
             self._parts[key] = found
         return found
@@ -282,7 +279,7 @@ class WholeHoles:
         _, frame, l, d = self._module(m)
         margin = d / 2 * (1 / l + 1 / self._limits(m)[1])
         grid = self.grid.box(origin, part.shape)
-        return VoxelRays(mu, self.grid, grid, self._views, m, frame, margin, part.dtype.type)
+        return VoxelRays(mu, self.grid, grid, self.views, m, frame, margin, part.dtype.type)
 
     def depths(self, m: int) -> Array:
         """The row (4,) that gives the depth of a voxel (x, y, z, 1) before view m's pinhole, mm."""
@@ -299,7 +296,7 @@ class WholeHoles:
         near = rounded_up(l / (_MOST_RATIO * (1 + l / far) - 1))
         first = float(depths.min())
         nearest = 1 / rounded_up(1.001 / first) if first > 0 else first
-        if nearest < near and self._is_strict:
+        if nearest < near and self.is_strict:
             raise InputError(
                 "emission: hole 'depth' is for volumes at some distance from the pinholes, but the grid's depths before one "
                 f"are from {depths.min():.3g} to {depths.max():.3g} mm: take a smaller grid, or hole 'auto' or 'rays'"
@@ -319,7 +316,7 @@ class WholeHoles:
         (_, near), (pinhole, frame, l, d) = self._limits(m), self._module(m)
         # A pyramid before the pinhole, wider by the hole: its corners at the pinhole's plane and at `near`.
         signs = np.array(list(itertools.product((-1, 1), repeat=2)))
-        views, (n_v, n_u) = self._views, self.pixels
+        views, (n_v, n_u) = self.views, self.views.shape
         rays = views.detector_centers[m] - pinhole + signs @ [views.u_steps[m] * n_u / 2, views.v_steps[m] * n_v / 2]
         hole = d * (1 + near / l) * signs @ frame[:2]
         corners = pinhole + np.concatenate([hole, hole + near * rays / (rays @ frame[2])[:, None]])
@@ -333,10 +330,10 @@ class WholeHoles:
 
     def make(self, m: int, far: float, near: float) -> Zone:
         """View m's response to voxels in a zone from far to near, mm."""
-        views, grid, (pinhole, frame, l, d) = self._views, self.grid, self._module(m)
+        views, grid, (pinhole, frame, l, d) = self.views, self.grid, self._module(m)
         u, v, k = frame
         rays = view_rays(views, m)
-        passage = None if self._passages is None else self._passages[m]
+        passage = None if self.passages is None else self.passages[m]
         front = l if passage is None else l - passage.mean_depth
         scale = front / float((views.detector_centers[m] - pinhole) @ k)
         # The pixels' places on the crystal: those of the first, and from pixel to pixel.
@@ -365,14 +362,13 @@ class WholeHoles:
         cell /= 1 if widths[0] == largest else _LARGE_VOXELS
 
         def weigh(v: Array, u: Array) -> Array:
-            weights: Array = self._weigh(m, v, u) * np.sqrt(1 + (u**2 + v**2) / l**2)
-            return weights
+            return np.asarray(self.weigh(m, v, u) * np.sqrt(1 + (u**2 + v**2) / l**2))
 
         return Zone(
             ViewNumbers(to_camera, l, d, first, pitch),
             views.shape,
             weigh,
-            float(self._sides[m]),
+            float(self.sides[m]),
             grid.voxel_volume,
             np.ceil(grid.spacing / largest_piece).astype(int),
             near,
@@ -389,8 +385,7 @@ class WholeHoles:
 def _by_taps(image: Array, cells: Array, of: DepthResponse, functions: ModuleType) -> Array:
     """Of the sum of `image` times what pixels count of `cells`, the derivatives by `of.kernel`."""
     if of.places is None:
-        alone: Array = functions.differentiate_taps(image, cells, of)
-        return alone
+        return np.asarray(functions.differentiate_taps(image, cells, of))
     by = np.zeros(of.kernel.shape)
     for (a, b), own, pixels, (rows, columns) in of.of_nodes():
         some, part = np.ascontiguousarray(image[pixels]), np.ascontiguousarray(cells[:, rows, columns])

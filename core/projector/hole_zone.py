@@ -130,8 +130,7 @@ class Zone:
         shadow = holes * (1 / l + inverses) ** 2
         made = np.average((1 + shadow) ** (-1.5 * share), 0, 1 + self._bend * shadow)
         of_voxel = -(1 - share) / 8 * blur * inverses**2
-        second: Array = ((1 + holes * inverses**2) ** -1.5).mean(axis=0) / made - 1 + of_voxel
-        return second
+        return np.asarray(((1 + holes * inverses**2) ** -1.5).mean(axis=0) / made - 1 + of_voxel)
 
     def _second_numbers(self) -> Array:
         return np.array([self.numbers.diameter, self.numbers.length, np.square(self._across).sum()])
@@ -330,9 +329,8 @@ class Zone:
             by_own[i] = by_second @ (self._second(*(own + step)) - self._second(*(own - step))) / (2 * step[i])
         diameter = by_own[0] + (by.hole / np.abs(sizes)).sum()
         length = by_own[1] + by.slopes @ self.inverses - 2 / n.length * (by.bend @ numbers.bend)
-        by_sizes = (
-            2 * by.bend * numbers.bend - by.hole * numbers.hole - (by.edges * numbers.edges).sum(axis=1)
-        ) / sizes
+        of_edges = (by.edges * numbers.edges).sum(axis=1)
+        by_sizes = (2 * by.bend * numbers.bend - by.hole * numbers.hole - of_edges) / sizes
         across = by.edges / sizes[:, None] + 2 * by_own[2] * self._across
         edges, result = self._edges, ViewNumbers.zero()
         depth, squared = edges[2], edges[2] @ edges[2]

@@ -10,7 +10,7 @@ import numpy as np
 from ..arrays import ArrayOrTensor, Floats, cropped
 from ..errors import InputError
 from ..geometry.grid import Grid
-from .rays import Attenuation, Ends, IndexFans, IndexRays, Rays, index_fans, index_rays
+from .rays import Attenuation, Rays
 
 Index = tuple[int, int, int]
 
@@ -35,20 +35,11 @@ class Lattices:
     mu_grid: Grid | None = None
     mu_origin: Index = (0, 0, 0)
 
-    def fans(
-        self, vectors: Floats, shape: tuple[int, int], parallel: float = 0.0
-    ) -> tuple[IndexFans, Attenuation | None]:
-        """Fans (F, 4, 3), vectors of `Fan.vectors`, of one shape in index space, and what attenuates them."""
-        return self._mapped(index_fans, vectors, shape, parallel)
-
-    def between(self, rays: Ends) -> tuple[IndexRays, Attenuation | None]:
-        """Rays from point to point in index space, and what attenuates them."""
-        return self._mapped(index_rays, rays.starts, rays.ends)
-
-    def _mapped(self, index: Callable[..., Any], *rays: Any) -> tuple[Any, Attenuation | None]:
+    def mapped(self, index: Callable[..., Rays], *rays: Any) -> tuple[Rays, Attenuation | None]:
+        """Rays in index space, as `index_fans` or `index_rays` makes them of these arguments, and what attenuates them."""
         attenuation = None
         if self.mu is not None:
-            mu_rays: Rays | None = None if self.mu_grid is None else index(self.mu_grid, *rays, self.mu_origin)
+            mu_rays = None if self.mu_grid is None else index(self.mu_grid, *rays, self.mu_origin)
             attenuation = Attenuation(self.mu, mu_rays)
         return index(self.grid, *rays, self.origin), attenuation
 

@@ -47,9 +47,7 @@ class LinearOperator(ABC):
         """
         return self._apply(self._check(x), progress)
 
-    def _apply(
-        self, x: ArrayOrTensor, progress: Progress | None = None, mu: ArrayOrTensor | None = None
-    ) -> ArrayOrTensor:
+    def _apply(self, x: ArrayOrTensor, progress: Progress | None = None, mu: ArrayOrTensor = None) -> ArrayOrTensor:
         """Apply to a checked array or tensor, whose gradient follows; not that of mu."""
         if not is_tensor(x):
             return self._run(x, progress, mu)
@@ -78,32 +76,25 @@ class LinearOperator(ABC):
     def _check(self, x: Any) -> ArrayOrTensor:
         return checked(x, self._names[0], self.shape_in, self._float64, batch=True)
 
-    def _run(
-        self, x: ArrayOrTensor, progress: Progress | None = None, mu: ArrayOrTensor | None = None
-    ) -> ArrayOrTensor:
+    def _run(self, x: ArrayOrTensor, progress: Progress | None = None, mu: ArrayOrTensor = None) -> ArrayOrTensor:
         """Apply to a checked array or tensor, one by one to those of a batch; nothing is recorded in a graph."""
         batch = tuple(x.shape[: x.ndim - len(self.shape_in)])
         if not batch:
             return self._run_one(x, progress, mu)
         n = math.prod(batch)
-        require(
-            x.itemsize * n * math.prod(self.shape_out), f"a batch of {n} times {shape_text(self.shape_out)} numbers"
-        )
+        what = f"a batch of {n} times {shape_text(self.shape_out)} numbers"
+        require(x.itemsize * n * math.prod(self.shape_out), what)
         results = zeros((*batch, *self.shape_out), x)
         for done, index in enumerate(np.ndindex(batch)):
             results[index] = self._run_one(x[index], part_of(progress, done, n), mu)
         return results
 
     @abstractmethod
-    def _run_one(
-        self, x: ArrayOrTensor, progress: Progress | None = None, mu: ArrayOrTensor | None = None
-    ) -> ArrayOrTensor:
+    def _run_one(self, x: ArrayOrTensor, progress: Progress | None = None, mu: ArrayOrTensor = None) -> ArrayOrTensor:
         """Apply to an array or tensor of `shape_in`."""
 
     @abstractmethod
-    def _run_back(
-        self, y: ArrayOrTensor, progress: Progress | None = None, mu: ArrayOrTensor | None = None
-    ) -> ArrayOrTensor:
+    def _run_back(self, y: ArrayOrTensor, progress: Progress | None = None, mu: ArrayOrTensor = None) -> ArrayOrTensor:
         """Apply the adjoint to an array or tensor of `shape_out`."""
 
 
@@ -133,12 +124,8 @@ class Adjoint(LinearOperator):
     def __repr__(self) -> str:
         return f"{self._operator!r}.T"
 
-    def _run_one(
-        self, x: ArrayOrTensor, progress: Progress | None = None, mu: ArrayOrTensor | None = None
-    ) -> ArrayOrTensor:
+    def _run_one(self, x: ArrayOrTensor, progress: Progress | None = None, mu: ArrayOrTensor = None) -> ArrayOrTensor:
         return self._operator._run_back(x, progress, mu)
 
-    def _run_back(
-        self, y: ArrayOrTensor, progress: Progress | None = None, mu: ArrayOrTensor | None = None
-    ) -> ArrayOrTensor:
+    def _run_back(self, y: ArrayOrTensor, progress: Progress | None = None, mu: ArrayOrTensor = None) -> ArrayOrTensor:
         return self._operator._run_one(y, progress, mu)

@@ -14,7 +14,7 @@ from ..arrays import ArrayOrTensor, Floats, is_tensor, namespace
 from ..errors import InputError
 from ..geometry.grid import Grid
 from ..geometry.views import Views
-from ..validation import freeze, positive, real_array, shape_text
+from ..validation import all_above_0, freeze, none_below_0, positive, real_array, shape_text
 from ..volumes.volume import LINE_INTEGRALS, Volume, require_quantity
 from .bundles import Beam
 from .hole_response import WholeHoles
@@ -160,7 +160,7 @@ def checked_background(value: ArrayLike, name: str, n: int, pixels: tuple[int, i
     n, pixels
         Number of views and their shape (n_v, n_u), if that is known.
     """
-    array = real_array(value, name, None)
+    array = none_below_0(value, name)
     real_array(array, name, None, np.float32)  # as which it is added
     if (
         array.ndim not in (0, 1, 3)
@@ -170,20 +170,16 @@ def checked_background(value: ArrayLike, name: str, n: int, pixels: tuple[int, i
         images = "" if pixels is None else f" of {shape_text(pixels)}"
         expected = f"one number, {n} numbers (one for each view), or {n} images{images}"
         raise InputError(f"{name}: expected {expected}, got {shape_text(array.shape)}")
-    if array.min(initial=0.0) < 0:
-        raise InputError(f"{name}: expected 0 or more, got {array.min():g}")
     return freeze(array) if array.ndim else float(array)
 
 
 def checked_times(value: ArrayLike, name: str, n: int, is_positive: bool = True) -> float | Floats:
     """Times, s: a number, or read-only those of `n` views (M,)."""
-    array = real_array(value, name, None)
+    array = all_above_0(value, name, unit="s") if is_positive else real_array(value, name, None)
     if array.shape not in ((), (n,)):
         raise InputError(
             f"{name}: expected one number, or {n} numbers (one for each view), got {shape_text(array.shape)}"
         )
-    if is_positive and array.min(initial=np.inf) <= 0:
-        raise InputError(f"{name}: expected more than 0 s, got {array.min():g}")
     return freeze(array) if array.ndim else float(array)
 
 

@@ -126,7 +126,7 @@ class Projector(LinearOperator):
         self._depths = None if self._parts else model.by_depth(views, grid)
 
     def __call__(
-        self, x: Volume | ArrayOrTensor, progress: Progress | None = None, mu: ArrayOrTensor | None = None
+        self, x: Volume | ArrayOrTensor, progress: Progress | None = None, mu: ArrayOrTensor = None
     ) -> ArrayOrTensor:
         """The images of a volume.
 
@@ -225,17 +225,14 @@ class Projector(LinearOperator):
         return parts
 
     def __repr__(self) -> str:
-        n_v, n_u = self.views.shape
-        return (
-            f"Projector({shape_text(self.grid.shape)} voxels, {len(self.views)} views of {n_v} x {n_u}, {self.backend})"
-        )
+        voxels, pixels = shape_text(self.grid.shape), shape_text(self.views.shape)
+        return f"Projector({voxels} voxels, {len(self.views)} views of {pixels}, {self.backend})"
 
     def _check(self, x: Volume | ArrayOrTensor, batch: bool = True) -> ArrayOrTensor:
         if isinstance(x, Volume):
             if not same_lattice(x.grid, self.grid):
-                raise InputError(
-                    f"volume: its grid ({_describe(x.grid)}) is not the projector's ({_describe(self.grid)})"
-                )
+                its, wanted = map(_describe, (x.grid, self.grid))
+                raise InputError(f"volume: its grid ({its}) is not the projector's ({wanted})")
             self.model.check_volume(x)
         array = x.array if isinstance(x, Volume) else checked(x, "volume", self.shape_in, self._float64, batch)
         # A thousand voxels or so: to look at all would take as long as an image.
@@ -246,9 +243,7 @@ class Projector(LinearOperator):
             warn(f"volume: {np.mean(air):.0%} of its values are those of air in CT numbers{CONVERT}", 4)
         return array
 
-    def _run_one(
-        self, x: ArrayOrTensor, progress: Progress | None = None, mu: ArrayOrTensor | None = None
-    ) -> ArrayOrTensor:
+    def _run_one(self, x: ArrayOrTensor, progress: Progress | None = None, mu: ArrayOrTensor = None) -> ArrayOrTensor:
         n_views, n_v, n_u = self.shape_out
         itemsize = 8 if self._float64 or is_double(x) else 4
         what = f"projecting {shape_text(self.shape_in)} voxels into {n_views} images of {n_v} x {n_u} pixels"
@@ -263,9 +258,7 @@ class Projector(LinearOperator):
             images = np.zeros(self.shape_out, np.float64 if self._float64 else np.float32)
         return to_caller(images, x)
 
-    def _run_back(
-        self, y: ArrayOrTensor, progress: Progress | None = None, mu: ArrayOrTensor | None = None
-    ) -> ArrayOrTensor:
+    def _run_back(self, y: ArrayOrTensor, progress: Progress | None = None, mu: ArrayOrTensor = None) -> ArrayOrTensor:
         if self._parts:
             n = len(self._parts)
             return sum(A._run_back(y, part_of(progress, k, n), mu) for k, A in enumerate(self._parts))
@@ -361,9 +354,8 @@ class Projector(LinearOperator):
         on_gpu = self._auto and is_tensor(x) and x.device.type != "cpu"
         backend = backends.for_tensor(x) if on_gpu else self._backend
         mu_grid = None if self.model.mu is None else self.model.mu.grid
-        return Execution(
-            backend, self.grid, mu_grid, self._float64 or backend.always_float64 or is_double(x), self.threads
-        )
+        float64 = self._float64 or backend.always_float64 or is_double(x)
+        return Execution(backend, self.grid, mu_grid, float64, self.threads)
 
     def _depth_arguments(self, x: ArrayOrTensor) -> tuple[ArrayOrTensor, Any, int]:
         """What `WholeHoles` takes: the array, the functions and the threads."""

@@ -249,13 +249,11 @@ def emission_images(
     n = require_points(pixel_points, "emission images: pixel_points")
     if n is None:
         views = _views(positions, rotations, l, pitch, offset, (n_v, n_u))
-        n = max(
-            points_needed(shadow_edges(views, m, within), positive(tolerance, "tolerance"), aperture_points)
-            for m in range(len(views))
-        )
+        edges, error = [shadow_edges(views, m, within) for m in range(len(views))], positive(tolerance, "tolerance")
+        n = max(points_needed(of_view, error, aperture_points) for of_view in edges)
     # For rays, rows and columns of each camera: (..., 1, 1, 1).
     optics = optics.with_numbers({name: x[..., None, None, None] for name, x in zip(given, own, strict=True)})
-    length, hole, side, thickness, seconds, *pitches = (
+    length, hole, side, thickness, seconds, pitch_u, pitch_v = (
         x[..., None, None, None] for x in (l, diameter, side, thickness, time, *pitch.unbind(dim=-1))
     )
     openings = optics.openings(hole, aperture_points)
@@ -276,11 +274,8 @@ def emission_images(
             v, u = _pixels(pitch[..., None, :], ends, (n_v, n_u))
             along = u[..., None, :], v[..., :, None]
             cells = n * len(openings)
-            weights = (
-                optics.pixel_weights(along, (pitches[0], pitches[1]), length, side, thickness, opening, layer, cells)
-                * seconds
-                / n
-            )
+            counted = optics.pixel_weights(along, (pitch_u, pitch_v), length, side, thickness, opening, layer, cells)
+            weights = counted * seconds / n
             middle = ends + point[..., None, :]
             each = middle.shape[:-1]
             on_plane = (

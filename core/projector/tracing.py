@@ -244,10 +244,8 @@ def _traced(
 
 def _by_geometry(gradient: Floats, parts: list[tuple[Part, Floats]], bundles: Bundles, execution: Execution) -> Floats:
     """The gradient by fans (images, 4, 3), or by starts and ends (2, rays, 3)."""
-    mu_grid = execution.mu_grid or execution.grid
-    results = in_order(
-        lambda of: ray_gradients.by_geometry(of[0], gradient, of[1], execution.grid, mu_grid), parts, execution.workers
-    )
+    grids = execution.grid, execution.mu_grid or execution.grid
+    results = in_order(lambda of: ray_gradients.by_geometry(of[0], gradient, of[1], *grids), parts, execution.workers)
     if len(bundles) and bundles[0].ends is not None:
         return np.concatenate([np.empty((2, 0, 3)), *(own for result in results for _, own in result)], axis=1)
     total = np.zeros((len(bundles), 4, 3))

@@ -92,8 +92,7 @@ class VoxelRays:
 
     @property
     def _mu_array(self) -> Array:
-        array: Array = self.mu.array.astype(self.kind, copy=False)
-        return array
+        return np.asarray(self.mu.array.astype(self.kind, copy=False))
 
     @functools.cached_property
     def _chords(self) -> Array:

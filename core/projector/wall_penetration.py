@@ -74,11 +74,8 @@ class Solids:
     ) -> Floats:
         """Lengths, mm, in square frusta from depth `first` to `last` behind the holes, of half-widths `start` and `end`."""
         first, last, start, end = (x[..., None] for x in (first, last, start, end))
-        frames, centers, slope = (
-            self.frames[which],
-            self.system.centers[which][..., None],
-            (end - start) / (last - first),
-        )
+        frames, centers = self.frames[which], self.system.centers[which][..., None]
+        slope = (end - start) / (last - first)
         (x, y, up), (dx, dy, rise) = (np.moveaxis(frames @ each, -2, 0) for each in (lines[0] - centers, lines[1]))
         half, opens = start - slope * (up + first), -slope * rise
         sides = [(half - sign * p, sign * dp - opens) for p, dp in ((x, dx), (y, dy)) for sign in (1, -1)]
@@ -87,10 +84,8 @@ class Solids:
         enter, leave = np.array(-np.inf), np.array(np.inf)
         for room, rate in [(last + up, -rise), (-up - first, rise), *sides]:
             at, enters = room / np.where(rate == 0, 1e-30, rate), rate < 0
-            enter, leave = (
-                np.where(enters, np.maximum(enter, at), enter),
-                np.where(enters, leave, np.minimum(leave, at)),
-            )
+            enter = np.where(enters, np.maximum(enter, at), enter)
+            leave = np.where(enters, leave, np.minimum(leave, at))
         return np.maximum(leave - enter, 0.0)
 
     def beside(self, m: int, is_open: bool) -> Floats:
@@ -106,9 +101,8 @@ class Solids:
         x, w = np.hstack([(a + size * (x + 1) / 2, size * w / 2) for a, size, x, w in gauss])
         (u, v), (w, h) = np.meshgrid([*-x, *x], [*-x, *x]), np.meshgrid([*w, *w], [*w, *w])
         fine = (np.arange(16) + 0.5) / 16 - 0.5
-        from_middle = np.hypot(
-            u[..., None, None] + w[..., None, None] * fine, (v[..., None] + h[..., None] * fine)[..., None]
-        )
+        along, across = u[..., None, None] + w[..., None, None] * fine, v[..., None] + h[..., None] * fine
+        from_middle = np.hypot(along, across[..., None])
         area = w * h * (from_middle > self.system.pinhole_diameter[m] / 2).mean(axis=(2, 3))
         area[(np.maximum(abs(u), abs(v)) < edge) & (not is_open)] = 0.0
         points = np.stack([u, v, area], axis=-1)
@@ -162,9 +156,8 @@ class ThroughWalls(Model):
         """Rays from points of the hole, or of the plane beside it, through the grid, from the points of the crystal."""
         model, hole, n_hole, n_places = self.model, self.holes[m], 0, _PLACES_BESIDE
         (u, v, _), (*axes, k) = self.whole._frames[hole], model._frames[m]
-        center, l, side = (
-            x[m] for x in (model.system.centers, model.system.collimator_length, model.system.detector_side)
-        )
+        system = model.system
+        center, l, side = system.centers[m], system.collimator_length[m], system.detector_side[m]
         rays, scale, pitch = view_rays(views, m), model._crystal_scale(views, m), model.crystal_pitch(views, m)
         middle = scale * (rays.corner - center) - l * k  # from that of the crystal, point-inverted
         n = model.pixel_points or 1
@@ -177,28 +170,22 @@ class ThroughWalls(Model):
             n = model.pixel_points or points_needed(shadow_edges(views, m, grid), model.tolerance, len(points))
         # Between places on the crystal weights' logarithms are linear; pixels have the shares of them that are on it.
         places, spread = np.linspace(-side / 2, side / 2, n_places), []
-        for axis, size, step, pixels in zip(
-            axes, pitch, (rays.column_step, rays.row_step), views.shape[::-1], strict=True
-        ):
+        of_axes = zip(axes, pitch, (rays.column_step, rays.row_step), views.shape[::-1], strict=True)
+        for axis, size, step, pixels in of_axes:
             at = -(middle @ axis + scale * (step @ axis) * np.arange(pixels))
             linear = np.stack([np.interp(at, places, hat) for hat in np.eye(n_places)], axis=1)
             spread += [linear, share_inside(at, size, side)]
         across = np.stack(np.meshgrid(places, places)).reshape(2, -1)
-        for layer, z in enumerate(model.optics.depths(model.system.detector_thickness[m])):
+        for layer, z in enumerate(model.optics.depths(system.detector_thickness[m])):
             ends = (center - (l + z) * k)[:, None] + np.stack(axes, axis=1) @ across
             starts = self.whole.system.centers[hole] + points[:, :1] * u + points[:, 1:2] * v
             counted = self._counted(m, layer, starts[..., None], ends) * (points[:, 2:] * pitch[0] * pitch[1] / n)
             first = center - (l + z) * k - middle
-            tables = zip(
-                starts,
-                np.log(counted + 1e-30).reshape(-1, n_places, n_places),
-                lattices(n_hole, len(points)),
-                strict=True,
-            )
-            for point, table, start in tables:
+            tables = np.log(counted + 1e-30).reshape(-1, n_places, n_places)
+            for point, table, start in zip(starts, tables, lattices(n_hole, len(points)), strict=True):
                 far = max(float(((grid.corners() - point) @ k).max() / ((point - first) @ k)), 1.0)
                 steps = far * scale * rays.row_step, far * scale * rays.column_step
-                seen = (1 + l / model.system.pinhole_distance[m]) * np.array([point @ axis for axis in axes]) / pitch
+                seen = (1 + l / system.pinhole_distance[m]) * np.array([point @ axis for axis in axes]) / pitch
                 shifts = offsets(n, start / n**0.5 - seen)[:, ::-1]  # from the isocentre all fill the pixel evenly
                 fan = Fan(point, point + far * (point - first), *steps, views.shape, shifts)
                 yield Beam(fan, partial(_weigh, spread, table, n))

@@ -190,13 +190,7 @@ def scatter(points: Array, planes: Floats, array: Array, matrix: Floats, slab: s
 
 
 def _run_places(
-    kernel: Any,
-    points: Array,
-    planes: Floats,
-    arrays: Array,
-    matrices: Floats,
-    written: list[Array],
-    **others: Any,
+    kernel: Any, points: Array, planes: Floats, arrays: Array, matrices: Floats, written: list[Array], **others: Any
 ) -> None:
     kind, shape = points.dtype, arrays.shape[1:]
     if kind not in (np.float32, np.float64) or arrays.dtype != kind or matrices.dtype != np.float64:

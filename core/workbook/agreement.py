@@ -6,11 +6,8 @@ from ..geometry.columns import AGREEING, LENGTH_UNITS
 
 EXACT = 1e-6
 """Two numbers of one column agree if they differ less: relative, and absolute in mm or rad."""
-_COARSEST_ROUNDING = {unit: 0.005 / factor for unit, factor in LENGTH_UNITS.items()} | {
-    "rad": 5e-4,
-    "deg": 5e-3,
-    "": 5e-3,
-}
+_COARSEST_ROUNDING = {"rad": 5e-4, "deg": 5e-3, "": 5e-3}
+_COARSEST_ROUNDING |= {unit: 0.005 / factor for unit, factor in LENGTH_UNITS.items()}
 """Unit -> the largest rounding error that a typed number is granted."""
 
 

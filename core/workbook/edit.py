@@ -151,9 +151,8 @@ class Edit:
         self.columns, self.modules = self.layout.columns, self.layout.modules
         self.workbook, declared = workbook, system.columns
         self.is_default = {name: declared[name].is_default(system) for name in declared.optional}
-        self.added = {
-            name: None for name in declared.optional if name not in self.columns and not self.is_default[name].all()
-        }
+        missing = [name for name in declared.optional if name not in self.columns]
+        self.added = [name for name in missing if not self.is_default[name].all()]
         self.numbered = self.modules.number_column is not None  # whether the workbook has the modules' numbers
         self.old_of = matched(system, self.old, self.numbered)
         self.required: dict[Place, float | str] = {}
@@ -223,9 +222,8 @@ class Edit:
                 f"{self.workbook.name}: sheet {title} has no column headed {name} for the {declared.title} of module "
                 f"{numbers[i]}, {declared.text_of(declared.of(self.system)[i])}, which is not {declared.blank_is}"
             )
-        unit = (
-            self.columns[self.system.columns.leading].unit if declared.kind == "length" else next(iter(declared.units))
-        )
+        of_coordinates, usual = self.columns[self.system.columns.leading].unit, next(iter(declared.units))
+        unit = of_coordinates if declared.kind == "length" else usual
         table.columns[name] = right, unit
         self.layout.add(table, name, table.rows)
         self.given[name] = np.array(["" if declared.is_text else math.nan] * len(self.old))

@@ -80,9 +80,8 @@ def _places(system: Scanner) -> dict[str, tuple[str, int]]:
     from openpyxl.utils import column_index_from_string as index
 
     columns = [*system.columns.values(), *system.columns.unread]
-    placed = {
-        c.name: (title, index(letters)) for c in columns for title, _, letters in [c.place.partition("!")] if title
-    }
+    named = [(column.name, *column.place.partition("!")) for column in columns]
+    placed = {name: (title, index(letters)) for name, title, _, letters in named if title}
     main = placed[system.columns.leading][0] if system.columns.leading in placed else system.sheet or "Coordinates"
     last = max((at for title, at in placed.values() if title == main), default=1)
     free = (column.name for column in columns if column.name not in placed)
@@ -102,12 +101,8 @@ def _content(column: Column, system: Scanner, places: dict[str, tuple[str, int]]
     content = []
     for row, (value, own, bad) in enumerate(zip(values, by_formula, undefined, strict=True), start=_FIRST_ROW):
         cells = {name: before[name] + cell_name((row, at)) for name, (_, at) in places.items()}
-        content.append(
-            (
-                CellError("#DIV/0!") if bad or value in _INFINITE else value,
-                column.formula.format_map(cells) if own else "",
-            )
-        )
+        shown = CellError("#DIV/0!") if bad or value in _INFINITE else value
+        content.append((shown, column.formula.format_map(cells) if own else ""))
     return content
 
 
@@ -151,6 +146,5 @@ def _cell(place: str, value: Any, style: int, formula: str = "") -> str:
 def _rows(columns: dict[int, list[str]]) -> dict[int, str]:
     """Row -> its XML, of a sheet's columns of cells."""
     in_order = [columns[at] for at in sorted(columns)]
-    return {
-        row: f'<row r="{row}">{"".join(cells)}</row>' for row, cells in enumerate(zip(*in_order, strict=True), start=1)
-    }
+    numbered = enumerate(zip(*in_order, strict=True), start=1)
+    return {row: f'<row r="{row}">{"".join(cells)}</row>' for row, cells in numbered}

@@ -8,7 +8,7 @@ import posixpath
 import re
 import warnings
 import zipfile
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
 from xml.parsers import expat
@@ -99,13 +99,13 @@ class Package:
         new_data = {part.casefold(): data for part, data in parts.items()}
         gone = {part.casefold() for part in removed}
         if gone:
-            relations = relations_part(owner)
-            new_data[relations.casefold()] = self._without(
-                relations, "Relationship", lambda attributes: _target(owner, attributes).casefold() in gone
-            )
-            new_data[CONTENT_TYPES.casefold()] = self._without(
-                CONTENT_TYPES, "Override", lambda a: a.get("PartName", "").lstrip("/").casefold() in gone
-            )
+            for name, element, target in (
+                (relations_part(owner), "Relationship", lambda attributes: _target(owner, attributes)),
+                (CONTENT_TYPES, "Override", lambda attributes: attributes.get("PartName", "").lstrip("/")),
+            ):
+                named = [e for e in self.elements(name) if e.name == element]
+                changes = [(e.start, e.end, b"") for e in named if target(e.attributes).casefold() in gone]
+                new_data[name.casefold()] = spliced(self.read(name), changes)
         out = io.BytesIO()
         with zipfile.ZipFile(out, "w") as new, warnings.catch_warnings():
             warnings.simplefilter("ignore")  # zipfile's, about names that occur twice
@@ -129,12 +129,6 @@ class Package:
         given = {"xmlns": found.namespace, **{key.replace("_", ":"): value for key, value in attributes.items()}}
         text = b"".join(b' %b="%b"' % (key.encode(), escaped(value)) for key, value in given.items())
         return spliced(data, [(found.close, found.close, b"<%b%b/>" % (element.encode(), text))])
-
-    def _without(self, name: str, element: str, is_meant: Callable[[dict[str, str]], bool]) -> bytes:
-        found = self.elements(name)
-        return spliced(
-            self.read(name), [(e.start, e.end, b"") for e in found if e.name == element and is_meant(e.attributes)]
-        )
 
 
 def relations_part(part: str) -> str:

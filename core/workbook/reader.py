@@ -201,11 +201,8 @@ def _differences(
     if column.declared.kind == "angle":
         turn = 2 * math.pi / column.factor
         difference = np.abs((given - expected + turn / 2) % turn - turn / 2)
-    differing = [
-        int(i)
-        for i in np.flatnonzero(np.isfinite(given))
-        if difference[i] > tolerance(given[i], expected[i], unit) + slack[i]
-    ]
+    filled = np.flatnonzero(np.isfinite(given)).tolist()
+    differing = [i for i in filled if difference[i] > tolerance(given[i], expected[i], unit) + slack[i]]
     for n, i in enumerate(differing[:_SHOWN], start=1):
         more = f"; so do {len(differing) - _SHOWN} more cells of this column" if n == _SHOWN < len(differing) else ""
         yield (

@@ -54,10 +54,8 @@ def recognize(book: Book, scanner: type[Scanner]) -> Recognized:
         tables.update({name: modules for name in declared.derived if name in modules.columns})
         for name in declared.position:
             if name in tables and tables[name] is not modules:
-                doubts.append(
-                    f"{declared.leading} is in sheet {modules.sheet.name} but {name} in sheet "
-                    f"{tables[name].sheet.name}, expected one table"
-                )
+                here, there = modules.sheet.name, tables[name].sheet.name
+                doubts.append(f"{declared.leading} is in sheet {here} but {name} in sheet {there}, expected one table")
         doubts += _shown_twins(book, scanner, modules)
     for table in dict.fromkeys(tables.values()):
         own = {*declared.typed, *(name for name, its in tables.items() if its is table)}
@@ -67,14 +65,10 @@ def recognize(book: Book, scanner: type[Scanner]) -> Recognized:
 
 def _shown_twins(book: Book, scanner: type[Scanner], modules: HeadedTable) -> Iterator[str]:
     """Sheets that are shown and have what that of the `modules`, which is hidden, has."""
-    hidden = book.workbook.hidden
+    hidden, needed = book.workbook.hidden, {scanner.columns.leading, *scanner.columns.position}
     for other in sheets_of(book, scanner).values() if modules.sheet.name in hidden else ():
         table = None if other.name in hidden else headed_table(other, modules.words)
-        if (
-            table is not None
-            and table.rows
-            and table.columns.keys() >= {scanner.columns.leading, *scanner.columns.position}
-        ):
+        if table is not None and table.rows and table.columns.keys() >= needed:
             yield f"sheet {modules.sheet.name} is hidden, but {other.name} is shown, expected one of them"
 
 
@@ -200,16 +194,11 @@ def _headings(table: HeadedTable) -> Iterator[str]:
         for at, text in table.head.items():
             if at[1] != column:
                 continue
-            heading = heads.get(at[0])
+            heading, cell = heads.get(at[0]), table.sheet.place(*at)
             if heading is None and unit_of(text) not in table.declared[name].units:
-                yield (
-                    f"{table.sheet.place(*at)} holds {quoted(text)} in the heading of {name}, expected its name and a "
-                    "unit alone"
-                )
+                yield f"{cell} holds {quoted(text)} in the heading of {name}, expected its name and a unit alone"
             if heading is not None and heading.name != name:
-                yield (
-                    f"{table.sheet.place(*at)} is headed as {heading.name} but {place} as {name}, expected one of them"
-                )
+                yield f"{cell} is headed as {heading.name} but {place} as {name}, expected one of them"
         units = [(unit, table.sheet.place(*at)) for unit, at in table.units(column).items()]
         if len(units) > 1:
             (unit, cell), (other, its) = units[:2]
@@ -233,10 +222,8 @@ def _other_tables(table: HeadedTable) -> Iterator[str]:
         over_numbers = any(is_number(table.sheet, row + 1, column) for column in found.values())
         if row < table.first_heading or len(found) > 1 or over_numbers:
             name, column = next(iter(found.items()))
-            yield (
-                f"{table.sheet.place(row, column)} is headed as {name}, apart from the headings in row "
-                f"{table.first_heading}, expected one table"
-            )
+            apart_from = f"apart from the headings in row {table.first_heading}"
+            yield f"{table.sheet.place(row, column)} is headed as {name}, {apart_from}, expected one table"
             return
 
 

@@ -41,9 +41,8 @@ def cores() -> int:
     """Processor cores that this job may use: its affinity, or a control group's share of time, rounded up."""
     most = [len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1]
     for group in _groups("cpu"):
-        limit = _text(group / "cpu.max") or " ".join(
-            _text(group / f"cpu.cfs_{name}_us") for name in ("quota", "period")
-        )
+        in_version_1 = (_text(group / f"cpu.cfs_{name}_us") for name in ("quota", "period"))
+        limit = _text(group / "cpu.max") or " ".join(in_version_1)
         quota, _, period = limit.partition(" ")
         if quota.isdigit():  # not "max", nor version 1's -1
             most.append(ceil(int(quota) / int(period)))

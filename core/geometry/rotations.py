@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from ..errors import InputError, needing
-from ..validation import one_of, radians
+from ..validation import one_of, radians, shape_text
 
 with needing(of="rotations"):
     import roma
@@ -158,7 +158,5 @@ def _require(rotation: Tensor | None, parameterization: str, convention: str | N
         return
     expected = (3, 3) if parameterization == "matrix" else (SIZES[parameterization],)
     if tuple(rotation.shape[-len(expected) :]) != expected:
-        found = " x ".join(map(str, rotation.shape)) or "one number"
-        raise InputError(
-            f"rotation: expected ... x {' x '.join(map(str, expected))} for {parameterization}, got {found}"
-        )
+        wanted, found = shape_text(expected), shape_text(tuple(rotation.shape))
+        raise InputError(f"rotation: expected ... x {wanted} for {parameterization}, got {found}")

@@ -133,9 +133,8 @@ class Scanner(ABC):
 
     def filled(self) -> dict[str, Array]:
         """The attributes that columns hold, without those in which all cells of a workbook could be blank."""
-        used = {
-            column.field for columns in self.columns.fields.values() for column in columns if not column.is_unused(self)
-        }
+        typed = [self.columns[name] for name in self.columns.typed]
+        used = {column.field for column in typed if not column.is_unused(self)}
         return {name: getattr(self, name) for name in self.columns.fields if name in used}
 
     @classmethod

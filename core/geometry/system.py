@@ -162,9 +162,8 @@ class PinholeSystem(Scanner):
         poses[:, :3, [0, 2]] *= -1  # camera space is X = -u, Y = v, Z = -k
         width = max(2, len(str(self.numbers.max())))
         parts = []
-        for number, pose, built, thickness in zip(
-            self.numbers.tolist(), poses, collimators, self.detector_thickness.tolist(), strict=True
-        ):
+        modules = zip(self.numbers.tolist(), poses, collimators, self.detector_thickness.tolist(), strict=True)
+        for number, pose, built, thickness in modules:
             name = f"Module {number:0{width}d}"
             crystal = crystal_solid(built.length, built.detector_side, thickness)
             parts.append(ModulePart(number, "collimator", f"{name} collimator", collimator_solid(built), pose))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +10,9 @@ from numpy.typing import NDArray
 from ..arrays import Floats
 from ..errors import InputError
 from ..validation import freeze, real_array, whole_shape
+
+VECTORS = ("sources", "detector_centers", "u_steps", "v_steps")
+"""The arrays of `Views`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +42,7 @@ class Views:
         object.__setattr__(self, "parallel", bool(self.parallel))
         sources = real_array(self.sources, "sources", (None, 3))
         object.__setattr__(self, "sources", freeze(sources))
-        for name in ("detector_centers", "u_steps", "v_steps"):
+        for name in VECTORS[1:]:
             value = real_array(getattr(self, name), name, (len(sources), 3))
             object.__setattr__(self, name, freeze(value))
         axes = self._axes()
@@ -57,10 +60,7 @@ class Views:
     def __getitem__(self, which: int | slice | NDArray[np.integer]) -> Views:
         """The views `which` (an index, a slice or an array of indices) as Views."""
         index = np.atleast_1d(np.arange(len(self))[which])
-        sources, centers, u_steps, v_steps = (
-            array[index] for array in (self.sources, self.detector_centers, self.u_steps, self.v_steps)
-        )
-        return Views(sources, centers, u_steps, v_steps, self.shape, self.parallel)
+        return replace(self, **{name: getattr(self, name)[index] for name in VECTORS})
 
     def rays(self, m: int) -> tuple[Floats, Floats]:
         """Ends of view m's rays: sources and targets, each (n_v * n_u, 3) in mm, row by row.

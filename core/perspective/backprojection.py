@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from ..arrays import ArrayLike, ArrayOrTensor, Floats, Floats32, checked, is_tensor, to_numpy
 from ..errors import InputError
 from ..geometry.grid import Grid
-from ..geometry.views import Views
+from ..geometry.views import VECTORS, Views
 from ..memory import require
 from ..progress import Progress, part_of
 from ..validation import freeze, instance, one_of
@@ -25,6 +25,8 @@ _PARTS = 8  # of a volume, one after the other
 _SAME = 1e-6  # mm: between places of the same view
 
 Counts = NDArray[np.int32]
+Taken = Iterable[tuple[Floats32, Floats]]
+"""Arrays, with the matrices that `gather` takes for them."""
 Depth = Callable[[int], tuple[PerspectiveGrid, ArrayOrTensor]] | Sequence[tuple[PerspectiveGrid, ArrayOrTensor]]
 """A depth distribution for each view: its perspective grid and an array (n_u, n_v, n_k) on it, or what gives them."""
 
@@ -94,7 +96,7 @@ def backproject(
     besides = 2 if kind == PRODUCT and depth is not None else 0
     require(4.0 * (1 + besides) * float(np.prod(grid.shape)), "a back-projection to {} x {} x {}".format(*grid.shape))
     points = np.empty(grid.shape, np.float32)
-    taken: Iterable[tuple[Floats32, Floats]]
+    taken: Taken
     if depth is None:
         matrices = _pixel_rows(views) @ to_world
         size = -(-len(points) // _PARTS)
@@ -204,18 +206,11 @@ def _is_view(g: PerspectiveGrid, views: Views, m: int) -> bool:
         return g.m == m
     if (g.views.shape, g.views.parallel) != (views.shape, views.parallel):
         return False
-    names = ("sources", "detector_centers", "u_steps", "v_steps")
-    return all(np.allclose(getattr(g.views, n)[g.m], getattr(views, n)[m], rtol=0, atol=_SAME) for n in names)
+    return all(np.allclose(getattr(g.views, n)[g.m], getattr(views, n)[m], rtol=0, atol=_SAME) for n in VECTORS)
 
 
 def _fill(
-    points: Floats32,
-    kind: int,
-    planes: Floats,
-    taken: Iterable[tuple[Floats32, Floats]],
-    n: int,
-    progress: Progress | None,
-    flat: bool = False,
+    points: Floats32, kind: int, planes: Floats, taken: Taken, n: int, progress: Progress | None, flat: bool = False
 ) -> None:
     """Combine what is taken, `n` times arrays with their matrices, into `points`."""
     points[...] = _NEUTRAL[kind]

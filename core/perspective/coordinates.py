@@ -28,7 +28,8 @@ def transform_points(matrix: ArrayLike, points: ArrayLike) -> Floats:
 
 def line_through(first: ArrayLike, second: ArrayLike) -> Floats:
     """The lines through two points each, (…, 3), as Plücker matrices (…, 4, 4): ``a b^T - b a^T`` of homogeneous points."""
-    a, b = (_homogeneous(real_array(each, "points of a line", (3,), batch=True)) for each in (first, second))
+    points = (real_array(each, "points of a line", (3,), batch=True) for each in (first, second))
+    a, b = (np.insert(each, 3, 1.0, axis=-1) for each in points)
     outer = a[..., :, None] * b[..., None, :]
     return outer - outer.swapaxes(-1, -2)
 
@@ -40,7 +41,3 @@ def transform_lines(matrix: ArrayLike, lines: ArrayLike) -> Floats:
     """
     matrix = real_array(matrix, "transform", (4, 4))
     return np.asarray(matrix @ real_array(lines, "lines", (4, 4), batch=True) @ matrix.T)
-
-
-def _homogeneous(points: Floats) -> Floats:
-    return np.concatenate([points, np.ones((*points.shape[:-1], 1))], axis=-1)

@@ -172,7 +172,8 @@ def epipolar_segments(views: Views, m: int, pixel: ArrayLike, near: float, far: 
     # What the last number was summed of: against it, that of a source is rounding.
     scale = np.einsum("mj,ej->me", np.abs(matrices[:, 2]), np.abs(both))
     ends = _within_image(np.einsum("mij,ej->mei", matrices, both), scale, views.shape)
-    ends[index] = pixel if _in_image(pixel, views.shape) else np.nan
+    in_image = (pixel >= -0.5).all() and (pixel <= np.array(views.shape[::-1]) - 0.5).all()
+    ends[index] = pixel if in_image else np.nan
     return ends
 
 
@@ -202,11 +203,6 @@ def _within_image(ends: Floats, scale: Floats, shape: tuple[int, int]) -> Floats
     pixels = np.where(at_source[..., None], pixels[:, ::-1], pixels)
     empty |= at_source.all(axis=1)
     return np.where(empty[:, None, None], np.nan, np.clip(pixels, -0.5, [n_u - 0.5, n_v - 0.5]))
-
-
-def _in_image(pixel: Floats, shape: tuple[int, int]) -> bool:
-    n_v, n_u = shape
-    return bool((pixel >= -0.5).all() and (pixel <= [n_u - 0.5, n_v - 0.5]).all())
 
 
 def _pair(views: Views, m: Indices, n: Indices, name: str) -> tuple[np.ndarray, np.ndarray]:

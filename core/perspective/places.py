@@ -82,13 +82,7 @@ def gather(
     see_through(in_order(work, range(0, n, size), workers), size, n, progress)
 
 
-def scatter(
-    points: Array,
-    planes: Floats,
-    array: Array,
-    matrix: Floats,
-    progress: Progress | None = None,
-) -> None:
+def scatter(points: Array, planes: Floats, array: Array, matrix: Floats, progress: Progress | None = None) -> None:
     """Add to `array` (m_x, m_y, m_z) the points' numbers, shared out at their places: the adjoint of `gather`'s sum.
 
     Each thread has planes of the array of its own, so the result does not depend on their number.

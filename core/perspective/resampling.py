@@ -33,6 +33,7 @@ _LOOKED_AT = 9  # cells along each axis, to find how many points one needs
 _GAP = 1.5  # voxels from ray to ray
 
 Lattice = Grid | PerspectiveGrid
+_Map = Callable[[Array, Progress | None], Array]
 
 
 def to_perspective(
@@ -211,12 +212,7 @@ class _Pair(LinearOperator):
         """The adjoint of an array of float32 or float64."""
 
 
-def _run(
-    function: Callable[[Array, Progress | None], Array],
-    x: ArrayOrTensor,
-    shape: tuple[int, int, int],
-    progress: Progress | None,
-) -> ArrayOrTensor:
+def _run(function: _Map, x: ArrayOrTensor, shape: tuple[int, int, int], progress: Progress | None) -> ArrayOrTensor:
     """What a function makes of an array, of this shape, as the caller's kind; there must be memory for it."""
     array = to_numpy(x, np.float64 if is_double(x) or x.dtype == np.float64 else np.float32)
     require(2 * array.itemsize * float(np.prod(shape)), "resampling to {} x {} x {} numbers".format(*shape))
@@ -351,7 +347,6 @@ def _places(matrix: Floats, target: Lattice, index: Floats) -> Floats:
 def _longest_step(matrix: Floats, target: Lattice, index: Floats, axis: int) -> float:
     """How far apart neighbours along an axis are in the other lattice, in its cells, at most; 0 where nothing is known."""
     half = 0.5 * np.eye(3)[axis]
-    steps = np.abs(_places(matrix, target, index + half) - _places(matrix, target, index - half)).max(
-        axis=1, initial=0.0
-    )
+    before, after = (_places(matrix, target, index + step) for step in (-half, half))
+    steps = np.abs(after - before).max(axis=1, initial=0.0)
     return float(steps[np.isfinite(steps)].max(initial=0.0))

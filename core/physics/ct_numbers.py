@@ -53,10 +53,8 @@ def hu_to_mu(volume: Volume, energy: float = 140.5, ct_energy: float = CT_ENERGY
         slab[:] = mu_of_hu(hu, energy, ct_energy)
     lowest, highest = float(volume.array.min()), float(volume.array.max())
     if 0 < max(-lowest, highest) < _WATER_HU:
-        warn(
-            f"values of {lowest:.4g} to {highest:.4g} HU are those of water alone: are they CT numbers, or mu already?",
-            2,
-        )
+        found = f"values of {lowest:.4g} to {highest:.4g} HU"
+        warn(f"{found} are those of water alone: are they CT numbers, or mu already?", 2)
     for count, what in (
         (outside, f"below {_PADDING_HU:g} HU: taken as air, outside the scanned region"),
         (metal, f"above {_METAL_HU:g} HU, as of metal: converted as bone, which is only approximate"),
@@ -109,9 +107,8 @@ def diffdrr_density(hu: Volume | ArrayOrTensor, bone_attenuation_multiplier: flo
         raise InputError("CT numbers: expected at least one")
     library = namespace(hu)
     thinnest = library.where(hu > DIFFDRR_AIR, hu, np.inf).min()
-    density = library.maximum(
-        hu, thinnest if thinnest <= DIFFDRR_BONE else hu.min()
-    )  # without tissue, air stays as it is
+    least = thinnest if thinnest <= DIFFDRR_BONE else hu.min()  # without tissue, air stays as it is
+    density = library.maximum(hu, least)
     density = library.where(hu > DIFFDRR_BONE, hu * factor, density)
     density = density - density.min()
     return density / max(density.max(), np.finfo(np.float32).tiny)

@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 
 from ..arrays import ArrayLike, Floats
-from ..errors import InputError
+from ..errors import InputError, expecting
 from ..validation import one_of, real_array
 
 DeadTimeKind = Literal["non-paralysable", "paralysable"]
@@ -88,9 +88,7 @@ def _checked(counts: ArrayLike, time: ArrayLike, dead_time: ArrayLike, kind: str
     if numbers.ndim == 3:
         totals = numbers.sum(axis=(1, 2), keepdims=True)
         seconds, busy = (x[:, None, None] if x.ndim == 1 else x for x in (seconds, busy))
-    try:
+    got = f"counts of shape {numbers.shape}, time {np.shape(time)}, dead_time {np.shape(dead_time)}"
+    with expecting(f"dead time: expected a number, or one of each module or counter, got {got}"):
         np.broadcast_shapes(totals.shape, np.broadcast_shapes(seconds.shape, busy.shape))
-    except ValueError:
-        got = f"counts of shape {numbers.shape}, time {np.shape(time)}, dead_time {np.shape(dead_time)}"
-        raise InputError(f"dead time: expected a number, or one of each module or counter, got {got}") from None
     return numbers, totals / seconds, busy

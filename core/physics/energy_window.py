@@ -139,9 +139,8 @@ def energy_window_scatter(
         raise InputError(f"{name}: expected counts of the lower or the upper window, or both")
     w_peak = positive(widths[1], f"{name}: width of the peak window", "keV")
     scatter, variance, tails = np.zeros(shape), np.zeros(shape), 0.0
-    a_lower, a_peak, a_upper = (
-        (0.0, 1.0, 0.0) if shares is None else real_array(shares, f"{name}: shares", (3,)).tolist()
-    )
+    no_tails = (0.0, 1.0, 0.0)
+    a_lower, a_peak, a_upper = real_array(no_tails if shares is None else shares, f"{name}: shares", (3,)).tolist()
     for word, counts, width, share in (("lower", lower, widths[0], a_lower), ("upper", upper, widths[2], a_upper)):
         if counts is None:
             continue
@@ -156,10 +155,8 @@ def energy_window_scatter(
         if not 0 < tails < 1:
             raise InputError(f"{name}: shares: expected less of the photons per keV beside the peak than in it")
         of_peak = real_array(peak, f"{name}: peak", shape)
-        scatter, variance = (
-            (scatter - tails * of_peak) / (1 - tails),
-            (variance + tails**2 * of_peak) / (1 - tails) ** 2,
-        )
+        scatter = (scatter - tails * of_peak) / (1 - tails)
+        variance = (variance + tails**2 * of_peak) / (1 - tails) ** 2
     if fwhm is None:
         return scatter, variance
     sigma = positive(fwhm, f"{name}: fwhm", "pixels") / FWHM_PER_SIGMA

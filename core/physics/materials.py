@@ -55,9 +55,8 @@ def attenuation(material: str, energy: float) -> float:
     energy = positive(energy, "energy", "keV")
     if not LOWEST_ENERGY <= energy <= HIGHEST_ENERGY:
         raise InputError(f"energy {energy:g} keV: expected {LOWEST_ENERGY:g} to {HIGHEST_ENERGY:g} keV")
-    return (
-        made.density / 10 * sum(share * mass_attenuation(symbol, energy) for symbol, share in made.composition.items())
-    )
+    shares = made.composition.items()
+    return made.density / 10 * sum(share * mass_attenuation(symbol, energy) for symbol, share in shares)
 
 
 def module_coefficients(

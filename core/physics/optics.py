@@ -225,13 +225,10 @@ class Optics:
         squared_secant = 1 + slope_u**2 + slope_v**2
         cosine = 1 / squared_secant**0.5
         squared = cosine * cosine  # many times faster than a power
-        counted = (
-            self.photons_per_decay / (4 * math.pi) * (squared * squared) * opening.area(slope_u, slope_v, self.library)
-        )
+        area, depths = opening.area(slope_u, slope_v, self.library), self.depths(thickness)
+        counted = self.photons_per_decay / (4 * math.pi) * (squared * squared) * area
         if self.crystal_mu is not None:
-            counted = counted * absorbed_share(
-                cosine, self.crystal_mu, thickness, self.depths(thickness), layer, self.library
-            )
+            counted = counted * absorbed_share(cosine, self.crystal_mu, thickness, depths, layer, self.library)
         if self.within_cone:
             counted = counted * within_cone(slope_u, slope_v, self.tangent, self.library)
         return counted, cosine

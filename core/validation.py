@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .errors import InputError, warn
+from .errors import InputError, expecting, warn
 from .memory import require
 
 # Copies of fewer numbers always fit into memory.
@@ -32,13 +32,11 @@ def real_array(
     else:
         with np.errstate(over="ignore"):  # what overflows is refused below
             array = np.array(raw, dtype=dtype, order="C")
-    if shape is not None and batch:
-        shape = batch_shape(shape, array.shape)
-    if shape is not None and (
-        array.ndim != len(shape) or any(n is not None and n != m for n, m in zip(shape, array.shape, strict=True))
-    ):
-        expected = " x ".join("any" if n is None else str(n) for n in shape) or "one number"
-        raise InputError(f"{name}: expected shape {expected}, got {shape_text(array.shape)}")
+    if shape is not None:
+        shape = batch_shape(shape, array.shape) if batch else shape
+        if array.ndim != len(shape) or any(n not in (None, m) for n, m in zip(shape, array.shape, strict=True)):
+            expected = " x ".join("any" if n is None else str(n) for n in shape) or "one number"
+            raise InputError(f"{name}: expected shape {expected}, got {shape_text(array.shape)}")
     require_finite(array, name, raw)
     return array
 
@@ -128,10 +126,8 @@ def whole_shape(value: Any, name: str, length: int) -> Any:
 
 def whole_number(value: Any, name: str) -> int:
     """`value` as a whole number of at least 1, or `InputError`."""
-    try:
+    with expecting(f"{name}: expected a whole number of at least 1, got {_short(value)}", InputError):
         return int(whole_shape([value], name, 1)[0])
-    except InputError:
-        raise InputError(f"{name}: expected a whole number of at least 1, got {_short(value)}") from None
 
 
 def strict_whole(value: Any, name: str, expected: str) -> int:

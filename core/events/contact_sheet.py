@@ -117,12 +117,12 @@ class _Panel:
     pixels_per_mm: float = 0.0  # where it has a scale bar
     cross: tuple[float, float] | None = None  # pixels from the upper left corner: where the other slices cut it
     gap: int = _GROUP
-    frame: tuple[int, int] = (_SIDE, _SIDE)  # columns and rows in whose middle it stands
+    frame: int = _SIDE  # columns in whose middle it stands, between `_SIDE` rows
 
     @property
     def room(self) -> int:
         """Columns that it takes, with the gap that follows."""
-        return self.frame[0] + self.gap
+        return self.frame + self.gap
 
 
 def _panels(event: ShownEvent, share: float) -> list[_Panel]:
@@ -158,7 +158,7 @@ def _slices(event: ShownEvent) -> list[_Panel]:
                 pixels_per_mm=scale if first else 0.0,
                 cross=(across, size[1] - upward),
                 gap=_GROUP if axis == 0 else _GAP,
-                frame=(max(size[0], _SIDE // 2), _SIDE),
+                frame=max(size[0], _SIDE // 2),
             )
         )
     return panels
@@ -223,7 +223,7 @@ def _mosaic(event: ShownEvent, images: Floats32, rings: Integers, share: float) 
     above = f"{event.model}: {len(images)} views, {_range(window, event.unit)}"
     part = "" if share == 1.0 else f"middle {n_v} × {n_u} of "
     below = f"{part}{whole[0]} × {whole[1]} pixels, ring by ring"
-    return _Panel(sheet, *size, above, below, frame=(size[0], _SIDE))
+    return _Panel(sheet, *size, above, below, frame=size[0])
 
 
 def _radon(event: ShownEvent, radon: Floats32) -> list[_Panel]:
@@ -239,15 +239,13 @@ def _radon(event: ShownEvent, radon: Floats32) -> list[_Panel]:
     view = display.colored(as_seen(radon[0]), window)
     sinogram = display.colored(radon[:, row, ::-1], window)
     return [
-        _Panel(
-            view, *size, above, f"at 0°, {n_v} × {n_u} pixels", cross=(-1.0, upper), gap=_GAP, frame=(size[0], _SIDE)
-        ),
-        _Panel(sinogram, size[0], _SIDE, "", f"sinogram, 0 to {event.radon_degrees:g}°", frame=(size[0], _SIDE)),
+        _Panel(view, *size, above, f"at 0°, {n_v} × {n_u} pixels", cross=(-1.0, upper), gap=_GAP, frame=size[0]),
+        _Panel(sinogram, size[0], _SIDE, "", f"sinogram, 0 to {event.radon_degrees:g}°", frame=size[0]),
     ]
 
 
 def _draw(page: Page, panel: _Panel, left: int, top: int) -> None:
-    x, y = left + (panel.frame[0] - panel.width) // 2, top + (panel.frame[1] - panel.height) // 2
+    x, y = left + (panel.frame - panel.width) // 2, top + (_SIDE - panel.height) // 2
     page.image(panel.picture, x, y, panel.width, panel.height)
     if panel.cross is not None:
         across, down = panel.cross
@@ -265,7 +263,7 @@ def _draw(page: Page, panel: _Panel, left: int, top: int) -> None:
         page.area(box(x + 10, y + panel.height - 14, wide, 4), _CROSS)
         page.text(f"{length} mm", x + 10, y + panel.height - 20, _TEXT, _CROSS)
     page.text(panel.above, left, top - 10, _TEXT, _INK)
-    page.text(panel.below, left, top + panel.frame[1] + 20, _TEXT, _FAINT)
+    page.text(panel.below, left, top + _SIDE + 20, _TEXT, _FAINT)
 
 
 def _bright(values: Floats32) -> float:

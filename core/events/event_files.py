@@ -27,6 +27,7 @@ _KIND = "mphDRR event"
 _COMPRESS_FROM = 1 << 13  # bytes: below, compressing costs more than it saves
 _BRICK = 32  # voxels along each axis of the truth's chunks, which are left out where they are empty
 _PIECE = 1 << 18  # numbers in a chunk of a list
+_PACKED: dict[str, Any] = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
 
 
 try:
@@ -115,10 +116,10 @@ def packed(event: EventArrays, recipe: EventRecipe, geometry: dict[str, Any], th
         for name, (array, unit) in small.items():
             file.create_dataset(name, data=array).attrs["unit"] = unit
         _write_truth(file, event.truth, recipe, pool)
-        for name, images in event.images.items():
-            _write_images(file, f"images/{name}", images, event.units[name], recipe, pool)
-        for count, images in event.radon.items():
-            _write_images(file, f"radon/{count}", images, f"{event.truth.unit} mm", recipe, pool)
+        named = [(f"images/{name}", images, event.units[name]) for name, images in event.images.items()]
+        named += [(f"radon/{count}", images, f"{event.truth.unit} mm") for count, images in event.radon.items()]
+        for name, images, unit in named:  # each image a chunk of its own, so that one reads alone
+            _write(file, name, images, recipe["storage.images"], (1, *images.shape[1:]), pool, {"unit": unit})
 
     with ThreadPoolExecutor(threads or cores()) as pool:
         return hdf5.pack(_KIND, {"event": str(planned.number), "recipe": recipe.fingerprint, "build": build()}, fill)
@@ -142,13 +143,6 @@ def _write_truth(file: Any, truth: Volume, recipe: EventRecipe, pool: ThreadPool
     _write(file, "truth_index", index, str(index.dtype), chunk, pool, {"unit": "1"})
 
 
-def _write_images(
-    file: Any, name: str, images: Floats32, unit: str, recipe: EventRecipe, pool: ThreadPoolExecutor
-) -> None:
-    """Images, each a chunk of its own, so that one reads alone."""
-    _write(file, name, images, recipe["storage.images"], (1, *images.shape[1:]), pool, {"unit": unit})
-
-
 def _write(
     file: Any, name: str, array: Array, store: str, chunk: tuple[int, ...], pool: ThreadPoolExecutor,
     attributes: dict[str, Any],
@@ -161,9 +155,7 @@ def _write(
     if array.nbytes < _COMPRESS_FROM:
         dataset = file.create_dataset(name, data=array.astype(kind, copy=False))
     else:
-        dataset = file.create_dataset(
-            name, array.shape, kind, chunks=chunk, compression="gzip", compression_opts=1, shuffle=True
-        )
+        dataset = file.create_dataset(name, array.shape, kind, chunks=chunk, **_PACKED)
         places = list(_places(array.shape, chunk))
 
         def deflated(place: tuple[int, ...]) -> bytes | None:

@@ -289,9 +289,8 @@ def _at_level(recipe: Recipe, level: float) -> Recipe:
     changes: dict[str, Any] = {key: level * recipe[key] for key in ("model.photons", "model.background") if recipe[key]}
     if recipe["model.kind"] == "emission":
         times, name = np.atleast_1d(recipe["model.time"]).tolist(), recipe["model.isotope"]
-        changes["model.time"] = [
-            level * time if name is None else isotope(name).duration(level, time) for time in times
-        ]
+        known = None if name is None else isotope(name)
+        changes["model.time"] = [known.duration(level, time) if known else level * time for time in times]
     return recipe.updated(changes)
 
 

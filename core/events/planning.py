@@ -131,11 +131,8 @@ class PlannedEvent:
             *(self.number, self.name, self.split or "", *self.position, *self.euler_degrees, self.mirror, self.size),
             *(self.activity_factor, self.noise_seed),
         )
-        return {
-            **dict(zip(FIXED_COLUMNS, fixed, strict=True)),
-            **({} if self.file is None else {"file": self.file}),
-            **{f"phantom.{key}": value for key, value in self.settings.items()},
-        }
+        row = dict(zip(FIXED_COLUMNS, fixed, strict=True)) | ({} if self.file is None else {"file": self.file})
+        return row | {f"phantom.{key}": value for key, value in self.settings.items()}
 
 
 def plan(recipe: EventRecipe, number: int) -> PlannedEvent:

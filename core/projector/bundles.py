@@ -234,13 +234,9 @@ def _part(pieces: list[tuple[int, Beam, slice]], rows: slice, columns: slice, tr
     vectors = np.concatenate([beam.rays.part(rows, columns, shifts).vectors() for _, beam, shifts in pieces])
     weights = None
     if any(beam.weigh for _, beam, _ in pieces):
-        shape = rows.stop - rows.start, columns.stop - columns.start
-        each = [
-            np.broadcast_to(
-                np.ones(1) if beam.weigh is None else beam.weigh(rows, columns, shifts),
-                (shifts.stop - shifts.start, *shape),
-            )
-            for _, beam, shifts in pieces
-        ]
+        shape, each = (rows.stop - rows.start, columns.stop - columns.start), []
+        for _, beam, shifts in pieces:
+            own = np.ones(1) if beam.weigh is None else beam.weigh(rows, columns, shifts)
+            each.append(np.broadcast_to(own, (shifts.stop - shifts.start, *shape)))
         weights = each[0] if len(each) == 1 else np.concatenate(each)
     return Part(images, vectors, rows, columns, transposed, weights, pieces[0][1].rays.parallel)

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..arrays import is_tensor
+from ..arrays import is_double, is_tensor, to_numpy
 from ..errors import InputError
 from ..geometry.grid import Grid
 from ..geometry.views import Views
@@ -61,20 +61,17 @@ def depth_images(
     mu_grid = mu.grid if isinstance(mu, Volume) else mu_grid or grid
 
     def run(needs: Any) -> Any:
-        given = array.detach().cpu().numpy() if is_tensor(array) else array
-        kind = np.float64 if np.float64 in (given.dtype, _numpy(positions).dtype) else np.float32
-        given = np.require(given, kind, ["C"])
-        on_mu = None
+        kind = np.float64 if is_double(array) or is_double(positions) else np.float32
+        given, on_mu = to_numpy(array, kind), None
         if attenuation is not None:
-            own = attenuation.detach().cpu().numpy() if is_tensor(attenuation) else attenuation
-            on_mu = Field(require_no_negative(np.asarray(own, kind)), mu_grid)
+            on_mu = Field(require_no_negative(to_numpy(attenuation, kind)), mu_grid)
         model = _whole_holes(grid, poses, holes, effective, shape, plain, on_mu)
         functions = backends.load("cpu" if backends.choose("auto").name == "cpu" else "reference_depth")
         threads = thread_count(None)
         images = np.stack(list(model.images(given, functions, threads))).reshape(*cameras, *shape)
 
         def gradients(gradient: Tensor, needs: Any) -> list[Tensor | None]:
-            weights = np.require(gradient.numpy(force=True), kind, ["C"]).reshape(-1, *shape)
+            weights = to_numpy(gradient, kind).reshape(-1, *shape)
             found: list[Any] = [None] * 8
             if needs[0]:
                 found[0] = model.backproject(weights, functions, threads, lambda done: None)
@@ -92,10 +89,6 @@ def depth_images(
 
     inputs = positions, rotations, holes.length, effective, holes.pitch, holes.offset
     return autograd.step(run, array, attenuation, *inputs) * factors[..., None, None]
-
-
-def _numpy(tensor: Tensor) -> Any:
-    return tensor.numpy(force=True)
 
 
 def _one_kernel(optics: Optics) -> Optics:
@@ -119,19 +112,15 @@ def _whole_holes(
     n = poses[0][..., 0].numel()
 
     def each(number: Tensor, *last: int) -> Any:
-        return _numpy(number).astype(np.float64).reshape(n, *last)
+        return number.numpy(force=True).astype(np.float64).reshape(n, *last)
 
-    position, rotation = each(poses[0], 3), each(poses[1], 3, 3)
-    length, pitch, offset = each(holes.length), each(holes.pitch, 2), each(holes.offset, 2)
-    u, v, k = frames = rotation.transpose(2, 0, 1)
-    centers = position + length[:, None] * k + offset[:, :1] * u + offset[:, 1:] * v
-    views = Views(position, centers, pitch[:, :1] * u, pitch[:, 1:] * v, shape)
+    views = camera_views(*poses, holes.length, holes.pitch, holes.offset, shape)
     sides = np.full(n, np.inf) if holes.side is None else each(holes.side)
     thickness, hole = each(holes.thickness), each(holes.diameter)
     numbers = {name: each(x) if is_tensor(x) else x for name, x in optics.numbers.items()}
     optics = replace(optics.with_numbers(numbers), within_crystal=False, within_walls=False)
     passages = [Passage.of(optics.of_modules(m, n), float(hole[m]), float(thickness[m])) for m in range(n)]
-    lengths, plain = length + [each.mean_depth for each in passages], _one_kernel(optics)
+    lengths, plain = each(holes.length) + [each.mean_depth for each in passages], _one_kernel(optics)
 
     def weigh(m: int, along_v: Any, along_u: Any) -> Any:
         own = plain.of_modules(m, n)
@@ -139,8 +128,21 @@ def _whole_holes(
         return own.pixel_weights((along_u, along_v), (1.0, 1.0), lengths[m], np.inf, thickness[m], opening)
 
     slants = None if optics.edge == "paix" and optics.depth_layers == 1 else passages
-    of_modules = frames.transpose(1, 0, 2), lengths, each(effective), sides, weigh
+    of_modules = each(poses[1], 3, 3).transpose(0, 2, 1), lengths, each(effective), sides, weigh
     return WholeHoles(views, grid, *of_modules, mu, True, slants)
+
+
+def camera_views(
+    positions: Tensor, rotations: Tensor, distance: Tensor, pitch: Tensor, offset: Tensor, shape: tuple[int, int]
+) -> Views:
+    """Cameras (...) as `Views`, one after the other."""
+    numbers = positions, rotations, distance, pitch, offset
+    position, rotation, along, size, middle = (
+        x.numpy(force=True).astype(np.float64).reshape(-1, *x.shape[positions.ndim - 1 :]) for x in numbers
+    )
+    u, v, k = np.moveaxis(rotation, 2, 0)
+    centers = position + along[:, None] * k + middle[:, :1] * u + middle[:, 1:] * v
+    return Views(position, centers, size[:, :1] * u, size[:, 1:] * v, shape)
 
 
 def _by_cameras(model: WholeHoles, volume: Any, weights: Any, functions: Any, threads: int) -> list[Any]:

@@ -91,12 +91,11 @@ class Execution:
         derivatives = self.backend.functions.derivatives
 
         def run(task: _Task) -> list[tuple[Part, Floats]]:
-            results = [
-                (part, to_caller(derivatives(lattices.volume, *part.in_index_space(lattices)), np.empty(0)).T)
-                for part in self._parts(task, bundles)
-            ]
-            for part, own in results:
+            results = []
+            for part in self._parts(task, bundles):
+                own = to_caller(derivatives(lattices.volume, *part.in_index_space(lattices)), np.empty(0)).T
                 part.add_to(images, 0, ray_gradients.integrals(part, own))
+                results.append((part, own))
             return results
 
         tasks = self._tasks(bundles, lattices, self.workers)

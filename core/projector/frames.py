@@ -83,11 +83,8 @@ class FrameProjector(LinearOperator):
 def _of_frames(values: ArrayLike, name: str, views: int, frames: int | None = None) -> Array:
     """Numbers of frames, (F,) or (F, M), as (F, M), read-only."""
     given = real_array(values, name, None)
-    if (
-        given.ndim not in (1, 2)
-        or given.shape[1:] not in ((), (views,))
-        or len(given) != (frames or max(len(given), 1))
-    ):
+    count = frames or max((1, *given.shape[:1]))
+    if given.shape not in ((count,), (count, views)):
         n = "F" if frames is None else frames
         raise InputError(f"{name}: expected shape ({n},) or ({n}, {views}), got {shape_text(given.shape)}")
     return freeze(np.tile(given, (views, 1)).T if given.ndim == 1 else given)

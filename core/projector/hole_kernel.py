@@ -13,6 +13,9 @@ from ..arrays import Array
 # Taps that are this small, by what all would be if they were alike, are left out: the spline's inverse makes some negative.
 _LEAST = 2e-4
 
+Counts = tuple[int, int]
+"""How many along v and u."""
+
 
 class KernelNumbers(NamedTuple):
     """What the kernels of a zone depend on; lengths in cells, along v and u. Derivatives by them have the same fields."""
@@ -27,7 +30,7 @@ class KernelNumbers(NamedTuple):
     """(2,): times squared distances, what the powers of the directions miss."""
 
 
-def kernels(numbers: KernelNumbers, steps: tuple[int, int]) -> Array:
+def kernels(numbers: KernelNumbers, steps: Counts) -> Array:
     """What a pixel of `steps` cells counts of those around its middle, (planes, taps, taps).
 
     In Fourier space the exact image, by what the spline has blurred; and `bend` more. It may not be negative anywhere, or
@@ -37,7 +40,7 @@ def kernels(numbers: KernelNumbers, steps: tuple[int, int]) -> Array:
     return spectra.of_pixels(spectra.images())[0]
 
 
-def kernels_gradient(numbers: KernelNumbers, steps: tuple[int, int], by_kernels: Array) -> tuple[Array, KernelNumbers]:
+def kernels_gradient(numbers: KernelNumbers, steps: Counts, by_kernels: Array) -> tuple[Array, KernelNumbers]:
     """The kernels, and a function's derivatives by `numbers` from those by the kernels."""
     spectra = Spectra(numbers, steps, half_taps(numbers, steps))
     image = spectra.images()
@@ -46,7 +49,7 @@ def kernels_gradient(numbers: KernelNumbers, steps: tuple[int, int], by_kernels:
     return found[0], spectra.gradient(by_image)._replace(bend=by_bend)
 
 
-def half_taps(numbers: KernelNumbers, steps: tuple[int, int], more: ArrayLike = 0.0) -> tuple[int, int]:
+def half_taps(numbers: KernelNumbers, steps: Counts, more: ArrayLike = 0.0) -> Counts:
     """Taps on each side of the middle one, along v and u; `more` are those that something else needs."""
     most = 2 * numbers.slopes[-1] - numbers.slopes[-2]
     reach = numbers.hole * (1 + most) / 2 + np.divide(steps, 2) + np.abs(numbers.edges).sum(axis=1) * most / 2 + more
@@ -61,7 +64,7 @@ def _means(image: Array) -> Array:
 class Spectra:
     """The spectra of images, factor by factor, for their derivatives, and the kernels that are made of images."""
 
-    def __init__(self, numbers: KernelNumbers, steps: tuple[int, int], half: tuple[int, int]) -> None:
+    def __init__(self, numbers: KernelNumbers, steps: Counts, half: Counts) -> None:
         first, last = numbers.slopes[:2], numbers.slopes[-2:]
         slopes = np.concatenate([[2 * first[0] - first[1]], numbers.slopes, [2 * last[1] - last[0]]])
         self.numbers, self.steps, self.half = numbers, steps, half

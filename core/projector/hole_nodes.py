@@ -19,7 +19,7 @@ from ..arrays import Array
 from ..physics.aperture import KnifeEdge
 from ..physics.crystal import recorded_depths
 from ..physics.optics import Optics
-from .hole_kernel import KernelNumbers, Spectra, disc_transform, half_taps
+from .hole_kernel import Counts, KernelNumbers, Spectra, disc_transform, half_taps
 
 # Attenuation in the edge beyond which what passes is not counted; nodes of Gauss in the crystal.
 _MOST_PASSED, _DEPTHS = 7.5, 32
@@ -168,7 +168,7 @@ def _gauss(n: int) -> tuple[Array, Array]:
     return (x + 1) / 2, w / 2
 
 
-def node_kernels(numbers: KernelNumbers, steps: tuple[int, int], each: list[Slanted], shape: tuple[int, int]) -> Array:
+def node_kernels(numbers: KernelNumbers, steps: Counts, each: list[Slanted], shape: Counts) -> Array:
     """The kernels (planes, nodes along v, along u, taps, taps) of a lattice of nodes of a `shape`, row by row."""
     half = _half(numbers, steps, each)
     spectra, kernels = SlantedSpectra(numbers, steps, half, each, shape), []
@@ -192,9 +192,7 @@ class NodesGradient:
     `by` are the sum's derivatives by the kernels of `node_kernels`.
     """
 
-    def __init__(
-        self, numbers: KernelNumbers, steps: tuple[int, int], each: list[Slanted], shape: tuple[int, int], by: Array
-    ) -> None:
+    def __init__(self, numbers: KernelNumbers, steps: Counts, each: list[Slanted], shape: Counts, by: Array) -> None:
         half = _half(numbers, steps, each)
         self._given = steps, half
         spectra = SlantedSpectra(numbers, steps, half, each, shape)
@@ -221,7 +219,7 @@ class NodesGradient:
         """The form, but for a constant, where only `edges` are others."""
         return float(np.vdot(self._by_common, Spectra(numbers, *self._given).common))
 
-    def __call__(self, numbers: KernelNumbers, each: list[Slanted], shape: tuple[int, int]) -> float:
+    def __call__(self, numbers: KernelNumbers, each: list[Slanted], shape: Counts) -> float:
         """The form."""
         spectra = SlantedSpectra(numbers, *self._given, each, shape)
         total = self._by_totals @ spectra.totals + self._by_bend @ numbers.bend
@@ -231,7 +229,7 @@ class NodesGradient:
         return float(total)
 
 
-def _half(numbers: KernelNumbers, steps: tuple[int, int], each: list[Slanted]) -> tuple[int, int]:
+def _half(numbers: KernelNumbers, steps: Counts, each: list[Slanted]) -> Counts:
     """Taps on each side of the middle one that all nodes need."""
     shifts = np.max([np.abs(own.shifts).max(axis=0) for own in each], axis=0)
     return half_taps(numbers._replace(hole=_widest(each)), steps, shifts)
@@ -284,14 +282,7 @@ def _widest(each: list[Slanted]) -> Array:
 class SlantedSpectra(Spectra):
     """The spectra of nodes' images. What passes the hole is made for 3 x 3 of them, and is quadratic between these."""
 
-    def __init__(
-        self,
-        numbers: KernelNumbers,
-        steps: tuple[int, int],
-        half: tuple[int, int],
-        each: list[Slanted],
-        shape: tuple[int, int],
-    ) -> None:
+    def __init__(self, numbers: KernelNumbers, steps: Counts, half: Counts, each: list[Slanted], shape: Counts) -> None:
         super().__init__(numbers, steps, half)
         self.each = each
         chosen, self.bases = zip(*(_quadratic(n) for n in shape), strict=True)

@@ -162,11 +162,7 @@ def checked_background(value: ArrayLike, name: str, n: int, pixels: tuple[int, i
     """
     array = none_below_0(value, name)
     real_array(array, name, None, np.float32)  # as which it is added
-    if (
-        array.ndim not in (0, 1, 3)
-        or array.shape[:1] not in ((), (n,))
-        or (array.ndim == 3 and pixels not in (None, array.shape[1:]))
-    ):
+    if array.ndim == 2 or array.shape not in ((), (n,), (n, *(pixels or array.shape[1:3]))):
         images = "" if pixels is None else f" of {shape_text(pixels)}"
         expected = f"one number, {n} numbers (one for each view), or {n} images{images}"
         raise InputError(f"{name}: expected {expected}, got {shape_text(array.shape)}")
@@ -177,9 +173,8 @@ def checked_times(value: ArrayLike, name: str, n: int, is_positive: bool = True)
     """Times, s: a number, or read-only those of `n` views (M,)."""
     array = all_above_0(value, name, unit="s") if is_positive else real_array(value, name, None)
     if array.shape not in ((), (n,)):
-        raise InputError(
-            f"{name}: expected one number, or {n} numbers (one for each view), got {shape_text(array.shape)}"
-        )
+        expected = f"one number, or {n} numbers (one for each view)"
+        raise InputError(f"{name}: expected {expected}, got {shape_text(array.shape)}")
     return freeze(array) if array.ndim else float(array)
 
 

@@ -85,8 +85,6 @@ def set_usual_threads(threads: int | None) -> None:
 
 def thread_count(threads: int | None) -> int:
     """`threads`, or the usual number: that of `set_usual_threads`, or of the cores that the job has (`memory.cores`)."""
-    if threads is None and _usual is not None:
-        return _usual
     if threads is None:
-        return cores()
+        return cores() if _usual is None else _usual
     return strict_whole(threads, "threads", "a whole number of at least 1")

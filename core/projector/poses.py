@@ -9,17 +9,15 @@ import itertools
 import math
 from typing import Any, Literal
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from ..errors import InputError
 from ..geometry.grid import Grid
-from ..geometry.views import Views
 from ..physics.optics import Optics, chosen_optics
 from ..validation import positive, whole_shape
 from ..volumes.volume import Volume, require_quantity
-from .depth_images import Holes, depth_images
+from .depth_images import Holes, camera_views, depth_images
 from .pixel_points import TOLERANCE, lattice, lattices, points_needed, require_points, shadow_edges
 from .tracing import trace_fans
 
@@ -248,20 +246,18 @@ def emission_images(
     depth = ((corners @ rotations.detach()[..., 2:])[..., 0].amax(dim=-1) / l.detach()).clamp(min=1.0)
     n = require_points(pixel_points, "emission images: pixel_points")
     if n is None:
-        views = _views(positions, rotations, l, pitch, offset, (n_v, n_u))
+        views = camera_views(positions, rotations, l, pitch, offset, (n_v, n_u))
         edges, error = [shadow_edges(views, m, within) for m in range(len(views))], positive(tolerance, "tolerance")
         n = max(points_needed(of_view, error, aperture_points) for of_view in edges)
     # For rays, rows and columns of each camera: (..., 1, 1, 1).
     optics = optics.with_numbers({name: x[..., None, None, None] for name, x in zip(given, own, strict=True)})
-    length, hole, side, thickness, seconds, pitch_u, pitch_v = (
-        x[..., None, None, None] for x in (l, diameter, side, thickness, time, *pitch.unbind(dim=-1))
-    )
+    of_cameras = l, diameter, side, thickness, time, *pitch.unbind(dim=-1)
+    length, hole, side, thickness, seconds, pitch_u, pitch_v = (x[..., None, None, None] for x in of_cameras)
     openings = optics.openings(hole, aperture_points)
+    starts = zip(openings, lattices(aperture_points, len(openings)), strict=True)
     distance = positions.norm(dim=-1)  # to the isocentre
     images: Any = 0.0
-    for (layer, z), (opening, start) in itertools.product(
-        enumerate(optics.depths(thickness)), zip(openings, lattices(aperture_points, len(openings)), strict=True)
-    ):
+    for (layer, z), (opening, start) in itertools.product(enumerate(optics.depths(thickness)), starts):
         point = torch.stack([(place + 0 * hole)[..., 0, 0, 0] for place in (opening.x, opening.y)], dim=-1)
         sources = positions + (rotations[..., :2] @ point[..., None])[..., 0]
         places = pitch.new_tensor(lattice(n)).expand(*pitch.shape[:-1], n, 2)
@@ -288,16 +284,3 @@ def emission_images(
             integrals = trace_fans(volume, vectors, (n_v, n_u), backend, grid, mu, mu_grid)
             images = images + (weights.to(integrals) * integrals).sum(dim=-3)
     return images
-
-
-def _views(
-    positions: Tensor, rotations: Tensor, distance: Tensor, pitch: Tensor, offset: Tensor, shape: tuple[int, int]
-) -> Views:
-    """The cameras as `Views`, one after the other."""
-    position, rotation, along, size, middle = (
-        x.detach().cpu().double().numpy().reshape(-1, *x.shape[positions.ndim - 1 :])
-        for x in (positions, rotations, distance, pitch, offset)
-    )
-    u, v, k = np.moveaxis(rotation, 2, 0)
-    centers = position + along[:, None] * k + middle[:, :1] * u + middle[:, 1:] * v
-    return Views(position, centers, size[:, :1] * u, size[:, 1:] * v, shape)

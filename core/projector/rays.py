@@ -133,9 +133,8 @@ def window(fans: Sequence[Fan], points: Floats) -> tuple[slice, slice]:
     to_corner = corner - source
     # point - source = w (i row_step + j column_step + to_corner), solved for w i, w j and w by Cramer's rule. LAPACK's
     # threads would go on waiting, busily, beside ours.
-    across = np.stack(
-        [np.cross(column_step, to_corner), np.cross(to_corner, row_step), np.cross(row_step, column_step)]
-    )
+    pairs = (column_step, to_corner), (to_corner, row_step), (row_step, column_step)
+    across = np.stack([np.cross(a, b) for a, b in pairs])
     w_row, w_column, w = np.einsum("kfi,fpi->kfp", across, points - source[:, None])
     volume = np.einsum("fi,fi->f", row_step, across[0])[:, None]
     parallel = fans[0].parallel

@@ -145,9 +145,8 @@ class Recalculation:
             wrong = not agree(value, number, at_least=1)
         if wrong:
             self._workbook.sheet(place[0]).type(place[1:], number)
-            shown = (
-                f"{value:.9g}" if type(value) is float else str(value) if isinstance(value, CellError) else repr(value)
-            )
+            shown = str(value) if isinstance(value, CellError) else repr(value)
+            shown = f"{value:.9g}" if type(value) is float else shown
             self.replaced[place] = str(value) if unknown else f"it gives {shown}"
             return number
         if unknown:

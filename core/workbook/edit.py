@@ -168,12 +168,10 @@ class Edit:
         for rows in self.rows.values():
             rows.move(workbook)
         self._number_modules()
-        for name in declared.typed:
-            if name in self.columns:
-                self._require(self.columns[name])
-        for name in declared.derived:
-            if name in self.columns:
-                self._derive(self.columns[name])
+        for column in [self.columns[name] for name in declared.typed if name in self.columns]:
+            self._require(column)
+        for column in [self.columns[name] for name in declared.derived if name in self.columns]:
+            self._derive(column)
         for table, rows in self.rows.items():
             name, last = table.sheet.name, max(rows.old)
             own = {workbook.text((name, row, column)) for row in rows.new for column in rows.columns}

@@ -247,8 +247,7 @@ def _labels(sheet: Sheet, rows: tuple[int, ...], column: int) -> tuple[Label, ..
         if label is None:
             raise InputError(f"{where} {sheet.found(row, column)}, expected a module's number (or a name in every row)")
         if label in first:
-            raise InputError(
-                f"{where} is module {label}, as is {sheet.place(first[label], column)}: expected another number"
-            )
+            other = sheet.place(first[label], column)
+            raise InputError(f"{where} is module {label}, as is {other}: expected another number")
         first[label] = row
     return tuple(first)

@@ -154,26 +154,23 @@ def _edited(system: Scanner, book: Book, read_by: ColumnMap | None, target: Path
 
 def _refuse_other_system(path: Path, name: str, columns: ColumnMap | None, system: Scanner, numbered: bool) -> None:
     """Refuse a workbook that would be read as another scanner: a template may be laid out so that it cannot hold it."""
+    cannot = f"{name} cannot hold this system"
     try:
         with recorded_warnings():
             back = read(Book(path), type(system), columns)
     except InputError as error:
         why = str(error).replace(str(path), name).replace(path.name, name)
-        raise InputError(f"{name} cannot hold this system, with it: {why}") from error
+        raise InputError(f"{cannot}, with it: {why}") from error
     if len(back.system) != len(system) or (numbered and not np.array_equal(back.system.numbers, system.numbers)):
-        raise InputError(
-            f"{name} cannot hold this system: its modules {several(system.numbers)} would be read as "
-            f"{several(back.system.numbers)}"
-        )
+        read_as = f"would be read as {several(back.system.numbers)}"
+        raise InputError(f"{cannot}: its modules {several(system.numbers)} {read_as}")
     for declared in [system.columns[typed] for typed in system.columns.typed]:
         wanted, got = declared.of(system), declared.of(back.system)
         for i in first(~declared.same(got, wanted, _WITHIN)):
             column = back.layout.columns.get(declared.name)
             why = f": {column.place(i)} is read for all modules" if column is not None and column.shared else ""
-            raise InputError(
-                f"{name} cannot hold this system: {declared.name} = {declared.text_of(wanted[i], 9)} of module "
-                f"{system.numbers[i]} would be read as {declared.text_of(got[i], 9)}{why}"
-            )
+            number = f"{declared.name} = {declared.text_of(wanted[i], 9)} of module {system.numbers[i]}"
+            raise InputError(f"{cannot}: {number} would be read as {declared.text_of(got[i], 9)}{why}")
 
 
 def _warn_of_formulas(workbook: WorkbookXml, recalculated: Recalculation) -> None:

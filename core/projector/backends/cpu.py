@@ -32,16 +32,8 @@ _NODE_ROWS, _GIVEN_ROWS = 4, 16  # in kernels.h
 _READ_ON = 16  # numbers that kernels read beyond the last of what they use
 _MOST_ALONG = 2**12  # where float32 knows the length of a segment to 0.1 %
 
-_FAN = np.dtype(
-    [
-        ("volume", "(4,3)f8"),
-        ("mu", "(4,3)f8"),
-        ("world", "(3,3)f8"),
-        ("rows", "i8"),
-        ("columns", "i8"),
-        ("parallel", "f8"),
-    ]
-)
+_FIELDS = {"volume": "(4,3)f8", "mu": "(4,3)f8", "world": "(3,3)f8", "rows": "i8", "columns": "i8", "parallel": "f8"}
+_FAN = np.dtype(list(_FIELDS.items()))
 
 
 class _Lattice(Structure):
@@ -86,12 +78,8 @@ class _PlacesJob(Structure):
 _KERNELS = {
     _Job: ("forward", "backproject", "differentiate", "differentiate_by_mu"),
     _DepthJob: (
-        "voxels_to_cells",
-        "cells_to_voxels",
-        "cells_to_pixels",
-        "pixels_to_cells",
-        "differentiate_places",
-        "differentiate_taps",
+        *("voxels_to_cells", "cells_to_voxels", "cells_to_pixels", "pixels_to_cells"),
+        *("differentiate_places", "differentiate_taps"),
     ),
     _PlacesJob: ("take_at", "give_at"),
 }
@@ -339,16 +327,10 @@ def differentiate_taps(image: Array, cells: Array, of: DepthResponse) -> Floats:
 def _padded(image: Array, of: DepthResponse) -> Array:
     """`image` times `of.after`, with the zeros around it that kernels read."""
     n_v, n_u = image.shape
-    before = (of.kernel.shape[-1] - 1) // of.steps[1]
-    padded = np.zeros((n_v, _padded_row(of)), image.dtype)
+    before, together = (of.kernel.shape[-1] - 1) // of.steps[1], of.shape[2] // of.steps[1]
+    padded = np.zeros((n_v, before + -(-together // _READ_ON) * _READ_ON), image.dtype)
     padded[:, before : before + n_u] = image * of.after
     return padded[:, before:]
-
-
-def _padded_row(of: DepthResponse) -> int:
-    """Numbers in a row of a padded image."""
-    before, together = (of.kernel.shape[-1] - 1) // of.steps[1], of.shape[2] // of.steps[1]
-    return before + -(-together // _READ_ON) * _READ_ON
 
 
 def _by_place(cells: Array, of: DepthResponse) -> Array:

@@ -201,9 +201,8 @@ def _foreign(target: SetFolder) -> Iterator[Fault]:
     """Files and folders that do not belong to the set."""
     store = target.store
     inputs = {INPUT_LIST, *(copy.path.name for copy in target.copies().values())}
-    originals = [
-        Path(os.path.normpath(target.path / name)) for name in target.recipe.files
-    ]  # may lie beside the recipe
+    # They may lie beside the recipe.
+    originals = [Path(os.path.normpath(target.path / name)) for name in target.recipe.files]
     for folder, known in (
         (target.path, {RECIPE, INDEX, INPUTS, ASKED, EVENTS, SHARDS}),
         (target.inputs, inputs),

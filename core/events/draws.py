@@ -92,9 +92,8 @@ class Drawn(Setting):
     def _range(self, value: Mapping[str, Any]) -> Mapping[str, Any]:
         if set(value) != {"from", "to"} or self.kind is str:
             found = ", ".join(value) or "nothing"
-            raise InputError(
-                f"{self.key}: expected {{ from = …, to = … }} or {{ one_of = […] }}, got a table of {found}"
-            )
+            expected = "{ from = …, to = … } or { one_of = […] }"
+            raise InputError(f"{self.key}: expected {expected}, got a table of {found}")
         number = Setting(f"{self.key}: from and to", int if self.kind is int else float, None, self.text)
         low, high = map(number.checked, (value["from"], value["to"]))
         if low > high:

@@ -177,9 +177,8 @@ class EventMaker:
     @cached_property
     def _radon(self) -> Remembered[dict[int, Projector]]:
         recipe, counts = self.recipe, () if self.recipe.radon is None else self.recipe.radon.counts
-        return remembered(
-            lambda: {n: Projector(recipe.grid, radon_views(recipe, n), threads=self.threads) for n in counts}
-        )
+        projector = partial(Projector, recipe.grid, threads=self.threads)
+        return remembered(lambda: {n: projector(radon_views(recipe, n)) for n in counts})
 
 
 def radon_views(recipe: EventRecipe, count: int) -> Views:

@@ -129,9 +129,7 @@ class Event:
     placement: Floats = _numbers("placement", "The pose with mirroring and the factor of size, (4, 4), mm.")
     position: Floats = _numbers("position", "Position of the phantom, (3,), mm.")
     euler_degrees: Floats = _numbers("euler_degrees", "phi, theta, psi of the phantom, (3,), degrees.")
-    module_gain: Floats = _numbers(
-        "module_gain", "Factors (M,) of the modules' sensitivities, in the images of counts."
-    )
+    module_gain: Floats = _numbers("module_gain", "Factors (M,) of the modules' sensitivities in images of counts.")
 
     @property
     def truth(self) -> Volume:

@@ -103,9 +103,8 @@ class SetFolder:
         if not self.recipe_path.exists():
             # Names with a dot are of files that other works have begun.
             if others := [name for name in os.listdir(self.path) if not name.startswith(".")]:
-                raise InputError(
-                    f"{self.path}: holds {others[0]} and no {RECIPE}: choose a new folder for the event set"
-                )
+                found = f"holds {others[0]} and no {RECIPE}"
+                raise InputError(f"{self.path}: {found}: choose a new folder for the event set")
             write_bytes(self.recipe_path, recipe.text.encode())
         there, places = read_recipe(self.recipe_path, self.copies()), self.store.places()
         if there.values != recipe.values:

@@ -42,10 +42,8 @@ class Index:
         except FileNotFoundError:
             return {}
         except (OSError, UnicodeError) as error:
-            folder = self.path.parent
-            raise InputError(
-                f"{self.path}: cannot be read ({error}): mphdrr events check {folder} --repair writes it anew"
-            ) from None
+            remedy = f"mphdrr events check {self.path.parent} --repair writes it anew"
+            raise InputError(f"{self.path}: cannot be read ({error}): {remedy}") from None
         if _CUT in heading:
             return {}
         names = _cells(heading)

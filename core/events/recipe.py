@@ -283,9 +283,8 @@ class EventRecipe:
             for key in ("file", "mu_file"):
                 if key in entry:
                     quantity = "mu" if key == "mu_file" else self.quantity
-                    entry[key] = changed(
-                        entry[key], "copy" if is_text(entry[key]) else _what(quantity, checked["energy"])
-                    )
+                    what = "copy" if is_text(entry[key]) else _what(quantity, checked["energy"])
+                    entry[key] = changed(entry[key], what)
         for name, model in self.models.items():
             if (files := model["attenuation.file"]) is not None:
                 found = [change(file, _what("mu", model["attenuation.energy"])) for file in files]

@@ -100,9 +100,8 @@ class TorchEvents(Dataset):
             shape = self.fields[names[0]]
             start = self._start(event, epoch, count, shape, size)
             for name in names:
-                parts[name] = tuple(
-                    slice(a, length if n is None else a + n) for a, n, length in zip(start, size, shape, strict=True)
-                )
+                cuts = zip(start, size, shape, strict=True)
+                parts[name] = tuple(slice(a, length if n is None else a + n) for a, n, length in cuts)
                 item[f"{name}_start"] = torch.tensor(start)
         for name, part in parts.items():
             item[name] = new(name, [cut.stop - cut.start for cut in part])

@@ -116,9 +116,8 @@ def torch_dataset(
         require_counted(events, [name for name in models if name in names or f"{name}{_SLOTS}" in names])
     shapes = {name: known[name] for name in names}
     crops = _crops(crop, shapes)
-    return TorchEvents(
-        events, shapes, crops, crop_at == "random", noise, chosen_levels, seed, chosen_slots, skip_damaged
-    )
+    at_random = crop_at == "random"
+    return TorchEvents(events, shapes, crops, at_random, noise, chosen_levels, seed, chosen_slots, skip_damaged)
 
 
 def _crops(crop: Crop, shapes: Mapping[str, tuple[int, ...]]) -> dict[tuple[str, ...], tuple[int | None, ...]]:

@@ -69,9 +69,8 @@ class Unet3d(Layout):
 
     def contained(self) -> dict[str, Any]:
         """The table of slots, and what raw is by default."""
-        return {"raw": self.raw} | (
-            {"slots": self.slots.table(self.chosen.events.system)} if self.raw == "slots" else {}
-        )
+        slots = {"slots": self.slots.table(self.chosen.events.system)} if self.raw == "slots" else {}
+        return {"raw": self.raw} | slots
 
     def files(self, row: Row) -> tuple[str, ...]:
         """One, in the folder of its split."""

@@ -45,10 +45,8 @@ class WebDataset(Layout):
 
     def write(self, part: Part, rows: list[Row], folder: Path, written: Callable[[], None]) -> None:
         """Write a shard."""
-        with (
-            replacing(folder / part.files[0]) as temporary,
-            tarfile.open(temporary, "w", format=tarfile.USTAR_FORMAT) as tar,
-        ):
+        path, kind = folder / part.files[0], tarfile.USTAR_FORMAT
+        with replacing(path) as temporary, tarfile.open(temporary, "w", format=kind) as tar:
             for i in part.events:
                 for name, content in self.contents(rows[i], self.chosen.events[i]):
                     member = tarfile.TarInfo(name)  # of no time and nobody

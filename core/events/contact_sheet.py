@@ -148,19 +148,11 @@ def _slices(event: ShownEvent) -> list[_Panel]:
     for axis, right, up in _SLICES:
         size = max(1, round(float(extent[right]) * scale)), max(1, round(float(extent[up]) * scale))
         across, upward = (float(middle[a] - low[a]) * scale for a in (right, up))
-        first = not panels
-        panels.append(
-            _Panel(
-                display.colored(array.take([index[axis]], axis).squeeze(axis).T[::-1], window),
-                *size,
-                above=f"Truth, {_range(window, event.truth.unit)}" if first else "",
-                below=f"{'xyz'[right]} {'xyz'[up]},  {'xyz'[axis]} = {number(round(float(middle[axis]), 1))} mm",
-                pixels_per_mm=scale if first else 0.0,
-                cross=(across, size[1] - upward),
-                gap=_GROUP if axis == 0 else _GAP,
-                frame=max(size[0], _SIDE // 2),
-            )
-        )
+        picture = display.colored(array.take([index[axis]], axis).squeeze(axis).T[::-1], window)
+        above, bar = ("", 0.0) if panels else (f"Truth, {_range(window, event.truth.unit)}", scale)
+        below = f"{'xyz'[right]} {'xyz'[up]},  {'xyz'[axis]} = {number(round(float(middle[axis]), 1))} mm"
+        cross, gap = (across, size[1] - upward), _GROUP if axis == 0 else _GAP
+        panels.append(_Panel(picture, *size, above, below, bar, cross, gap, max(size[0], _SIDE // 2)))
     return panels
 
 

@@ -66,20 +66,11 @@ def _leap(views: Views) -> dict[str, Any]:
     ``rowVectors`` point to the next row, ``colVectors`` to the next column; all modules have one pixel size.
     """
     views, (width, height), (columns, rows) = _with_common_pitch(views, "leap")
-    vectors = {
-        "sourcePositions": views.sources,
-        "moduleCenters": views.detector_centers,
-        "rowVectors": rows,
-        "colVectors": columns,
-    }
-    return {
-        "numAngles": len(views),
-        "numRows": views.shape[0],
-        "numCols": views.shape[1],
-        "pixelHeight": height,
-        "pixelWidth": width,
-        **{name: vector.astype(np.float32) for name, vector in vectors.items()},
-    }
+    sizes = {"numAngles": len(views), "numRows": views.shape[0], "numCols": views.shape[1]}
+    pixel = {"pixelHeight": height, "pixelWidth": width}
+    places = {"sourcePositions": views.sources, "moduleCenters": views.detector_centers}
+    vectors = {**places, "rowVectors": rows, "colVectors": columns}
+    return {**sizes, **pixel, **{name: vector.astype(np.float32) for name, vector in vectors.items()}}
 
 
 def _opencv(views: Views) -> dict[str, Any]:

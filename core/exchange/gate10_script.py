@@ -183,10 +183,8 @@ def images(data: dict[str, Any], positions: NDArray[np.float64]) -> NDArray[np.u
         local = (positions - module["crystal_center_mm"]) @ np.transpose(module["axes_uvk"])
         half = np.array(module["crystal_size_mm"]) / 2
         local = local[np.all(np.abs(local) <= half + 1e-3, axis=1)]
-        column, row = (
-            np.clip(np.floor((local[:, i] / half[i] + 1) / 2 * n), 0, n - 1).astype(int)
-            for i, n in ((0, columns), (1, rows))
-        )
+        pixels = np.floor((local[:, :2] / half[:2] + 1) / 2 * (columns, rows))
+        column, row = np.clip(pixels, 0, (columns - 1, rows - 1)).astype(int).T
         np.add.at(image, (row, column), 1)
     return made
 

@@ -93,11 +93,8 @@ class Column:
     @property
     def expected(self) -> str:
         """What a cell of it must hold, for messages."""
-        words = {
-            "whole": "a whole number",
-            "text": self.pattern[1] or "a text",
-            "choice": f"one of {', '.join(self.choices)}",
-        }
+        one = f"one of {', '.join(self.choices)}"
+        words = {"whole": "a whole number", "text": self.pattern[1] or "a text", "choice": one}
         return words.get(self.kind, "a number")
 
     def word(self, text: str) -> str | None:

@@ -95,10 +95,8 @@ class PinholeSystem(Scanner):
             yield "x1", i, f"{puts} {numbers[i]} {at}, expected another place"
 
     def __repr__(self) -> str:
-        b, l = (
-            f"{name} {x.min():.4g} to {x.max():.4g} mm"
-            for name, x in (("b", self.pinhole_distance), ("l", self.collimator_length))
-        )
+        sizes = {"b": self.pinhole_distance, "l": self.collimator_length}
+        b, l = (f"{name} {x.min():.4g} to {x.max():.4g} mm" for name, x in sizes.items())
         return f"PinholeSystem({len(self)} modules, {b}, {l})"
 
     @property

@@ -40,11 +40,9 @@ class Views:
         if not isinstance(self.parallel, bool | np.bool_):
             raise InputError(f"parallel: expected True or False, got {self.parallel!r}")
         object.__setattr__(self, "parallel", bool(self.parallel))
-        sources = real_array(self.sources, "sources", (None, 3))
-        object.__setattr__(self, "sources", freeze(sources))
-        for name in VECTORS[1:]:
-            value = real_array(getattr(self, name), name, (len(sources), 3))
-            object.__setattr__(self, name, freeze(value))
+        for name in VECTORS:
+            n = None if name == "sources" else len(self.sources)
+            object.__setattr__(self, name, freeze(real_array(getattr(self, name), name, (n, 3))))
         axes = self._axes()
         lengths = np.linalg.norm(axes, axis=1, keepdims=True)
         with np.errstate(invalid="ignore", divide="ignore"):

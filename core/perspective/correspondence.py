@@ -123,15 +123,9 @@ def find_correspondences(
     starts, per_depth = rays_by_depth(grid.views, grid.m, flat)
     points = starts + depths[:, None] * per_depth
     places = np.stack([pixels_of(matrix, points) for matrix in grid.views[chosen].projection_matrices()])
-    shape = pixels.shape[:-1]
-    return Correspondences(
-        chosen,
-        depths.reshape(shape),
-        places.reshape(len(chosen), *shape, 2),
-        scores.reshape(shape),
-        curves.reshape(*shape, grid.n_k),
-        counts.reshape(*shape, grid.n_k),
-    )
+    shape, at_planes = pixels.shape[:-1], (*pixels.shape[:-1], grid.n_k)
+    places, depths, scores = places.reshape(len(chosen), *shape, 2), depths.reshape(shape), scores.reshape(shape)
+    return Correspondences(chosen, depths, places, scores, curves.reshape(at_planes), counts.reshape(at_planes))
 
 
 def _scores(

@@ -185,9 +185,8 @@ def _within_image(ends: Floats, scale: Floats, shape: tuple[int, int]) -> Floats
     column, row, factor = np.moveaxis(ends, -1, 0)
     n_v, n_u = shape
     # At least 0 in the image: linear along a segment. In front of the source follows from the sum of two.
-    bounds = np.stack(
-        [column + 0.5 * factor, (n_u - 0.5) * factor - column, row + 0.5 * factor, (n_v - 0.5) * factor - row]
-    )
+    half = 0.5 * factor
+    bounds = np.stack([column + half, (n_u - 0.5) * factor - column, row + half, (n_v - 0.5) * factor - row])
     at_first, at_last = bounds[..., 0], bounds[..., 1]
     with np.errstate(divide="ignore", invalid="ignore"):
         crossing = at_first / (at_first - at_last)

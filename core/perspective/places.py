@@ -152,8 +152,7 @@ def _gather_in_numpy(
             elif how == LEAST:
                 changed = np.minimum(plane, value)
             else:
-                mantissa, exponent = np.frexp(plane * value)
-                changed = mantissa
+                changed, exponent = np.frexp(plane * value)
                 exponents[i] += inside * exponent
             plane[...] = np.where(inside, changed, plane)
             if seen is not None:

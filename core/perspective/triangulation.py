@@ -117,17 +117,9 @@ def fit_marker(views: Views, modules: Indices, pixels: ArrayLike, sigma: ArrayLi
         own = np.eye(2) - slopes @ covariance @ slopes.swapaxes(1, 2)
         misfits = np.einsum("ni,nij,nj->n", whitened, np.linalg.pinv(own, rcond=1e-9, hermitian=True), whitened)
     degrees = 2 * len(index) - 3
-    return MarkerFit(
-        freeze(index),
-        freeze(point),
-        freeze(covariance),
-        freeze(residuals),
-        chi2,
-        degrees,
-        _chance(chi2, degrees),
-        freeze(misfits),
-        freeze(np.exp(-misfits / 2)),
-    )
+    place = freeze(index), freeze(point), freeze(covariance), freeze(residuals)
+    p_value, p_values = _chance(chi2, degrees), np.exp(-misfits / 2)
+    return MarkerFit(*place, chi2, degrees, p_value, freeze(misfits), freeze(p_values))
 
 
 def _fitted(

@@ -17,7 +17,7 @@ from ..arrays import ArrayLike, Floats
 from ..errors import InputError
 from ..validation import positive, real_array, shape_text
 from .crystal import gaussian_blur
-from .isotopes import Isotope
+from .isotopes import Isotope, Line, Window
 
 FWHM_PER_SIGMA = 2 * math.sqrt(2 * math.log(2))
 
@@ -25,7 +25,7 @@ _LEAST_SHARE = 1e-4
 """Lines that count less, as a share of the one that counts most, are left out."""
 
 
-def acceptance(energy: float, window: tuple[float, float], fwhm: float) -> float:
+def acceptance(energy: float, window: Window, fwhm: float) -> float:
     """Share of the photons of an `energy` that are measured within a `window`; energies blur with this FWHM. All in keV."""
     scale = math.sqrt(2) * fwhm / FWHM_PER_SIGMA
     low, high = ((edge - energy) / scale for edge in window)
@@ -34,9 +34,7 @@ def acceptance(energy: float, window: tuple[float, float], fwhm: float) -> float
     return (math.erf(high) - math.erf(low)) / 2
 
 
-def counted_lines(
-    isotope: Isotope, window: tuple[float, float], energy_fwhm: float | None = None
-) -> tuple[tuple[float, float], ...]:
+def counted_lines(isotope: Isotope, window: Window, energy_fwhm: float | None = None) -> tuple[Line, ...]:
     """The lines that count in a `window`, keV: their energies, keV, in order, and photons per decay that are counted.
 
     `energy_fwhm` is the FWHM of the energy resolution at the strongest line within the window, as a share of its energy; at
@@ -59,9 +57,7 @@ def counted_lines(
     return tuple((energy, photons) for energy, photons in found if photons > _LEAST_SHARE * most)
 
 
-def peak_shares(
-    isotope: Isotope, windows: Sequence[tuple[float, float] | None], energy_fwhm: float
-) -> tuple[float, float, float]:
+def peak_shares(isotope: Isotope, windows: Sequence[Window | None], energy_fwhm: float) -> tuple[float, float, float]:
     """Shares of the photons of the peak's lines that are measured in the lower, the peak and the upper window; 0 of None.
 
     The lines are those within the peak window, and `energy_fwhm` is that of `counted_lines`.
@@ -73,7 +69,7 @@ def peak_shares(
     reference, _ = max(lines, key=lambda line: line[1])
     total = sum(photons for _, photons in lines)
 
-    def share(window: tuple[float, float] | None) -> float:
+    def share(window: Window | None) -> float:
         own = ((e, photons, energy_fwhm * math.sqrt(reference * e)) for e, photons in lines)
         return 0.0 if window is None else sum(photons * acceptance(e, window, fwhm) for e, photons, fwhm in own) / total
 

@@ -12,6 +12,11 @@ from .mass_attenuation import table_lines
 
 _SECONDS = {"min": 60.0, "h": 3600.0, "d": 24 * 3600.0}
 
+Line = tuple[float, float]
+"""Energy, keV, and photons per decay."""
+Window = tuple[float, float]
+"""Energies, keV, between which photons are counted."""
+
 
 @dataclass(frozen=True)
 class Isotope:
@@ -19,10 +24,10 @@ class Isotope:
 
     name: str  # such as "Tc-99m"
     half_life: float  # s
-    lines: tuple[tuple[float, float], ...]  # energy, keV, and photons per decay, by energy
+    lines: tuple[Line, ...]  # by energy
 
     @property
-    def window(self) -> tuple[float, float]:
+    def window(self) -> Window:
         """The usual energy window, keV: 10 % to either side of the strongest line."""
         energy, _ = max(self.lines, key=lambda line: line[1])
         return 0.9 * energy, 1.1 * energy
@@ -31,7 +36,7 @@ class Isotope:
         """Photons per decay in the energy window from `low` to `high`, keV."""
         return sum(photons for _, photons in self.lines_within(low, high))
 
-    def lines_within(self, low: float, high: float) -> tuple[tuple[float, float], ...]:
+    def lines_within(self, low: float, high: float) -> tuple[Line, ...]:
         """The `lines` in the energy window from `low` to `high`, keV."""
         return tuple((energy, photons) for energy, photons in self.lines if low <= energy <= high)
 

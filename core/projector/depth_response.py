@@ -125,12 +125,8 @@ class DepthResponse:
         farther = min(max(math.floor(planes.min()), 0), nearer - 1)
         matrix[0] -= cells[1].start * matrix[2]
         matrix[1] -= cells[0].start * matrix[2]
-        return replace(
-            self,
-            matrix=matrix,
-            first_plane=self.first_plane + farther / self.planes_per_inverse,
-            before=self.before[tuple(cells)],
-            padded=self.padded[farther : nearer + 1],
-            after=self.after[tuple(pixels)],
-            places=None if self.places is None else (self.places[0][pixels[0]], self.places[1][pixels[1]]),
-        ), (pixels[0], pixels[1])
+        before, after = self.before[tuple(cells)], self.after[tuple(pixels)]
+        first, padded = self.first_plane + farther / self.planes_per_inverse, self.padded[farther : nearer + 1]
+        places = None if self.places is None else (self.places[0][pixels[0]], self.places[1][pixels[1]])
+        part = replace(self, matrix=matrix, first_plane=first, before=before, padded=padded, after=after, places=places)
+        return part, (pixels[0], pixels[1])

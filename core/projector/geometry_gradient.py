@@ -93,14 +93,10 @@ def geometry_gradient(A: Projector, volume: Volume | Floats | Floats32, images: 
     u, v, _ = model.system.frames().transpose(1, 0, 2)
     # Along a real detector, steps go backwards.
     signs = np.sign([np.einsum("mi,mi->m", s, a) for s, a in ((A.views.v_steps, v), (A.views.u_steps, u))]).T
-    return GeometryGradient(
-        centers,
-        frames,
-        by["length"],
-        by["diameter"] * _effective_rise(model),
-        (by["pitch"] * signs)[:, ::-1] + sum(map(partial(_by_blur, A), volumes, given)),
-        (by["first"] * signs)[:, ::-1],
-    )
+    diameter = by["diameter"] * _effective_rise(model)
+    pitch, offset = ((by[name] * signs)[:, ::-1] for name in ("pitch", "first"))
+    pitch = pitch + sum(map(partial(_by_blur, A), volumes, given))
+    return GeometryGradient(centers, frames, by["length"], diameter, pitch, offset)
 
 
 def _effective_rise(model: Emission) -> Floats:

@@ -364,22 +364,19 @@ class WholeHoles:
         def weigh(v: Array, u: Array) -> Array:
             return np.asarray(self.weigh(m, v, u) * np.sqrt(1 + (u**2 + v**2) / l**2))
 
-        return Zone(
+        of_view = (
             ViewNumbers(to_camera, l, d, first, pitch),
             views.shape,
             weigh,
             float(self.sides[m]),
             grid.voxel_volume,
-            np.ceil(grid.spacing / largest_piece).astype(int),
-            near,
-            far,
-            np.linspace(farthest, nearest, n_planes),
-            steps,
-            (_POINT_SMEAR / cell, _PAIR_SMEAR, cell / _PART_SMEAR),
-            round(l / (l + 2 / (1 / near + 1 / far)), 2),
-            passage,
-            1 if passage is None else _pixels_apart(passage, widths[0], float(np.abs(pitch).max()), l),
         )
+        pieces = np.ceil(grid.spacing / largest_piece).astype(int)
+        planes = np.linspace(farthest, nearest, n_planes)
+        limits = _POINT_SMEAR / cell, _PAIR_SMEAR, cell / _PART_SMEAR
+        share = round(l / (l + 2 / (1 / near + 1 / far)), 2)
+        apart = 1 if passage is None else _pixels_apart(passage, widths[0], float(np.abs(pitch).max()), l)
+        return Zone(*of_view, pieces, near, far, planes, steps, limits, share, passage, apart)
 
 
 def _by_taps(image: Array, cells: Array, of: DepthResponse, functions: ModuleType) -> Array:

@@ -44,13 +44,9 @@ class Fan:
         row, last_row, _ = rows.indices(self.shape[0])
         column, last_column, _ = columns.indices(self.shape[1])
         offset = row * self.row_step + column * self.column_step
-        return replace(
-            self,
-            source=self.source + self.parallel * offset,
-            corner=self.corner + offset,
-            shape=(last_row - row, last_column - column),
-            shifts=self.shifts[shifts],
-        )
+        source, corner = self.source + self.parallel * offset, self.corner + offset
+        shape = last_row - row, last_column - column
+        return replace(self, source=source, corner=corner, shape=shape, shifts=self.shifts[shifts])
 
     def transposed(self) -> Fan:
         """The same rays with rows and columns exchanged."""

@@ -78,10 +78,8 @@ def require(n_bytes: float, what: str) -> None:
     """Raise `InputError` if `n_bytes` do not fit; `what` needs them, such as ``"a volume of 9 x 9 x 9 voxels"``."""
     usable = _USABLE_SHARE * available()
     if n_bytes > usable:
-        raise InputError(
-            f"{what} needs {readable_size(n_bytes)} of memory, but {readable_size(usable)} can be used: "
-            "choose fewer voxels or pixels, or free some memory"
-        )
+        needs = f"{what} needs {readable_size(n_bytes)} of memory, but {readable_size(usable)} can be used"
+        raise InputError(f"{needs}: choose fewer voxels or pixels, or free some memory")
 
 
 class Requirements:

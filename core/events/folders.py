@@ -116,10 +116,9 @@ class SetFolder:
             copies = self._copy(recipe, copies)
         vars(self)["recipe"] = EventRecipe(there.text, there.name, there.folder, copies)
         if self.recipe.fingerprint != recipe.fingerprint:
-            raise InputError(
-                f"{recipe.name}: a file that it names has changed since the set was begun; the set's own copies are in "
-                f"{self.inputs}: go on with these (mphdrr events make {self.path}), or choose another folder"
-            )
+            changed = "a file that it names has changed since the set was begun"
+            advice = f"go on with these (mphdrr events make {self.path}), or choose another folder"
+            raise InputError(f"{recipe.name}: {changed}; the set's own copies are in {self.inputs}: {advice}")
         self._ask(asked)
         if not self.index.is_current():
             self.complete_index()
@@ -134,16 +133,13 @@ class SetFolder:
                 missing.append(number)
                 continue
             if found.recipe != self.recipe.fingerprint:
-                raise InputError(
-                    f"{self.store.event_path(number)}: an event of another recipe: choose another folder, or "
-                    f"`mphdrr events check {self.path} --repair` makes such events anew"
-                )
+                remedy = f"choose another folder, or `mphdrr events check {self.path} --repair` makes such events anew"
+                raise InputError(f"{self.store.event_path(number)}: an event of another recipe: {remedy}")
             if found.build != build() and not has_warned:
                 has_warned = True
-                warn(
-                    f"{self.path}: event {number} was made by another build of mphDRR ({found.build or 'of version 0.1'}, "
-                    f"this is {build()}): events of the two may differ in their last digits, or by what was mended between"
-                )
+                builds = f"({found.build or 'of version 0.1'}, this is {build()})"
+                differ = "events of the two may differ in their last digits, or by what was mended between"
+                warn(f"{self.path}: event {number} was made by another build of mphDRR {builds}: {differ}")
         return missing
 
     def _copy(self, recipe: EventRecipe, known: dict[str, Input]) -> dict[str, Input]:

@@ -35,10 +35,8 @@ def in_processes(target: SetFolder, numbers: Sequence[int], workers: int) -> Ite
     if not numbers:
         return
     if __name__.startswith("bl_ext."):  # an extension's name, which no other process knows
-        raise InputError(
-            f"workers: expected 1 within Blender, which takes all cores, got {workers}; mphdrr as a Python package takes "
-            "more, and several commands share a set by --shard"
-        )
+        advice = "mphdrr as a Python package takes more, and several commands share a set by --shard"
+        raise InputError(f"workers: expected 1 within Blender, which takes all cores, got {workers}; {advice}")
     target.maker.require_memory(workers)
     waiting, breaks = deque(numbers), 0
     while waiting:
@@ -60,11 +58,10 @@ def in_processes(target: SetFolder, numbers: Sequence[int], workers: int) -> Ite
             breaks += 1
             missing = sorted(under_way.values())
             if breaks == _MOST_BREAKS:
-                raise InputError(
-                    f"event {missing[0] if missing else waiting[0]}: its worker ended {breaks} times before it was made "
-                    "(killed, or out of memory: try fewer workers; a script calls this under if __name__ == "
-                    '"__main__":)'
-                ) from None
+                event = f"event {missing[0] if missing else waiting[0]}"
+                why = 'out of memory: try fewer workers; a script calls this under if __name__ == "__main__":'
+                ended = f"its worker ended {breaks} times before it was made"
+                raise InputError(f"{event}: {ended} (killed, or {why})") from None
             waiting.extendleft(reversed(missing))
         except (KeyboardInterrupt, GeneratorExit):  # nobody waits for what is under way
             for worker in list(pool._processes.values()):

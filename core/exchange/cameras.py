@@ -218,9 +218,8 @@ def _camera_matrices(views: Views, format: str, mirrored: bool = True) -> tuple[
     distance = np.einsum("mi,mi->m", z, to_detector)
     mirror = distance < 0
     if mirror.any() and not mirrored:
-        raise InputError(
-            f"view {int(np.argmax(mirror))}: format {format} cannot hold a mirror image; reverse its columns or its rows"
-        )
+        cannot = f"format {format} cannot hold a mirror image"
+        raise InputError(f"view {int(np.argmax(mirror))}: {cannot}; reverse its columns or its rows")
     sign = np.where(mirror, -1.0, 1.0)
     n_v, n_u = views.shape
     foot = -np.stack([np.einsum("mi,mi->m", axis, to_detector) for axis in (x, y)], axis=1) / pitches
@@ -245,10 +244,8 @@ def _pixel_axes(views: Views, format: str) -> tuple[Floats, Floats]:
     # How far the last row slides along the columns, and the last column along the rows, in pixels.
     slide = np.abs(cosine) * np.maximum(n_v * proportion, n_u / proportion) / 2
     for m in np.flatnonzero(~(slide <= _TOLERANCE))[:1]:
-        raise InputError(
-            f"view {m}: format {format} needs pixel rows perpendicular to columns, and these are "
-            f"{np.degrees(np.arccos(cosine[m])):.4g} degrees apart"
-        )
+        found = f"{np.degrees(np.arccos(cosine[m])):.4g} degrees apart"
+        raise InputError(f"view {m}: format {format} needs pixel rows perpendicular to columns, and these are {found}")
     y = y - cosine[:, None] * x
     return pitches, np.stack([x, y / np.linalg.norm(y, axis=1, keepdims=True)])
 
@@ -263,10 +260,9 @@ def _with_common_pitch(views: Views, format: str) -> tuple[Views, tuple[float, f
     proportion = pitches[:, 1] / pitches[:, 0]
     stretch = np.abs(proportion / proportion[0] - 1) * max(views.shape) / 2
     for m in np.flatnonzero(~(stretch <= _TOLERANCE))[:1]:
-        raise InputError(
-            f"view {m}: format {format} has one pixel size for all views, and its pixels of {pitches[m, 0]:g} x "
-            f"{pitches[m, 1]:g} mm have other proportions than view 0's of {pitches[0, 0]:g} x {pitches[0, 1]:g} mm"
-        )
+        its, first = (f"{pitches[i, 0]:g} x {pitches[i, 1]:g} mm" for i in (m, 0))
+        differ = f"its pixels of {its} have other proportions than view 0's of {first}"
+        raise InputError(f"view {m}: format {format} has one pixel size for all views, and {differ}")
     pitch_u, pitch_v = pitches[np.argmax(pitches[:, 0])].tolist()
     scale = pitch_u / pitches[:, :1]
     centers = views.sources + scale * (views.detector_centers - views.sources)

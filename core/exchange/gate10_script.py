@@ -102,10 +102,9 @@ def activity_for_each_thread(opengate: Any, threads: int) -> float:
     for emitted in (1.0, 1.0 / threads):
         if abs(given["activity"] - emitted) < 1e-9:
             return 1.0 / (threads * emitted)
-    raise SystemExit(
-        f"opengate {opengate.__version__}: each of {threads} threads would emit {given['activity']:g} of the activity, "
-        f"expected all or 1/{threads} of it; use --threads 1, and run copies with other seeds"
-    )
+    found = f"each of {threads} threads would emit {given['activity']:g} of the activity"
+    advice = "use --threads 1, and run copies with other seeds"
+    raise SystemExit(f"opengate {opengate.__version__}: {found}, expected all or 1/{threads} of it; {advice}")
 
 
 def add_source(
@@ -170,9 +169,8 @@ def check_emitted(data: dict[str, Any], emitted: int) -> None:
     photons = sum(photons for _, photons in data["lines_keV_photons_per_decay"])
     decays = sum(emitter["activity_Bq"] for emitter in data["emitters"]) * -np.expm1(-decay * data["time_s"]) / decay
     if abs(emitted - photons * decays) > 6 * np.sqrt(photons * decays) + 1:
-        raise SystemExit(
-            f"{emitted} photons were emitted, expected {photons * decays:.0f}: do not use images.npy; use --threads 1"
-        )
+        found = f"{emitted} photons were emitted, expected {photons * decays:.0f}"
+        raise SystemExit(f"{found}: do not use images.npy; use --threads 1")
 
 
 def images(data: dict[str, Any], positions: NDArray[np.float64]) -> NDArray[np.uint32]:

@@ -89,21 +89,17 @@ class Collimator:
     def __post_init__(self) -> None:
         plate, angle = self.construction.plate_thickness, math.degrees(self.construction.opening_angle)
         if not plate < self.length:
-            raise InputError(
-                f"aperture plate: expected less than the collimator's {self.length:g} mm, got {plate:g} mm"
-            )
+            most = f"the collimator's {self.length:g} mm"
+            raise InputError(f"aperture plate: expected less than {most}, got {plate:g} mm")
         if not 0 < self.diameter < self.detector_side:
-            raise InputError(
-                f"pinhole diameter: expected more than 0 and less than the crystal's {self.detector_side:g} mm, "
-                f"got {self.diameter:g} mm"
-            )
+            most = f"the crystal's {self.detector_side:g} mm"
+            raise InputError(f"pinhole diameter: expected more than 0 and less than {most}, got {self.diameter:g} mm")
         width = 2 * max(radius for _, radius in self.hole_profile)
         if not width < self.detector_side:
-            raise InputError(
-                f"aperture plate: with {plate:g} mm and an opening angle of {angle:g} degrees its hole is {width:.4g} mm "
-                f"wide, expected less than the crystal's {self.detector_side:g} mm; choose a thinner plate or a smaller "
-                "angle"
-            )
+            found = f"with {plate:g} mm and an opening angle of {angle:g} degrees its hole is {width:.4g} mm wide"
+            most = f"the crystal's {self.detector_side:g} mm"
+            advice = "choose a thinner plate or a smaller angle"
+            raise InputError(f"aperture plate: {found}, expected less than {most}; {advice}")
 
     def hole_radius(self, depth: float) -> float:
         """Radius of the hole, mm, at a depth within the plate: ``d/2 + |s| tan(alpha/2)``."""

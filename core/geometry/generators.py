@@ -68,9 +68,8 @@ def ellipse_rings(
     turn = float(radians(rotation, "rotation"))
     ellipse = Ellipse(lengths(semi_axes, "semi_axes", 2), real_array(center, "center", (2,)), turn)
     if not ellipse.holds_isocentre:
-        raise InputError(
-            f"the isocentre must be inside the ellipse, but its centre is {np.linalg.norm(ellipse.center):g} mm off"
-        )
+        off = float(np.linalg.norm(ellipse.center))
+        raise InputError(f"the isocentre must be inside the ellipse, but its centre is {off:g} mm off")
     if np.ndim(modules) == 0:
         azimuths = even_azimuths(ellipse, modules, start, end, spacing)
     else:
@@ -110,10 +109,8 @@ def plate_rings(
         counts = np.empty(0)
     whole = counts.shape == (len(starts),) and counts.dtype.kind in "iu"
     if not whole or counts.min() < 0 or not 0 < counts.max() <= _MOST_MODULES:
-        raise InputError(
-            f"modules: expected a whole number up to {_MOST_MODULES}, or one for each of the {len(starts)} plates, "
-            f"got {modules}"
-        )
+        expected = f"a whole number up to {_MOST_MODULES}, or one for each of the {len(starts)} plates"
+        raise InputError(f"modules: expected {expected}, got {modules}")
     shares = np.concatenate([(np.arange(n) + 0.5) / n for n in counts if n])[:, None]
     places = (1 - shares) * np.repeat(starts, counts, axis=0) + shares * np.repeat(ends, counts, axis=0)
     sizes = (pinhole_diameter, detector_side, detector_thickness, roi_radius)

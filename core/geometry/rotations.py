@@ -151,9 +151,8 @@ def _require(rotation: Tensor | None, parameterization: str, convention: str | N
         axes = convention or ""
         good = len(axes) == 3 and (set(axes) <= set("XYZ") or set(axes) <= set("xyz"))
         if not good or axes[1] in (axes[0], axes[2]):
-            raise InputError(
-                f"convention {convention!r}: expected three letters of XYZ or of xyz, neighbours different, such as ZXY"
-            )
+            expected = "three letters of XYZ or of xyz, neighbours different, such as ZXY"
+            raise InputError(f"convention {convention!r}: expected {expected}")
     if rotation is None:
         return
     expected = (3, 3) if parameterization == "matrix" else (SIZES[parameterization],)

@@ -62,14 +62,10 @@ class PinholeSystem(Scanner):
     def __post_init__(self) -> None:
         object.__setattr__(self, "centers", real_array(self.centers, "pinhole centres", (None, 3)))
         super().__post_init__()
-        self._refuse(
-            self.pinhole_diameter >= self.detector_side,
-            "pinhole_diameter {pinhole_diameter:g} mm must be less than detector_side {detector_side:g} mm",
-        )
-        self._refuse(
-            self.pinhole_distance <= self.roi_radius,
-            "its pinhole is {pinhole_distance:g} mm from the isocentre, inside the ROI of {roi_radius:g} mm",
-        )
+        wide = "pinhole_diameter {pinhole_diameter:g} mm must be less than detector_side {detector_side:g} mm"
+        self._refuse(self.pinhole_diameter >= self.detector_side, wide)
+        inside = "its pinhole is {pinhole_distance:g} mm from the isocentre, inside the ROI of {roi_radius:g} mm"
+        self._refuse(self.pinhole_distance <= self.roi_radius, inside)
         self._refuse(repeated(self.centers), "another module has the same pinhole centre")
 
     @classmethod

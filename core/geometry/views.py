@@ -48,9 +48,8 @@ class Views:
         with np.errstate(invalid="ignore", divide="ignore"):
             flat = ~(np.abs(np.linalg.det(axes / lengths)) > 1e-12)
         if flat.any():
-            raise InputError(
-                f"view {int(np.argmax(flat))}: its source lies in the detector's plane, or its pixel steps are parallel"
-            )
+            why = "its source lies in the detector's plane, or its pixel steps are parallel"
+            raise InputError(f"view {int(np.argmax(flat))}: {why}")
 
     def __len__(self) -> int:
         return len(self.sources)

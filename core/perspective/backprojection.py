@@ -167,9 +167,8 @@ def _plain(values: Any, name: str, shape: tuple[int, ...]) -> Floats32:
     """`values`, an array or tensor without a gradient, as float32; not copied without need."""
     if is_tensor(values):
         if values.requires_grad:
-            raise InputError(
-                f"{name}: a back-projection has no gradients; sum from_perspective(...) of each view, or detach() the tensor"
-            )
+            advice = "sum from_perspective(...) of each view, or detach() the tensor"
+            raise InputError(f"{name}: a back-projection has no gradients; {advice}")
         values = to_numpy(values, None)
     return np.require(checked(values, name, shape, False), requirements=["C", "A"])
 

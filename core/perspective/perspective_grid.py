@@ -67,10 +67,8 @@ class PerspectiveGrid:
         for name in ("near", "far"):
             object.__setattr__(self, name, float(real_array(getattr(self, name), name, ())))
         if not self.near < self.far or (self.near <= 0 and not self.views.parallel):
-            least = "" if self.views.parallel else "0 < "
-            raise InputError(
-                f"perspective grid: expected depths {least}near < far, got {self.near:g} and {self.far:g} mm"
-            )
+            order = "near < far" if self.views.parallel else "0 < near < far"
+            raise InputError(f"perspective grid: expected depths {order}, got {self.near:g} and {self.far:g} mm")
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -222,9 +220,8 @@ def depth_ranges(views: Views, grid: Grid) -> tuple[Floats, Floats]:
     depths = depths_in_views(views, grid.corners())
     near, far = depths.min(axis=1), depths.max(axis=1)
     if not views.parallel and (near <= 0).any():
-        raise InputError(
-            f"view {int(near.argmin())}: expected a grid in front of its source, but it begins {-near.min():.3g} mm behind"
-        )
+        found = f"it begins {-near.min():.3g} mm behind"
+        raise InputError(f"view {int(near.argmin())}: expected a grid in front of its source, but {found}")
     return near, far
 
 

@@ -140,9 +140,8 @@ def prediction_errors(images: ArrayOrTensor, predicted: ArrayOrTensor, covered: 
     shape = tuple(predicted.shape[-3:])
     if tuple(images.shape[-3:]) != shape or tuple(covered.shape) != shape:
         shapes = ", ".join(shape_text(tuple(each.shape)) for each in (images, predicted, covered))
-        raise InputError(
-            f"prediction errors: expected images, predictions and pixels covered of one shape, got {shapes}"
-        )
+        expected = "images, predictions and pixels covered of one shape"
+        raise InputError(f"prediction errors: expected {expected}, got {shapes}")
     differences: Any = images - predicted
     return differences * cast_like(covered, differences)
 
@@ -162,6 +161,5 @@ def _require_shares(image: ArrayOrTensor, distribution: ArrayOrTensor) -> None:
     lost = (plain.sum(-1) == 0) & (image.swapaxes(-1, -2) != 0)
     if lost.any():
         index = np.argwhere(lost.cpu().numpy() if is_tensor(lost) else lost)[0]
-        raise InputError(
-            f"depth distribution: it is 0 all along the ray of column {index[-2]}, row {index[-1]}, whose pixel is not 0"
-        )
+        ray = f"the ray of column {index[-2]}, row {index[-1]}"
+        raise InputError(f"depth distribution: it is 0 all along {ray}, whose pixel is not 0")

@@ -92,9 +92,8 @@ def to_perspective(
             raise InputError("to_perspective: a volume has its own grid; leave `grid` out")
         grid, volume = volume.grid, volume.array
     if grid is None:
-        raise InputError(
-            "to_perspective: expected a Volume, or the grid of the array: to_perspective(array, g, grid=...)"
-        )
+        how = "to_perspective(array, g, grid=...)"
+        raise InputError(f"to_perspective: expected a Volume, or the grid of the array: {how}")
     instance(grid, Grid, "to_perspective")
     if keep == "density":
         return _AlongRays(grid, g)(volume, progress)
@@ -311,22 +310,18 @@ def _cells_covered(matrix: Floats, source: Lattice, target: Lattice) -> Floats:
 def _warn_of_few_points(operator: _Taking, what: str) -> None:
     """Warn where what is shared out at a cell's points leaves some of the cells between them out."""
     if operator.apart > _APART:
-        covered = operator.apart * _MOST_POINTS
-        warn(
-            f"{what} cover up to {covered:.2g} cells along an axis and are shared out at {_MOST_POINTS} points: the total "
-            "is kept, but single cells get too much or too little; give fewer pixels and planes, or finer "
-            + what.split()[1]
-        )
+        covered = f"cover up to {operator.apart * _MOST_POINTS:.2g} cells along an axis"
+        kept = "the total is kept, but single cells get too much or too little"
+        advice = f"give fewer pixels and planes, or finer {what.split()[1]}"
+        warn(f"{what} {covered} and are shared out at {_MOST_POINTS} points: {kept}; {advice}")
 
 
 def _warn_of_gaps(g: PerspectiveGrid, grid: Grid) -> None:
     """Warn where rays are so far apart that they leave voxels out."""
     apart = _cells_covered(_with_ones(grid.index_from_world) @ g.inverse, grid, g)[:2].max()
     if apart > _GAP:
-        warn(
-            f"from_perspective: rays are up to {apart:.2g} voxels apart, and voxels between them get nothing: give coarser "
-            'voxels or finer pixels, or keep "density"'
-        )
+        found = f"rays are up to {apart:.2g} voxels apart, and voxels between them get nothing"
+        warn(f'from_perspective: {found}: give coarser voxels or finer pixels, or keep "density"')
 
 
 def _some_cells(lattice: Lattice) -> Floats:

@@ -105,11 +105,9 @@ def fit_marker(views: Views, modules: Indices, pixels: ArrayLike, sigma: ArrayLi
     if not views.parallel:
         distance = float(np.linalg.norm(point - views.sources[index], axis=1).min())
         if not math.sqrt(along) < distance:
-            raise InputError(
-                "triangulation: the rays are so nearly parallel that sigma leaves the depth unknown, by "
-                f"{math.sqrt(along):.3g} mm at {distance:.3g} mm from a source; expected views farther apart, or a "
-                "smaller sigma"
-            )
+            unknown = f"the depth unknown, by {math.sqrt(along):.3g} mm at {distance:.3g} mm from a source"
+            found = f"the rays are so nearly parallel that sigma leaves {unknown}"
+            raise InputError(f"triangulation: {found}; expected views farther apart, or a smaller sigma")
     whitened = np.einsum("nij,nj->ni", whitening, residuals)
     chi2 = float((whitened**2).sum())
     misfits = np.full(len(index), np.nan)
@@ -131,9 +129,8 @@ def _fitted(
         raise InputError(f"triangulation: expected two or more views, got {index.size}")
     kinds, counts = np.unique(index, return_counts=True)
     if counts.max() > 1:
-        raise InputError(
-            f"triangulation: expected each view once, got view {kinds[counts.argmax()]} {counts.max()} times"
-        )
+        found = f"view {kinds[counts.argmax()]} {counts.max()} times"
+        raise InputError(f"triangulation: expected each view once, got {found}")
     pixels = real_array(pixels, "pixels", (len(index), 2))
     whitening = _whitening(sigma, len(index))
     point = _nearest_to_rays(views, index, pixels)
@@ -144,10 +141,9 @@ def _fitted(
     shift = np.zeros(3)
     state = _residuals(matrices, offsets, shift, pixels, whitening)
     if state is None:
-        raise InputError(
-            f"triangulation: the rays meet behind the source of image {offsets[:, 2].argmin() + 1} of {len(index)}; "
-            "expected the images of one point in front of all sources, as (column, row)"
-        )
+        found = f"the rays meet behind the source of image {offsets[:, 2].argmin() + 1} of {len(index)}"
+        expected = "the images of one point in front of all sources, as (column, row)"
+        raise InputError(f"triangulation: {found}; expected {expected}")
     last = math.inf
     for _ in range(_STEPS):
         residuals, slopes = state
@@ -193,10 +189,8 @@ def _nearest_to_rays(views: Views, index: Indexes, pixels: Floats) -> Floats:
     directions = directions / np.linalg.norm(directions, axis=1, keepdims=True)
     angle = float(np.linalg.norm(np.cross(directions[:, None], directions[None]), axis=-1).max())
     if angle < _LEAST_ANGLE:
-        raise InputError(
-            f"triangulation: the rays are parallel to {angle:.1g} rad, so nothing says how deep the point is; expected "
-            "views from different directions"
-        )
+        found = f"the rays are parallel to {angle:.1g} rad, so nothing says how deep the point is"
+        raise InputError(f"triangulation: {found}; expected views from different directions")
     across = np.eye(3) - directions[:, :, None] * directions[:, None]
     middle = starts.mean(axis=0)
     # By least squares, not by its normal equations: rays may be nearly parallel.

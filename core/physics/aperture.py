@@ -76,10 +76,9 @@ def points_needed(tolerance: float, shadow: float, pitch: tuple[float, float], b
     while np.abs(_point_images(disk_points(n), shadow, pitch, blur) - exact).sum(axis=(0, 2)).max() > tolerance:
         n = 3 if n == 1 else n + math.ceil(n / 4)
         if n > _MOST_POINTS:
-            raise InputError(
-                f"aperture_tolerance {tolerance:g} takes more than {_MOST_POINTS} points of a hole whose shadow of "
-                f"{shadow:.3g} mm falls on pixels of {pitch[0]:.3g} mm: allow more, or give aperture_points"
-            )
+            hole = f"a hole whose shadow of {shadow:.3g} mm falls on pixels of {pitch[0]:.3g} mm"
+            found = f"aperture_tolerance {tolerance:g} takes more than {_MOST_POINTS} points of {hole}"
+            raise InputError(f"{found}: allow more, or give aperture_points")
     return n
 
 

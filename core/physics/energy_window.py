@@ -128,9 +128,8 @@ def energy_window_scatter(
     if len(shape) != 3:
         raise InputError(f"{name}: peak: expected counts (M, n_v, n_u), got shape {shape_text(shape)}")
     if len(widths) != 3:
-        raise InputError(
-            f"{name}: widths: expected those of the lower, the peak and the upper window, got {len(widths)}"
-        )
+        expected = "those of the lower, the peak and the upper window"
+        raise InputError(f"{name}: widths: expected {expected}, got {len(widths)}")
     if lower is None and upper is None:
         raise InputError(f"{name}: expected counts of the lower or the upper window, or both")
     w_peak = positive(widths[1], f"{name}: width of the peak window", "keV")

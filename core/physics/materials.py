@@ -97,10 +97,8 @@ def module_coefficients(
         warn("the modules' crystal materials are not used: without an isotope their photons have no energy")
         return aperture, crystal
     if crystal is None and not named.all():
-        number = system.numbers[np.argmin(named)]
-        raise InputError(
-            f"module {number} has no crystal material, others have: expected one for each, or crystal_mu for the rest"
-        )
+        without = f"module {system.numbers[np.argmin(named)]} has no crystal material, others have"
+        raise InputError(f"{without}: expected one for each, or crystal_mu for the rest")
     stopping_own = lru_cache(maxsize=None)(partial(stopping, name="crystal_material"))
     each = zip(own.tolist(), system.detector_thickness.tolist(), strict=True)
     return aperture, np.array([stopping_own(*one) if one[0] else crystal for one in each], np.float64)
@@ -118,7 +116,6 @@ def _at_lines(material: str, lines: Sequence[tuple[float, float]], name: str) ->
         _known(material)  # refuses an unknown material even without lines
         coefficients = [attenuation(material, energy) for energy, _ in lines]
     if not lines:
-        raise InputError(
-            f"{name} {material!r}: at which energy? expected an isotope with photons in its window, or a number, 1/mm"
-        )
+        expected = "an isotope with photons in its window, or a number, 1/mm"
+        raise InputError(f"{name} {material!r}: at which energy? expected {expected}")
     return np.array(coefficients)

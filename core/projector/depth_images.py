@@ -50,9 +50,8 @@ def depth_images(
     by_diameter = () if optics.edge == "path" else ("aperture_mu", "opening_angle")
     for name, number in {"crystal_thickness": holes.thickness, "crystal_side": holes.side, **optics.numbers}.items():
         if name not in ("photons_per_decay", *by_diameter) and getattr(number, "requires_grad", False):
-            raise InputError(
-                f"emission images: hole 'depth' has no derivatives by {name}: take hole 'rays', or detach it"
-            )
+            what = f"hole 'depth' has no derivatives by {name}"
+            raise InputError(f"emission images: {what}: take hole 'rays', or detach it")
     factors = time * optics.photons_per_decay
     plain = optics.with_numbers({"photons_per_decay": 1.0})
     effective = _one_kernel(plain).effective_diameter(holes.diameter)

@@ -60,10 +60,9 @@ def _doubts_of_plates(model: Emission) -> Iterator[str]:
         shares.append(optics.through_plate(model.system[m : m + 1].collimators(built)[0]))
     worst = int(np.argmax(shares))
     if shares[worst] > _MOST_THROUGH:
-        yield (
-            "emission: photons through the solid plate beside the hole are not counted: "
-            f"up to {100 * shares[worst]:.2g} % of those through the hole (module {model.system.numbers[worst]})"
-        )
+        share, number = f"up to {100 * shares[worst]:.2g} %", model.system.numbers[worst]
+        passing = f"{share} of those through the hole (module {number})"
+        yield f"emission: photons through the solid plate beside the hole are not counted: {passing}"
 
 
 def doubts_of_mu(mu: Floats32, model: Emission) -> Iterator[str]:

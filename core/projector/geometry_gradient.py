@@ -74,14 +74,12 @@ def geometry_gradient(A: Projector, volume: Volume | Floats | Floats32, images: 
         return GeometryGradient(*(np.sum(own, axis=0) for own in zip(*of_parts, strict=True)))
     holes, model = A._depths, A.model
     if holes is None or not isinstance(model, Emission):
-        raise InputError(
-            "geometry gradient: expected a projector of Emission by hole 'depth'; those by rays are in `emission_images`"
-        )
+        expected = "a projector of Emission by hole 'depth'; those by rays are in `emission_images`"
+        raise InputError(f"geometry gradient: expected {expected}")
     if A._close_parts:
-        raise InputError(
-            f"geometry gradient: voxels before pinhole {model.system.numbers[A._close_parts[0][0]]} are too close to it; "
-            "take a smaller grid"
-        )
+        number = model.system.numbers[A._close_parts[0][0]]
+        close = f"voxels before pinhole {number} are too close to it"
+        raise InputError(f"geometry gradient: {close}; take a smaller grid")
     array = A._check(volume)
     array = array.reshape(-1, *A.shape_in)
     given = checked(images, "images", A.shape_out, A._float64, batch=True).reshape(-1, *A.shape_out)

@@ -297,10 +297,9 @@ class WholeHoles:
         first = float(depths.min())
         nearest = 1 / rounded_up(1.001 / first) if first > 0 else first
         if nearest < near and self.is_strict:
-            raise InputError(
-                "emission: hole 'depth' is for volumes at some distance from the pinholes, but the grid's depths before one "
-                f"are from {depths.min():.3g} to {depths.max():.3g} mm: take a smaller grid, or hole 'auto' or 'rays'"
-            )
+            expected = "hole 'depth' is for volumes at some distance from the pinholes"
+            found = f"the grid's depths before one are from {depths.min():.3g} to {depths.max():.3g} mm"
+            raise InputError(f"emission: {expected}, but {found}: take a smaller grid, or hole 'auto' or 'rays'")
         return far, max(nearest, near)
 
     def zones(self, m: int) -> list[tuple[float, float]]:

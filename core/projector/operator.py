@@ -109,9 +109,8 @@ class Projector(LinearOperator):
         self._settings: dict[str, Any] = {"backend": backend, "threads": threads, "double": double}
         if self._backend.name == "cuda":
             if double:
-                raise InputError(
-                    "projector: backend cuda computes in float32 alone: leave double out, or take another backend"
-                )
+                advice = "leave double out, or take another backend"
+                raise InputError(f"projector: backend cuda computes in float32 alone: {advice}")
             model = model.by_rays()
         self.model = model
         model.check(views)
@@ -157,9 +156,8 @@ class Projector(LinearOperator):
         if self.model.mu is None:
             raise InputError("mu: the projector's model has none; give it one to say on which grid mu is")
         if any(part.model.mu is not self.model.mu for part in self._parts):
-            raise InputError(
-                "mu: each of the model's lines has its own; give the model one volume of mu for all of them"
-            )
+            advice = "give the model one volume of mu for all of them"
+            raise InputError(f"mu: each of the model's lines has its own; {advice}")
         x, mu = promote(x, require_no_negative(checked(mu, "mu", self.model.mu.grid.shape, self._float64)))
         if not getattr(mu, "requires_grad", False):
             return self._apply(x, progress, mu)

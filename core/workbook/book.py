@@ -22,6 +22,8 @@ HEADING_ROWS = 20
 _SAME_RESULT = 1e-6
 """Largest difference, relative and absolute, between a formula's stored value and what it gives."""
 
+SAVING = "opening the workbook in Excel or LibreOffice and saving it"
+
 _OLE = bytes.fromhex("d0cf11e0a1b11ae1")
 _ENCRYPTED = "EncryptedPackage".encode("utf-16-le")
 
@@ -85,10 +87,8 @@ class Sheet:
         """The rows with content; `InputError` if they are too many for a table of modules."""
         found = sorted({at[0] for at, cell in self.cells.items() if not cell.blank})
         if len(found) > MAX_ROWS:
-            raise InputError(
-                f"{self.book.path.name}: sheet {self.name} has more than {MAX_ROWS} rows with content: "
-                "expected a row a module"
-            )
+            many = f"sheet {self.name} has more than {MAX_ROWS} rows with content"
+            raise InputError(f"{self.book.path.name}: {many}: expected a row a module")
         return found
 
     @cached_property
@@ -145,15 +145,11 @@ class Sheet:
         if value is None:
             return "is blank"
         if isinstance(value, Uncomputed):
-            return (
-                f"holds the formula {formula} without a stored value ({shortened(value, 80)}; opening the workbook in "
-                "Excel or LibreOffice and saving it stores the value)"
-            )
+            remedy = f"{SAVING} stores the value"
+            return f"holds the formula {formula} without a stored value ({shortened(value, 80)}; {remedy})"
         if isinstance(value, Outdated):
-            return (
-                f"stores {_number(value.stored)}, but its formula {formula} gives {_number(value.computed)} (opening the "
-                "workbook in Excel or LibreOffice and saving it stores the right value)"
-            )
+            gives = f"its formula {formula} gives {_number(value.computed)}"
+            return f"stores {_number(value.stored)}, but {gives} ({SAVING} stores the right value)"
         if isinstance(value, CellError):
             return f"shows the error {value}"
         if isinstance(value, bool):

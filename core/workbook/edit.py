@@ -114,10 +114,9 @@ class Rows:
             # Formulas filled down beyond the modules are no obstacle.
             filled_down = cell.formula is not None and cell.formula == moved(sheet.cell(model).formula, model, at)
             if not (cell.blank or filled_down):
-                raise InputError(
-                    f"{self.table.sheet.book.path.name}: {self.table.sheet.place(*at)} is not blank, where an added "
-                    f"module's row belongs, expected {len(self.added)} free rows below row {last}"
-                )
+                expected = f"{len(self.added)} free rows below row {last}"
+                where = self.table.sheet.where(*at)
+                raise InputError(f"{where} is not blank, where an added module's row belongs, expected {expected}")
 
 
 def _columns(table: Table, rows: Sequence[int]) -> list[int]:
@@ -177,10 +176,8 @@ class Edit:
             own = {workbook.text((name, row, column)) for row in rows.new for column in rows.columns}
             found = [text for text in workbook.ranges_ending_at(name, last) if text not in own] if rows.added else []
             if found:
-                warn(
-                    f"{workbook.name}: {several(found)} end{'s' * (len(found) == 1)} at row {last} of sheet {name}, so the "
-                    "modules added below are left out there"
-                )
+                ends = f"{several(found)} end{'s' * (len(found) == 1)} at row {last} of sheet {name}"
+                warn(f"{workbook.name}: {ends}, so the modules added below are left out there")
 
     def column_map(self) -> ColumnMap | None:
         """The column map that the workbook was read by, if any, with the rows and columns that it has now."""
@@ -199,11 +196,9 @@ class Edit:
     def _warn_of_unheld_numbers(self) -> None:
         numbers = self.system.numbers
         if not self.numbered and not np.array_equal(numbers, np.arange(1, len(numbers) + 1)):
-            warn(
-                f"{self.workbook.name}: sheet {self.modules.sheet.name} has no column of the modules' numbers: "
-                f"{several(numbers)} will be read as 1, 2, ... in the order of their rows",
-                4,
-            )
+            without = f"sheet {self.modules.sheet.name} has no column of the modules' numbers"
+            read_as = f"{several(numbers)} will be read as 1, 2, ... in the order of their rows"
+            warn(f"{self.workbook.name}: {without}: {read_as}", 4)
 
     def _add_column(self, name: str) -> None:
         """Add a column that the workbook lacks at the right of the modules' sheet, with its headings.
@@ -216,10 +211,9 @@ class Edit:
         right = max(self.workbook.extent(title)[1], *(area.right for area in sheet.merged), 0) + 1
         if declared.formula or right > MAX_COLUMN:
             i = int(np.argmin(self.is_default[name]))
-            raise InputError(
-                f"{self.workbook.name}: sheet {title} has no column headed {name} for the {declared.title} of module "
-                f"{numbers[i]}, {declared.text_of(declared.of(self.system)[i])}, which is not {declared.blank_is}"
-            )
+            lacks = f"sheet {title} has no column headed {name} for the {declared.title} of module {numbers[i]}"
+            value = declared.text_of(declared.of(self.system)[i])
+            raise InputError(f"{self.workbook.name}: {lacks}, {value}, which is not {declared.blank_is}")
         of_coordinates, usual = self.columns[self.system.columns.leading].unit, next(iter(declared.units))
         unit = of_coordinates if declared.kind == "length" else usual
         table.columns[name] = right, unit
@@ -272,10 +266,9 @@ class Edit:
                 place = (sheet.name, row, c)
                 if row != first and place not in self.required:
                     if not sheet.cell((row, c)).blank:
-                        raise InputError(
-                            f"{self.workbook.name}: {self.workbook.text(place)} is not blank, where the modules' different "
-                            f"numbers in place of {table.sheet.place(first, c)} belong, expected free cells below that"
-                        )
+                        where = f"{self.workbook.name}: {self.workbook.text(place)}"
+                        belong = f"the modules' different numbers in place of {table.sheet.place(first, c)} belong"
+                        raise InputError(f"{where} is not blank, where {belong}, expected free cells below that")
                     sheet.copy(model.typed(None), (first, c), (row, c))
                 if c == table.number_column:
                     self._demand(place, float(self.system.numbers[i]), None)

@@ -177,10 +177,9 @@ def mapped_layout(book: Book, declared: ColumnTable, columns: ColumnMap) -> Layo
             rows = layout.rows_of[table] = in_order(modules, table)
         elif mapped.rows == "by number":
             if modules.labels is None:
-                raise InputError(
-                    f"{book.path.name}: the column map matches the rows of sheet {mapped.sheet} by number, but its first "
-                    "table has no number, expected the column of the modules' numbers there"
-                )
+                matches = f"the column map matches the rows of sheet {mapped.sheet} by number"
+                found = "its first table has no number, expected the column of the modules' numbers there"
+                raise InputError(f"{book.path.name}: {matches}, but {found}")
             rows = layout.rows_of[table] = by_label(modules, table)
         for name in table.columns:
             layout.add(table, name, rows)
@@ -208,18 +207,15 @@ def by_label(modules: Table, table: Table) -> tuple[int, ...]:
     row_of = dict(zip(table.labels, table.rows, strict=True))
     for label, row in zip(modules.labels, modules.rows, strict=True):
         if label not in row_of:
-            raise InputError(
-                f"{modules.sheet.where(row, modules.label_column or 1)} is module {label}, expected a row for it in "
-                f"sheet {table.sheet.name} too, with its {', '.join(table.columns)}"
-            )
+            where = modules.sheet.where(row, modules.label_column or 1)
+            expected = f"a row for it in sheet {table.sheet.name} too, with its {', '.join(table.columns)}"
+            raise InputError(f"{where} is module {label}, expected {expected}")
     extra = [label for label in table.labels if label not in set(modules.labels)]
     if extra:
         more = f" and {len(extra) - 1} more modules" if len(extra) > 1 else ""
-        warn(
-            f"{table.sheet.where(row_of[extra[0]], table.label_column or 1)} has module {extra[0]}{more} without "
-            f"coordinates in sheet {modules.sheet.name}: left out",
-            2,
-        )
+        where = table.sheet.where(row_of[extra[0]], table.label_column or 1)
+        left = f"has module {extra[0]}{more} without coordinates in sheet {modules.sheet.name}"
+        warn(f"{where} {left}: left out", 2)
     return tuple(row_of[label] for label in modules.labels)
 
 
@@ -228,11 +224,10 @@ def in_order(modules: Table, table: Table) -> tuple[int, ...]:
     if len(table.rows) != len(modules.rows):
         name, (column, _) = next(iter(table.columns.items()))
         sheet, rows = table.sheet, table.rows
-        raise InputError(
-            f"{sheet.book.path.name}: sheet {sheet.name} has {len(rows)} rows of {name} ({sheet.place(rows[0], column)} "
-            f"to {sheet.place(rows[-1], column)}), expected one or one for each of the {len(modules.rows)} modules of "
-            f"sheet {modules.sheet.name}"
-        )
+        has = f"sheet {sheet.name} has {len(rows)} rows of {name}"
+        places = f"({sheet.place(rows[0], column)} to {sheet.place(rows[-1], column)})"
+        expected = f"one or one for each of the {len(modules.rows)} modules of sheet {modules.sheet.name}"
+        raise InputError(f"{sheet.book.path.name}: {has} {places}, expected {expected}")
     return table.rows
 
 

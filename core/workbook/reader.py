@@ -128,10 +128,8 @@ def _doubtful(
             slack = _rounding(cells[rounded], declared[rounded].of(system)) if rounded in cells else 0.0
             yield from _differences(cells[name], given[name], declared[name].of(system), "formula", slack)
     for place, why in list(book.unverified.items())[:1]:
-        yield (
-            f"{book.path.name}: {book.workbook.text(place)}: the stored value is used, though the file asks to be "
-            f"calculated when it is opened and the formula cannot be computed here ({why})"
-        )
+        though = "the file asks to be calculated when it is opened and the formula cannot be computed here"
+        yield f"{book.path.name}: {book.workbook.text(place)}: the stored value is used, though {though} ({why})"
 
 
 def _rounding(column: ColumnCells, values: Floats) -> Floats:
@@ -182,10 +180,8 @@ def _implausible(system: Scanner, cells: dict[str, ColumnCells]) -> Iterator[str
             several = len(set(column.rows)) > 1 and len(odd) > 1
             more = f" (so it is for {len(odd) - 1} more modules)" if several else ""
             limits = f"{low / next(iter(declared.units.values())):g} to {declared.text_of(high)}"
-            yield (
-                f"{column.where(int(odd[0]))} makes {name} = {declared.text_of(values[odd[0]])}{more}, which is unlikely, "
-                f"expected {limits}: are the units right?"
-            )
+            makes = f"makes {name} = {declared.text_of(values[odd[0]])}{more}"
+            yield f"{column.where(int(odd[0]))} {makes}, which is unlikely, expected {limits}: are the units right?"
 
 
 def _differences(
@@ -205,7 +201,5 @@ def _differences(
     differing = [i for i in filled if difference[i] > tolerance(given[i], expected[i], unit) + slack[i]]
     for n, i in enumerate(differing[:_SHOWN], start=1):
         more = f"; so do {len(differing) - _SHOWN} more cells of this column" if n == _SHOWN < len(differing) else ""
-        yield (
-            f"{column.where(i)} has {name} = {given[i]:.9g} {unit}, the formula gives {expected[i]:.9g} {unit} "
-            f"(the {used}'s is used{more})"
-        )
+        both = f"has {name} = {given[i]:.9g} {unit}, the formula gives {expected[i]:.9g} {unit}"
+        yield f"{column.where(i)} {both} (the {used}'s is used{more})"

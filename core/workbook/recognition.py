@@ -164,10 +164,8 @@ def _notes(layout: Layout, found: Recognized) -> Iterator[str]:
     yield from itertools.islice(others, 1)
     gap = sorted(set(range(modules.rows[0], modules.rows[-1])) - set(modules.rows))
     if gap and modules.labels is None:
-        yield (
-            f"row {gap[0]} of sheet {modules.sheet.name} holds no module; the rows below have no numbers and were taken "
-            "for modules too"
-        )
+        below = "the rows below have no numbers and were taken for modules too"
+        yield f"row {gap[0]} of sheet {modules.sheet.name} holds no module; {below}"
 
 
 def _doubts_about(table: HeadedTable, names: set[str]) -> Iterator[str]:

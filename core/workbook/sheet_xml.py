@@ -174,10 +174,8 @@ class SheetXml:
     def _read_cell(self, at: At, element: Element, strings: list[str], masters: dict[str, tuple[At, str]]) -> None:
         parts = {e.name: e for e in element.children if e.namespace == MAIN}
         if at in self.cells:
-            raise InputError(
-                f"{self._file}: {self.name}!{cell_name(at)} is stored twice in the file, expected it once; Excel or "
-                "LibreOffice may repair it"
-            )
+            twice = f"{self.name}!{cell_name(at)} is stored twice in the file"
+            raise InputError(f"{self._file}: {twice}, expected it once; Excel or LibreOffice may repair it")
         if len(parts) < sum(e.namespace == MAIN for e in element.children):
             raise InputError(f"{self._file}: {self.name}!{cell_name(at)} has several values in the file, expected one")
         value = _value(element.attributes.get("t", "n"), parts, strings)
@@ -225,10 +223,8 @@ class SheetXml:
         """Raise `InputError` for a cell of an array formula of several cells: these change only together."""
         area = self.cell(at).array
         if area is not None:
-            raise InputError(
-                f"{self._file}: {self.name}!{cell_name(at)} is one cell of the array formula or data table {area.name}, "
-                "expected a cell of its own: its number cannot be changed alone"
-            )
+            found = f"{self.name}!{cell_name(at)} is one cell of the array formula or data table {area.name}"
+            raise InputError(f"{self._file}: {found}, expected a cell of its own: its number cannot be changed alone")
 
     @property
     def changed(self) -> list[At]:

@@ -53,9 +53,8 @@ class WorkbookXml:
                 continue
             title = e.attributes.get("name", "")
             if title.casefold() in map(str.casefold, self.all_sheets):
-                raise InputError(
-                    f"{name}: has two sheets called {title}, expected one; Excel or LibreOffice may repair it"
-                )
+                twice = f"has two sheets called {title}, expected one"
+                raise InputError(f"{name}: {twice}; Excel or LibreOffice may repair it")
             self.all_sheets.append(title)
             if e.attributes.get("state", "visible") != "visible":
                 self.hidden.add(title)

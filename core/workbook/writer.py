@@ -13,7 +13,7 @@ from ..files import AnyPath, replacing, write_bytes
 from ..geometry.scanner import Scanner, first
 from ..recording import recorded_warnings
 from ..validation import instance
-from .book import Book, shortened
+from .book import SAVING, Book, shortened
 from .calculation import Recalculation
 from .column_map import ColumnMap, column_map
 from .edit import Edit
@@ -178,13 +178,9 @@ def _warn_of_formulas(workbook: WorkbookXml, recalculated: Recalculation) -> Non
     for place in sorted(recalculated.replaced):
         replaced[place[0], place[2]].append(place)
     for places in replaced.values():
-        warn(
-            f"{workbook.name}: {several(map(workbook.text, places), shown=1)}: the formula was replaced by the system's "
-            f"number ({recalculated.replaced[places[0]]})"
-        )
+        cells, why = several(map(workbook.text, places), shown=1), recalculated.replaced[places[0]]
+        warn(f"{workbook.name}: {cells}: the formula was replaced by the system's number ({why})")
     if recalculated.cleared:
-        first = next(iter(recalculated.cleared.values()))
-        warn(
-            f"{workbook.name}: {several(map(workbook.text, recalculated.cleared), shown=1)}: the formula's new value could "
-            f"not be calculated ({first}); opening the workbook in Excel or LibreOffice and saving it stores the value"
-        )
+        cells, first = recalculated.cleared, next(iter(recalculated.cleared.values()))
+        where = f"{workbook.name}: {several(map(workbook.text, cells), shown=1)}"
+        warn(f"{where}: the formula's new value could not be calculated ({first}); {SAVING} stores the value")

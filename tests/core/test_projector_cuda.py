@@ -19,8 +19,7 @@ from mphdrr.core.geometry.views import Views
 from mphdrr.core.projector import Projector, backends
 from mphdrr.core.projector import trace_rays as trace
 from mphdrr.core.projector.backends import cuda, reference
-from mphdrr.core.projector.lattices import Lattices
-from mphdrr.core.projector.rays import Attenuation, IndexFans, IndexRays, view_rays
+from mphdrr.core.projector.rays import Attenuation, IndexFans, IndexRays, index_fans, view_rays
 from mphdrr.core.volumes.volume import Volume
 
 from .conftest import emission, general_grid, refused
@@ -227,7 +226,7 @@ def test_projector_agrees_with_the_reference(attenuation, system, rng, monkeypat
 def test_rays_of_fans_are_the_listed_rays(rng, small_pieces):
     grid = Grid(SHAPE, affine(LINEAR["sheared"], SHAPE))
     views = some_views(rng, (7, 30), n=4)
-    fans, _ = Lattices(grid).fans(np.concatenate([view_rays(views, m).vectors() for m in range(4)]), views.shape)
+    fans = index_fans(grid, np.concatenate([view_rays(views, m).vectors() for m in range(4)]), views.shape)
     volume = rng.random(SHAPE, dtype=np.float32)
     for function in (cuda.forward, cuda.derivatives):
         together = function(volume, fans)
@@ -246,7 +245,7 @@ def test_tensors_on_the_device_are_not_copied(rays_at_once, rng, monkeypatch):
     volume = torch.tensor(rng.random(SHAPE), dtype=torch.float32, device=place)
     assert cuda.to_backend(volume).data_ptr() == volume.data_ptr()
 
-    fan, _ = Lattices(grid).fans(view_rays(some_views(rng, (9, 5)), 0).vectors(), (9, 5))
+    fan = index_fans(grid, view_rays(some_views(rng, (9, 5)), 0).vectors(), (9, 5))
     integrals = cuda.forward(volume, fan)
     assert integrals.device == volume.device and integrals.dtype == torch.float32
     np.testing.assert_allclose(integrals.cpu(), cuda.forward(volume.cpu().numpy(), fan), rtol=1e-6)
@@ -299,7 +298,7 @@ def test_what_is_missing_is_said_in_one_line(monkeypatch):
 def test_short_memory_means_more_launches(monkeypatch, rng):
     grid = Grid(SHAPE, affine(LINEAR["sheared"], SHAPE))
     views = some_views(rng, (7, 30), n=4)
-    fans, _ = Lattices(grid).fans(np.concatenate([view_rays(views, m).vectors() for m in range(4)]), views.shape)
+    fans = index_fans(grid, np.concatenate([view_rays(views, m).vectors() for m in range(4)]), views.shape)
     volume = rng.random(SHAPE, dtype=np.float32)
     launches = []
     launch = warp.launch

@@ -14,7 +14,7 @@ from mphdrr.core.errors import InputError
 from mphdrr.core.geometry.grid import Grid
 from mphdrr.core.projector.backends import cpu, reference
 from mphdrr.core.projector.lattices import Lattices
-from mphdrr.core.projector.rays import Ends, view_rays
+from mphdrr.core.projector.rays import index_fans, index_rays, view_rays
 
 from .conftest import run_python
 from .test_projector import LINEAR, SHAPES, affine, nasty_rays, random_rays, some_views
@@ -54,7 +54,8 @@ def close(values, expected, kind):
 def test_every_level_agrees_with_the_reference(level, kind, rng):
     for volume, lattices in lattices_of(rng, kind):
         fans = np.concatenate([view_rays(some_views(rng, (11, 13)), m).vectors() for m in range(3)])
-        for mapped in (lattices.fans(fans, (11, 13)), lattices.between(Ends(*random_rays(rng, lattices.grid, 500)))):
+        rays = lattices.mapped(index_rays, *random_rays(rng, lattices.grid, 500))
+        for mapped in (lattices.mapped(index_fans, fans, (11, 13), 0.0), rays):
             values = rng.random(len(mapped[0])).astype(kind)
             expected = reference.forward(volume.astype(float), *as_double(mapped))
             assert expected.any()
@@ -77,12 +78,12 @@ def test_every_level_agrees_with_the_reference(level, kind, rng):
 def test_every_level_takes_rays_along_faces_edges_and_corners(level, kind, rng):
     for shape, linear in itertools.product(SHAPES, LINEAR.values()):
         lattices, volume = Lattices(Grid(shape, affine(linear, shape))), rng.random(shape).astype(kind)
-        mapped = lattices.between(Ends(*nasty_rays(lattices.grid, rng)))
+        mapped = lattices.mapped(index_rays, *nasty_rays(lattices.grid, rng))
         close(cpu.forward(volume, *mapped), reference.forward(volume.astype(float), *mapped), kind)
 
 
 def test_no_rays():
-    mapped = Lattices(Grid.centered(4, 1.0)).between(Ends(np.empty((0, 3)), np.empty((0, 3))))
+    mapped = Lattices(Grid.centered(4, 1.0)).mapped(index_rays, np.empty((0, 3)), np.empty((0, 3)))
     assert cpu.forward(np.ones((4, 4, 4)), *mapped).shape == (0,)
     assert cpu.derivatives(np.ones((4, 4, 4)), *mapped).shape == (0, 7)
 
@@ -123,7 +124,8 @@ def test_a_library_of_another_version_is_not_used(monkeypatch):
 def test_denormal_numbers_are_0_in_kernels_and_nowhere_else(level, kind):
     """They are slow there, and what else runs in the thread may need them."""
     volume = np.full((8, 8, 8), np.finfo(kind).tiny / 8, kind)
-    mapped = Lattices(Grid.centered(volume.shape, 1.0)).between(Ends(np.full((1, 3), -9.0), np.full((1, 3), 9.0)))
+    ends = np.full((1, 3), 9.0)
+    mapped = Lattices(Grid.centered(volume.shape, 1.0)).mapped(index_rays, -ends, ends)
     assert not cpu.forward(volume, *mapped).any()
     assert cpu.forward(2**20 * volume, *mapped).all()
     assert (volume * kind(0.5)).all()
@@ -135,7 +137,7 @@ def test_the_last_voxel_of_a_long_way_counts_whole(level, kind):
     volume = np.zeros(grid.shape, kind)
     volume[..., -1] = 1
     ends = np.array([[1.3, -0.4, 900.0], [-2.2, 3.1, 700.0]])
-    mapped = Lattices(grid).between(Ends(-ends, ends))
+    mapped = Lattices(grid).mapped(index_rays, -ends, ends)
     close(cpu.forward(volume, *mapped), reference.forward(volume.astype(float), *mapped), kind)
     sums, expected = np.zeros_like(volume), np.zeros(grid.shape)
     cpu.backproject(sums, np.ones(2, kind), *mapped)
@@ -145,7 +147,8 @@ def test_the_last_voxel_of_a_long_way_counts_whole(level, kind):
 
 def test_what_does_not_fit_is_not_taken():
     volume = np.ones((3, 4, 5), np.float32)
-    mapped = Lattices(Grid.centered(volume.shape, 1.0)).between(Ends(np.array([[0.0, 0, -9]]), np.array([[0.0, 0, 9]])))
+    ends = np.array([[0.0, 0, 9]])
+    mapped = Lattices(Grid.centered(volume.shape, 1.0)).mapped(index_rays, -ends, ends)
     shared = type("Attenuation", (), {"mu": volume[:2], "rays": None})
     read_only = volume.copy()
     read_only.flags.writeable = False
@@ -165,6 +168,7 @@ def test_what_does_not_fit_is_not_taken():
 @pytest.mark.parametrize("shape", [(2**11, 2**10, 2**10), (1, 1, 2**12 + 1)])
 def test_volumes_too_large_for_the_indices_are_refused(shape):
     volume = np.broadcast_to(np.float32(1), shape)
-    mapped = Lattices(Grid.centered(shape, 1.0)).between(Ends(np.array([[0.0, 0, -9]]), np.array([[0.0, 0, 9]])))
+    ends = np.array([[0.0, 0, 9]])
+    mapped = Lattices(Grid.centered(shape, 1.0)).mapped(index_rays, -ends, ends)
     with pytest.raises(InputError, match=" x ".join(map(str, shape))):
         cpu.forward(volume, *mapped)

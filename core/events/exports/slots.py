@@ -21,6 +21,7 @@ MIRRORED = 4
 """Columns of mirrored images at the end of a row."""
 
 _TRUE, _FALSE = ("1", "yes", "true"), ("0", "no", "false", "")
+_ADVICE = "say which module each slot shows in a table of slots"
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,15 +63,11 @@ def row_slots(system: Scanner) -> Slots:
     rows = [np.flatnonzero(rings == ring) for ring in dict.fromkeys(rings.tolist())]
     sizes = [len(row) for row in rows]
     if len(set(sizes)) > 1:
-        raise InputError(
-            f"the slots of a scanner whose rings have {', '.join(map(str, sizes))} modules: expected rings of one size; "
-            "say which module each slot shows in a table of slots"
-        )
+        rings_of = f"whose rings have {', '.join(map(str, sizes))} modules"
+        raise InputError(f"the slots of a scanner {rings_of}: expected rings of one size; {_ADVICE}")
     if sizes[0] < MIRRORED:
-        raise InputError(
-            f"the slots of a scanner with {sizes[0]} modules in a ring: expected {MIRRORED} or more, as many as are "
-            "mirrored; say which module each slot shows in a table of slots"
-        )
+        expected = f"{MIRRORED} or more, as many as are mirrored"
+        raise InputError(f"the slots of a scanner with {sizes[0]} modules in a ring: expected {expected}; {_ADVICE}")
     modules = np.concatenate([np.concatenate([row, row[: -MIRRORED - 1 : -1]]) for row in rows])
     columns = sizes[0] + MIRRORED
     return Slots(modules, np.arange(len(modules)) % columns >= sizes[0], columns)

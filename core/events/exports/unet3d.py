@@ -21,7 +21,7 @@ from ...errors import InputError
 from ...files import AnyPath
 from ...perspective.backprojection import backproject
 from ...runs.backprojecting import run_line_integrals
-from ...validation import one_of
+from ...validation import one_of, shape_text
 from ..event_set import Event
 from .arrays import hdf5
 from .layout import Chosen, Layout, Row, only_model
@@ -51,16 +51,14 @@ class Unet3d(Layout):
         shapes, counts = chosen.shapes, chosen.radon_counts
         if self.label not in shapes:
             had = ", ".join(map(str, counts)) or "none"
-            raise InputError(
-                f"raw slots: {len(self.slots)} slots need Radon images of as many angles for their label, and the set has "
-                f"{had}; name them in the recipe's [radon] angles, or choose raw backprojection"
-            )
+            needed = f"{len(self.slots)} slots need Radon images of as many angles for their label"
+            advice = "name them in the recipe's [radon] angles, or choose raw backprojection"
+            raise InputError(f"raw slots: {needed}, and the set has {had}; {advice}")
         images, radon = shapes[self.model][1:], shapes[self.label][1:]
         if images != radon:
-            raise InputError(
-                f"raw slots: raw and label must be of one shape, but views have {images[0]} x {images[1]} pixels and Radon "
-                f"images {radon[0]} x {radon[1]}; make them alike in the recipe, or choose raw backprojection"
-            )
+            found = f"views have {shape_text(images)} pixels and Radon images {shape_text(radon)}"
+            advice = "make them alike in the recipe, or choose raw backprojection"
+            raise InputError(f"raw slots: raw and label must be of one shape, but {found}; {advice}")
 
     @property
     def fields(self) -> tuple[str, ...]:

@@ -88,10 +88,8 @@ class Plan:
     def _require_room(self) -> None:
         free = shutil.disk_usage(self.folder).free
         if not self.layout.packed and self.size > free:
-            raise InputError(
-                f"{self.folder}: the export needs {readable_size(self.size)}, but the disk has {readable_size(free)} left; "
-                "choose another folder, or one split of the set"
-            )
+            needed = f"the export needs {readable_size(self.size)}, but the disk has {readable_size(free)} left"
+            raise InputError(f"{self.folder}: {needed}; choose another folder, or one split of the set")
 
 
 def plan_export(layout: Layout, chosen: Chosen, folder: Path, program: str, options: dict[str, Any]) -> Plan:

@@ -17,6 +17,7 @@ import numpy as np
 
 from ...arrays import Array, Floats
 from ...errors import InputError
+from ...validation import shape_text
 from ..depth_response import DepthResponse
 from ..rays import Attenuation, IndexFans, IndexRays, Rays
 
@@ -193,10 +194,8 @@ def _run_places(
         return
     most_along = _MOST_PLACES_ALONG if kind == np.float32 else _MOST_VOXELS
     if arrays[0].size > _MOST_VOXELS or max(shape) > most_along:
-        raise InputError(
-            f"expected an array of at most {_MOST_VOXELS} numbers, and {most_along} along an axis in {kind}; got "
-            f"{' x '.join(map(str, shape))}"
-        )
+        expected = f"an array of at most {_MOST_VOXELS} numbers, and {most_along} along an axis in {kind}"
+        raise InputError(f"expected {expected}; got {shape_text(shape)}")
     middle = float(planes[len(planes) // 2])
     relative = np.ascontiguousarray(planes - middle, kind)
     job = _PlacesJob(
@@ -256,10 +255,9 @@ def _lattice(voxels: Array, like: Array, written: bool = False) -> _Lattice:
     """`voxels`, of the same type as `like`."""
     most_along = _MOST_ALONG if voxels.dtype == np.float32 else _MOST_VOXELS
     if voxels.size > _MOST_VOXELS or max(voxels.shape) > most_along:
-        raise InputError(
-            f"backend 'cpu': {' x '.join(map(str, voxels.shape))} voxels, but there can be at most {_MOST_VOXELS}, and "
-            f"{_MOST_ALONG} along an axis in float32; use the backend numpy"
-        )
+        most = f"at most {_MOST_VOXELS}, and {_MOST_ALONG} along an axis in float32"
+        found = f"{shape_text(voxels.shape)} voxels, but there can be {most}"
+        raise InputError(f"backend 'cpu': {found}; use the backend numpy")
     flags, kind = voxels.flags, voxels.dtype
     of_the_kind = kind in (np.float32, np.float64) and kind == like.dtype
     if not of_the_kind or not flags.c_contiguous or written > flags.writeable:

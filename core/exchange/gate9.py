@@ -43,11 +43,8 @@ def _write(system: PinholeSystem, views: Views, temporary: Path, **options: Any)
         for solid, *air in setup.collimators
     ]
     world = _under("/gate/world", *(f"geometry/set{axis}Length {_n(setup.world)} mm" for axis in "XYZ"))
-    geometry = [
-        folder.macro("geometry/world", [*world, "/gate/world/setMaterial Air"]),
-        folder.list("geometry/heads", heads),
-        folder.list("geometry/collimators", collimators),
-    ]
+    geometry = [folder.macro("geometry/world", [*world, "/gate/world/setMaterial Air"])]
+    geometry += [folder.list("geometry/heads", heads), folder.list("geometry/collimators", collimators)]
     if setup.phantom is not None:
         parts = (setup.phantom, *(rods for rods, _ in setup.rods))
         geometry.append(folder.macro("geometry/phantom", [x for part in parts for x in _repeated(folder, part)]))
@@ -165,12 +162,9 @@ def _centered(part: Placed) -> list[str]:
 
 def _repeated(folder: _Folder, part: Placed) -> list[str]:
     """A volume at all its places."""
-    return _volume(part) + _under(
-        f"/gate/{part.name}",
-        "repeaters/insert genericRepeater",
-        f"genericRepeater/setPlacementsFilename {folder.placements(part)}",
-        "genericRepeater/useRelativeTranslation 0",
-    )
+    file = f"genericRepeater/setPlacementsFilename {folder.placements(part)}"
+    commands = "repeaters/insert genericRepeater", file, "genericRepeater/useRelativeTranslation 0"
+    return _volume(part) + _under(f"/gate/{part.name}", *commands)
 
 
 def _head(folder: _Folder, crystal: Placed, name: str) -> str:
@@ -204,12 +198,9 @@ def _digitizer(folder: _Folder, crystal: str, simulation: Simulation) -> str:
     window = ["setInputCollection Singles", "insert energyFraming"]
     window += [f"energyFraming/setMin {_n(low)} keV", f"energyFraming/setMax {_n(high)} keV"]
     detector = f"/gate/digitizerMgr/{crystal}/SinglesDigitizer"
-    lines = [
-        *_under(f"{detector}/Singles", *singles),
-        *_under("/gate/digitizerMgr", "name Window", f"chooseSD {crystal}", "insert SinglesDigitizer"),
-        *_under(f"{detector}/Window", *window),
-    ]
-    return folder.macro(f"digitizer/{crystal}", lines)
+    lines = _under(f"{detector}/Singles", *singles)
+    lines += _under("/gate/digitizerMgr", "name Window", f"chooseSD {crystal}", "insert SinglesDigitizer")
+    return folder.macro(f"digitizer/{crystal}", lines + _under(f"{detector}/Window", *window))
 
 
 def _source(folder: _Folder, setup: Setup, simulation: Simulation) -> list[str]:

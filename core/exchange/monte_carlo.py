@@ -190,10 +190,8 @@ def build_setup(system: PinholeSystem, simulation: Simulation) -> Setup:
     poses = system.poses()
     bodies = system.collimators(simulation.construction)
     l, side, thickness = system.collimator_length, system.detector_side, system.detector_thickness
-    collimators = [
-        _collimator(f"collimator_{i + 1}", poses[modules], bodies[modules[0]], simulation.collimator)
-        for i, modules in enumerate(_alike(l, system.pinhole_diameter, side, thickness))
-    ]
+    kinds, material = enumerate(_alike(l, system.pinhole_diameter, side, thickness), 1), simulation.collimator
+    collimators = [_collimator(f"collimator_{i}", poses[own], bodies[own[0]], material) for i, own in kinds]
     crystals = []
     sizes = _alike(side, thickness)
     for i, modules in enumerate(sizes):

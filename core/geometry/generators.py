@@ -162,10 +162,8 @@ def _rings(
         shape = np.broadcast_shapes(heights.shape, places.shape[:2])
     except ValueError:
         rings, n = places.shape[:2]
-        raise InputError(
-            f"z: expected one number, one for each of {f'the {rings}' if rings > 1 else 'the'} rings, or rings x {n}, "
-            f"got shape {' x '.join(map(str, np.shape(z)))}"
-        ) from None
+        expected = f"one number, one for each of {f'the {rings}' if rings > 1 else 'the'} rings, or rings x {n}"
+        raise InputError(f"z: expected {expected}, got shape {' x '.join(map(str, np.shape(z)))}") from None
     centers = np.concatenate([np.broadcast_to(places, (*shape, 2)), np.broadcast_to(heights, shape)[..., None]], axis=2)
     if mirrored:
         if np.any(heights == 0):

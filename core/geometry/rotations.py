@@ -17,17 +17,8 @@ from ..validation import one_of, radians, shape_text
 with needing(of="rotations"):
     import roma
 
-SIZES = {
-    "axis_angle": 3,
-    "euler_angles": 3,
-    "matrix": 9,
-    "quaternion": 4,
-    "quaternion_adjugate": 10,
-    "rotation_6d": 6,
-    "rotation_9d": 9,
-    "rotation_10d": 10,
-    "se3_log_map": 3,
-}
+SIZES = {"axis_angle": 3, "euler_angles": 3, "matrix": 9, "quaternion": 4, "quaternion_adjugate": 10}
+SIZES |= {"rotation_6d": 6, "rotation_9d": 9, "rotation_10d": 10, "se3_log_map": 3}
 """The parameterisations, and how many numbers each takes for a rotation."""
 
 # A symmetric 4 x 4 matrix from its upper triangle, row by row.
@@ -151,8 +142,8 @@ def _require(rotation: Tensor | None, parameterization: str, convention: str | N
         axes = convention or ""
         good = len(axes) == 3 and (set(axes) <= set("XYZ") or set(axes) <= set("xyz"))
         if not good or axes[1] in (axes[0], axes[2]):
-            expected = "three letters of XYZ or of xyz, neighbours different, such as ZXY"
-            raise InputError(f"convention {convention!r}: expected {expected}")
+            letters = "three letters of XYZ or of xyz, neighbours different, such as ZXY"
+            raise InputError(f"convention {convention!r}: expected {letters}")
     if rotation is None:
         return
     expected = (3, 3) if parameterization == "matrix" else (SIZES[parameterization],)

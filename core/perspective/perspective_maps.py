@@ -40,10 +40,8 @@ class PerspectiveMaps:
         numbers = 3.0 * len(views) * (grid.n_voxels + np.prod(self.grids[0].shape))
         require(float(4 * numbers), f"maps of {len(views)} views")
         world = moved(grid.affine, np.moveaxis(np.indices(grid.shape), 0, -1))
-        cells, voxels = [], []
-        for g in self.grids:
-            cells.append(_normalized(moved(grid.index_from_world, g.centers()), grid.shape))
-            voxels.append(_normalized(g.index_from_world(world), g.shape))
+        cells = [_normalized(moved(grid.index_from_world, g.centers()), grid.shape) for g in self.grids]
+        voxels = [_normalized(g.index_from_world(world), g.shape) for g in self.grids]
         self._cells, self._voxels = torch.stack(cells), torch.stack(voxels)
         edges = 1 + 1 / torch.tensor([n - 1 for n in self.grids[0].shape[::-1]])
         self._inside = (self._voxels.abs() <= edges).all(-1)[:, None]

@@ -443,10 +443,9 @@ class Emission(Model):
         advice = "take smaller pixels, or larger voxels"
         if self.pixel_points is not None:
             advice = f"pixel_points=None (--pixel-points auto) takes as many as keep {100 * self.tolerance:g} %"
-        return (
-            f"emission: with {n} point{'s' * (n > 1)} of each pixel the total counts of a single voxel of {voxel} mm may be "
-            f"{most} % off (in module {self.system.numbers[module]}), those of larger sources less; {advice}"
-        )
+        rays = f"{n} point{'s' * (n > 1)} of each pixel"
+        off = f"{most} % off (in module {self.system.numbers[module]}), those of larger sources less"
+        return f"emission: with {rays} the total counts of a single voxel of {voxel} mm may be {off}; {advice}"
 
     def _pixel_points(self, views: Views, m: int, grid: Grid) -> int:
         """Points of the pixels of view m, for each point of the hole."""

@@ -274,13 +274,10 @@ def emission_images(
             weights = counted * seconds / n
             middle = ends + point[..., None, :]
             each = middle.shape[:-1]
-            on_plane = (
-                (depth * l)[..., None].expand(each),
-                (stretch[..., None] * pitch)[..., None, :].expand(middle.shape),
-                stretch[..., None, None] * middle,
-            )
-            turned = rotations[..., None, :, :].expand(*each, 3, 3)
-            vectors = _fans((n_v, n_u), sources[..., None, :].expand(*each, 3), turned, *on_plane)
+            pinholes, turned = sources[..., None, :].expand(*each, 3), rotations[..., None, :, :].expand(*each, 3, 3)
+            distances, pitches = (depth * l)[..., None].expand(each), (stretch[..., None] * pitch)[..., None, :]
+            off_axis = stretch[..., None, None] * middle
+            vectors = _fans((n_v, n_u), pinholes, turned, distances, pitches.expand(middle.shape), off_axis)
             integrals = trace_fans(volume, vectors, (n_v, n_u), backend, grid, mu, mu_grid)
             images = images + (weights.to(integrals) * integrals).sum(dim=-3)
     return images

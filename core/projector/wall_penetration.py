@@ -42,10 +42,8 @@ class Solids:
     def __init__(self, model: Any) -> None:
         optics, self.system, self.wall = model.optics, model.system, model.wall_thickness
         n = len(self.system)
-        self.plate, angles, self.mu = (
-            np.broadcast_to(x, n).astype(float)
-            for x in (optics.plate_thickness or _PLATE, optics.opening_angle, optics.aperture_mu)
-        )
+        numbers = optics.plate_thickness or _PLATE, optics.opening_angle, optics.aperture_mu
+        self.plate, angles, self.mu = (np.broadcast_to(x, n).astype(float) for x in numbers)
         constructions = (Construction(t, self.wall, angle) for t, angle in zip(self.plate, angles, strict=True))
         built = [self.system[m : m + 1].collimators(each)[0] for m, each in enumerate(constructions)]
         self.front, self.channel = np.array([(each.front_half_width, each.channel_half_width) for each in built]).T

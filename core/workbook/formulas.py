@@ -195,16 +195,10 @@ def _power(base: float, exponent: float) -> float:
     return result
 
 
+_COMPARISONS = {"=": "eq", "<>": "ne", "<": "lt", "<=": "le", ">": "gt", ">=": "ge"}  # names in `operator`
 # From loosest to tightest; all group from the left, and a sign in front binds tighter: -2^2 is 4.
 _OPERATORS: list[dict[str, Callable[[Any, Any], Any]]] = [
-    {
-        "=": _compared(operator.eq),
-        "<>": _compared(operator.ne),
-        "<": _compared(operator.lt),
-        "<=": _compared(operator.le),
-        ">": _compared(operator.gt),
-        ">=": _compared(operator.ge),
-    },
+    {sign: _compared(getattr(operator, name)) for sign, name in _COMPARISONS.items()},
     {"&": lambda a, b: _text(a) + _text(b)},
     {"+": _of_two_numbers(_sum), "-": _of_two_numbers(lambda a, b: _sum(a, -b))},
     {"*": _of_two_numbers(operator.mul), "/": _of_two_numbers(operator.truediv)},

@@ -181,6 +181,6 @@ def _warn_of_formulas(workbook: WorkbookXml, recalculated: Recalculation) -> Non
         cells, why = several(map(workbook.text, places), shown=1), recalculated.replaced[places[0]]
         warn(f"{workbook.name}: {cells}: the formula was replaced by the system's number ({why})")
     if recalculated.cleared:
-        cells, first = recalculated.cleared, next(iter(recalculated.cleared.values()))
-        where = f"{workbook.name}: {several(map(workbook.text, cells), shown=1)}"
+        cleared, first = recalculated.cleared, next(iter(recalculated.cleared.values()))
+        where = f"{workbook.name}: {several(map(workbook.text, cleared), shown=1)}"
         warn(f"{where}: the formula's new value could not be calculated ({first}); {SAVING} stores the value")

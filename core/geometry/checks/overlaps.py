@@ -85,10 +85,8 @@ def find_swallowed_pinholes(system: PinholeSystem, hulls: Hulls) -> tuple[Swallo
     found = []
     for number, center in zip(system.numbers.tolist(), system.centers, strict=True):
         depth = (hulls.offsets - hulls.normals @ center).min(axis=1)
-        found += [
-            SwallowedPinhole(number, int(hulls.numbers[p]), hulls.kinds[p], float(depth[p]))
-            for p in np.flatnonzero((depth > TOUCH) & (hulls.numbers != number))
-        ]
+        inside = np.flatnonzero((depth > TOUCH) & (hulls.numbers != number))
+        found += [SwallowedPinhole(number, int(hulls.numbers[p]), hulls.kinds[p], float(depth[p])) for p in inside]
     return tuple(found)
 
 

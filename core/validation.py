@@ -15,10 +15,11 @@ _MANY = 2**20
 _FEW = 2**12
 """Up to so many, a mask of which numbers are finite is faster than what does without."""
 
+Shape = tuple[int | None, ...] | None
+"""What an array's shape must be: None is any length, and None alone any shape."""
 
-def real_array(
-    value: ArrayLike, name: str, shape: tuple[int | None, ...] | None, dtype: Any = np.float64, batch: bool = False
-) -> NDArray[Any]:
+
+def real_array(value: ArrayLike, name: str, shape: Shape, dtype: Any = np.float64, batch: bool = False) -> NDArray[Any]:
     """A copy of `value` as a C-ordered array of real, finite numbers.
 
     In the expected `shape` None is any length; None alone is any shape; of a `batch`, any axes may come before it. Error
@@ -41,7 +42,7 @@ def real_array(
     return array
 
 
-def radians(value: ArrayLike, name: str, shape: tuple[int | None, ...] | None = ()) -> NDArray[np.float64]:
+def radians(value: ArrayLike, name: str, shape: Shape = ()) -> NDArray[np.float64]:
     """Angles in rad, checked by `real_array`; warns where they are, or reach over, more than a full turn, as degrees do."""
     angles = real_array(value, name, shape)
     most = max(float(np.ptp(angles)), float(np.abs(angles).min())) if angles.size else 0.0
@@ -146,9 +147,7 @@ def seed_number(value: Any, name: str = "seed", also: str = "") -> int:
     return int(value)
 
 
-def all_above_0(
-    value: Any, name: str, shape: tuple[int | None, ...] | None = None, unit: str = ""
-) -> NDArray[np.float64]:
+def all_above_0(value: Any, name: str, shape: Shape = None, unit: str = "") -> NDArray[np.float64]:
     """`value` as an array of finite numbers above 0, or `InputError`; `shape` as in `real_array`."""
     array = real_array(value, name, shape)
     if array.min(initial=np.inf) <= 0:
@@ -156,9 +155,7 @@ def all_above_0(
     return array
 
 
-def none_below_0(
-    value: Any, name: str, shape: tuple[int | None, ...] | None = None, unit: str = ""
-) -> NDArray[np.float64]:
+def none_below_0(value: Any, name: str, shape: Shape = None, unit: str = "") -> NDArray[np.float64]:
     """`value` as an array of finite numbers, each 0 or more, or `InputError`; `shape` as in `real_array`."""
     array = real_array(value, name, shape)
     if array.min(initial=0.0) < 0:

@@ -72,11 +72,8 @@ def fit_ellipse(points: Floats) -> Ellipse | None:
         distance, normal, angle = ellipse.distances(points)
         on_circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
         arm = on_circle * ellipse.semi_axes @ ellipse.axes.T  # from the centre to the nearest points
-        columns = [
-            *(normal @ ellipse.axes * on_circle).T,
-            *normal.T,
-            normal[:, 1] * arm[:, 0] - normal[:, 0] * arm[:, 1],
-        ]
+        by_rotation = normal[:, 1] * arm[:, 0] - normal[:, 0] * arm[:, 1]
+        columns = [*(normal @ ellipse.axes * on_circle).T, *normal.T, by_rotation]
         step, *_ = np.linalg.lstsq(np.stack(columns, axis=1), distance, rcond=1e-9)
         better = Ellipse(ellipse.semi_axes + step[:2], ellipse.center + step[2:4], ellipse.rotation + float(step[4]))
         if np.any(better.semi_axes <= 0) or not (better.distances(points)[0] ** 2).sum() < (distance**2).sum():

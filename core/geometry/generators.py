@@ -170,11 +170,8 @@ def _rings(
             raise InputError("mirrored: a ring at z = 0 is its own mirror image; expected z other than 0")
         centers = np.concatenate([centers, centers[::-1] * [1, 1, -1]])
     centers = centers.reshape(-1, 3)
-    names = ("pinhole_diameter", "detector_side", "detector_thickness", "roi_radius")
-    d, side, thickness, radius = (
-        real_array(size, name, (len(centers),) if np.ndim(size) else ())
-        for size, name in zip(sizes, names, strict=True)
-    )
+    named = zip(sizes, ("pinhole_diameter", "detector_side", "detector_thickness", "roi_radius"), strict=True)
+    d, side, thickness, radius = (real_array(x, name, (len(centers),) if np.ndim(x) else ()) for x, name in named)
     if collimator_length is None:
         collimator_length = designed_length(np.linalg.norm(centers, axis=1), d, side, radius)
     return PinholeSystem(centers, d, collimator_length, side, thickness, radius)  # type: ignore[arg-type]  # or numbers

@@ -16,9 +16,7 @@ def integrals(part: Part, derivatives: Floats) -> Floats:
     return np.concatenate([length for _, length in _rays(part)]) * derivatives[0]
 
 
-def by_geometry(
-    part: Part, gradient: Floats, derivatives: Floats, grid: Grid, mu_grid: Grid
-) -> list[tuple[int, Floats]]:
+def by_geometry(part: Part, gradient: Floats, derivatives: Floats, *grids: Grid) -> list[tuple[int, Floats]]:
     """The gradient by the geometry of each image of a part, with the image's number.
 
     Parameters
@@ -29,7 +27,7 @@ def by_geometry(
         By the images, (images, rows, columns).
     derivatives
         What the backend returned, (7 or 14, rays).
-    grid, mu_grid
+    grids
         The volume's and mu's.
 
     Returns
@@ -39,22 +37,23 @@ def by_geometry(
     """
     by = _by_ends if isinstance(part.rays, Ends) else _by_fan
     each = zip(part.images, np.split(derivatives, len(part.images), axis=1), _rays(part), strict=True)
+    linear = [grid.index_from_world[:3, :3] for grid in grids]
     return [
-        (number, by(part, part.pixels(gradient[number]).reshape(-1), own, *rays, grid, mu_grid))
+        (number, by(part, part.pixels(gradient[number]).reshape(-1), own, *rays, *linear))
         for (number, _), own, rays in each
     ]
 
 
 def _by_ends(
-    part: Part, values: Floats, derivatives: Floats, along: Floats, lengths: Floats, grid: Grid, mu_grid: Grid
+    part: Part, values: Floats, derivatives: Floats, along: Floats, lengths: Floats, linear: Floats, of_mu: Floats
 ) -> Floats:
     """The gradient (2, n, 3) by start and end of the rays."""
     weights = values * lengths
     result = np.empty((2, len(values), 3))
     for end in range(2):
-        result[end] = (weights * derivatives[1 + 3 * end : 4 + 3 * end]).T @ _linear(grid)
+        result[end] = (weights * derivatives[1 + 3 * end : 4 + 3 * end]).T @ linear
         if len(derivatives) > 7:
-            result[end] += (weights * derivatives[7 + 3 * end : 10 + 3 * end]).T @ _linear(mu_grid)
+            result[end] += (weights * derivatives[7 + 3 * end : 10 + 3 * end]).T @ of_mu
     by_length = (_by_length(values, lengths, derivatives) * along).T
     result[0] -= by_length
     result[1] += by_length
@@ -62,17 +61,17 @@ def _by_ends(
 
 
 def _by_fan(
-    part: Part, values: Floats, derivatives: Floats, along: Floats, lengths: Floats, grid: Grid, mu_grid: Grid
+    part: Part, values: Floats, derivatives: Floats, along: Floats, lengths: Floats, linear: Floats, of_mu: Floats
 ) -> Floats:
     """The gradient (4, 3) by source, corner, row step and column step."""
     numbers = _numbers(part)
     # Sums over the rays first, times their numbers where a step moves their ends as often.
     # einsum, not `@`: BLAS would start threads of its own beside ours.
     by_planes = np.einsum("in,jn->ij", derivatives[1:13], values * lengths * numbers)
-    by_start, by_end = by_planes[:3, 0] @ _linear(grid), by_planes[3:6].T @ _linear(grid)
+    by_start, by_end = by_planes[:3, 0] @ linear, by_planes[3:6].T @ linear
     if len(derivatives) > 7:
-        by_start += by_planes[6:9, 0] @ _linear(mu_grid)
-        by_end += by_planes[9:].T @ _linear(mu_grid)
+        by_start += by_planes[6:9, 0] @ of_mu
+        by_end += by_planes[9:].T @ of_mu
     by_length = np.einsum("jn,in->ji", _by_length(values, lengths, derivatives) * numbers, along)
     result = np.concatenate([by_start[None] - by_length[:1], by_end + by_length])
     # The part's corner is that of its first row and column.
@@ -102,7 +101,3 @@ def _numbers(part: Part) -> Floats:
     """For each ray of a fan: 1, the row's number and the column's, (3, n), counted from the part's corner."""
     rows, columns = np.indices(part.shape, float).reshape(2, -1)
     return np.stack([np.ones_like(rows), rows, columns])
-
-
-def _linear(grid: Grid) -> Floats:
-    return grid.index_from_world[:3, :3]

@@ -106,10 +106,9 @@ def _refuse_texts(system: Scanner) -> None:
     for column in (column for column in system.columns.values() if column.is_text):
         for number, text in zip(system.numbers, column.of(system).tolist(), strict=True):
             if text != text.strip() or _NOT_IN_CELLS.search(text) or len(text) > _LONGEST:
-                raise InputError(
-                    f"module {number}: {column.title} {shortened(repr(text))}: no cell can hold it, expected at most "
-                    f"{_LONGEST} characters without blanks at the ends and control characters"
-                )
+                expected = f"at most {_LONGEST} characters without blanks at the ends and control characters"
+                found = f"module {number}: {column.title} {shortened(repr(text))}"
+                raise InputError(f"{found}: no cell can hold it, expected {expected}")
 
 
 def _refuse_other_suffix(workbook: WorkbookXml, target: Path) -> None:

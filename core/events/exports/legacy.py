@@ -59,8 +59,7 @@ class Legacy(Layout):
     def tables(self, rows: list[Row]) -> dict[str, bytes]:
         """The poses, and what the slots show."""
         index = self.chosen.events.index
-        return {
-            "RunTranslate.npy": npy(np.array([[row[f"{axis}_mm"] for axis in "xyz"] for row in index], np.float64)),
-            "RunRotate.npy": npy(np.radians([[row[f"{name}_degrees"] for name in _ANGLES] for row in index])),
-            "slots.csv": self.slots.table(self.chosen.events.system).encode(),
-        }
+        places = np.array([[row[f"{axis}_mm"] for axis in "xyz"] for row in index], np.float64)
+        angles = np.radians([[row[f"{name}_degrees"] for name in _ANGLES] for row in index])
+        slots = self.slots.table(self.chosen.events.system).encode()
+        return {"RunTranslate.npy": npy(places), "RunRotate.npy": npy(angles), "slots.csv": slots}

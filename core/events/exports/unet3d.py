@@ -16,7 +16,6 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ...arrays import Array
 from ...errors import InputError
 from ...files import AnyPath
 from ...perspective.backprojection import backproject
@@ -84,8 +83,7 @@ class Unet3d(Layout):
             run = replace(event.run(self.model), projections=images)
             volume: Any = backproject(run_line_integrals(run), run.views, run.volume.grid)  # type: ignore[union-attr]
             raw, label = volume.array.T, run.volume.array.T  # type: ignore[union-attr]
-        arrays: dict[str, Array] = {"raw": np.ascontiguousarray(raw), "label": np.ascontiguousarray(label)}
-        arrays = {name: array.astype(np.float32, copy=False) for name, array in arrays.items()}
+        arrays = {"raw": np.ascontiguousarray(raw, np.float32), "label": np.ascontiguousarray(label, np.float32)}
         yield self.files(row)[0], hdf5(arrays, {"event": row["event"]})
 
     def tables(self, rows: list[Row]) -> dict[str, bytes]:

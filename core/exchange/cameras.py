@@ -101,14 +101,9 @@ def _pytorch3d(views: Views, *, in_ndc: bool = True) -> dict[str, Any]:
         half_side = min(views.shape) / 2
         focal = focal / half_side
         principal = (np.array(views.shape[::-1]) / 2 - principal) / half_side
-    return {
-        "R": rotations.transpose(0, 2, 1) * half_turn,
-        "T": translations * half_turn,
-        "focal_length": focal,
-        "principal_point": principal,
-        "image_size": np.tile(views.shape, (len(views), 1)),
-        "in_ndc": in_ndc,
-    }
+    poses = {"R": rotations.transpose(0, 2, 1) * half_turn, "T": translations * half_turn}
+    size = np.tile(views.shape, (len(views), 1))
+    return {**poses, "focal_length": focal, "principal_point": principal, "image_size": size, "in_ndc": in_ndc}
 
 
 _RTK_PARAMETERS = (

@@ -53,8 +53,7 @@ def samples_along_rays(images: ArrayLike, grid: PerspectiveGrid, pixels: ArrayLi
         Interpolated linearly between pixels; NaN outside an image, which ends half a pixel beyond the outermost pixels'
         centres, and behind a source. In the grid's own view the value is the same at all planes.
     """
-    images = _images(images, grid)
-    pixels = real_array(pixels, "pixels", (2,), batch=True)
+    images, pixels = _checked(images, grid, pixels)
     n = pixels.size // 2 * grid.n_k
     require(8 * n * (2 * len(images) + 20), f"samples along {pixels.size // 2} rays at {grid.n_k} planes")
     points = _points(grid, pixels).reshape(-1, 3)
@@ -106,8 +105,7 @@ def find_correspondences(
     InputError
         There are no other views, or the grid's own is among them.
     """
-    images = _images(images, grid)
-    pixels = real_array(pixels, "pixels", (2,), batch=True)
+    images, pixels = _checked(images, grid, pixels)
     half_width = whole_number(half_width, "half width")
     chosen = np.delete(np.arange(len(images)), grid.m)
     if others is not None:
@@ -135,11 +133,10 @@ def _scores(
     around = np.arange(-half_width, half_width + 1, dtype=np.float64)
     square = pixel + np.stack(np.meshgrid(around, around), axis=-1).reshape(-1, 2)
     wanted, shape = _normalised(_interpolated(images[grid.m], square)[:, None], images[grid.m])
-    none = np.full(grid.n_k, np.nan), np.zeros(grid.n_k, np.intp)
-    if not shape.all():
-        return none
-    points = _points(grid, square)
     total, count = np.zeros(grid.n_k), np.zeros(grid.n_k, np.intp)
+    if not shape.all():
+        return np.full(grid.n_k, np.nan), count
+    points = _points(grid, square)
     for m, matrix in zip(others, grid.views[others].projection_matrices(), strict=True):
         values = _interpolated(images[m], pixels_of(matrix, points))
         seen = np.isfinite(values).all(axis=0)
@@ -193,6 +190,8 @@ def _interpolated(image: Floats, pixels: Floats) -> Floats:
     return np.where(inside, upper * (1 - y) + lower * y, np.nan)
 
 
-def _images(images: ArrayLike, grid: PerspectiveGrid) -> Floats:
+def _checked(images: ArrayLike, grid: PerspectiveGrid, pixels: ArrayLike) -> tuple[Floats, Floats]:
+    """Images of all views of a grid, and pixels (…, 2)."""
     instance(grid, PerspectiveGrid, "perspective grid")
-    return real_array(images, "images", (len(grid.views), *grid.views.shape))
+    images = real_array(images, "images", (len(grid.views), *grid.views.shape))
+    return images, real_array(pixels, "pixels", (2,), batch=True)

@@ -20,10 +20,6 @@ class Npz(Layout):
 
     def contents(self, row: Row, event: Event) -> Iterator[tuple[str, bytes | memoryview]]:
         """All that there is of the event; `record` is text, as JSON."""
-        arrays = {
-            **dict(self.chosen.arrays(event)),
-            "truth_affine": event.recipe.grid.affine,
-            "pose": event.pose,
-            "record": json.dumps(record(self.chosen, event)),
-        }
+        affine, text = event.recipe.grid.affine, json.dumps(record(self.chosen, event))
+        arrays = {**dict(self.chosen.arrays(event)), "truth_affine": affine, "pose": event.pose, "record": text}
         yield self.files(row)[0], packed(arrays)

@@ -149,15 +149,9 @@ def _source(book: Book, layout: Layout, columns: ColumnMap | None) -> SystemSour
         letters = get_column_letter(modules.number_column)
         cells.insert(0, QuantityCells("number", modules.sheet.name, letters, modules.rows))
     dimension = (*modules.declared.dimensions, modules.declared.leading)[0]
-    return SystemSource(
-        path=book.path.absolute(),
-        sha256=book.sha256,
-        coordinates_sheet=modules.sheet.name,
-        dimensions_sheet=layout.columns[dimension].table.sheet.name,
-        numbers=modules.module_numbers,
-        cells=tuple(cells),
-        columns=columns,
-    )
+    coordinates, dimensions = modules.sheet.name, layout.columns[dimension].table.sheet.name
+    path, numbers = book.path.absolute(), modules.module_numbers
+    return SystemSource(path, book.sha256, coordinates, dimensions, numbers, tuple(cells), columns)
 
 
 def _refuse_not_positive(column: ColumnCells, values: Floats) -> None:

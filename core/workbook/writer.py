@@ -142,13 +142,10 @@ def _edited(system: Scanner, book: Book, read_by: ColumnMap | None, target: Path
     own = edit.column_map()
     _refuse_other_system(temporary, workbook.name, own, system, edit.numbered)
     _warn_of_formulas(workbook, recalculated)
-    return WrittenWorkbook(
-        path=target.absolute(),
-        changed=tuple(workbook.text(place) for place in dict.fromkeys([*edited, *recalculated.replaced])),
-        recalculated={workbook.text(place): value for place, value in sorted(recalculated.values.items())},
-        cleared=tuple(workbook.text(place) for place in sorted(recalculated.cleared)),
-        columns=own,
-    )
+    changed = tuple(workbook.text(place) for place in dict.fromkeys([*edited, *recalculated.replaced]))
+    values = {workbook.text(place): value for place, value in sorted(recalculated.values.items())}
+    cleared = tuple(workbook.text(place) for place in sorted(recalculated.cleared))
+    return WrittenWorkbook(target.absolute(), changed, values, cleared, own)
 
 
 def _refuse_other_system(path: Path, name: str, columns: ColumnMap | None, system: Scanner, numbered: bool) -> None:

@@ -39,16 +39,11 @@ class Hulls:
         a, b, _, d = (vertices[:, BOX_FACES[:, i]] for i in range(4))
         normals = _unit(np.cross(b - a, d - a))
         centers = vertices.mean(axis=1)
-        return cls(
-            numbers=np.array([part.number for part in parts]),
-            kinds=tuple(part.kind for part in parts),
-            vertices=vertices,
-            normals=normals,
-            offsets=np.einsum("pfx,pfx->pf", normals, a),
-            edges=_unit(vertices[:, _EDGES[:, 1]] - vertices[:, _EDGES[:, 0]]),
-            centers=centers,
-            radii=np.linalg.norm(vertices - centers[:, None], axis=2).max(axis=1),
-        )
+        numbers, kinds = np.array([part.number for part in parts]), tuple(part.kind for part in parts)
+        offsets = np.einsum("pfx,pfx->pf", normals, a)
+        edges = _unit(vertices[:, _EDGES[:, 1]] - vertices[:, _EDGES[:, 0]])
+        radii = np.linalg.norm(vertices - centers[:, None], axis=2).max(axis=1)
+        return cls(numbers, kinds, vertices, normals, offsets, edges, centers, radii)
 
     def __len__(self) -> int:
         return len(self.numbers)

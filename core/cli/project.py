@@ -113,9 +113,8 @@ def _chosen(arguments: argparse.Namespace) -> tuple[mph.Recipe, dict[str, Any]]:
     together = recipe["attenuation.of_phantom"] or (recipe["volume.center"] and "attenuation" in now)
     if not together and all(now.get(table) == before.get(table) for table in ("volume", "phantom")):
         if run.volume is None and recipe["counts.files"] is None:
-            raise mph.InputError(
-                f"{file}: it holds measured counts, not what was measured; name a volume, a phantom, or --counts"
-            )
+            found = "it holds measured counts, not what was measured"
+            raise mph.InputError(f"{file}: {found}; name a volume, a phantom, or --counts")
         kept["volume"] = run.volume
         if run.recipe["model.kind"] == recipe["model.kind"] == "spectral":  # whose runs hold mu at that energy
             recipe = recipe.updated({"volume.energy": CT_ENERGY})
@@ -150,9 +149,8 @@ def _run(arguments: argparse.Namespace) -> None:
     several = (recipe[key] or () for key in ("volume.states", "counts.files", "attenuation.file"))
     for file in (*itertools.chain(*several), recipe["volume.file"]):
         if file is not None and Path(file).resolve() in outputs:
-            raise mph.InputError(
-                f"{file}: the projections would replace what they are made from; choose another --output"
-            )
+            wrong = "the projections would replace what they are made from"
+            raise mph.InputError(f"{file}: {wrong}; choose another --output")
     for number, run in enumerate(mph.run_recipe(recipe, **kept, stages=progress_bar), 1):
         file = numbered_path(path, number, count)
         mph.write_run(run, file)

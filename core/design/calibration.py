@@ -241,9 +241,8 @@ def _known_distances(distances: ArrayLike | None, n_k: int) -> tuple[Indexes, Fl
     pairs = np.argwhere(np.triu(~np.isnan(table), 1))
     lengths = table[tuple(pairs.T)]
     if not np.array_equal(table, table.T, equal_nan=True) or not (np.isfinite(lengths) & (lengths > 0)).all():
-        raise InputError(
-            "calibrate: distances: expected lengths above 0 mm, the same from j to i as from i to j, or NaN"
-        )
+        expected = "lengths above 0 mm, the same from j to i as from i to j, or NaN"
+        raise InputError(f"calibrate: distances: expected {expected}")
     return pairs, lengths
 
 
@@ -252,9 +251,8 @@ def _require_spots(seen: Bools, modules: int) -> None:
         found = f"acquisition {k + 1}: {seen[k].sum()} modules see a point source"
         raise InputError(f"calibrate: images: {found}, expected {modules} or more")
     if seen.sum(axis=0).max() < _FEWEST:
-        raise InputError(
-            f"calibrate: images: no module sees {_FEWEST} points; expected more of them in its field of view"
-        )
+        found = f"no module sees {_FEWEST} points"
+        raise InputError(f"calibrate: images: {found}; expected more of them in its field of view")
 
 
 def _triangulated(system: PinholeSystem, places: Floats, seen: Bools) -> Floats:

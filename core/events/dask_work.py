@@ -33,15 +33,18 @@ def in_cluster(target: SetFolder, numbers: Sequence[int], address: str, workers:
         threads = None  # those of a worker of the cluster
         if address == "local":
             threads = threads_each(workers)
-            quiet: Any = {"dashboard_address": None, "silence_logs": logging.CRITICAL}
-            where = stack.enter_context(LocalCluster(n_workers=workers, threads_per_worker=1, **quiet))
+            cluster = LocalCluster(
+                n_workers=workers, threads_per_worker=1, dashboard_address=None, silence_logs=logging.CRITICAL
+            )
+            where = stack.enter_context(cluster)
         try:
             client = stack.enter_context(Client(where, timeout=_ANSWER_SECONDS, set_as_default=False))
         except (OSError, ValueError) as error:
             raise InputError(f"--dask {address}: no scheduler answers there ({error})") from None
         path = target.path
-        how: Any = {"retries": _RETRIES, "pure": False}
-        futures = [client.submit(_write, path, n, threads, key=f"{path}-{n}", **how) for n in numbers]
+        futures = [
+            client.submit(_write, path, n, threads, key=f"{path}-{n}", retries=_RETRIES, pure=False) for n in numbers
+        ]
         of = dict(zip((future.key for future in futures), numbers, strict=True))
         try:
             for future in as_completed(futures, loop=client.loop):

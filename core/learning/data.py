@@ -73,9 +73,8 @@ class Source:
         if self.events.recipe.models[name]["attenuation.of_phantom"]:
             raise InputError(f"data.model: {name}: each event attenuates otherwise; choose a model without attenuation")
         if self.events.recipe.models[name]["model.dead_time"]:
-            raise InputError(
-                f"data.model: {name}: dead time takes another share of each event; choose a model without it"
-            )
+            differs = "dead time takes another share of each event"
+            raise InputError(f"data.model: {name}: {differs}; choose a model without it")
         return str(name)
 
     @cached_property

@@ -236,9 +236,8 @@ class DerenzoPhantom(Phantom):
             warn(f"no rod of {', '.join(empty)} mm fits into a radius of {self.radius:g} mm: such sectors stay empty")
         if not self.cylinder_radius:
             if self.background or self.cylinder_height:
-                raise InputError(
-                    "Derenzo cylinder radius: expected more than 0 mm around a background or with a height"
-                )
+                expected = "more than 0 mm around a background or with a height"
+                raise InputError(f"Derenzo cylinder radius: expected {expected}")
         elif self.cylinder_radius < self.radius or self._water_height < self.height:
             expected = f"a radius of {self.radius:g} mm and a height of {self.height:g} mm or more"
             found = f"{self.cylinder_radius:g} and {self._water_height:g}"

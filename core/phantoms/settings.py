@@ -78,6 +78,5 @@ def require_apart(diameters: Sequence[float], ring_radius: float, name: str) -> 
     for (i, first), (j, second) in itertools.combinations(enumerate(diameters), 2):
         apart = 2 * ring_radius * math.sin(math.pi * (j - i) / len(diameters))
         if first and second and first + second > 2 * apart * (1 + 1e-9):
-            raise InputError(
-                f"{name}: spheres of {first:g} and {second:g} mm overlap: their centres are {apart:.6g} mm apart"
-            )
+            both = f"spheres of {first:g} and {second:g} mm overlap"
+            raise InputError(f"{name}: {both}: their centres are {apart:.6g} mm apart")

@@ -236,9 +236,8 @@ def _times(time: Any, found: Counts, used: list[int], called: list[str]) -> floa
     if time is None:
         for k, seconds in zip(used, own, strict=True):
             if math.isnan(seconds):
-                raise InputError(
-                    f"{found.name}: {called[k]}: the file says no time, of others it does; say it (--time)"
-                )
+                advice = "say it (--time)"
+                raise InputError(f"{found.name}: {called[k]}: the file says no time, of others it does; {advice}")
         return _one_or_all(own)
     given = np.broadcast_to(checked_times(time, "time (--time)", len(used)), len(used))
     wrong = [(k, said, taken) for k, said, taken in zip(used, own, given, strict=True) if differs(said, taken)]

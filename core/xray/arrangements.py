@@ -56,15 +56,13 @@ def xray_arc(
     """
     count = whole_number(n, "number of sources")
     first, last = (float(radians(value, name)) for value, name in ((start, "start"), (end, "end")))
-    closed = abs(last - first) >= FULL_TURN - 1e-9
-    if abs(last - first) > FULL_TURN + 1e-9:
-        raise InputError(
-            f"start and end: expected at most a full turn apart, got {math.degrees(abs(last - first)):g} degrees"
-        )
+    turn = abs(last - first)
+    if turn > FULL_TURN + 1e-9:
+        raise InputError(f"start and end: expected at most a full turn apart, got {math.degrees(turn):g} degrees")
     distance, height = positive(source_radius, "source_radius", "mm"), float(real_array(z, "z", ()))
     if abs(height) >= distance:
         raise InputError(f"z: expected less than the sources' {distance:g} mm from the isocentre, got {height:g}")
-    azimuths = np.linspace(first, last, count, endpoint=not closed)
+    azimuths = np.linspace(first, last, count, endpoint=turn < FULL_TURN - 1e-9)  # a closed ring has no end
     around = math.sqrt(distance**2 - height**2)
     sources = np.stack([around * np.cos(azimuths), around * np.sin(azimuths), np.full(count, height)], axis=1)
     u, v, k = module_frames(sources).transpose(1, 0, 2)

@@ -54,9 +54,8 @@ def table_lines(name: str) -> list[str]:
 def between(energies: Floats, known: Floats, values: Floats) -> Floats:
     """Positive `values` at `known` energies, at others: a cubic in the logarithms through the four nearest."""
     if energies.min() < known[0] or energies.max() > known[-1]:
-        raise InputError(
-            f"energies {energies.min():g} to {energies.max():g} keV: expected {known[0]:g} to {known[-1]:g} keV"
-        )
+        given = f"energies {energies.min():g} to {energies.max():g} keV"
+        raise InputError(f"{given}: expected {known[0]:g} to {known[-1]:g} keV")
     first = np.clip(np.searchsorted(known, energies) - 2, 0, len(known) - 4)[:, None] + np.arange(4)
     x, at, y = np.log(energies)[:, None], np.log(known)[first], np.log(values)[first]
     total = np.zeros(len(energies))

@@ -134,9 +134,8 @@ def decompose_images(images: ArrayLike, materials: Sequence[str], energies: Arra
     at = real_array(energies, "energies", (None,))
     given = real_array(images, "images", None)
     if not given.ndim or len(given) != len(at) or len(at) < len(materials):
-        raise InputError(
-            f"images: expected one for each of {len(at)} energies, and as many as materials, {len(materials)}"
-        )
+        expected = f"one for each of {len(at)} energies, and as many as materials, {len(materials)}"
+        raise InputError(f"images: expected {expected}")
     mu = np.stack([attenuations(name, at) for name in materials], axis=1)
     return np.tensordot(np.linalg.pinv(mu), given, axes=1)
 

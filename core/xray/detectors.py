@@ -115,7 +115,6 @@ def checked_bins(bins: Bins) -> Floats:
         if not 0 <= low < high:
             raise InputError(f"bins: bin {i}: expected a lower and a higher energy, keV, got {low:g} and {high:g}")
         if i and low < edges[i - 1, 1]:
-            raise InputError(
-                f"bins: bins {i - 1} and {i} overlap or are out of order: {low:g} < {edges[i - 1, 1]:g} keV"
-            )
+            before = edges[i - 1, 1]
+            raise InputError(f"bins: bins {i - 1} and {i} overlap or are out of order: {low:g} < {before:g} keV")
     return edges

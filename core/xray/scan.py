@@ -99,9 +99,8 @@ class SpectralScan(Model):
             return hu_to_mu(volume, CT_ENERGY)
         self.check_volume(volume)
         if energy is None:
-            raise InputError(
-                "volume.energy (--energy): missing; spectra need the energy at which the volume's mu holds"
-            )
+            needed = "spectra need the energy at which the volume's mu holds"
+            raise InputError(f"volume.energy (--energy): missing; {needed}")
         if energy == CT_ENERGY:
             return volume
         mu = virtual_monoenergetic(self._relative(volume, energy), self._names, CT_ENERGY)

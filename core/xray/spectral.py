@@ -185,9 +185,8 @@ class SpectralTransmission:
 
     def _paths(self, volumes: Sequence[Volume | Array] | Array, A: Projector) -> Floats:
         if len(volumes) != len(self.materials):
-            raise InputError(
-                f"volumes: expected {len(self.materials)}, {', '.join(self.materials)}; got {len(volumes)}"
-            )
+            expected = f"{len(self.materials)}, {', '.join(self.materials)}"
+            raise InputError(f"volumes: expected {expected}; got {len(volumes)}")
         arrays = (volume.array if isinstance(volume, Volume) else volume for volume in volumes)
         return np.stack([np.asarray(A(array), np.float64) for array in arrays])
 

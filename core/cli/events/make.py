@@ -43,9 +43,8 @@ def chosen_recipe(folder: str, recipe: str | None) -> events.EventRecipe:
     if recipe is not None:
         return events.read_recipe(recipe)
     if Path(folder).is_file():
-        raise InputError(
-            f"{folder}: is a file; name the set's folder, and a recipe by --recipe: make set --recipe {folder}"
-        )
+        advice = f"name the set's folder, and a recipe by --recipe: make set --recipe {folder}"
+        raise InputError(f"{folder}: is a file; {advice}")
     if not SetFolder(folder).recipe_path.is_file():
         raise InputError(f"{folder}: it holds no recipe.toml: give --recipe FILE (mphdrr events new writes one)")
     return SetFolder(folder).recipe

@@ -89,9 +89,8 @@ def _option(format: Format, text: str) -> tuple[str, Any]:
     name, equals, value = text.partition("=")
     options = _options(format)
     if not equals or name not in options:
-        raise mph.InputError(
-            f"--set {text!r}: expected NAME=VALUE, format {format.name} has {', '.join(options) or 'none'}"
-        )
+        known = ", ".join(options) or "none"
+        raise mph.InputError(f"--set {text!r}: expected NAME=VALUE, format {format.name} has {known}")
     type_, _ = options[name]
     if type_ is mph.Grid:
         return name, mph.read_volume(value).grid

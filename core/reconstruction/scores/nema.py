@@ -145,9 +145,8 @@ def _background_places(phantom: NemaBody) -> Floats:
     body = next(shape for shape in phantom.shapes if shape.name == "front")
     low = body.position[2] - phantom.length / 2
     if low > min(_SLICES):
-        raise InputError(
-            f"nema_score: expected a body that reaches from the spheres {-min(_SLICES):g} mm down, got {-low:g}"
-        )
+        expected = f"a body that reaches from the spheres {-min(_SLICES):g} mm down"
+        raise InputError(f"nema_score: expected {expected}, got {-low:g}")
     margin = _CLEAR + _LARGEST / 2
     keep_off = [(d / 2, place) for d, place in zip(phantom.sphere_diameters, sphere_places(), strict=True) if d]
     if phantom.lung_diameter:

@@ -206,7 +206,7 @@ def _foreign(target: SetFolder) -> Iterator[Fault]:
     for folder, known in (
         (target.path, {RECIPE, INDEX, INPUTS, ASKED, EVENTS, SHARDS}),
         (target.inputs, inputs),
-        (target.asked_path, {f"{part[0]}-{part[-1]}" for part in target.asked} if target.asked_path.is_dir() else ()),
+        (target.asked_path, target.asked_names),  # of works that began at once some may lie within others
         (store.events, {store.event_path(number).name for number in store.alone()}),
         (store.shards, {LOCK, *(path.name for path in store.shard_paths())}),
     ):

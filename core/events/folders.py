@@ -161,23 +161,29 @@ class SetFolder:
         return copies
 
     @property
+    def asked_names(self) -> list[str]:
+        """The empty files whose names say which events were asked for, so that works add to them at once."""
+        return (
+            [name for name in os.listdir(self.asked_path) if _RANGE.fullmatch(name)] if self.asked_path.is_dir() else []
+        )
+
+    @property
     def asked(self) -> list[range]:
-        """The events that were asked for, in order: by the names of empty files, so that works add to them at once."""
-        names = os.listdir(self.asked_path) if self.asked_path.is_dir() else []
-        found = [range(int(match[1]), int(match[2]) + 1) for match in map(_RANGE.fullmatch, names) if match]
+        """The events that were asked for, in order."""
+        ends = (map(int, name.split("-")) for name in self.asked_names)
+        found = [range(first, last + 1) for first, last in ends]
         if not found and (self.path / INDEX).exists():  # of an earlier version
             found = [range(n, n + 1) for n in self.index.read()]
         return _joined(found)
 
     def _ask(self, asked: Sequence[range]) -> None:
         """Note which events are asked for; ranges that touch become one."""
-        before = self.asked
+        before, whole = self.asked_names, _joined([*self.asked, *asked])
         ensure_folder(self.asked_path)
-        for part in (whole := _joined([*before, *asked])):
-            (self.asked_path / f"{part[0]}-{part[-1]}").touch()
-        for part in before:
-            if part not in whole:
-                (self.asked_path / f"{part[0]}-{part[-1]}").unlink(missing_ok=True)
+        for name in (names := [f"{part[0]}-{part[-1]}" for part in whole]):
+            (self.asked_path / name).touch()
+        for name in set(before) - set(names):
+            (self.asked_path / name).unlink(missing_ok=True)
 
     def planned(self) -> list[int]:
         """The numbers of the events that were asked for, in order."""

@@ -273,7 +273,13 @@ def test_works_that_grow_a_set_at_once_lose_no_rows(tmp_path):
     assert found.numbers == list(range(12))
     lines = (tmp_path / "set" / "index.csv").read_text().splitlines()
     assert [line.split(",")[0] for line in lines] == ["event", *map(str, range(12))]
-    assert SetFolder(tmp_path / "set").asked == [range(12)] and events.check(tmp_path / "set") == []
+    folder = SetFolder(tmp_path / "set")
+    assert folder.asked == [range(12)] and events.check(folder.path) == []
+    for name in ("0-3", "2-9"):  # as of works that asked at one time
+        (folder.asked_path / name).touch()
+    assert folder.asked == [range(12)] and events.check(folder.path) == []
+    events.make(recipe, folder.path, 12)
+    assert [path.name for path in folder.asked_path.iterdir()] == ["0-11"]
 
 
 @pytest.mark.parametrize("kept", [0, 5, 14])

@@ -225,8 +225,8 @@ def _complete(cls: Any) -> None:
         cls.bl_label = getattr(cls, "bl_label", ids.label(cls.__name__))
     if issubclass(cls, bpy.types.Operator):
         cls.bl_idname = vars(cls).get("bl_idname", ids.operator_name(cls.__name__))
-        if cls.__doc__ is not None:
-            cls.bl_description = " ".join(cls.__doc__.split())  # Blender would keep line breaks and indentation
+    if issubclass(cls, (bpy.types.Operator, bpy.types.Panel)) and cls.__doc__ is not None:
+        cls.bl_description = " ".join(cls.__doc__.split()).removesuffix(".")  # Blender keeps line breaks
 
 
 def unregister() -> None:

@@ -118,7 +118,7 @@ def _draw_module(layout: bpy.types.UILayout, camera: bpy.types.Object, kind: mod
             ("Sensitivity", f"{module.sensitivity:.2f} cps/MBq"),
             ("Resolution", f"{module.resolution:.2f} mm FWHM"),
             ("Magnif. l / b", f"{module.magnification:.3f}"),
-            ("Radius seen", f"{module.roi_seen:.2f} mm, {'all' if module.sees_roi else 'not all'}"),
+            ("Sees the ROI", f"{'whole' if module.sees_roi else 'in part'}, to {module.roi_seen:.2f} mm"),
         ]
     draw_facts(layout.box().split(factor=0.42), *facts)
 

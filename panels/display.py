@@ -6,7 +6,7 @@ from bpy.app.translations import pgettext_iface as iface
 from ..addon.blender import ids, layouts
 from ..addon.pictures import images, tiles
 from ..addon.scanner import selection
-from .sidebar import Folded, ImagesSidebar, draw_facts
+from .sidebar import ImagesSidebar, Popover, draw_facts
 
 
 class _Display:
@@ -47,8 +47,8 @@ def _draw_totals(layout: bpy.types.UILayout, context: bpy.types.Context) -> None
     draw_facts(numbers, (shown["summed"].capitalize(), total), ("Maximum", most))
 
 
-class MPHDRR_PT_display(_Display, Folded, bpy.types.Panel):
-    bl_parent_id = "MPHDRR_PT_projections"
+class MPHDRR_PT_display(_Display, Popover, bpy.types.Panel):
+    """Colours and window of the last run's pictures, and where they stand in the scene."""
 
     def draw(self, context: bpy.types.Context) -> None:
         _Display.draw(self, context)

@@ -79,9 +79,9 @@ class MPHDRR_PT_geometry(Folded, bpy.types.Panel):
         for first, last in json.loads(properties.quick_ranges or "[]"):
             _show(row, f"{first}-{last}", first, last, "ONLY")
         _show(row, "All", 0, 0, "ALL")
-        column = layout.column(align=True)
-        column.operator("mphdrr.import_geometry", text="Import Workbook", icon="IMPORT")
-        column.operator("mphdrr.add_xray_system", icon="LIGHT_SPOT")
+        row = layout.row(align=True)
+        row.operator("mphdrr.import_geometry", text="Import Workbook")
+        row.operator("mphdrr.add_xray_system")
 
 
 class ScannerPanel(Folded):

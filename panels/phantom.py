@@ -9,7 +9,7 @@ from ..addon.perspective import frustums
 from ..addon.phantoms import phantom_properties, phantoms
 from ..addon.scanner import scanner, selection
 from ..addon.volumes import slices, volumes
-from .sidebar import Folded, draw_facts, draw_hint, draw_text
+from .sidebar import Folded, Popover, draw_facts, draw_text
 
 
 class MPHDRR_PT_phantom(Folded, bpy.types.Panel):
@@ -30,8 +30,13 @@ class MPHDRR_PT_phantom(Folded, bpy.types.Panel):
         item = volumes.meant(context)
         if item is not None:
             _draw_numbers(layout, item)
+            row = layout.split(factor=0.32, align=True)
+            row.popover("MPHDRR_PT_phantom_settings")
+            row = row.split(factor=0.38, align=True)
+            row.popover("MPHDRR_PT_look")
+            row.popover("MPHDRR_PT_perspective")
         elif volumes.volume_objects(context.scene):
-            draw_hint(layout, "Select a volume to see its numbers.")
+            draw_text(layout, "Select a volume to see its numbers.", "INFO")
 
 
 def _draw_missing(column: bpy.types.UILayout, scene: bpy.types.Scene) -> None:
@@ -60,7 +65,6 @@ def _draw_numbers(layout: bpy.types.UILayout, item: bpy.types.Object) -> None:
         *([("State", volumes.state_text(item))] if item.data.is_sequence else []),
         ("File", volumes.file_state(item)),
     )
-    settings = item.mphdrr_volume
     if settings.message:
         column = layout.column()
         column.alert = settings.outdated
@@ -69,10 +73,8 @@ def _draw_numbers(layout: bpy.types.UILayout, item: bpy.types.Object) -> None:
         _draw_update(layout, item)
 
 
-class _OfVolume(Folded):
+class _OfVolume(Popover):
     """Mix into panels of the volume that is meant; they draw by `draw_volume`."""
-
-    bl_parent_id = "MPHDRR_PT_phantom"
 
     poll = layouts.shown_where(volumes.meant)
 
@@ -80,9 +82,9 @@ class _OfVolume(Folded):
         layout, item = layouts.invoking(layouts.labelled(self.layout)), volumes.meant(context)  # type: ignore[attr-defined]
         if item is not None:  # the scene may have changed since poll
             layout.context_pointer_set("object", item)  # which the buttons work on, active or not
-            self.draw_volume(layout, item)
+            self.draw_volume(layout, context, item)
 
-    def draw_volume(self, layout: bpy.types.UILayout, item: bpy.types.Object) -> None:
+    def draw_volume(self, layout: bpy.types.UILayout, context: bpy.types.Context, item: bpy.types.Object) -> None:
         """Draw the panel for a volume."""
         raise NotImplementedError
 
@@ -90,8 +92,32 @@ class _OfVolume(Folded):
 class MPHDRR_PT_look(_OfVolume, bpy.types.Panel):
     """How the volume is drawn, and what is made of it."""
 
-    def draw_volume(self, layout: bpy.types.UILayout, item: bpy.types.Object) -> None:
-        _draw_display(layout, item)
+    def draw_volume(self, layout: bpy.types.UILayout, context: bpy.types.Context, item: bpy.types.Object) -> None:
+        settings = item.mphdrr_volume
+        if settings.quantity == "hu":
+            layout.operator("mphdrr.ct_to_attenuation", icon="MOD_FLUIDSIM")
+        if settings.quantity == "activity":
+            layout.operator_menu_enum("mphdrr.add_dose_map", "isotope", text="Dose Map", icon="OUTLINER_DATA_VOLUME")
+        column = layout.column(align=True)
+        column.prop(settings, "display_low", text=iface("Low, {unit}").format(unit=settings.unit))
+        column.prop(settings, "display_high", text=iface("High, {unit}").format(unit=settings.unit))
+        looks = layout.grid_flow(columns=2, align=True)
+        looks.use_property_split = False  # or each name stands beside its button
+        for name, *_ in phantom_properties.LOOKS[: None if settings.quantity in ("hu", "mu") else 4]:
+            looks.prop_enum(settings, "look", name)
+        if settings.look not in ("DENSITY", "BRIGHTEST"):
+            layout.prop(settings, "surface", text=iface("Surface, {unit}").format(unit=settings.unit))
+        if item.data.is_sequence:
+            column = layout.column(align=True)
+            column.prop(item.data, "frame_start", text="First Frame")
+            column.prop(item.data, "sequence_mode", text="Then")
+        if slices.planes_of(item):
+            column = layout.column(align=True)
+            for axis, name in enumerate(slices.names(item)):
+                column.prop(settings, "slices", index=axis, text=name)
+            column.operator("mphdrr.remove_slices", icon="X")
+        else:
+            layout.operator("mphdrr.add_slices", icon="MESH_PLANE")
 
 
 class MPHDRR_PT_phantom_settings(_OfVolume, bpy.types.Panel):
@@ -101,7 +127,7 @@ class MPHDRR_PT_phantom_settings(_OfVolume, bpy.types.Panel):
 
     poll = layouts.shown_where(lambda context: phantoms.settings_of(volumes.meant(context)) is not None)
 
-    def draw_volume(self, layout: bpy.types.UILayout, item: bpy.types.Object) -> None:
+    def draw_volume(self, layout: bpy.types.UILayout, context: bpy.types.Context, item: bpy.types.Object) -> None:
         phantoms.settings_of(item).draw_settings(layout)
         column = layout.column(align=True)
         _draw_update(column, item)
@@ -109,34 +135,6 @@ class MPHDRR_PT_phantom_settings(_OfVolume, bpy.types.Panel):
         shown = phantoms.outline_of(item) is not None
         text = "Hide Outline" if shown else "Show Outline"
         column.operator("mphdrr.show_phantom_outline", text=text, icon="SHADING_WIRE", depress=shown)
-
-
-def _draw_display(layout: bpy.types.UILayout, item: bpy.types.Object) -> None:
-    settings = item.mphdrr_volume
-    if settings.quantity == "hu":
-        layout.operator("mphdrr.ct_to_attenuation", icon="MOD_FLUIDSIM")
-    if settings.quantity == "activity":
-        layout.operator_menu_enum("mphdrr.add_dose_map", "isotope", text="Dose Map", icon="OUTLINER_DATA_VOLUME")
-    column = layout.column(align=True)
-    column.prop(settings, "display_low", text=iface("Low, {unit}").format(unit=settings.unit))
-    column.prop(settings, "display_high", text=iface("High, {unit}").format(unit=settings.unit))
-    looks = layout.grid_flow(columns=2, align=True)
-    looks.use_property_split = False  # or each name stands beside its button
-    for name, *_ in phantom_properties.LOOKS[: None if settings.quantity in ("hu", "mu") else 4]:
-        looks.prop_enum(settings, "look", name)
-    if settings.look not in ("DENSITY", "BRIGHTEST"):
-        layout.prop(settings, "surface", text=iface("Surface, {unit}").format(unit=settings.unit))
-    if item.data.is_sequence:
-        column = layout.column(align=True)
-        column.prop(item.data, "frame_start", text="First Frame")
-        column.prop(item.data, "sequence_mode", text="Then")
-    if slices.planes_of(item):
-        column = layout.column(align=True)
-        for axis, name in enumerate(slices.names(item)):
-            column.prop(settings, "slices", index=axis, text=name)
-        column.operator("mphdrr.remove_slices", icon="X")
-    else:
-        layout.operator("mphdrr.add_slices", icon="MESH_PLANE")
 
 
 def _draw_update(layout: bpy.types.UILayout, item: bpy.types.Object) -> None:
@@ -148,18 +146,15 @@ def _draw_update(layout: bpy.types.UILayout, item: bpy.types.Object) -> None:
     row.operator("mphdrr.update_phantom", text=text, icon="FILE_REFRESH")
 
 
-class MPHDRR_PT_perspective(Folded, bpy.types.Panel):
-    bl_parent_id = "MPHDRR_PT_phantom"
+class MPHDRR_PT_perspective(_OfVolume, bpy.types.Panel):
+    """The volume in the coordinates of the active module: column, row and depth."""
 
     poll = layouts.shown_where(lambda context: selection.active_module(context) and volumes.meant(context))
 
-    def draw(self, context: bpy.types.Context) -> None:
-        layout = layouts.invoking(layouts.labelled(self.layout))
+    def draw_volume(self, layout: bpy.types.UILayout, context: bpy.types.Context, item: bpy.types.Object) -> None:
         settings, camera = context.scene.mphdrr_perspective, selection.active_module(context)
-        item = volumes.meant(context)
-        if camera is None or item is None:  # the scene may have changed since poll
+        if camera is None:  # the scene may have changed since poll
             return
-        layout.context_pointer_set("object", item)
         text = iface("{volume}, by {module}").format(volume=item.name, module=camera.name)
         layout.label(text=text, translate=False, icon="VIEW_PERSPECTIVE")
         layouts.draw_all(layout.column(align=True), settings, "uniform", "planes")

@@ -33,14 +33,17 @@ class MPHDRR_PT_projections(Folded, bpy.types.Panel):
         layouts.draw_settings(column, settings, (each for each in drawn(settings, "model") if each[0] in _MAIN))
         collection = scanner.active_scanner(context.scene)
         own = collection and scanner.own_pixels(collection)
+        split = column.split(factor=0.4)
+        name = split.row()
+        name.alignment = "RIGHT"  # as the settings' names
+        name.label(text="Pixels")
         if own:  # as its views are, whatever the settings for other scanners
-            split = column.split(factor=0.4)
-            name = split.row()
-            name.alignment = "RIGHT"  # as the settings' names
-            name.label(text="Pixels")
             split.label(text=iface("{columns} × {rows}, its own").format(rows=own[0], columns=own[1]), translate=False)
         else:
-            layouts.draw_settings(column, settings, (each for each in drawn(settings, "detector") if each[0] in _MAIN))
+            pixels = split.row(align=True)
+            pixels.use_property_split = False
+            pixels.prop(settings, "width", text="X")
+            pixels.prop(settings, "height", text="Y")
         row = layouts.invoking(layout.row())
         row.scale_y = 1.4
         row.enabled = _can_render(context)
@@ -55,9 +58,8 @@ class MPHDRR_PT_projections(Folded, bpy.types.Panel):
         if rendering.integrates_activity(context):
             draw_text(layout, "Line integrals of activity: for counts choose the model SPECT Counts.", icon="INFO")
         row = layout.row(align=True)
-        row.popover("MPHDRR_PT_advanced", icon="PREFERENCES")
-        if settings.run_file:
-            row.operator("mphdrr.show_projections", text="Show Mosaic", icon="IMAGE_DATA")
+        for panel in ("MPHDRR_PT_physics", "MPHDRR_PT_advanced", "MPHDRR_PT_display"):
+            row.popover(panel)
 
 
 def _can_render(context: bpy.types.Context) -> bool:
@@ -65,16 +67,14 @@ def _can_render(context: bpy.types.Context) -> bool:
     return scanner.active_scanner(context.scene) is not None and bool(volumes.volume_objects(context.scene))
 
 
-class MPHDRR_PT_physics(Folded, bpy.types.Panel):
-    bl_parent_id = "MPHDRR_PT_projections"
+class MPHDRR_PT_physics(Popover, bpy.types.Panel):
+    """What photons, aperture, crystal and noise are like."""
 
     poll = layouts.shown_where(lambda context: context.scene.mphdrr_projections.model != "INVERSE_SQUARE")
 
-    def draw_header_preset(self, context: bpy.types.Context) -> None:
-        self.layout.operator_menu_enum("mphdrr.use_preset", "preset", text="", icon="PRESET")
-
     def draw(self, context: bpy.types.Context) -> None:
         layout = layouts.labelled(self.layout)
+        layout.operator_menu_enum("mphdrr.use_preset", "preset", text="Presets", icon="PRESET")
         settings = context.scene.mphdrr_projections
         column = layout.column(align=True)
         if settings.model == "EMISSION":

@@ -74,6 +74,8 @@ def _draw_result(layout: bpy.types.UILayout, settings: bpy.types.PropertyGroup, 
 
 
 class MPHDRR_PT_reconstruction_model(Popover, bpy.types.Panel):
+    """What few change: the voxels' size and place, subsets, the model, a prior, a file that is the method."""
+
     bl_label = "Advanced"
 
     def draw(self, context: bpy.types.Context) -> None:
@@ -86,6 +88,8 @@ class MPHDRR_PT_reconstruction_model(Popover, bpy.types.Panel):
 
 
 class MPHDRR_PT_backprojection(Popover, bpy.types.Panel):
+    """What all modules say of each voxel along their rays, as a volume: a sight, not a reconstruction."""
+
     bl_label = "Back-Projection"
 
     def draw(self, context: bpy.types.Context) -> None:

@@ -51,9 +51,11 @@ class _Runs:
         column.active = False
         for part in settings.run_summary.split(", ", 1):
             column.label(text=part)
+        row = layouts.invoking(layout.row(align=True))
+        row.operator("mphdrr.show_projections", text="Show Mosaic", icon="IMAGE_DATA")
         if len(settings.runs) > 1:
             column.label(text=iface("All runs: {size}").format(size=runs.size_text(settings.runs)))
-            row = layouts.invoking(layout.row())
+            row = row.row(align=True)
             row.enabled = not jobs.is_running()
             row.operator_menu_enum("mphdrr.compare_runs", "other", text="Compare With", icon="SELECT_DIFFERENCE")
             if text := images.difference_text():

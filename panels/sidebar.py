@@ -27,6 +27,7 @@ class Popover(Sidebar):
     """Mixed into panels that a button opens: what few change."""
 
     bl_options = {"INSTANCED"}
+    bl_ui_units_x = 13  # as wide as the sidebar: labels fit in it
 
 
 class ImagesSidebar(Sidebar):
@@ -41,13 +42,6 @@ def draw_facts(split: bpy.types.UILayout, *facts: tuple[str, str]) -> None:
     for name, value in facts:
         names.label(text=name)
         values.label(text=value)
-
-
-def draw_hint(layout: bpy.types.UILayout, text: str) -> None:
-    """Draw what comes next, in grey."""
-    row = layout.row()
-    row.active = False
-    row.label(text=text, icon="INFO")
 
 
 def draw_text(layout: bpy.types.UILayout, text: str, icon: str = "ERROR") -> None:

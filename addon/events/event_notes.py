@@ -32,7 +32,6 @@ class Note:
 
 
 _Stamp = tuple[Any, ...]  # by which a file that has changed is read again
-NOTHING = Note("")
 _UNKNOWN: tuple[_Stamp | None, Note] = None, Note("Reading …")
 _known: dict[Path, tuple[_Stamp, Note]] = {}
 _readers: dict[Path, threading.Thread] = {}

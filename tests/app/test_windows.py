@@ -411,4 +411,4 @@ def test_tutorial(window, work_folder, monkeypatch):
 
 def test_how_tall_the_tab_is_with_everything_open(window):
     seen = window("panels")
-    assert 2000 < seen["height"] <= 3500
+    assert 1500 < seen["height"] <= 2500

@@ -25,7 +25,7 @@ def steps():
         i for i, o in enumerate(scene.mphdrr_geometry.scanner.all_objects) if o == camera
     )
     bpy.context.view_layer.objects.active = phantom
-    only("MPHDRR_PT_phantom", "MPHDRR_PT_perspective", "MPHDRR_PT_reconstruction", "MPHDRR_PT_backprojection")
+    only("MPHDRR_PT_phantom", "MPHDRR_PT_reconstruction")
     yield 1
     open_tab()
     press(bpy.ops.mphdrr.show_in_perspective)
@@ -69,8 +69,7 @@ def steps():
     settings.volume, settings.model, settings.width, settings.height = phantom, "TRANSMISSION", 128, 128
     press(bpy.ops.mphdrr.render_projections)
     yield from idle()
-    for name in ("MPHDRR_PT_perspective", "MPHDRR_PT_phantom"):  # the others are in sight
-        bpy.utils.unregister_class(getattr(bpy.types, name))
+    bpy.utils.unregister_class(bpy.types.MPHDRR_PT_phantom)  # Reconstruction is in sight
     scene.mphdrr_display.planes = "NONE"
     scene.mphdrr_reconstruction.voxels, scene.mphdrr_reconstruction.how = 96, "PRODUCT"
     press(bpy.ops.mphdrr.backproject)

@@ -13,6 +13,7 @@ from driving import (
     editor,
     folder,
     is_idle,
+    keys,
     module,
     open_tab,
     opened,
@@ -58,7 +59,7 @@ def step(function: Callable) -> Callable:
 
 @step
 def load():
-    opened("MPHDRR_PT_design", "MPHDRR_PT_display", "MPHDRR_PT_export")
+    opened("MPHDRR_PT_design", "MPHDRR_PT_projections", "MPHDRR_PT_export")
     _, area, _ = editor("VIEW_3D")
     area.spaces.active.show_region_ui = True
     yield 1
@@ -132,17 +133,21 @@ def display():
     settings.colors, settings.scale = "VIRIDIS", "SQRT"
     yield 2
     assert totals() == before, "the numbers stay"
-    yield from scroll(6)
+    mouse(sidebar().x, 300)  # where the popover is put
+    window, area, _ = editor()
+    with bpy.context.temp_override(window=window, area=area, region=sidebar()):
+        bpy.ops.wm.call_panel("INVOKE_DEFAULT", name="MPHDRR_PT_display")
     return ["Viridis", "Square Root"]
 
 
 @step
 def export():
+    keys("Escape")  # the popover closes
+    yield 1
     bpy.ops.wm.save_as_mainfile(filepath=str(folder / "heart.blend"))
     press(bpy.ops.mphdrr.export_dataset, "EXEC_DEFAULT", filepath=str(folder / "run.h5"))
     yield 1
     (inside,) = folder.glob("heart_*")
-    yield from scroll(20)
     return ["heart.blend", inside.name, "run.h5"]
 
 

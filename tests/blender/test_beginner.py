@@ -22,7 +22,8 @@ PANELS = [cls for cls in registration.CLASSES if issubclass(cls, bpy.types.Panel
 WIDTH = 236  # pixels for a panel's contents, in a sidebar of Blender's default width
 LABELS = 0.4  # share of settings' names, where they have a column of their own
 BESIDE = {"BOOLEAN": 20, "INT": 40, "FLOAT": 40}  # pixels beside a name in the same button: a box, or a number
-LETTERS, ICON, MARGIN, ROOM = 11, 20, 4, 24  # pixels: a button asks for more room than its text and margin need
+LETTERS, ICON, MARGIN = 11, 20, 4  # pixels
+BUTTON = 200  # pixels that whatever has a text asks for, however long that is, where it fills its place
 
 
 class Layout:
@@ -76,10 +77,19 @@ class Layout:
         self._leaf("button", text, icon, explained=True, name=name)
 
     def popover(self, name: str, text: str | None = None, icon: str = "NONE") -> None:
-        self._leaf("button", getattr(bpy.types, name).bl_label if text is None else text, icon, name=name, more=ICON)
+        known = getattr(bpy.types, name)
+        said = known.bl_label if text is None else text
+        self._leaf("button", said, icon, explained=bool(known.bl_description), name=name, more=ICON)
 
     def prop(
-        self, owner: Any, name: str, text: str | None = None, icon: str = "NONE", expand: bool = False, **_: Any
+        self,
+        owner: Any,
+        name: str,
+        text: str | None = None,
+        icon: str = "NONE",
+        expand: bool = False,
+        toggle: bool = False,
+        **_: Any,
     ) -> None:
         known = owner.bl_rna.properties[name]
         said = known.name if text is None else text
@@ -90,7 +100,7 @@ class Layout:
                 row._leaf("property", item.name, explained=bool(known.description), name=name)
         else:
             what = "name" if is_split else "property"
-            more = 0 if is_split or not said else BESIDE.get(known.type, 0)
+            more = 0 if is_split or not said or toggle else BESIDE.get(known.type, 0)
             self._leaf(what, said, icon, explained=bool(known.description.strip()), name=name, more=more)
 
     def prop_enum(self, owner: Any, name: str, value: str) -> None:
@@ -112,12 +122,17 @@ class Layout:
 
     def wanted(self) -> float:
         """The width that it asks for."""
-        widths = [item.wanted() if isinstance(item, Layout) else _needed(item) + ROOM for item in self.items] or [0.0]
+        widths = self._widths() or [0.0]
         return sum(widths) if self.kind == "row" else max(widths)
+
+    def _widths(self) -> list[float]:
+        """The widths that its items ask for."""
+        asked = (lambda item: BUTTON if item["text"] else ICON) if self.alignment == "EXPAND" else _needed
+        return [item.wanted() if isinstance(item, Layout) else asked(item) for item in self.items]
 
     def cut(self, width: float) -> Iterator[str]:
         """The texts for which there is not enough room."""
-        wanted = [item.wanted() if isinstance(item, Layout) else _needed(item) + ROOM for item in self.items]
+        wanted = self._widths()
         for k, (item, asked) in enumerate(zip(self.items, wanted, strict=True)):
             if self.kind == "grid":
                 own = width / self.factor

@@ -198,7 +198,6 @@ def test_physics_panel_shows_settings_that_exist(scanned, scene, model):
     settings.model, settings.photons = model, 100
     layout = MagicMock()
     layout.row.return_value = layout.column.return_value = layout
-    assert "DEFAULT_CLOSED" in MPHDRR_PT_physics.bl_options
     assert MPHDRR_PT_physics.poll(bpy.context) == (model != "INVERSE_SQUARE")
     for panel in (MPHDRR_PT_physics, MPHDRR_PT_advanced):
         panel.draw(SimpleNamespace(layout=layout), bpy.context)

@@ -93,6 +93,14 @@ def imported_module(kind: Kind, camera: bpy.types.Object) -> Scanner:
     return kind.of({name: [exact[name]] for name in ("numbers", *kind.columns.fields) if name in exact})
 
 
+@lru_cache(maxsize=8)
+def _imported(kind: Kind, exact: tuple[str, ...]) -> Scanner:
+    """Modules as they were imported, by their cameras' texts, without their numbers, which copies share."""
+    known = [_parsed(text) for text in exact]
+    names = [name for name in kind.columns.fields if all(name in values for values in known)]
+    return kind.of({name: [values[name] for values in known] for name in names})
+
+
 def with_design(camera: bpy.types.Object, module: Scanner) -> Scanner:
     """A copy of a camera's module with the values by formula that follow its own, if the camera's do."""
     if camera.mphdrr_module.length_mode != FROM_ROI:
@@ -114,7 +122,7 @@ def read_modules(
     poses, moved, turned = _poses(cameras_, matrices, known)
     if moved.any():
         poses[moved] = _straightened(kind, poses[moved], turned[moved])
-        _carry(kind, rows, known, poses, np.flatnonzero(moved).tolist())
+        _carry(kind, rows, cameras_, poses, np.flatnonzero(moved).tolist())
     _design(kind, rows, cameras_, known)
     return kind.of({name: np.array(row) for name, row in rows.items()} | {"source": source})
 
@@ -174,10 +182,12 @@ def _poses(
 
 def _straightened(kind: Kind, poses: NDArray[np.float64], turned: NDArray[np.bool_]) -> NDArray[np.float64]:
     """Poses (M, 4, 4) without rounding where they are aimed, and with a proper rotation where they were turned."""
-    left, _, right = np.linalg.svd(poses[turned, :3, :3])
-    poses[turned, :3, :3] = left @ right
     exact, aimed = _aims(kind, poses)
     poses[aimed] = exact[aimed]
+    others = turned & ~aimed
+    if others.any():
+        left, _, right = np.linalg.svd(poses[others, :3, :3])
+        poses[others, :3, :3] = left @ right
     return poses
 
 
@@ -194,14 +204,12 @@ def _aims(kind: Kind, poses: NDArray[np.float64]) -> tuple[NDArray[np.float64], 
 
 
 def _carry(
-    kind: Kind, rows: _Rows, known: Sequence[dict[str, Any]], poses: NDArray[np.float64], which: list[int]
+    kind: Kind, rows: _Rows, cameras_: Sequence[bpy.types.Object], poses: NDArray[np.float64], which: list[int]
 ) -> None:
     """Write the attributes into `rows` that modules have at their poses; one by one where they cannot be together."""
-    names = kind.columns.fields
 
     def carried(which: list[int]) -> Mapping[str, NDArray[Any]]:
-        imported = kind.of({name: np.array([known[m].get(name, rows[name][m]) for m in which]) for name in names})
-        return imported.attributes_at(poses[which])
+        return _imported(kind, tuple(cameras_[m].mphdrr_module.exact for m in which)).attributes_at(poses[which])
 
     for some, there in together(which, carried):
         if isinstance(there, InputError):

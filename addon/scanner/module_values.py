@@ -182,12 +182,10 @@ def _poses(
 
 def _straightened(kind: Kind, poses: NDArray[np.float64], turned: NDArray[np.bool_]) -> NDArray[np.float64]:
     """Poses (M, 4, 4) without rounding where they are aimed, and with a proper rotation where they were turned."""
+    left, _, right = np.linalg.svd(poses[turned, :3, :3])
+    poses[turned, :3, :3] = left @ right
     exact, aimed = _aims(kind, poses)
     poses[aimed] = exact[aimed]
-    others = turned & ~aimed
-    if others.any():
-        left, _, right = np.linalg.svd(poses[others, :3, :3])
-        poses[others, :3, :3] = left @ right
     return poses
 
 

@@ -4,6 +4,7 @@ A scanner is a collection with a sub-collection for each ring; a module is a cam
 children are its parts: its collimator and its crystal.
 """
 
+import itertools
 import json
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict
@@ -173,6 +174,12 @@ def find_scanner(scene: bpy.types.Scene, name: str) -> bpy.types.Collection | No
     return by_name[0] if by_name else None
 
 
+def free_name(scene: bpy.types.Scene, name: str) -> str:
+    """A name that no scanner in the scene has: this one, or with a number."""
+    names = itertools.chain([name], (f"{name} {number}" for number in itertools.count(2)))
+    return next(each for each in names if find_scanner(scene, each) is None)
+
+
 def scanner_of(scene: bpy.types.Scene, item: bpy.types.Object | None) -> bpy.types.Collection | None:
     """The scene's scanner that an object is in, the active one first; None for other objects."""
     if item is None:
@@ -236,6 +243,11 @@ def read_scanner(collection: bpy.types.Collection) -> Scanner:
     )
     known = source(collection) if as_imported else None
     return read_modules(kind_of(collection), found, objects.world_matrices(found), known)
+
+
+def sees_activity(collection: bpy.types.Collection | None) -> bool:
+    """Whether a scanner, if there is one, is of those that see activity."""
+    return collection is None or "activity" in kind_of(collection).takes
 
 
 def own_pixels(collection: bpy.types.Collection) -> tuple[int, int] | None:

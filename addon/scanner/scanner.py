@@ -23,7 +23,7 @@ from ..blender import ids, objects, storage
 from ..blender.decimals import typed
 from . import cameras, collimators, following, framing, pinholes
 from .following import modules
-from .module_values import aim_of, changes, kind_of, off_aim, read_modules, remember
+from .module_values import changes, kind_of, off_aim, placed, read_modules, remember
 from .scanner_parts import NewScanner, clear, losses
 
 _DEFAULT = Construction()
@@ -294,8 +294,9 @@ def check_geometry(collection: bpy.types.Collection) -> tuple[list[str], list[bp
 def aim_modules(collection: bpy.types.Collection) -> list[int]:
     """Turn every camera that does not look at the isocentre; returns their modules' numbers."""
     found = modules(collection)
+    places = placed(kind_of(collection), found, objects.world_matrices(found))
     turned = []
-    for camera, matrix, aimed in zip(found, *aim_of(kind_of(collection), objects.world_matrices(found)), strict=True):
+    for camera, matrix, aimed in zip(found, cameras.matrices_of(places.aims), places.aimed, strict=True):
         if not aimed:
             objects.set_world_matrix(camera, matrix)
             turned.append(camera.mphdrr_module.number)

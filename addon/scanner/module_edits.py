@@ -110,7 +110,7 @@ def _read(collection: bpy.types.Collection, camera: bpy.types.Object) -> Scanner
     try:
         return scanner.read_module(collection, camera)
     except InputError:
-        return module_values.imported_module(module_values.kind_of(collection), camera)
+        return module_values.imported(module_values.kind_of(collection), (camera.mphdrr_module.exact,))
 
 
 def _solids(collection: bpy.types.Collection, camera: bpy.types.Object) -> Sequence[ModulePart]:

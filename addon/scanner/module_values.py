@@ -97,15 +97,9 @@ def _parsed(text: str) -> dict[str, Any]:
     return values
 
 
-def imported_module(kind: Kind, camera: bpy.types.Object) -> Scanner:
-    """A module as it was imported, as a scanner of its own."""
-    exact = exact_values(camera)
-    return kind.of({name: [exact[name]] for name in ("numbers", *kind.columns.fields) if name in exact})
-
-
 @lru_cache(maxsize=8)
-def _imported(kind: Kind, exact: tuple[str, ...]) -> Scanner:
-    """Modules as they were imported, by their cameras' texts, without their numbers, which copies share."""
+def imported(kind: Kind, exact: tuple[str, ...]) -> Scanner:
+    """Modules as they were imported, by their `exact` texts, without their numbers, which copies share."""
     known = [_parsed(text) for text in exact]
     names = [name for name in kind.columns.fields if all(name in values for values in known)]
     return kind.of({name: [values[name] for values in known] for name in names})
@@ -224,7 +218,7 @@ def _carry(
     """Write the attributes into `rows` that modules have at their poses; one by one where they cannot be together."""
 
     def carried(which: list[int]) -> Mapping[str, NDArray[Any]]:
-        return _imported(kind, tuple(cameras_[m].mphdrr_module.exact for m in which)).attributes_at(poses[which])
+        return imported(kind, tuple(cameras_[m].mphdrr_module.exact for m in which)).attributes_at(poses[which])
 
     for some, there in together(which, carried):
         if isinstance(there, InputError):

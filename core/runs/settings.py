@@ -273,7 +273,7 @@ _DECLARED = (
     Setting("counts.raw_big_endian", bool, False, "The most significant byte of a raw file's numbers comes first",
             needs=("counts.files",), label="Big-Endian"),
     Setting("counts.lower_frames", str, None, "Frames of the energy window below the peak's, from which scatter is "
-            "estimated: which module each is of, as in counts.frames", needs=("counts.files",), label="Lower Window"),
+            "estimated: which module each is of, as in frames", needs=("counts.files",), label="Lower Window"),
     Setting("counts.upper_frames", str, None, "Frames of the energy window above the peak's, likewise",
             needs=("counts.files",), label="Upper Window"),
     Setting("counts.window_widths", float, None, "Widths of the lower, the peak and the upper energy window", "what the "

@@ -105,7 +105,7 @@ def _run(scene: bpy.types.Scene) -> bpy.types.PropertyGroup | None:
 
 def _is_without_dose(scene: bpy.types.Scene) -> bool:
     """Whether SPECT beside X-ray tubes has been reconstructed, of an isotope whose dose is known, and no dose made yet."""
-    has_tubes = any("activity" not in scanner.kind_of(each).takes for each in scanner.scanners(scene))
+    has_tubes = not all(map(scanner.sees_activity, scanner.scanners(scene)))
     has_dose = any(volumes.quantity_of(each) == "dose_rate" for each in volumes.volume_objects(scene))
     return has_tubes and not has_dose and runs.settings_of(scene).get("model.isotope") in decays()
 

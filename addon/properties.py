@@ -21,6 +21,7 @@ from bpy.props import (
 
 from ..core.geometry.system import PinholeSystem
 from .blender import choices, ids
+from .blender.file_properties import path_property
 from .blender.updates import FUNCTIONS, on_edit
 from .events import event_properties
 from .perspective import perspective_properties
@@ -104,10 +105,7 @@ class ScannerProperties(bpy.types.PropertyGroup):
         name="Kind", description="What kind of scanner it is", default=PinholeSystem.kind, options={"HIDDEN"}
     )
     scanner_name: StringProperty(name="Scanner Name", description="Its name in the import: the same name replaces it")
-    workbook: StringProperty(
-        name="Workbook", description="File last read from or written to", subtype="FILE_PATH",
-        options={"PATH_SUPPORTS_BLEND_RELATIVE"},
-    )  # fmt: skip
+    workbook: path_property("Workbook", "File last read from or written to")
     sha256: StringProperty(name="SHA-256", description="Checksum of the workbook when it was read")
     n_modules: IntProperty(name="Modules", description="Number of modules when it was imported", min=0)
     quick_ranges: StringProperty(

@@ -25,7 +25,7 @@ def chain(scene: bpy.types.Scene) -> tuple[bpy.types.Collection, bpy.types.Objec
     if runs.settings_of(scene).get("model.kind") != "spectral" or not shown_reconstruction(scene):
         return None
     body = runs.projected(scene)
-    pinholes = [each for each in scanner.scanners(scene) if "activity" in scanner.kind_of(each).takes]
+    pinholes = list(filter(scanner.sees_activity, scanner.scanners(scene)))
     found = [each for each in volumes.volume_objects(scene) if volumes.quantity_of(each) == "activity"]
     found.sort(key=lambda each: body is None or each != body.parent)
     return (pinholes[0], found[0]) if pinholes and found else None

@@ -28,7 +28,7 @@ class AddPhantom(jobs.JobOperator):
 
     def invoke(self: Any, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         """From the window: attenuation, too, where the scanner sees that alone; else a model that suits the phantom."""
-        sees_activity = _sees_activity(context)
+        sees_activity = scanner.sees_activity(scanner.active_scanner(context.scene))
         if not self.properties.is_property_set("attenuation"):
             self.attenuation = not sees_activity
         if self.confirmed and sees_activity:
@@ -47,12 +47,6 @@ class AddPhantom(jobs.JobOperator):
     def adding(self: Any, name: str) -> jobs.Job:
         pose = euler_pose(self.phi, self.theta, self.psi, self.location)
         return phantoms.adding(self, name, pose, self.attenuation)
-
-
-def _sees_activity(context: bpy.types.Context) -> bool:
-    """Whether the chosen scanner, if there is one, is of those that see activity."""
-    collection = scanner.active_scanner(context.scene)
-    return collection is None or "activity" in scanner.kind_of(collection).takes
 
 
 class AddKind(AddPhantom):

@@ -114,4 +114,4 @@ class MPHDRR_OT_export_dataset(jobs.ExportJob, bpy.types.Operator):
             self.layout.label(text=line, icon="ERROR")
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        return rendering.exporting(context.scene, self.filepath)
+        return rendering.exporting(context.scene, self.given_file("set filepath to a name ending in .h5, .npz or .pt"))

@@ -84,11 +84,8 @@ class MPHDRR_OT_flood_efficiency(jobs.ExportJob, bpy.types.Operator):
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
         flood = storage.absolute(runs.required(context.scene, "take efficiencies from").file)
-        path, order, scene_uid = (
-            self.given_file("expected a name ending in .npy"),
-            self.order,
-            context.scene.session_uid,
-        )
+        path = self.given_file("expected a name ending in .npy")
+        order, scene_uid = self.order, context.scene.session_uid
 
         def finish(lines: list[str]) -> str:
             scene = jobs.scene_again(scene_uid, "the efficiencies are")

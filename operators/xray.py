@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from typing import Any
 
@@ -82,9 +81,7 @@ class MPHDRR_OT_add_xray_system(Reported, bpy.types.Operator):
         settings |= {"shape": (self.pixels, self.pixels), "start": start}
         is_arc = self.arrangement == "ARC"
         system = xray_arc(self.sources, end=end, **settings) if is_arc else xray_ring(self.sources, **settings)
-        names = itertools.chain([self.name], (f"{self.name} {number}" for number in itertools.count(2)))
-        name = next(each for each in names if scanner.find_scanner(context.scene, each) is None)
-        collection = scanner.build_scanner(context.scene, system, name)
+        collection = scanner.build_scanner(context.scene, system, scanner.free_name(context.scene, self.name))
         studio.light(context.scene)
         context.view_layer.update()  # so that scripts find the children's matrix_world in place
         panel, reconstruction = context.scene.mphdrr_projections, context.scene.mphdrr_reconstruction

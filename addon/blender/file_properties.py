@@ -1,4 +1,4 @@
-"""Properties of operators that Blender's file browser sets, or reads."""
+"""Properties that are paths: of operators, which Blender's file browser sets or reads, and of what the .blend keeps."""
 
 from collections.abc import Iterable
 from typing import Any
@@ -15,6 +15,12 @@ def file_property(description: str) -> Any:
 def files_property(description: str) -> Any:
     """The `files` of an operator that takes several, which are in its `directory`."""
     return CollectionProperty(description=description, type=bpy.types.OperatorFileListElement, options={"SKIP_SAVE"})
+
+
+def path_property(name: str, description: str, *options: str, subtype: str = "FILE_PATH", **more: Any) -> Any:
+    """A path that the .blend keeps, which may be relative to it."""
+    every = {"PATH_SUPPORTS_BLEND_RELATIVE", *options}
+    return StringProperty(name=name, description=description, subtype=subtype, options=every, **more)
 
 
 DIRECTORY = StringProperty(description="Where the files are", subtype="DIR_PATH", options={"SKIP_SAVE"})

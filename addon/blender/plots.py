@@ -34,12 +34,6 @@ def objective_icon(objective: Sequence[float]) -> int:
     return int(_icons["objective"].icon_id)
 
 
-def forget() -> None:
-    """Draw anew next time."""
-    global _drawn
-    _drawn = ()
-
-
 def stop() -> None:
     """Remove the icons: the extension is disabled."""
     global _icons

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
-from bpy.props import BoolProperty, EnumProperty, FloatProperty, FloatVectorProperty, IntProperty, StringProperty
+from bpy import props
 
 from ...core.errors import InputError, expecting
 from ...core.runs.recipe import is_met
@@ -35,15 +35,17 @@ def of_modules(name: str, setting: Setting) -> str | None:
 
 
 def identifier(name: str, word: str) -> str:
-    """How an enumeration calls a word: isotopes and materials by their names, others in capitals."""
-    return word if name == "isotope" or name.endswith("_material") else word.upper().replace("-", "_")
+    """How an enumeration calls a word: isotopes, materials and what is said of files by their names, others in capitals."""
+    is_name = name in ("isotope", "orientation", "raw_type") or name.endswith("_material")
+    return word if is_name else word.upper().replace("-", "_")
 
 
 def properties_of(settings: Settings) -> dict[str, Any]:
     """The properties, annotations of a class, of settings."""
     made: dict[str, Any] = {}
     for name, setting in settings.items():
-        absent = f"; 0: {setting.absent}" if setting.default is None else ""
+        nothing = "empty" if setting.kind is str else "0"
+        absent = f"; {nothing}: {setting.absent}" if setting.default is None and setting.absent else ""
         common: dict[str, Any] = {"name": setting.label, "description": setting.text + absent}
         if setting.kind in (int, float):
             least = setting.least if setting.above is None else 1e-6
@@ -56,23 +58,26 @@ def properties_of(settings: Settings) -> dict[str, Any]:
             made[material] = _enumeration(material, setting, none)
             common["name"] = f"µ ({setting.unit})"  # below the material's menu
         if setting.kind is bool:
-            made[name] = BoolProperty(name=setting.label, description=setting.text, default=setting.default)
+            made[name] = props.BoolProperty(**common, default=setting.default)
+        elif setting.kind is str and not setting.words:
+            made[name] = props.StringProperty(**common)
         elif setting.kind is str:
-            absent_item = ("NONE", "None", setting.absent.capitalize()) if setting.default is None else None
+            absent_item = ("NONE", setting.unset, setting.absent.capitalize()) if setting.default is None else None
             made[name] = _enumeration(name, setting, absent_item)
         elif is_list(setting):
             text = f"{setting.text}; such as 10, 20, 30. Empty: {setting.absent}"
-            made[name] = StringProperty(name=setting.label, description=text)
+            made[name] = props.StringProperty(name=setting.label, description=text)
         elif _is_vector(setting):
-            made[name] = FloatVectorProperty(size=setting.sizes[0], default=(0.0,) * setting.sizes[0], **common)  # type: ignore[index]
+            many = props.IntVectorProperty if setting.kind is int else props.FloatVectorProperty
+            made[name] = many(size=setting.sizes[0], default=(0,) * setting.sizes[0], **common)  # type: ignore[index]
         else:
-            make: Callable[..., Any] = IntProperty if setting.kind is int else FloatProperty
+            make: Callable[..., Any] = props.IntProperty if setting.kind is int else props.FloatProperty
             default = setting.default[0] if isinstance(setting.default, tuple) else setting.default or 0
             made[name] = make(default=default, **common)
         if each := of_modules(name, setting):
             or_file = f", or a file with an image for each ({', '.join(setting.endings)})" if setting.endings else ""
             as_file = {"subtype": "FILE_PATH", "options": {"PATH_SUPPORTS_BLEND_RELATIVE"}} if setting.endings else {}
-            made[each] = StringProperty(
+            made[each] = props.StringProperty(
                 **as_file,
                 name=f"Each {setting.label.partition(' (')[0]}",
                 description=f"A number for each module that is projected, such as 10, 20, 30{or_file}. Empty: one for all",
@@ -107,7 +112,7 @@ def check_mark(name: str, word: str, text: str, first: Any) -> Any:
             setattr(owner, name, nothing if unset else first)
 
     description = f"{word}: {text}. Take the check mark away to give a number"
-    return BoolProperty(name=word, description=description, get=is_unset, set=give)
+    return props.BoolProperty(name=word, description=description, get=is_unset, set=give)
 
 
 def values_of(settings: Settings, get: Callable[[str], Any]) -> dict[str, Any]:
@@ -123,13 +128,16 @@ def values_of(settings: Settings, get: Callable[[str], Any]) -> dict[str, Any]:
             name, value = material, get(material)
         if is_list(setting):
             values[setting.key] = _numbers(setting, value)
+        elif isinstance(value, str) and not setting.words:
+            values[setting.key] = value or None
         elif isinstance(value, str):
             words = {identifier(name, word): word for word in setting.words} | {"NONE": None}
             if value not in words:
                 raise InputError(f"{setting.label}: {value!r} is not known to this version; choose another")
             values[setting.key] = words[value]
         elif _is_vector(setting):
-            values[setting.key] = tuple(map(decimals.typed, value)) if any(value) else None
+            numbers = (decimals.typed(each) if setting.kind is float else each for each in value)
+            values[setting.key] = tuple(numbers) if any(value) else None
         else:
             number = decimals.typed(value) if isinstance(value, float) else value
             values[setting.key] = number if number or setting.default is not None else None
@@ -199,4 +207,4 @@ def _enumeration(name: str, setting: Setting, none: tuple[str, str, str] | None)
     words = [(identifier(name, word), label, text) for word, (label, text) in setting.words.items()]
     items = choices.items(_NUMBERS.get(name, {}), ([none] if none else []) + words)
     default = none[0] if none else identifier(name, setting.default)
-    return EnumProperty(name=setting.label, description=setting.text, items=items, default=default)
+    return props.EnumProperty(name=setting.label, description=setting.text, items=items, default=default)

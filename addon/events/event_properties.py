@@ -5,6 +5,7 @@ from typing import Any
 import bpy
 from bpy.props import IntProperty, PointerProperty, StringProperty
 
+from ..blender.file_properties import path_property
 from ..volumes import volumes
 from . import event_notes
 
@@ -15,10 +16,8 @@ def _models(self: bpy.types.PropertyGroup, context: bpy.types.Context, typed: st
 
 def recipe(update: Any = None) -> Any:
     """A property for a recipe's file."""
-    return StringProperty(
-        name="Recipe", description="Text (.toml) that says from which phantoms, poses and models events are drawn",
-        subtype="FILE_PATH", options={"SKIP_SAVE", "PATH_SUPPORTS_BLEND_RELATIVE"}, update=update,
-    )  # fmt: skip
+    text = "Text (.toml) that says from which phantoms, poses and models events are drawn"
+    return path_property("Recipe", text, "SKIP_SAVE", update=update)
 
 
 def _propose_folder(self: Any, context: bpy.types.Context) -> None:
@@ -28,10 +27,9 @@ def _propose_folder(self: Any, context: bpy.types.Context) -> None:
 
 
 RECIPE = recipe()
-FOLDER = StringProperty(
-    name="Folder", description="Of the event set: its recipe, its index and a file for each event", subtype="DIR_PATH",
-    options={"SKIP_SAVE", "PATH_SUPPORTS_BLEND_RELATIVE"},
-)  # fmt: skip
+FOLDER = path_property(
+    "Folder", "Of the event set: its recipe, its index and a file for each event", "SKIP_SAVE", subtype="DIR_PATH"
+)
 COUNT = IntProperty(
     name="Events", description="Of the whole set, numbered from 0; those that are there stay as they are", default=10,
     min=1, soft_max=10000, options={"SKIP_SAVE"},
@@ -68,10 +66,7 @@ class EventProperties(bpy.types.PropertyGroup):
         name="Truth", description="Of the event that was opened last", type=bpy.types.Object,
         poll=lambda self, item: volumes.is_volume(item), options={"HIDDEN"},
     )  # fmt: skip
-    proposed: StringProperty(
-        name="Proposed Folder", description="That the recipe has proposed", subtype="DIR_PATH",
-        options={"HIDDEN", "PATH_SUPPORTS_BLEND_RELATIVE"},
-    )  # fmt: skip
+    proposed: path_property("Proposed Folder", "That the recipe has proposed", "HIDDEN", subtype="DIR_PATH")
     tried: StringProperty(name="Tried", description="What the phantom in the scene is", options={"HIDDEN"})
 
 

@@ -167,7 +167,8 @@ def views_of(mosaic: bpy.types.Image) -> tuple[Views, NDArray[np.float64]] | Non
 
 def share_shown() -> tuple[float, float]:
     """What the pictures show of the width and height of the exact images."""
-    x, y = (tiles(bpy.data.images.get(ids.MOSAIC)) or {}).get("share", (1.0, 1.0))
+    mosaic = bpy.data.images.get(ids.MOSAIC)
+    x, y = (1.0, 1.0) if mosaic is None or _TILES not in mosaic else mosaic[_TILES].get("share", (1.0, 1.0))
     return x, y
 
 

@@ -151,10 +151,8 @@ def active_tile(context: bpy.types.Context, image: bpy.types.Image | None) -> in
 
 def frame(context: bpy.types.Context, picture: Picture, size: Sequence[int]) -> tuple[float, float, float, float]:
     """Left, bottom, right and top, in the Image Editor's region, of a picture in an image of that width and height."""
-    to_region, ((row, column), (rows, columns), (width, height)) = (
-        context.region.view2d.view_to_region,
-        (picture.corner, picture.size, size),
-    )
+    to_region = context.region.view2d.view_to_region
+    (row, column), (rows, columns), (width, height) = picture.corner, picture.size, size
     left, top = to_region(column / width, 1.0 - row / height, clip=False)
     right, bottom = to_region((column + columns) / width, 1.0 - (row + rows) / height, clip=False)
     return left, bottom, right, top

@@ -14,6 +14,7 @@ from ...core.reconstruction.methods import METHOD_FILES, METHODS
 from ...core.runs.recipe import Recipe, fitting_recipe
 from ...core.runs.settings import SETTINGS
 from ..blender import choices
+from ..blender.file_properties import path_property
 from ..blender.setting_properties import drawn_of, properties_of, unset_of, values_of
 from ..volumes import volumes
 
@@ -44,10 +45,9 @@ class ReconstructionSettings:
 
 _FILES = ", ".join(METHOD_FILES)
 ReconstructionSettings.__annotations__ = properties_of(PROPERTIES)
-ReconstructionSettings.__annotations__["method_file"] = StringProperty(
-    name="Method File", description=f"A trained network ({_FILES}) instead of the method; it has voxels of its own",
-    subtype="FILE_PATH", options={"PATH_SUPPORTS_BLEND_RELATIVE"},
-)  # fmt: skip
+ReconstructionSettings.__annotations__["method_file"] = path_property(
+    "Method File", f"A trained network ({_FILES}) instead of the method; it has voxels of its own"
+)
 _OF_FILES = ("ignore_attenuation", "ignore_blur", "hole", "aperture_points", "pixel_points")
 """Settings that matter to methods in files: of the model alone."""
 

@@ -34,7 +34,7 @@ from ...core.runs.recipe import recipe_of_tables
 from ...core.runs.reconstructing import reconstruct_run, reconstruction_grid, voxels_text
 from ...core.runs.run_recipe import truth_of_run
 from ...core.volumes.sights import bright_value, full_slices
-from ..blender import ids, jobs, objects, plots, storage, windows
+from ..blender import ids, jobs, objects, storage, windows
 from ..pictures import images
 from ..runs import rendering, runs
 from ..volumes import slices, stored_volumes, volume_materials, volumes
@@ -209,7 +209,6 @@ class _Shelf:
         images.store_drawn(ids.RECONSTRUCTION, shown.picture)
         settings = scene.mphdrr_reconstruction
         settings.volume, settings.record = item, json.dumps(shown.record)
-        plots.forget()
         return item
 
     def _hide(self, *items: bpy.types.Object | None) -> None:
@@ -247,7 +246,6 @@ class _Shelf:
                 images.store_drawn(ids.RECONSTRUCTION, self._picture)
             elif image is not None:
                 bpy.data.images.remove(image)
-            plots.forget()
         self.tidy()
 
 

@@ -7,7 +7,6 @@ import functools
 from collections.abc import Callable
 from typing import Any
 
-import blf
 import bpy
 import gpu
 import numpy as np
@@ -88,11 +87,12 @@ def _draw_box(session: Any) -> None:
     unit = context.preferences.system.ui_scale
     margin, size = _MARGIN * unit, _TEXT * unit
     right = context.region.width - margin - _BESIDE * unit - _covered(context)
-    blf.size(0, size)
     shown, width, height = session.shown, _WIDTH * unit, 0.0
-    lines = [
-        piece for line in session.lines for piece in wrapped(line, lambda text: blf.dimensions(0, text)[0] <= width)
-    ]
+
+    def fits(text: str) -> bool:
+        return windows.text_width(text, size) <= _WIDTH * unit
+
+    lines = [piece for line in session.lines for piece in wrapped(line, fits)]
     if shown is not None:
         rows, columns = shown.picture.shape[:2]
         free = context.region.height - _ABOVE * unit - 2 * margin - (1.4 * len(lines) + 2) * size
@@ -105,17 +105,12 @@ def _draw_box(session: Any) -> None:
     top = bottom + high
     box = left - size, bottom - size, left + wide + size, top
     _boxes[context.region.as_pointer()] = box, room
-    gpu.state.blend_set("ALPHA")
     windows.draw_rectangle(box, _BACK)
     if shown is not None:
         picture, colors = _textures(shown)
         _picture(picture, _box(left, bottom + size, left + width, bottom + size + height))
         _picture(colors, _box(left, bottom, left + width, bottom + 0.6 * size))
-    blf.color(0, *_FRONT)
-    for number, line in enumerate(lines):
-        blf.position(0, left, top - (1.4 * number + 1.7) * size, 0)
-        blf.draw(0, line)
-    gpu.state.blend_set("NONE")
+    windows.draw_texts(((line, left, top - (1.4 * k + 1.7) * size, _FRONT) for k, line in enumerate(lines)), size)
 
 
 def _draw_plane(session: Any) -> None:

@@ -14,6 +14,7 @@ from ...core.runs.presets import PRESETS
 from ...core.runs.recipe import Recipe, fitting_recipe
 from ...core.runs.settings import SETTINGS
 from ..blender import setting_properties
+from ..blender.file_properties import path_property
 from ..blender.setting_properties import drawn_of, identifier, material_of, of_modules, properties_of, set_property
 from ..blender.updates import on_edit
 from ..scanner import scanner
@@ -156,10 +157,7 @@ class RunProperties(bpy.types.PropertyGroup):
 
     name: StringProperty(name="Name", description="Of the run; one that is given another name is kept")
     usual_name: StringProperty(name="Usual Name", description="That it got when it was made", options={"HIDDEN"})
-    file: StringProperty(
-        name="File", description="With its exact arrays", subtype="FILE_PATH",
-        options={"HIDDEN", "PATH_SUPPORTS_BLEND_RELATIVE"},
-    )  # fmt: skip
+    file: path_property("File", "With its exact arrays", "HIDDEN")
     scanner: PointerProperty(name="Scanner", description="That it is of", type=bpy.types.Collection)
     summary: StringProperty(name="Summary", description="What it is", options={"HIDDEN"})
     state: StringProperty(name="State", description="Of the scene when it was made, float64 JSON", options={"HIDDEN"})
@@ -214,10 +212,7 @@ class ProjectionProperties(ProjectionSettings, bpy.types.PropertyGroup):
     active_run: IntProperty(
         name="Run", description="The run in the list whose images are shown", update=on_edit("active_run")
     )
-    run_file: StringProperty(
-        name="Run", description="File with the shown run's exact arrays", subtype="FILE_PATH",
-        options={"HIDDEN", "PATH_SUPPORTS_BLEND_RELATIVE"},
-    )  # fmt: skip
+    run_file: path_property("Run", "File with the shown run's exact arrays", "HIDDEN")
     run_summary: StringProperty(name="Shown Run", description="What the shown run is", options={"HIDDEN"})
 
 

@@ -116,8 +116,7 @@ def attenuating(context: bpy.types.Context, recipe: Recipe, mu: str = "") -> bpy
 def integrates_activity(context: bpy.types.Context) -> bool:
     """Whether the panel's settings ask for a radiograph of activity, whatever volume is meant: few want one."""
     settings, known = context.scene.mphdrr_projections, volumes.volume_objects(context.scene)
-    collection = scanner.active_scanner(context.scene)
-    if collection is not None and "activity" not in scanner.kind_of(collection).takes:
+    if not scanner.sees_activity(scanner.active_scanner(context.scene)):
         return False
     meant = [settings.volume] if settings.volume else [context.object] if context.object in known else known
     is_radiograph = settings.model == "TRANSMISSION" and not settings.photons
@@ -149,7 +148,7 @@ def _set_physics(scene: bpy.types.Scene, recipe: Recipe) -> None:
         collection.mphdrr_scanner.opening_angle = math.radians(recipe[projection_properties.OPENING_ANGLE])
 
 
-def exporting(scene: bpy.types.Scene, filepath: str) -> jobs.Job:
+def exporting(scene: bpy.types.Scene, path: Path) -> jobs.Job:
     """The job that writes the shown run to a file, in the format of its suffix: .h5, .npz or .pt.
 
     Warns where the scene has changed since the run was made.
@@ -157,9 +156,6 @@ def exporting(scene: bpy.types.Scene, filepath: str) -> jobs.Job:
     if not scene.mphdrr_projections.run_file:
         raise InputError("nothing to export: render the projections first")
     source = file_of(scene.mphdrr_projections.run_file)
-    if not filepath:
-        raise InputError("no file given: set filepath to a name ending in .h5, .npz or .pt")
-    path = storage.absolute(filepath)
     if found := runs.changes(scene):
         warn(f"the run is not of the scene as it is now ({'; '.join(found)}): {path.name} holds what was rendered")
 

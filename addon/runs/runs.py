@@ -288,7 +288,8 @@ def _of_modules(
     kind, found = module_values.kind_of(collection), scanner.modules(collection)
     count, modes = len(found), {str(o.mphdrr_module.number): o.mphdrr_module.length_mode for o in found}
     now: dict[str, dict[str, Any]] = {}
-    for _, system in module_values.readings(kind, found, objects.world_matrices(found)):
+    places = module_values.placed(kind, found, objects.world_matrices(found))
+    for _, system in module_values.readings(kind, found, places):
         if isinstance(system, InputError):
             yield str(system), None
         else:

@@ -17,7 +17,7 @@ from ...core.geometry.scanner import Scanner
 from ...core.scanner_kinds import SCANNERS
 from ..blender import objects
 from . import cameras, collimators, pinholes
-from .module_values import TYPED, Kind, aim_of, designed, kind_of, readings, together
+from .module_values import TYPED, Kind, designed, kind_of, placed, readings, together
 
 _KEY = "mphdrr_solid"  # custom property of a mesh: the values that it was built from
 _Parts = dict[bpy.types.Object, list[bpy.types.Object]]
@@ -117,22 +117,25 @@ def has_moved(camera: bpy.types.Object) -> bool:
 def _refresh_modules(kind: Kind, parts: _Parts, scanner: bpy.types.PropertyGroup, aim: bool) -> bool:
     """Make modules follow, all together, which is faster than one by one; returns whether a value has changed."""
     cameras_, matrices = list(parts), objects.world_matrices(list(parts))
-    exact, aimed = aim_of(kind, matrices)
+    places = placed(kind, cameras_, matrices)
     to_aim = []
     for m, (camera, place) in enumerate(zip(cameras_, matrices[:, :3, 3], strict=True)):
         module = camera.mphdrr_module
         if np.any(np.array(module.placed, np.float32) != place.astype(np.float32)):
-            if aim and scanner.keep_aimed and not aimed[m] and module.built and is_free(camera):
+            if aim and scanner.keep_aimed and not places.aimed[m] and module.built and is_free(camera):
                 to_aim.append(m)  # it is not new
             module.placed = place
     for m in to_aim:
-        objects.set_world_matrix(cameras_[m], exact[m])
-        matrices[m], aimed[m] = objects.world_matrix(cameras_[m]), True
+        objects.set_world_matrix(cameras_[m], cameras.matrices_of(places.aims[m]))
+        matrices[m] = objects.world_matrix(cameras_[m])
+        places.moved[m] = places.aimed[m] = True
     _places.update(zip((camera.session_uid for camera in cameras_), map(np.ndarray.tobytes, matrices), strict=True))
     distances = np.linalg.norm(matrices[:, :3, 3], axis=1)
     changed = [
-        _follow(found, [cameras_[m] for m in which], aimed[which].tolist(), distances[which].tolist(), parts, scanner)
-        for which, found in readings(kind, cameras_, matrices)
+        _follow(
+            found, [cameras_[m] for m in which], places.aimed[which].tolist(), distances[which].tolist(), parts, scanner
+        )
+        for which, found in readings(kind, cameras_, places)
     ]
     return any(changed)
 

@@ -110,7 +110,7 @@ def _read(collection: bpy.types.Collection, camera: bpy.types.Object) -> Scanner
     try:
         return scanner.read_module(collection, camera)
     except InputError:
-        return module_values.imported_module(module_values.kind_of(collection), camera)
+        return module_values.imported(module_values.kind_of(collection), (camera.mphdrr_module.exact,))
 
 
 def _solids(collection: bpy.types.Collection, camera: bpy.types.Object) -> Sequence[ModulePart]:
@@ -121,9 +121,7 @@ def _solids(collection: bpy.types.Collection, camera: bpy.types.Object) -> Seque
 
 def _add_parts(collection: bpy.types.Collection, camera: bpy.types.Object) -> None:
     for built in _solids(collection, camera):
-        part = built.kind.upper()
-        name = ids.part_name(camera.name, part)
-        item = new_part(camera, part, name, collimators.new_mesh(name, built.solid, collimators.part_material(part)))
+        item = new_part(camera, ids.part_name(camera.name, built.kind), built)
         item.hide_viewport, item.hide_render = camera.hide_viewport, camera.hide_render
         for home in camera.users_collection:
             home.objects.link(item)

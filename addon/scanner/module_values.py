@@ -8,8 +8,9 @@ import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from functools import lru_cache
+from operator import itemgetter
 from types import SimpleNamespace
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import bpy
 import numpy as np
@@ -32,6 +33,15 @@ Made = TypeVar("Made")
 Kind = type[Scanner]
 _Rows = dict[str, list[Any]]
 """Attribute of a scanner -> its values, module by module."""
+
+
+class Placed(NamedTuple):
+    """Where modules stand."""
+
+    poses: NDArray[np.float64]  # (M, 4, 4), as imported where they have not moved; rotations are proper ones
+    moved: NDArray[np.bool_]  # (M,): moved or turned since
+    aims: NDArray[np.float64]  # (M, 4, 4): the poses that look at the isocentre from there (`_aims`)
+    aimed: NDArray[np.bool_]  # (M,): which do so, up to rounding
 
 
 def kind_of(collection: bpy.types.Collection) -> Kind:
@@ -87,10 +97,12 @@ def _parsed(text: str) -> dict[str, Any]:
     return values
 
 
-def imported_module(kind: Kind, camera: bpy.types.Object) -> Scanner:
-    """A module as it was imported, as a scanner of its own."""
-    exact = exact_values(camera)
-    return kind.of({name: [exact[name]] for name in ("numbers", *kind.columns.fields) if name in exact})
+@lru_cache(maxsize=8)
+def imported(kind: Kind, exact: tuple[str, ...]) -> Scanner:
+    """Modules as they were imported, by their `exact` texts, without their numbers, which copies share."""
+    known = [_parsed(text) for text in exact]
+    names = [name for name in kind.columns.fields if all(name in values for values in known)]
+    return kind.of({name: [values[name] for values in known] for name in names})
 
 
 def with_design(camera: bpy.types.Object, module: Scanner) -> Scanner:
@@ -109,12 +121,25 @@ def read_modules(
     What has not changed is as imported. A camera that is turned has a tilted module, and none if it is aimed. An `l` that
     follows the ROI is calculated in float64 once a number in its formula has changed.
     """
+    return _read(kind, cameras_, placed(kind, cameras_, matrices), source)
+
+
+def placed(kind: Kind, cameras_: Sequence[bpy.types.Object], matrices: NDArray[np.float64]) -> Placed:
+    """Where modules stand whose cameras have these world matrices (M, 4, 4)."""
+    poses, moved, turned = _poses(cameras_, matrices, [exact_values(camera) for camera in cameras_])
+    left, _, right = np.linalg.svd(poses[turned, :3, :3])
+    poses[turned, :3, :3] = left @ right
+    return Placed(poses, moved, *_aims(kind, poses))
+
+
+def _read(
+    kind: Kind, cameras_: Sequence[bpy.types.Object], places: Placed, source: SystemSource | None = None
+) -> Scanner:
     known = [exact_values(camera) for camera in cameras_]
     rows = _shown(kind, cameras_, known)
-    poses, moved, turned = _poses(cameras_, matrices, known)
-    if moved.any():
-        poses[moved] = _straightened(kind, poses[moved], turned[moved])
-        _carry(kind, rows, known, poses, np.flatnonzero(moved).tolist())
+    if places.moved.any():
+        poses = np.where(places.aimed[:, None, None], places.aims, places.poses)  # without rounding
+        _carry(kind, rows, cameras_, poses, np.flatnonzero(places.moved).tolist())
     _design(kind, rows, cameras_, known)
     return kind.of({name: np.array(row) for name, row in rows.items()} | {"source": source})
 
@@ -132,11 +157,14 @@ def together(which: list[Item], make: Callable[[list[Item]], Made]) -> Iterator[
 
 
 def readings(
-    kind: Kind, cameras_: Sequence[bpy.types.Object], matrices: NDArray[np.float64]
+    kind: Kind, cameras_: Sequence[bpy.types.Object], places: Placed
 ) -> Iterator[tuple[list[int], Scanner | InputError]]:
-    """Indices of modules and what is read of them, or why there are none."""
-    all_of_them = list(range(len(cameras_)))
-    return together(all_of_them, lambda which: read_modules(kind, [cameras_[m] for m in which], matrices[which]))
+    """Indices of modules and what is read of them at their `places`, or why there are none."""
+
+    def read(which: list[int]) -> Scanner:
+        return _read(kind, [cameras_[m] for m in which], Placed(*map(itemgetter(which), places)))
+
+    return together(list(range(len(cameras_))), read)
 
 
 def _shown(kind: Kind, cameras_: Sequence[bpy.types.Object], known: Sequence[dict[str, Any]]) -> _Rows:
@@ -158,7 +186,7 @@ def _poses(
     cameras_: Sequence[bpy.types.Object], matrices: NDArray[np.float64], known: Sequence[dict[str, Any]]
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_]]:
     """The modules' poses (M, 4, 4), as imported where the cameras stand so; which (M,) are moved or turned, and turned."""
-    was = np.array([exact["pose"] for exact in known])
+    was = np.reshape([exact["pose"] for exact in known], (-1, 4, 4))
     now = cameras.poses_of(matrices)
     place, old = now[:, :3, 3], was[:, :3, 3]
     for m, axis in np.argwhere(place.astype(np.float32) != old.astype(np.float32)).tolist():
@@ -170,15 +198,6 @@ def _poses(
     place[stays] = old[stays]
     now[~turned, :3, :3] = was[~turned, :3, :3]
     return now, turned | ~stays.all(axis=1), turned
-
-
-def _straightened(kind: Kind, poses: NDArray[np.float64], turned: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Poses (M, 4, 4) without rounding where they are aimed, and with a proper rotation where they were turned."""
-    left, _, right = np.linalg.svd(poses[turned, :3, :3])
-    poses[turned, :3, :3] = left @ right
-    exact, aimed = _aims(kind, poses)
-    poses[aimed] = exact[aimed]
-    return poses
 
 
 def _aims(kind: Kind, poses: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
@@ -194,14 +213,12 @@ def _aims(kind: Kind, poses: NDArray[np.float64]) -> tuple[NDArray[np.float64], 
 
 
 def _carry(
-    kind: Kind, rows: _Rows, known: Sequence[dict[str, Any]], poses: NDArray[np.float64], which: list[int]
+    kind: Kind, rows: _Rows, cameras_: Sequence[bpy.types.Object], poses: NDArray[np.float64], which: list[int]
 ) -> None:
     """Write the attributes into `rows` that modules have at their poses; one by one where they cannot be together."""
-    names = kind.columns.fields
 
     def carried(which: list[int]) -> Mapping[str, NDArray[Any]]:
-        imported = kind.of({name: np.array([known[m].get(name, rows[name][m]) for m in which]) for name in names})
-        return imported.attributes_at(poses[which])
+        return imported(kind, tuple(cameras_[m].mphdrr_module.exact for m in which)).attributes_at(poses[which])
 
     for some, there in together(which, carried):
         if isinstance(there, InputError):
@@ -248,17 +265,8 @@ def changes(found: Sequence[bpy.types.Object]) -> tuple[list[bool], list[bool]]:
     return moved.tolist(), edited
 
 
-def aim_of(kind: Kind, matrices: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """The world matrices (M, 4, 4) with which cameras look at the isocentre from where they stand, and which do so, upright.
-
-    `matrices` (M, 4, 4) are those that they have; see `_aims`.
-    """
-    exact, aimed = _aims(kind, cameras.poses_of(matrices))
-    return cameras.matrices_of(exact), aimed
-
-
 def off_aim(collection: bpy.types.Collection, cameras_: Iterable[bpy.types.Object]) -> list[int]:
     """Numbers of a scanner's modules whose cameras do not look at the isocentre, or are rolled."""
     found = list(cameras_)
-    _, aimed = aim_of(kind_of(collection), objects.world_matrices(found))
+    aimed = placed(kind_of(collection), found, objects.world_matrices(found)).aimed
     return [camera.mphdrr_module.number for camera, is_aimed in zip(found, aimed, strict=True) if not is_aimed]

@@ -1,6 +1,5 @@
 """A scanner designed by gradients in the window: it moves in the scene while the search goes on."""
 
-import itertools
 import json
 import threading
 from collections.abc import Iterator, Sequence
@@ -88,9 +87,7 @@ class _Shown:
         if collection is not None:
             module_edits.become(collection, system)
             return collection
-        names = itertools.chain([self._name], (f"{self._name} {number}" for number in itertools.count(2)))
-        name = next(each for each in names if scanner.find_scanner(scene, each) is None)
-        collection = scanner.build_scanner(scene, system, name)
+        collection = scanner.build_scanner(scene, system, scanner.free_name(scene, self._name))
         self._uid = collection.session_uid
         return collection
 

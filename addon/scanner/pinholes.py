@@ -2,12 +2,13 @@
 
 from collections.abc import Sequence
 from dataclasses import asdict
+from functools import lru_cache
 
 import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core import InputError, PinholeSystem, isocentre_performance, resolution, sensitivity
+from ...core import InputError, Optics, PinholeSystem, isocentre_performance, resolution, sensitivity
 from ...core.geometry import checks
 from ...core.geometry.collimator import Construction, EdgePlace
 from ...core.geometry.finding import Finding
@@ -16,6 +17,9 @@ from ..blender.decimals import typed
 from . import collimators, module_values
 
 _READOUTS = ("sensitivity", "resolution", "magnification", "roi_seen")
+# Both take long to be checked, and are asked for whenever a module moves.
+_construction = lru_cache(maxsize=8)(Construction)
+_optics = lru_cache(maxsize=8)(lambda intrinsic_fwhm: Optics(intrinsic_fwhm=intrinsic_fwhm))
 
 
 def has_pinholes(kind: module_values.Kind) -> bool:
@@ -36,7 +40,7 @@ def settings(scanner: bpy.types.PropertyGroup) -> tuple[float | str, ...]:
 
 def construction(scanner: bpy.types.PropertyGroup, kind: module_values.Kind = PinholeSystem) -> Construction | None:
     """How the scanner's collimators are built, None for a kind without; raises `InputError` where they cannot be."""
-    return Construction(*construction_values(scanner)) if has_pinholes(kind) else None
+    return _construction(*construction_values(scanner)) if has_pinholes(kind) else None
 
 
 def new_roi(system: Scanner, material: bpy.types.Material) -> bpy.types.Object | None:
@@ -71,22 +75,22 @@ def write_readouts(
     """Write the readouts of the modules `which` of a system, 0 where there is none."""
     values = np.zeros((len(modules), len(_READOUTS)))
     if isinstance(found, PinholeSystem):
-        values = _readouts(found, typed(scanner.intrinsic_fwhm))[which]
+        values = _readouts(found, _optics(typed(scanner.intrinsic_fwhm)))[which]
     for module, row in zip(modules, values.tolist(), strict=True):
         for name, value in zip(_READOUTS, row, strict=True):
             setattr(module, name, value)
 
 
-def _readouts(system: PinholeSystem, intrinsic_fwhm: float) -> NDArray[np.float64]:
+def _readouts(system: PinholeSystem, optics: Optics) -> NDArray[np.float64]:
     """The `_READOUTS` of the modules at the isocentre, (M, 4)."""
     at = isocentre_performance(
         system.pinhole_distance, system.pinhole_diameter, system.collimator_length, system.detector_side,
-        system.detector_thickness, intrinsic_fwhm=intrinsic_fwhm,
+        system.detector_thickness, optics=optics,
     )  # fmt: skip
     counts, fwhm, magnification, seen = at
     if system.tilt.any():  # else the dimensions alone say it, which is faster
         counts, seen = sensitivity(system, np.zeros((1, 3)))[0], system.roi_radius_seen()
-        fwhm = resolution(system, np.zeros((1, 3)), intrinsic_fwhm=intrinsic_fwhm)[0]
+        fwhm = resolution(system, np.zeros((1, 3)), optics=optics)[0]
     return np.stack([1e6 * counts, fwhm, magnification, seen], axis=1)
 
 
@@ -99,4 +103,4 @@ def write_totals(scanner: bpy.types.PropertyGroup, modules: Sequence[bpy.types.P
 
 def check(scanner: bpy.types.PropertyGroup, system: PinholeSystem) -> tuple[Finding, ...]:
     """What a check for overlaps, blocked holes and ROIs that are not seen finds."""
-    return checks.check_geometry(system, **asdict(Construction(*construction_values(scanner)))).findings
+    return checks.check_geometry(system, **asdict(_construction(*construction_values(scanner)))).findings

@@ -4,6 +4,7 @@ A scanner is a collection with a sub-collection for each ring; a module is a cam
 children are its parts: its collimator and its crystal.
 """
 
+import itertools
 import json
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict
@@ -22,7 +23,7 @@ from ..blender import ids, objects, storage
 from ..blender.decimals import typed
 from . import cameras, collimators, following, framing, pinholes
 from .following import modules
-from .module_values import aim_of, changes, kind_of, off_aim, read_modules, remember
+from .module_values import changes, kind_of, off_aim, placed, read_modules, remember
 from .scanner_parts import NewScanner, clear, losses
 
 _DEFAULT = Construction()
@@ -173,6 +174,12 @@ def find_scanner(scene: bpy.types.Scene, name: str) -> bpy.types.Collection | No
     return by_name[0] if by_name else None
 
 
+def free_name(scene: bpy.types.Scene, name: str) -> str:
+    """A name that no scanner in the scene has: this one, or with a number."""
+    names = itertools.chain([name], (f"{name} {number}" for number in itertools.count(2)))
+    return next(each for each in names if find_scanner(scene, each) is None)
+
+
 def scanner_of(scene: bpy.types.Scene, item: bpy.types.Object | None) -> bpy.types.Collection | None:
     """The scene's scanner that an object is in, the active one first; None for other objects."""
     if item is None:
@@ -238,6 +245,11 @@ def read_scanner(collection: bpy.types.Collection) -> Scanner:
     return read_modules(kind_of(collection), found, objects.world_matrices(found), known)
 
 
+def sees_activity(collection: bpy.types.Collection | None) -> bool:
+    """Whether a scanner, if there is one, is of those that see activity."""
+    return collection is None or "activity" in kind_of(collection).takes
+
+
 def own_pixels(collection: bpy.types.Collection) -> tuple[int, int] | None:
     """The pixels (n_v, n_u) of a scanner's images, of a kind that says them: those of its first module."""
     properties = collection.mphdrr_scanner
@@ -282,8 +294,9 @@ def check_geometry(collection: bpy.types.Collection) -> tuple[list[str], list[bp
 def aim_modules(collection: bpy.types.Collection) -> list[int]:
     """Turn every camera that does not look at the isocentre; returns their modules' numbers."""
     found = modules(collection)
+    places = placed(kind_of(collection), found, objects.world_matrices(found))
     turned = []
-    for camera, matrix, aimed in zip(found, *aim_of(kind_of(collection), objects.world_matrices(found)), strict=True):
+    for camera, matrix, aimed in zip(found, cameras.matrices_of(places.aims), places.aimed, strict=True):
         if not aimed:
             objects.set_world_matrix(camera, matrix)
             turned.append(camera.mphdrr_module.number)

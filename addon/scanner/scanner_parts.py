@@ -53,11 +53,10 @@ class NewScanner:
 
     def _make_parts(self, system: Scanner, parts: Sequence[ModulePart]) -> None:
         for part in parts:
-            camera, kind = self.cameras[part.number], part.kind.upper()
-            name = ids.part_name(ids.module_name(part.number, len(system), system.word), kind)
-            mesh = self._keep(collimators.new_mesh(name, part.solid, self._materials[kind]), name)
-            child = self._keep(new_part(camera, kind, name, mesh), name)
-            self.rings[camera.mphdrr_module.ring].objects.link(child)
+            name = ids.part_name(ids.module_name(part.number, len(system), system.word), part.kind)
+            child = self._keep(new_part(self.cameras[part.number], name, part), name)
+            self._keep(child.data, name)
+            self.rings[child.parent.mphdrr_module.ring].objects.link(child)
 
     def _make_roi(self, system: Scanner) -> bpy.types.Object | None:
         roi = pinholes.new_roi(system, self._materials["ROI"])
@@ -81,9 +80,10 @@ class NewScanner:
             collection.objects.link(self.roi)
 
 
-def new_part(camera: bpy.types.Object, part: str, name: str, mesh: bpy.types.Mesh) -> bpy.types.Object:
+def new_part(camera: bpy.types.Object, name: str, built: ModulePart) -> bpy.types.Object:
     """A part of a module, parented to its camera. Its mesh is its own, so that it can be reshaped."""
-    item = bpy.data.objects.new(name, mesh)
+    part = built.kind.upper()
+    item = bpy.data.objects.new(name, collimators.new_mesh(name, built.solid, collimators.part_material(part)))
     item.parent = camera
     item.lock_scale = (True, True, True)  # moving it moves the module (`grabbing.py`)
     item.mphdrr_module.part, item.mphdrr_module.number = part, camera.mphdrr_module.number

@@ -56,10 +56,8 @@ def active_faces(context: bpy.types.Context) -> NDArray[np.float64]:
         if part.mphdrr_module.part not in ("COLLIMATOR", "CRYSTAL") or not part.visible_get():
             continue
         mesh, matrix = part.data, np.array(part.matrix_world)
-        points, corners = (
-            np.empty((len(mesh.vertices), 3), np.float32),
-            np.empty((len(mesh.loop_triangles), 3), np.int32),
-        )
+        points = np.empty((len(mesh.vertices), 3), np.float32)
+        corners = np.empty((len(mesh.loop_triangles), 3), np.int32)
         mesh.vertices.foreach_get("co", points.reshape(-1))
         mesh.loop_triangles.foreach_get("vertices", corners.reshape(-1))
         middle = points.mean(axis=0)

@@ -57,6 +57,8 @@ def tilted(frames: Floats, tilt: Floats) -> Floats:
 
 def tilts(frames: Floats, turned: Floats) -> Floats:
     """Rotation vectors (M, 3), rad, about u, v and k of `frames` (M, 3, 3) that make them `turned`; 0 within rounding."""
+    if np.array_equal(frames, turned):  # as nearly always: to the last digit
+        return np.zeros((len(frames), 3))
     found = rotation_vectors((turned @ frames.transpose(0, 2, 1)).transpose(0, 2, 1))
     return np.where(np.abs(found).max(axis=1, keepdims=True) > _ROUNDING, found, 0.0)
 

@@ -252,25 +252,31 @@ _DECLARED = (
             "another simulator's scanner (.npy, .npz, .h5, DICOM, .mhd, Interfile's .hdr, raw numbers)", is_path=True,
             sizes=(), needs=(_COUNTS, "no volume.file", "no volume.states", *_NO_PHANTOM), option="--counts"),
     Setting("counts.frames", str, None, "Which module each frame is of: the modules' numbers in the frames' order, such as "
-            "1-80, 80-1 or 3,1,2; none for one that is not used", needs=("no counts.frames_file",), option="--frames"),
+            "1-80, 80-1 or 3,1,2; none for one that is not used, none*80 for 80 of them", option="--frames",
+            needs=("no counts.frames_file",)),
     Setting("counts.frames_file", str, None, "Text file with these numbers", is_path=True, needs=("no counts.frames",)),
     Setting("counts.orientation", str, None, "How a frame, as a picture with row 0 at the top, lies on the crystal: seen "
             "from the front (the pinhole) or from the back, with which of the module's axes at the top; one word, or one "
-            "for each frame", words=ORIENTATIONS, sizes=()),
-    Setting("counts.expected", bool, False, "The numbers are expected means, which may be fractions"),
-    Setting("counts.dataset", str, None, "Name of the array in .npz and .h5", "the only one of three axes"),
+            "for each frame", words=ORIENTATIONS, sizes=(), unset="Not Said"),
+    Setting("counts.expected", bool, False, "The numbers are expected means, which may be fractions",
+            label="Expected Means"),
+    Setting("counts.dataset", str, None, "Name of the array in .npz and .h5", "the only one of three axes",
+            label="Array"),
     Setting("counts.raw_shape", int, None, "Frames, rows and columns of a raw file", least=1, sizes=(3,)),
-    Setting("counts.raw_type", str, None, "Type of a raw file's numbers", words=named(RAW_TYPES, "")),
-    Setting("counts.raw_big_endian", bool, False, "The most significant byte of a raw file's numbers comes first"),
+    Setting("counts.raw_type", str, None, "Type of a raw file's numbers", "the file is not raw",
+            words=named(RAW_TYPES, ""), unset="Not Said"),
+    Setting("counts.raw_big_endian", bool, False, "The most significant byte of a raw file's numbers comes first",
+            label="Big-Endian"),
     Setting("counts.lower_frames", str, None, "Frames of the energy window below the peak's, from which scatter is "
-            "estimated: which module each is of, as in counts.frames"),
-    Setting("counts.upper_frames", str, None, "Frames of the energy window above the peak's, likewise"),
+            "estimated: which module each is of, as in frames", label="Lower Window"),
+    Setting("counts.upper_frames", str, None, "Frames of the energy window above the peak's, likewise",
+            label="Upper Window"),
     Setting("counts.window_widths", float, None, "Widths of the lower, the peak and the upper energy window", "what the "
-            "file says", unit="keV", above=0, sizes=(3,), needs=(_SCATTER,)),
+            "file says", unit="keV", above=0, sizes=(3,), needs=(_SCATTER,), label="Widths (keV)"),
     Setting("counts.scatter_fwhm", float, None, "FWHM of the Gaussian that smooths the estimate of scatter", "it is not "
-            "smoothed", unit="pixels", above=0, needs=(_SCATTER,)),
+            "smoothed", unit="pixels", above=0, needs=(_SCATTER,), label="Smoothing (pixels)"),
     Setting("counts.scatter_tails", bool, False, "The photopeak's tails in those windows, by the energy resolution, are no "
-            "scatter", needs=(_SCATTER, "model.isotope", "model.energy_fwhm")),
+            "scatter", needs=(_SCATTER, "model.isotope", "model.energy_fwhm"), label="Peak's Tails"),
     Setting("model.kind", str, "transmission", "What a pixel holds", label="Model", option="--model", words={
         "transmission": ("Radiograph", "Line integrals of the volume"),
         "emission": ("SPECT Counts", "Photons of a volume of activity that the crystal counts"),
@@ -286,7 +292,7 @@ _DECLARED = (
     Setting("model.photons", float, None, "X-ray photons per pixel: a radiograph of attenuation coefficients then holds "
             "those that pass", "line integrals", above=0, slider=1e6, needs=("model.kind=transmission",), unset="None"),
     Setting("model.isotope", str, None, "What decays: its photons are counted, and its activity falls during the "
-            "acquisition", "one photon per decay, and a constant activity", words=_ISOTOPES, needs=(_COUNTS,)),
+            "acquisition", "one photon per decay, and a constant activity", words=_ISOTOPES, needs=(_COUNTS,), unset="None"),
     Setting("model.window", float, None, "Energies that are counted, from and to", "10 % around the isotope's strongest "
             "line; of X rays, all", unit="keV", least=0, slider=1000, sizes=(2,), needs=(_PHOTONS,
             f"model.isotope or {_XRAYS}", "no model.panel=energy"), label="Window (keV)"),
@@ -295,7 +301,7 @@ _DECLARED = (
         "energy": ("Integrates Energy", "The energy, keV, that it absorbs"),
     }, needs=(_XRAYS,)),
     Setting("model.sensor", str, None, "Material of the panel that stops the X rays", "all are stopped",
-            words=named(("CdTe", "CZT", "silicon", "CsI")), needs=(_XRAYS,)),
+            words=named(("CdTe", "CZT", "silicon", "CsI")), needs=(_XRAYS,), unset="None"),
     Setting("model.sensor_thickness", float, 2.0, "Its thickness", unit="mm", above=0, slider=5, needs=(_XRAYS,
             "model.sensor"), label="Sensor (mm)"),
     Setting("model.sensor_fwhm", float, 0.0, "FWHM of a panel's energy resolution", unit="keV", least=0, slider=20,
@@ -428,7 +434,7 @@ _DECLARED = (
     _argument("photons", float, "Of a pixel where nothing is between", "those of the run, or 1", above=0),
     _argument("nonnegative", bool, "Values below 0 become 0"),
     _argument("prior", str, "Penalty on noise", "none",
-              words={name: (prior.label, prior.text) for name, prior in PRIORS.items()}),
+              words={name: (prior.label, prior.text) for name, prior in PRIORS.items()}, unset="None"),
     _argument("weight", float, "How much the penalty counts beside the data", above=0, slider=1),
     _argument("gamma", float, "How much large differences are spared", least=0, slider=10),
     _argument("edge", float, "Value below which differences count as noise", "what suits the penalty", above=0, slider=10),

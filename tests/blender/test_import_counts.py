@@ -146,7 +146,7 @@ def test_frames_of_other_energy_windows_give_the_background(scanned, scene, tmp_
     ("said", "message"),
     [
         ({"frames": ""}, "8 frames of 6 x 6 pixels; say which module each frame is of"),
-        ({"orientation": "UNSAID"}, "say how frames lie on the crystal"),
+        ({"orientation": "NONE"}, "say how frames lie on the crystal"),
         ({"time": 0.0}, "say the exposure time in seconds"),
         ({"frames": "1-7,7"}, "module 7 has several frames"),
         ({"filepath": ""}, "no file given"),

@@ -14,13 +14,15 @@ import pytest
 if "PYTEST_XDIST_WORKER" in os.environ:
     os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
+from mphdrr.core import memory
 from mphdrr.core.workbook import reader
 
 # No test cuts the power: to wait until each small file is on the disk would be most of what some of them take.
 os.fsync = lambda descriptor: None
 
 # Python's search for garbage among a million objects of imported libraries, again and again, would be a sixth of the
-# tests' time: it rests while they are collected, and what stays after a file of tests is not looked at again.
+# tests' time: it rests while they are collected,
+# comes less often, and does not look again at what stays after a file of tests.
 gc.disable()
 _file: Path | None = None
 
@@ -43,6 +45,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 def pytest_collection_finish() -> None:
     gc.freeze()
+    gc.set_threshold(50_000)
     gc.enable()
 
 
@@ -54,15 +57,30 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
         gc.freeze()
 
 
-# The users' workbook is read hundreds of times in a process; what it gives cannot be changed, but a kind's columns can.
-WORKBOOK = Path(__file__).parents[1] / "examples" / "dc-spect-80.xlsx"
-_read = reader._read
-_read_workbook = functools.cache(lambda kind, columns: _read(WORKBOOK, kind, None))
+# Workbooks are read thousands of times in a process: the cells of those read last are kept, and all that two of them give,
+# which cannot be changed, but a kind's columns can.
+ROOT = Path(__file__).parents[1]
+WORKBOOKS = (ROOT / "examples" / "dc-spect-80.xlsx", ROOT / "tests" / "core" / "data" / "first-24-modules.xlsx")
+_Book, _read = reader.Book, reader._read
+_kept_book = functools.lru_cache(32)(lambda path, content: _Book(path))
+_kept_system = functools.cache(lambda path, kind, columns: _read(path, kind, None))
+reader.Book = lambda path: _kept_book(Path(path), content) if (content := _content(path)) else _Book(path)
 reader._read = lambda path, kind, columns: (
-    _read_workbook(kind, tuple(kind.columns))
-    if columns is None and Path(path) == WORKBOOK
+    _kept_system(Path(path), kind, tuple(kind.columns))
+    if columns is None and Path(path) in WORKBOOKS
     else _read(path, kind, columns)
 )
+
+
+def _content(path: str | os.PathLike[str]) -> bytes:
+    try:
+        return Path(path).read_bytes()
+    except OSError:
+        return b""
+
+
+# To ask how much memory is free takes as long as many a small projection; who tests just that asks anew.
+memory.available = functools.cache(memory.available)
 
 
 @atexit.register

@@ -129,9 +129,9 @@ def test_every_example_runs(example, inputs, tmp_path):
     if words[1:3] == ["figure", "scanner"]:
         example += " --size 320x240 --samples 1"
     elif words[1:3] == ["figure", "cut-away"]:
-        example += " --samples 1"
+        example += " --size 320x240 --samples 1"
     elif words[1:3] == ["figure", "light-up"]:
-        example = example.replace("--seconds 8 --size 640x400", "--seconds 1 --fps 3 --size 160x120 --samples 1")
+        example = example.replace("--seconds 8 --size 640x400", "--seconds 1 --fps 2 --size 160x120 --samples 1")
     elif words[1:3] == ["project", "scanner.xlsx"] and "--counts" not in words:
         example += " --size 16 16"
     elif "--method model.pt" in example:  # of a scan by the scanner of its training

@@ -7,16 +7,22 @@ import functools
 import gc
 import os
 from pathlib import Path
+from types import ModuleType
+from typing import Any
 
 import pytest
 
+from mphdrr.core import memory
+from mphdrr.core.phantoms import painting
+from mphdrr.core.reconstruction import counts
 from mphdrr.core.workbook import reader
 
 # No test cuts the power: to wait until each small file is on the disk would be most of what some of them take.
 os.fsync = lambda descriptor: None
 
 # Python's search for garbage among a million objects of imported libraries, again and again, would be a sixth of the
-# tests' time: it rests while they are collected, and what stays after a file of tests is not looked at again.
+# tests' time: it rests while they are collected, comes less often, and does not look again at what stays after a file of
+# tests.
 gc.disable()
 _file: Path | None = None
 
@@ -39,6 +45,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 def pytest_collection_finish() -> None:
     gc.freeze()
+    gc.set_threshold(50_000)
     gc.enable()
 
 
@@ -48,17 +55,46 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
         _file = item.path
         gc.collect()
         gc.freeze()
+        for module, values in (SHIPPED if getattr(item.module, "AS_SHIPPED", False) else SHORT).items():
+            vars(module).update(values)
 
 
-# The users' workbook is read hundreds of times in a process; what it gives cannot be changed, but a kind's columns can.
-WORKBOOK = Path(__file__).parents[1] / "examples" / "dc-spect-80.xlsx"
-_read = reader._read
-_read_workbook = functools.cache(lambda kind, columns: _read(WORKBOOK, kind, None))
+# What takes long and is the subject of few tests: a phantom's voxels take a hundredth of their samples, and nothing asks
+# whether counts are in reversed order. A file that tests these, or compares with another process, says AS_SHIPPED = True.
+SHORT: dict[ModuleType, dict[str, Any]] = {
+    counts: {"_warn_if_reversed": lambda *_: None},
+    painting: {
+        "_MIN_SAMPLES": 16,
+        "_MAX_SAMPLES": 1 << 7,
+        "_SAMPLES_OF_MIXED": 1 << 14,
+        "_SAMPLES_OF_FEW": 1 << 6,
+        "_SAMPLES_OF_OVERLAP": 1 << 13,
+    },
+}
+SHIPPED = {module: {name: getattr(module, name) for name in short} for module, short in SHORT.items()}
+
+
+# Workbooks are read thousands of times in a process: the cells of those read last are kept, and all that two of them give,
+# wherever they are, which cannot be changed, but a kind's columns can.
+def _content(path: str | os.PathLike[str]) -> bytes:
+    return Path(path).read_bytes() if os.path.isfile(path) else b""  # of a pipe nothing would come
+
+
+ROOT = Path(__file__).parents[1]
+KNOWN = {_content(ROOT / name) for name in ("examples/dc-spect-80.xlsx", "tests/core/data/first-24-modules.xlsx")}
+_Book, _read = reader.Book, reader._read
+_kept_book = functools.lru_cache(32)(lambda path, content: _Book(path))
+_kept_system = functools.cache(lambda path, content, kind, columns: _read(path, kind, None))
+reader.Book = lambda path: _kept_book(Path(path), content) if (content := _content(path)) else _Book(path)
 reader._read = lambda path, kind, columns: (
-    _read_workbook(kind, tuple(kind.columns))
-    if columns is None and Path(path) == WORKBOOK
+    _kept_system(Path(path), content, kind, tuple(kind.columns))
+    if columns is None and (content := _content(path)) in KNOWN
     else _read(path, kind, columns)
 )
+
+
+# To ask how much memory is free takes as long as many a small projection; who tests just that asks anew.
+memory.available = functools.cache(memory.available)
 
 
 @atexit.register

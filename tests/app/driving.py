@@ -180,6 +180,15 @@ def escape_asks() -> Iterator[float]:
     keys("Escape")
 
 
+def drawn(times: int = 2) -> Iterator[float]:
+    """Wait until all has been drawn anew, which takes seconds in software: timers run between two drawings."""
+    for _ in range(times):
+        for window in bpy.context.window_manager.windows:
+            for area in window.screen.areas:
+                area.tag_redraw()
+        yield 0.1
+
+
 beats: list[float] = []
 
 
@@ -210,10 +219,7 @@ def pause_beyond_redraw() -> Iterator[float]:
     """Yields seconds to wait; returns the longest pause since the beats were cleared, without what a redraw takes."""
     during = longest_pause()
     beats.clear()
-    for _ in range(3):
-        for area in bpy.context.window_manager.windows[0].screen.areas:
-            area.tag_redraw()
-        yield 0.1
+    yield from drawn(3)
     return round(during - longest_pause(), 3)
 
 
@@ -221,8 +227,9 @@ def run(steps: Iterator[float | Callable[[], bool]], patience: float = 120.0, se
     """Take the steps: each yields what to wait for, seconds or a function that says when it has happened.
 
     After such an event `settle` seconds more are waited, for what may still come; after `patience` seconds without it the
-    script has failed. What was seen is written after the last step.
+    script has failed. What was seen is written when all is drawn after the last step.
     """
+    all_steps = itertools.chain(steps, drawn())
     wanted: float | Callable[[], bool] = 0.0
     since = 0.0
 
@@ -237,7 +244,7 @@ def run(steps: Iterator[float | Callable[[], bool]], patience: float = 120.0, se
                 wanted = settle
                 if settle:
                     return settle
-            wanted, since = next(steps), time.monotonic()
+            wanted, since = next(all_steps), time.monotonic()
             return 0.2 if callable(wanted) else wanted
         except StopIteration:
             seen["ok"] = True

@@ -13,7 +13,7 @@ import time
 from pathlib import Path
 
 SCREEN = 1600, 1000
-_REDRAW = 5.0  # s that the window gets to be drawn, in software, after the script is done
+_SHOWN = 0.5  # s until the screen has what the script has drawn at last
 
 
 def is_done(folder: Path) -> bool:
@@ -46,7 +46,7 @@ def main(picture: str, script: str, seconds: str, folder: str, *arguments: str) 
     end = time.monotonic() + float(seconds)
     while time.monotonic() < end and blender.poll() is None and not is_done(Path(folder)):
         time.sleep(0.3)
-    time.sleep(_REDRAW)
+    time.sleep(_SHOWN)
     subprocess.run(["import", "-window", "root", picture], check=True)
     for process in (blender, screen):
         process.kill()

@@ -6,7 +6,7 @@ With the example, and in a new scene with a workbook.
 from collections.abc import Iterator
 
 import bpy
-from driving import WORKBOOK, click_proposed, editor, idle, open_tab, picture, proposed, run, seen
+from driving import WORKBOOK, click_proposed, drawn, editor, idle, open_tab, picture, proposed, run, seen
 
 _MOST = 6
 
@@ -19,7 +19,7 @@ def clicks(name: str) -> Iterator[float]:
         seen[name].append(proposed())
         click_proposed()
         yield from idle()
-        yield 2
+        yield from drawn()
     settings = scene.mphdrr_projections, scene.mphdrr_reconstruction
     seen[name] += [settings[0].model, settings[1].method, settings[1].known["scores"][0][0], proposed()]
 
@@ -38,7 +38,7 @@ def steps():
     bpy.ops.mphdrr.import_geometry(filepath=str(WORKBOOK))
     settings = bpy.context.scene.mphdrr_projections
     settings.width = settings.height = 32
-    yield 2
+    yield from drawn()
     yield from clicks("workbook")
 
 

@@ -3,7 +3,7 @@
 import json
 
 import bpy
-from driving import ARGUMENTS, editor, folder, module, on_screen, picture, press, run, seen, xdotool
+from driving import ARGUMENTS, drawn, editor, folder, module, on_screen, picture, press, run, seen, xdotool
 
 (workbook,) = ARGUMENTS
 
@@ -23,12 +23,12 @@ def steps():
     yield 1
     press(bpy.ops.mphdrr.import_geometry, filepath=str(workbook))
     yield lambda: form().workbook
-    yield 2
+    yield from drawn()
     seen["opened"] = {"refusal": form().refusal, "doubts": form().doubts}
     picture("opened")
 
     xdotool("key", "Return")  # a map that is not complete is not taken: the dialog opens again
-    yield 2
+    yield from drawn()
     seen["asked_again"] = {"refusal": form().refusal, "scanners": len(scanners())}
     form().unit = "mm"
     for name, column in zip(("x1", "y1", "z1"), "BCD", strict=True):
@@ -48,10 +48,11 @@ def steps():
     columns.write_text(seen["source"])
     press(bpy.ops.mphdrr.import_geometry, filepath=str(workbook), columns=str(columns), choose_columns=True)
     yield lambda: form().preview
-    yield 2
+    yield from drawn()
     picture("complete")
     xdotool("key", "Return")
-    yield 3
+    yield 1
+    yield from drawn()
     picture("replace")
     seen["kept"] = module(1).location.x == 300.0
     xdotool("key", "Return")

@@ -2,7 +2,7 @@
 
 import bpy
 import numpy as np
-from driving import WORKBOOK, folder, ours, press, run, seen
+from driving import WORKBOOK, drawn, folder, ours, press, run, seen
 
 jobs, runs = ours("addon.blender.jobs"), ours("addon.runs.runs")
 
@@ -22,14 +22,14 @@ def steps():
     area.type = "IMAGE_EDITOR"
     yield 1.0
     press(bpy.ops.mphdrr.import_counts)
-    yield 3.0
+    yield lambda: areas("FILE_BROWSER")
     seen["browsers"] = len(areas("FILE_BROWSER"))
     for window in bpy.context.window_manager.windows:
         for area in window.screen.areas:
             if area.type == "FILE_BROWSER":
                 with bpy.context.temp_override(window=window, area=area, region=area.regions[0]):
                     bpy.ops.file.cancel()
-    yield 2.0
+    yield from drawn()
     said = {"frames": "80-1", "orientation": "front+v", "time": 600.0}
     press(bpy.ops.mphdrr.import_counts, filepath=str(counts), **said)
     yield 1.0

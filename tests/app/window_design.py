@@ -1,7 +1,21 @@
 """Design in the window: keys and undo as a user's; leaves the window while a module is being moved."""
 
 import bpy
-from driving import WORKBOOK, editor, empty_scene, keys, module, open_tab, opened, press, run, scanner, seen, within
+from driving import (
+    WORKBOOK,
+    drawn,
+    editor,
+    empty_scene,
+    keys,
+    module,
+    open_tab,
+    opened,
+    press,
+    run,
+    scanner,
+    seen,
+    within,
+)
 from mathutils import Euler
 
 
@@ -53,7 +67,7 @@ def steps():
     empty_scene()
     bpy.ops.mphdrr.import_geometry("EXEC_DEFAULT", True, filepath=str(WORKBOOK))
     show()
-    yield 3
+    yield from drawn()
     open_tab()
     select(3)
     yield 1

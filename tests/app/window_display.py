@@ -4,7 +4,7 @@ import time
 
 import bpy
 import numpy as np
-from driving import editor, is_idle, open_tab, press, run, seen, xdotool
+from driving import drawn, editor, is_idle, open_tab, press, run, seen, xdotool
 
 
 def place_of(number: int) -> tuple[int, int, int, int]:
@@ -39,17 +39,18 @@ def steps():
         yield 0.1
     seen["seconds"] = time.monotonic() - started
     open_tab()
-    yield 8.0  # drawn in software, slowly
+    yield from drawn()
     left, top, right, bottom = place_of(30)
     xdotool("mousemove", round(left + 0.5 * (right - left)), round(top + 0.7 * (bottom - top)))
     xdotool("click", 1)
-    yield 3.0
+    yield lambda: active()[0] == 30
+    yield from drawn()
     seen["clicked"] = active()
     plane = bpy.data.objects["Projection 55"]
     bpy.ops.object.select_all(action="DESELECT")
     plane.select_set(True)
     bpy.context.view_layer.objects.active = plane
-    yield 3.0
+    yield from drawn()
     seen["selected"] = active()
     seen["tile"], seen["other"] = place_of(55), place_of(31)
     seen["tiles"] = [place_of(number) for number in range(1, 81)]

@@ -5,6 +5,7 @@ import numpy as np
 from bpy_extras.view3d_utils import location_3d_to_region_2d, region_2d_to_origin_3d, region_2d_to_vector_3d
 from driving import (
     WORKBOOK,
+    drawn,
     editor,
     idle,
     on_screen,
@@ -54,12 +55,18 @@ def slider() -> tuple[int, int]:
     return sidebar.x + int(columns[len(columns) // 4]), window.height - 1 - sidebar.y - row
 
 
+def pixel() -> list[float]:
+    """The number of the module and its pixel that are picked."""
+    found = epipolar.picked(bpy.context.scene)
+    return [found.run.numbers[found.index], *found.pixel.tolist()]
+
+
 def steps():
     """Yields seconds to wait."""
     opened("MPHDRR_PT_epipolar_of_images", but_closed=("MPHDRR_PT_display_of_images", "MPHDRR_PT_runs_of_images"))
     press(bpy.ops.mphdrr.load_example)
     yield from idle()
-    yield 4.0
+    yield from drawn()
     scene = bpy.context.scene
     bpy.data.objects["Derenzo"].hide_viewport = True
     # The point is where the pixel's ray is, at a depth of its own.
@@ -82,16 +89,16 @@ def steps():
     settings.width = settings.height = 64
     press(bpy.ops.mphdrr.render_projections)
     yield from idle()
-    yield 6.0
+    yield from drawn()
     _, area, region = editor("IMAGE_EDITOR")
     area.spaces.active.show_region_ui = True
-    yield 1.0
+    yield from drawn()
     open_tab("IMAGE_EDITOR")
-    yield 1.0
+    yield from drawn()
     press(
         bpy.ops.image.view_zoom_ratio, "EXEC_DEFAULT", kind="IMAGE_EDITOR", ratio=2.0
     )  # a pixel is some of the screen's then
-    yield 1.0
+    yield from drawn()
     start = np.array(place_of(NUMBER, PIXEL))
     middle = np.array(on_screen(region.width / 2, region.height / 2, "IMAGE_EDITOR"))
     press(
@@ -100,7 +107,7 @@ def steps():
         kind="IMAGE_EDITOR",
         offset=(np.array([1, -1]) * (start - middle) / 2).tolist(),
     )
-    yield 1.0
+    yield from drawn()
     press(bpy.ops.mphdrr.pick_pixel, kind="IMAGE_EDITOR")
     yield 0.5
     at = place_of(NUMBER, PIXEL)
@@ -108,12 +115,13 @@ def steps():
     xdotool("mousemove", *at)
     yield 0.5
     xdotool("click", 1)
-    yield 3.0
+    yield lambda: epipolar.picked(scene) is not None
+    yield from drawn()
     found = epipolar.picked(scene)
-    seen["picked"] = None if found is None else [found.run.numbers[found.index], *found.pixel.tolist(), found.seen_by]
+    seen["picked"] = None if found is None else [*pixel(), found.seen_by]
     picture("picked")
     press(bpy.ops.image.view_all, "EXEC_DEFAULT", kind="IMAGE_EDITOR", fit_view=True)
-    yield 3.0
+    yield from drawn()
     before = found.places
     x, y = slider()
     wanted = found.k / SHARE
@@ -133,7 +141,7 @@ def steps():
         xdotool("mousemove", x, y)
         yield 0.25
     xdotool("mouseup", 1)
-    yield 3.0
+    yield from drawn()
     found = epipolar.picked(scene)
     seen["k"] = [wanted, found.k, len(set(trail))]
     seen["marker"] = found.marker.tolist()
@@ -156,7 +164,7 @@ def steps():
         epipolar.picked(scene)
     seen["ms for each k"] = 20 * (own_time() - started)
     scene.mphdrr_epipolar.k = found.k
-    yield 2.0
+    yield from drawn()
     spent = []
     for draw in (epipolar_drawing.draw_over_pictures, epipolar_drawing.draw_in_scene):
         kind = "IMAGE_EDITOR" if draw is epipolar_drawing.draw_over_pictures else "VIEW_3D"
@@ -194,9 +202,10 @@ def steps():
     xdotool("mousemove", *target[1])
     yield 0.5
     xdotool("click", 1)
-    yield 3.0
-    found = epipolar.picked(scene)
-    seen["on plane"] = [found.run.numbers[found.index], *found.pixel.tolist()]
+    before = pixel()
+    yield lambda: pixel() != before
+    yield from drawn()
+    seen["on plane"] = pixel()
     picture("plane")
 
 

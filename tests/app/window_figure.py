@@ -5,7 +5,7 @@ import sys
 import time
 
 import bpy
-from driving import WORKBOOK, editor, escape_asks, folder, idle, is_idle, picture, press, run, seen
+from driving import WORKBOOK, drawn, editor, escape_asks, folder, idle, is_idle, picture, press, run, seen
 
 
 def steps():
@@ -37,7 +37,7 @@ def steps():
     yield from idle()
     press(bpy.ops.mphdrr.render_picture, filepath=str(folder / "picture.png"), width=480, height=300, samples=8)
     yield from idle()
-    yield 2.0
+    yield from drawn()
     seen["shown"] = editor("IMAGE_EDITOR")[1].spaces.active.image.name
     picture("shown")
     seen.update(scenes=len(bpy.data.scenes), display=[shown_in, bpy.context.preferences.view.render_display_type])

@@ -1,7 +1,7 @@
 """A phantom as one module sees it, from aside and from its pinhole, and a back-projection; a picture of each."""
 
 import bpy
-from driving import WORKBOOK, editor, idle, look, only, open_tab, picture, place, press, run, seen
+from driving import WORKBOOK, drawn, editor, idle, look, only, open_tab, picture, place, press, run, seen
 
 MODULE = 27
 
@@ -14,7 +14,7 @@ def steps():
     space.show_region_ui, space.overlay.show_floor = True, False
     space.overlay.show_axis_x = space.overlay.show_axis_y = space.overlay.show_text = False
     press(bpy.ops.mphdrr.import_geometry, "EXEC_DEFAULT", filepath=str(WORKBOOK))
-    yield 2
+    yield from drawn()
     scene = bpy.context.scene
     press(bpy.ops.mphdrr.add_derenzo, "EXEC_DEFAULT", voxels=160)
     yield from idle()
@@ -35,12 +35,12 @@ def steps():
     phantom.hide_set(True)
     middle = camera.matrix_world.translation * 0.4
     look(520.0, (1.2, 0.0, 0.6), middle)
-    yield 5
+    yield from drawn()
     frustum = bpy.data.objects[f"Perspective {MODULE}"]
     seen["corners"] = [place(frustum.matrix_world @ vertex.co) for vertex in frustum.data.vertices]
     picture("aside")
     press(bpy.ops.mphdrr.look_through_module, "EXEC_DEFAULT", number=MODULE)
-    yield 5
+    yield from drawn()
     seen["through"] = [place(frustum.matrix_world @ vertex.co) for vertex in frustum.data.vertices[1:]]
     seen["frame"] = [place(camera.matrix_world @ corner) for corner in camera.data.view_frame()]
     picture("pinhole")
@@ -48,10 +48,10 @@ def steps():
     editor()[2].data.view_perspective = "ORTHO"
     bpy.context.view_layer.objects.active = camera
     camera.location.z += 15.0
-    yield 3
+    yield from drawn()
     picture("moved")
     camera.location.z -= 15.0
-    yield 1
+    yield from drawn()
     bpy.context.view_layer.objects.active = phantom
     press(bpy.ops.mphdrr.resample_in_perspective)
     yield from idle()
@@ -59,7 +59,7 @@ def steps():
     bpy.ops.mphdrr.clear_perspective()
     press(bpy.ops.mphdrr.add_slices, "EXEC_DEFAULT")
     look(300.0, (1.05, 0.0, 0.95))
-    yield 4
+    yield from drawn()
     picture("through")
     for item in bpy.context.scene.objects:
         if item.type == "VOLUME" or (item.parent is not None and item.parent.type == "VOLUME"):

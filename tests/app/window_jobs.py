@@ -6,7 +6,21 @@ from pathlib import Path
 import addon_utils
 import bpy
 import numpy as np
-from driving import WORKBOOK, beat, beats, editor, folder, open_tab, ours, pause_beyond_redraw, press, run, seen, within
+from driving import (
+    WORKBOOK,
+    beat,
+    beats,
+    drawn,
+    editor,
+    folder,
+    open_tab,
+    ours,
+    pause_beyond_redraw,
+    press,
+    run,
+    seen,
+    within,
+)
 
 jobs = ours("addon.blender.jobs")
 seen |= {"gaps": {}, "words": [], "changed": []}
@@ -73,10 +87,10 @@ def steps():
     open_tab()
     bpy.data.objects.remove(bpy.data.objects["Cube"])
     mph.import_geometry(filepath=str(WORKBOOK))
-    yield 2.0
+    yield from drawn()
     # Without the 3D view, which takes seconds to draw in software: what is measured is not the drawing.
     area.type = "TEXT_EDITOR"
-    yield 1.0
+    yield from drawn()
     render = {"width": 256, "height": 256, "volume": "Derenzo"}
     yield from measured("phantom", mph.add_derenzo, voxels=128)
     yield from measured("projecting", mph.render_projections, **render)

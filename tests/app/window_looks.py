@@ -1,7 +1,7 @@
 """A look is dragged from the Asset Browser onto a phantom with slices; leaves the window as it is then."""
 
 import bpy
-from driving import editor, empty_scene, idle, look, on_screen, picture, press, run, seen, within, xdotool
+from driving import drawn, editor, empty_scene, idle, look, on_screen, picture, press, run, seen, within, xdotool
 
 
 def brightest(item) -> list[float]:
@@ -29,7 +29,7 @@ def steps():
         bpy.ops.screen.area_split(direction="HORIZONTAL", factor=0.4)
     area = min((a for a in editor()[0].screen.areas if a.type == "VIEW_3D"), key=lambda a: a.height)
     area.ui_type = "ASSETS"
-    yield 2
+    yield from drawn()
     area.spaces.active.params.asset_library_reference = "mphDRR"
     yield 4
     window, _, region = editor()
@@ -44,8 +44,8 @@ def steps():
         yield 0.5
     picture("dragged")
     xdotool("mouseup", 1)
-    yield 3
-    item = bpy.data.objects["Derenzo"]
+    yield lambda: item.data.materials[0].name != "Derenzo activity"
+    yield from drawn()
     seen["materials"].append(item.data.materials[0].name)
     seen["brightest"].append(brightest(item))
     seen["slice"] = sorted(

@@ -3,7 +3,7 @@
 import math
 
 import bpy
-from driving import WORKBOOK, editor, empty_scene, folder, open_tab, place, press, run, seen
+from driving import WORKBOOK, drawn, editor, empty_scene, folder, open_tab, place, press, run, seen
 from mathutils import Euler
 
 
@@ -23,7 +23,7 @@ def steps():
     view.view_distance, view.view_location = 520, (40, 0, 10)
     view.view_rotation = Euler((1.05, 0, 0.95)).to_quaternion()
     seen["files"] = sorted(path.name for path in folder.iterdir())
-    yield 3
+    yield from drawn()
     open_tab()
     bpy.context.view_layer.objects.active.select_set(False)  # its outline has the rods' colour
     area.tag_redraw()

@@ -1,7 +1,7 @@
 """Commands found by the menus' search (F3) and started from it; leaves the search for "projection" open."""
 
 import bpy
-from driving import WORKBOOK, editor, on_screen, press, run, seen, xdotool
+from driving import WORKBOOK, drawn, editor, on_screen, press, run, seen, xdotool
 
 
 def search() -> None:
@@ -24,13 +24,14 @@ def steps():
     bpy.context.view_layer.update()
     for text in ("collimator aim", "preset ideal", "projection"):
         search()
-        yield 3.0
+        yield from drawn()
         seen.setdefault("before", [camera.mphdrr_module.aimed, model()])
         xdotool("type", "--delay", "100", text)
-        yield 6.0
+        yield 1.0
+        yield from drawn()
         if text != "projection":
             xdotool("key", "Return")
-            yield 2.0
+            yield from drawn()
     seen["after"] = [camera.mphdrr_module.aimed, model()]
 
 

@@ -1,7 +1,7 @@
 """How tall the tab is with everything open, after the example was reconstructed, in pixels."""
 
 import bpy
-from driving import editor, idle, open_tab, opened, panels, picture, press, run, seen, sidebar
+from driving import drawn, editor, idle, open_tab, opened, panels, picture, press, run, seen, sidebar
 
 
 def steps():
@@ -16,13 +16,13 @@ def steps():
     area.spaces.active.show_region_ui = True
     yield 1
     open_tab()
-    yield 2
+    yield from drawn()
     height, top = sidebar().height, 0.0
     for page in range(14):
         picture(f"page-{page}")
         with bpy.context.temp_override(window=window, area=area, region=sidebar()):
             bpy.ops.view2d.pan(deltay=60 - height)
-        yield 1
+        yield from drawn()
         if sidebar().view2d.region_to_view(0, 0)[1] == top:
             break
         top = sidebar().view2d.region_to_view(0, 0)[1]

@@ -2,7 +2,7 @@
 
 import bpy
 import numpy as np
-from driving import editor, folder, idle, on_screen, open_tab, ours, own_time, picture, press, run, seen, xdotool
+from driving import drawn, editor, folder, idle, on_screen, open_tab, ours, own_time, picture, press, run, seen, xdotool
 
 core, preview, volumes = (ours(name) for name in ("core", "addon.runs.preview", "addon.volumes.volumes"))
 images = ours("addon.pictures.images")
@@ -50,11 +50,17 @@ def figures(name, times):
     seen[name] = {"median": float(np.median(times)), "p95": float(np.percentile(times, 95)), "most": max(times)}
 
 
+def at_rest() -> bool:
+    """Whether the preview has all pixels of what there is."""
+    shown = preview.session().shown
+    return shown is not None and not shown.is_quick
+
+
 def steps():
     editor()[1].spaces.active.show_region_ui = True
     press(bpy.ops.mphdrr.load_example)
     yield from idle()
-    yield 6.0  # drawn in software, slowly
+    yield from drawn()
     open_tab()
     scene = bpy.context.scene
     camera, phantom = bpy.data.objects["Module 55"], bpy.data.objects["Derenzo"]
@@ -65,7 +71,7 @@ def steps():
     scene.mphdrr_projections.width = scene.mphdrr_projections.height = 256
     bpy.ops.mphdrr.show_modules(first=50, last=60, mode="ONLY")  # drawn in software, slowly
     phantom.display_type = "BOUNDS"
-    yield 4.0
+    yield from drawn()
     off = []
     for _ in range(MOVES // 2):
         spent["move"] = 0.0
@@ -75,8 +81,8 @@ def steps():
     figures("off", off)
     names = set(bpy.data.images.keys()), set(bpy.data.objects.keys())
     bpy.ops.mphdrr.live_preview()
-    yield 4.0
     session = preview.session()
+    yield at_rest
     seen["first"] = [session.problem, session.lines, session.shown is not None and not session.shown.is_quick]
     times, quick = [], []
     for number in range(MOVES):
@@ -87,7 +93,7 @@ def steps():
         quick.append(session.shown.is_quick)
     figures("on", times)
     seen["quick"] = sum(quick)
-    yield 3.0
+    yield at_rest
     seen["full"] = not session.shown.is_quick
     run = session.shown.run
     volume = volumes.volume_from_object(phantom)
@@ -96,17 +102,18 @@ def steps():
     seen["largest"] = float(exact.max())
     seen["same place"] = bool(np.allclose(run.system.centers[0], camera.location, atol=1e-5))
     camera.mphdrr_module.collimator_length = 60.0
-    yield 3.0
+    yield lambda: at_rest() and session.shown.run.system.collimator_length[0] == 60.0
     seen["typed"] = float(session.shown.run.system.collimator_length[0])
     camera.mphdrr_module.pinhole_diameter = 400.0
-    yield 3.0
+    yield lambda: session.problem
     seen["impossible"] = session.problem
     camera.mphdrr_module.pinhole_diameter = 2.3
-    yield 3.0
+    yield lambda: not session.problem and at_rest()
     seen["again"] = session.problem
     seen["images"] = (set(bpy.data.images.keys()), set(bpy.data.objects.keys())) == names
     scene.mphdrr_projections.model, phantom.display_type = "EMISSION", "TEXTURED"
-    yield 6.0
+    yield lambda: session.shown.run.unit == "counts" and at_rest()
+    yield from drawn()
     seen["unit"] = session.shown.run.unit
     drawing, _, region = preview.preview_drawing, *editor()[1:]
     left, bottom, right, top = drawing._boxes[region.as_pointer()][0]
@@ -119,17 +126,17 @@ def steps():
         xdotool("mousemove", *on_screen((left + right) / 2 - 20 * step, (bottom + top) / 2 + 10 * step))
         yield 0.3
     xdotool("mouseup", 1)
-    yield 3.0
+    yield from drawn()
     box = drawing._boxes[region.as_pointer()][0]
     seen["dragged"] = [box[0] - left, box[1] - bottom, list(camera.location) == place]
     picture("dragged")
     bpy.ops.wm.save_as_mainfile(filepath=str(folder / "a.blend"))
-    yield 3.0
+    yield from drawn()
     picture("saved")
-    pick_high(30)
-    yield 4.0
-    exact = images.projection_array(bpy.data.images["mphDRR 30"])
     settings = scene.mphdrr_display
+    pick_high(30)
+    yield lambda: not settings.automatic
+    exact = images.projection_array(bpy.data.images["mphDRR 30"])
     seen["picked"] = [settings.automatic, settings.low, bool(settings.high > 0 and np.isin(settings.high, exact))]
 
 

@@ -1,7 +1,7 @@
 """Two runs of the example in the window: a module is moved and moved back, the run is rendered again, both are compared."""
 
 import bpy
-from driving import editor, idle, open_tab, ours, own_time, press, run, seen
+from driving import drawn, editor, idle, open_tab, ours, own_time, press, run, seen
 
 runs = ours("addon.runs.runs")
 
@@ -27,18 +27,18 @@ def steps():
     yield from idle()
     editor("IMAGE_EDITOR")[1].spaces.active.show_region_ui = True
     changes("loaded")
-    yield 4  # drawn in software, slowly
+    yield from drawn()
     open_tab()
     open_tab("IMAGE_EDITOR")
     move()
-    yield 4
+    yield from drawn()
     changes("moved")
     bpy.ops.ed.undo()
-    yield 4
+    yield from drawn()
     changes("undone")
     bpy.context.scene.mphdrr_projections.runs[0].name = "As imported"
     move()
-    yield 4
+    yield from drawn()
     changes("moved again")
     started = own_time()
     for _ in range(1000):
@@ -46,17 +46,17 @@ def steps():
     seen["handler ms"] = own_time() - started
     press(bpy.ops.mphdrr.render_projections, volume=runs.volume_to_render(bpy.context.scene))
     yield from idle()
-    yield 4
+    yield from drawn()
     changes("rendered")
     bpy.context.scene.mphdrr_projections.active_run = 0  # as a click in the list does, which starts a job
     yield lambda: runs.shown(bpy.context.scene).name == "As imported"
     yield from idle()
-    yield 4
+    yield from drawn()
     changes("chosen")
     seen["shown"] = runs.shown(bpy.context.scene).name
     press(bpy.ops.mphdrr.compare_runs, other="1")
     yield from idle()
-    yield 4
+    yield from drawn()
     seen["runs"] = [item.name for item in bpy.context.scene.mphdrr_projections.runs]
     window, area, _ = editor("IMAGE_EDITOR")
     seen["image"] = area.spaces.active.image.name

@@ -3,7 +3,21 @@
 import bpy
 import numpy as np
 from bpy_extras.view3d_utils import location_3d_to_region_2d
-from driving import WORKBOOK, editor, empty_scene, keys, module, on_screen, open_tab, press, run, seen, within, xdotool
+from driving import (
+    WORKBOOK,
+    drawn,
+    editor,
+    empty_scene,
+    keys,
+    module,
+    on_screen,
+    open_tab,
+    press,
+    run,
+    seen,
+    within,
+    xdotool,
+)
 from mathutils import Matrix, Vector
 
 
@@ -102,10 +116,10 @@ def steps():
     for name, first in (("A", 30), ("B", 60)):
         bpy.ops.mphdrr.import_geometry("EXEC_DEFAULT", True, filepath=str(WORKBOOK), name=name, replace=True)
         bpy.ops.mphdrr.show_modules(first=first, last=first, mode="ONLY")
-    yield 2
+    yield from drawn()
     seen["imported"] = state()
     look_at_back("A", 30)
-    yield 3
+    yield from drawn()
     click_on(part("A", 30, "CRYSTAL"))
     yield lambda: state()["panel"] == "A" and state()["listed"] == 30
     seen["clicked"] = seen["before"] = state()

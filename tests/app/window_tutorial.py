@@ -10,6 +10,7 @@ from collections.abc import Callable
 import bpy
 import numpy as np
 from driving import (
+    drawn,
     editor,
     folder,
     is_idle,
@@ -27,7 +28,6 @@ from driving import (
 )
 
 STEPS: list[Callable] = []
-_DRAWN = 4.0  # s until all is drawn, in software
 
 
 def mouse(x: float, y: float, *buttons: int) -> None:
@@ -68,7 +68,7 @@ def load():
     press(bpy.ops.mphdrr.load_example)
     yield 1
     yield is_idle
-    yield 6  # the mosaic is fitted to its editor once that is drawn
+    yield from drawn()  # the mosaic is fitted to its editor once that is drawn
     planes = [o for o in bpy.data.objects if o.mphdrr_module.part == "PLANE"]
     rings = sum(c.mphdrr_scanner.is_ring for c in scanner().children)
     return [f"{scanner().mphdrr_scanner.count} modules", f"{rings} rings", f"{len(planes)} projections", "Derenzo"]
@@ -131,7 +131,7 @@ def display():
     before = totals()
     settings = bpy.context.scene.mphdrr_display
     settings.colors, settings.scale = "VIRIDIS", "SQRT"
-    yield 2
+    yield from drawn()
     assert totals() == before, "the numbers stay"
     mouse(sidebar().x, 300)  # where the popover is put
     window, area, _ = editor()
@@ -155,7 +155,8 @@ def steps():
     """Take the tutorial's steps, and a picture of each."""
     for function in STEPS:
         seen[function.__name__] = yield from function()
-        yield _DRAWN
+        yield 1
+        yield from drawn()
         picture(function.__name__)
 
 

@@ -3,6 +3,7 @@
 import bpy
 from driving import (
     WORKBOOK,
+    drawn,
     editor,
     frame,
     look,
@@ -40,13 +41,13 @@ def steps():
     nema.hide_set(False)
     look(500.0)
     seen["frame"] = frame()
-    yield 4
+    yield from drawn()
     picture("slice")
     settings.display_low = 0.0
     for plane in slices.planes_of(nema):
         plane.hide_set(False)
     look(900.0, (1.05, 0.0, 0.95))
-    yield 4
+    yield from drawn()
     picture("slices")
     before = list(settings.slices)
     start, step = slices.way(nema, 2)
@@ -54,14 +55,15 @@ def steps():
     ends = place(handle + step * 6), place(handle + step * 16)
     seen["arrow"] = ends
     xdotool("mousemove", *ends[0])
-    yield 2
+    yield 0.5
+    yield from drawn()
     xdotool("mousedown", 1)
     yield 0.5
     for share in (0.3, 0.7, 1.0):
         xdotool("mousemove", *(round(a + share * (b - a)) for a, b in zip(*ends, strict=True)))
         yield 0.7
     xdotool("mouseup", 1)
-    yield 2
+    yield from drawn()
     seen["dragged"] = [before, list(settings.slices)]
     plane = slices.planes_of(nema)[2]
     image = plane.data.materials[0].node_tree.nodes["Slice"].image
@@ -72,17 +74,17 @@ def steps():
     moved = list(image.pixels)
     with within():
         bpy.ops.ed.undo()
-    yield 1
+    yield from drawn()
     nema = bpy.data.objects[nema_name]
     settings = nema.mphdrr_volume
     image = slices.planes_of(nema)[2].data.materials[0].node_tree.nodes["Slice"].image
     seen["undone"] = [settings.slices[2], painted != moved, list(image.pixels) == painted]
     settings.look = "CUT"
-    yield 4
+    yield from drawn()
     picture("cut")
     slices.remove_slices(nema)
     settings.look = "SHELL"
-    yield 3
+    yield from drawn()
     picture("shell")
     nema.hide_set(True)
     for child in nema.children:
@@ -90,7 +92,7 @@ def steps():
     press(bpy.ops.mphdrr.add_torso, "EXEC_DEFAULT", voxels=64)
     torso = bpy.context.object
     torso.mphdrr_volume.look = "SHELL"
-    yield 4
+    yield from drawn()
     picture("heart")
     torso.hide_set(True)
     for child in torso.children:
@@ -99,7 +101,7 @@ def steps():
     press(bpy.ops.mphdrr.add_map, "EXEC_DEFAULT", quantity="sensitivity", voxels=32)
     press(bpy.ops.mphdrr.show_modules, "EXEC_DEFAULT", first=1, last=40, mode="ONLY")
     look(420.0, (1.05, 0.0, 0.95), (0.0, 0.0, -30.0))
-    yield 5
+    yield from drawn()
     picture("map")
     seen["map"] = [place((0.0, 0.0, 0.0)), place((60.0, -60.0, 60.0))]
     left, bottom, width, height = color_bar.place()
@@ -107,7 +109,7 @@ def steps():
     space.show_region_ui = True
     bpy.context.view_layer.objects.active = bpy.data.objects["Sensitivity map"]
     look(600.0, (1.05, 0.0, 0.95))
-    yield 2
+    yield from drawn()
     open_tab()
 
 

@@ -1,7 +1,7 @@
 """From a clean home to CT, SPECT with it, and dose, by clicks on the buttons that the tab proposes."""
 
 import bpy
-from driving import click_proposed, editor, idle, open_tab, ours, picture, proposed, run, seen
+from driving import click_proposed, drawn, editor, idle, open_tab, ours, picture, proposed, run, seen
 
 _FIRST = 78  # pixels from the sidebar's top to the button of the X-ray example
 
@@ -18,10 +18,10 @@ def steps():
         seen["clicks"].append(proposed())
         click_proposed(_FIRST)
         yield from idle()
-        yield 2
+        yield from drawn()
         if number == 1:
             editor()[2].data.view_distance *= 0.55
-            yield 1
+            yield from drawn()
         picture(f"click-{number}")
         scene.mphdrr_reconstruction.iterations = 30 if number < 3 else 0  # of the CT, for speed
     volumes = ours("addon.volumes.volumes")

@@ -1,8 +1,9 @@
-"""Every test gets a fresh factory scene and the registered extension; without bpy they are skipped."""
+"""Every test gets a fresh factory scene in which the extension is registered; without bpy they are skipped."""
 
 from __future__ import annotations
 
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,10 @@ import pytest
 bpy = pytest.importorskip("bpy", reason="needs Blender's Python module: pip install mphdrr[blender]")
 
 from mphdrr.addon import registration  # noqa: E402
+from mphdrr.addon.blender import jobs, plots, timers  # noqa: E402
+from mphdrr.addon.events import event_notes  # noqa: E402
+from mphdrr.addon.pictures import recoloring  # noqa: E402
+from mphdrr.addon.runs import preview  # noqa: E402
 from mphdrr.core.geometry.system import PinholeSystem  # noqa: E402
 from mphdrr.core.workbook import read_system, write_system  # noqa: E402
 
@@ -18,19 +23,22 @@ WORKBOOK = Path(__file__).parents[2] / "examples" / "dc-spect-80.xlsx"
 
 
 @pytest.fixture(scope="session")
-def factory_settings() -> None:
-    """Blender's own preferences and add-ons, once: to set them up takes five times as long as a scene."""
+def registered() -> Iterator[None]:
+    """The extension in Blender with its own preferences and add-ons: to register it takes longer than a scene."""
     bpy.ops.wm.read_factory_settings()
+    registration.register()
+    yield
+    registration.unregister()
 
 
 @pytest.fixture(autouse=True)
-def scene(factory_settings):
-    """A fresh factory scene with the extension registered."""
+def scene(registered: None) -> Iterator[bpy.types.Scene]:
+    """A fresh factory scene; what was going on in the one before has ended, as when the extension is disabled."""
     bpy.ops.wm.read_homefile(use_factory_startup=True)
     shutil.rmtree(Path(bpy.app.tempdir, "mphdrr"), ignore_errors=True)
-    registration.register()
     yield bpy.context.scene
-    registration.unregister()
+    for module in (jobs, preview, plots, recoloring, event_notes, timers):
+        module.stop()
 
 
 @pytest.fixture(scope="session")

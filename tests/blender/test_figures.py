@@ -180,11 +180,11 @@ def test_a_volume_is_seen_or_its_absence_is_said(example, tmp_path, look):
     (item,) = volumes.volume_objects(example)
     item.mphdrr_volume.look, path = look, tmp_path / "a.png"
     for kind in ("cut-away", "inside"):
-        job = figures.figure_job(bpy.context, kind, [path], (480, 300), samples=1)
+        job = figures.figure_job(bpy.context, kind, [path], (240, 150), samples=1)
         assert warned(lambda job=job: jobs.run(job)) == []
     item.mphdrr_volume.display_high = item.mphdrr_volume.surface = 1e7
     item.mphdrr_volume.display_low = 9e6
-    (text,) = warned(lambda: jobs.run(figures.figure_job(bpy.context, "inside", [path], (480, 300), samples=1)))
+    (text,) = warned(lambda: jobs.run(figures.figure_job(bpy.context, "inside", [path], (240, 150), samples=1)))
     assert "Low and High draw none of its values" in text
 
 

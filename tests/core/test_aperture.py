@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import itertools
 
 import numpy as np
@@ -93,6 +94,7 @@ def test_point_source_on_the_axis_counts_what_the_edge_lets_pass(n):
 FINE, SIDE = 0.1, 8.0
 
 
+@functools.cache
 def voxel_image(n, fwhm):
     """Image on fine pixels, of a sum of 1, of a voxel of 8 mm^3 at the isocentre through n points of the hole."""
     grid, system = turned_grid((1, 1, 1), 2.0), one_module()

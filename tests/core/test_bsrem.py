@@ -9,6 +9,8 @@ import pytest
 import mphdrr.core as mph
 from mphdrr.core.reconstruction.priors import Penalty
 
+AS_SHIPPED = True  # its bounds are of these counts
+
 PRIORS = [mph.Quadratic(0.1), mph.RelativeDifference(2.0), mph.TotalVariation(1.0, edge=5.0)]
 
 

@@ -16,6 +16,8 @@ from mphdrr.core import events
 from .small_events import small_recipe
 from .test_event_work import tree
 
+AS_SHIPPED = True  # other processes make the same
+
 COUNT = 8
 pytestmark = pytest.mark.long
 

@@ -233,7 +233,7 @@ OPTIONS = {"legacy": {"models": "rays"}, "3dunet": {"models": "rays"}, "webdatas
 
 
 @pytest.mark.parametrize("program", PROGRAMS)
-def test_exports_go_on_where_they_stopped_and_are_the_same_bytes(program, event_set, tmp_path):
+def test_exports_that_stopped_go_on_and_more_events_are_added_and_the_bytes_are_the_same(program, event_set, tmp_path):
     if program == "legacy":
         pytest.importorskip("torch")
     options = OPTIONS[program]
@@ -250,6 +250,9 @@ def test_exports_go_on_where_they_stopped_and_are_the_same_bytes(program, event_
     export_events(event_set, tmp_path / "parts", program, **options)
     assert contents(tmp_path / "parts") == contents(tmp_path / "whole")
     assert {path: path.stat().st_ino for path in there} == there, "what was there is kept"
+    export_events(event_set[:3], tmp_path / "grown", program, **options)
+    export_events(event_set, tmp_path / "grown", program, **options)
+    assert contents(tmp_path / "grown") == contents(tmp_path / "whole")
 
 
 def test_what_a_killed_export_was_writing_is_removed(event_set, tmp_path):
@@ -273,18 +276,6 @@ def test_another_table_of_slots_is_another_export(event_set, tmp_path):
     slots.write_text(slots.read_text().replace(",1\n", ",0\n"))
     with pytest.raises(InputError, match="another options"):
         export_events(event_set, tmp_path / "out", "3dunet", models="rays", slots=slots)
-
-
-@pytest.mark.parametrize("program", PROGRAMS)
-def test_an_export_of_more_events_adds_them(program, event_set, tmp_path):
-    if program == "legacy":
-        pytest.importorskip("torch")
-    options = OPTIONS[program]
-    export_events(event_set[:3], tmp_path / "grown", program, **options)
-    export_events(event_set, tmp_path / "grown", program, **options)
-    export_events(event_set, tmp_path / "whole", program, **options)
-    grown, whole = contents(tmp_path / "grown"), contents(tmp_path / "whole")
-    assert grown == whole
 
 
 def test_folders_that_hold_something_else_are_refused(event_set, tmp_path):

@@ -23,6 +23,8 @@ from .conftest import WORKBOOK
 from .small_events import TEXT, small_recipe
 from .small_events import WORKBOOK as SMALL_WORKBOOK
 
+AS_SHIPPED = True  # other processes make the same
+
 COUNT = 6
 
 

@@ -22,6 +22,8 @@ from mphdrr.core.events.draws import Dice
 
 from .small_events import TEXT, WORKBOOK, small_recipe
 
+AS_SHIPPED = True  # compared with voxels of every Python
+
 
 @pytest.fixture(scope="module")
 def small(tmp_path_factory) -> events.EventSet:

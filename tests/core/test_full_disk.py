@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import gc
 import importlib.util
 import os
@@ -38,8 +39,10 @@ def collected() -> Iterator[None]:
     """Here, and not in another test; files of libraries that are still open keep their room on the disk, too."""
     yield
     gc.collect()
+    gc.freeze()  # what is left is not looked at again
 
 
+@functools.cache
 def many_modules(count: int = 300) -> mph.PinholeSystem:
     """So many that what describes them is larger than the disk."""
     angles = np.linspace(0, 6.2, count)
@@ -47,34 +50,40 @@ def many_modules(count: int = 300) -> mph.PinholeSystem:
     return mph.PinholeSystem(centers, 2.0, 60.0, detector_side=40, detector_thickness=8, roi_radius=50)
 
 
+@functools.cache
 def a_volume() -> mph.Volume:
     array = np.random.default_rng(3).random((32, 32, 32), np.float32)
     return mph.Volume(array, mph.Grid(array.shape, np.eye(4)), "activity")
 
 
+@functools.cache
 def a_run() -> mph.ProjectionRun:
     system = many_modules()
     views = system.views(shape=(4, 6), detector="real", pitch=(7, 7))
     return mph.ProjectionRun(np.ones((len(system), 4, 6), np.float32), system, views, a_volume())
 
 
+@functools.cache
 def a_page() -> Page:
     page = Page(400, 300)
     page.image(np.random.default_rng(3).integers(0, 255, (150, 150, 3), np.uint8), 0, 0, 400, 300)
     return page
 
 
+@functools.cache
 def a_mesh() -> Mesh:
     points = np.random.default_rng(3).random((9000, 3))
     return Mesh(points, np.arange(9000).reshape(-1, 3))
 
 
+@functools.cache
 def a_reconstruction() -> Any:
     from mphdrr.core.reconstruction.result import Reconstruction
 
     return Reconstruction(a_volume(), np.ones(3), {"method": "mlem"}, {"previous": a_volume().array})
 
 
+@functools.cache
 def a_phantom() -> Any:
     from mphdrr.core.phantoms.phantom import ShapePhantom
     from mphdrr.core.phantoms.shapes import Sphere

@@ -126,12 +126,10 @@ def test_every_example_runs(example, inputs, tmp_path):
         pytest.importorskip("lightning", reason="networks need torch and Lightning, which are not installed here")
     # A few events of many (the fiftieth part of 150 has three), and small pictures, runs and volumes.
     example = example.replace("-n 100000 ", "-n 150 ").replace("-n 1000", "-n 6").replace("1600x900", "320x240")
-    if words[1:3] == ["figure", "scanner"]:
+    if words[1:3] in (["figure", "scanner"], ["figure", "cut-away"]):
         example += " --size 320x240 --samples 1"
-    elif words[1:3] == ["figure", "cut-away"]:
-        example += " --samples 1"
     elif words[1:3] == ["figure", "light-up"]:
-        example = example.replace("--seconds 8 --size 640x400", "--seconds 1 --fps 3 --size 160x120 --samples 1")
+        example = example.replace("--seconds 8 --size 640x400", "--seconds 1 --fps 2 --size 160x120 --samples 1")
     elif words[1:3] == ["project", "scanner.xlsx"] and "--counts" not in words:
         example += " --size 16 16"
     elif "--method model.pt" in example:  # of a scan by the scanner of its training

@@ -26,6 +26,7 @@ MIB = 2**20
 def job(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """A folder that stands for /sys/fs/cgroup, with /proc/self beside it; `groups` says where a process is."""
     monkeypatch.setattr(memory, "_PROCESS", tmp_path / "proc")
+    monkeypatch.setattr(memory, "available", memory.available.__wrapped__)  # type: ignore[attr-defined]
     memory._groups.cache_clear()
     yield tmp_path / "sys"
     memory._groups.cache_clear()

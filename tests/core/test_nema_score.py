@@ -8,6 +8,8 @@ from scipy.ndimage import gaussian_filter
 
 import mphdrr.core as mph
 
+AS_SHIPPED = True  # voxels of all samples
+
 BODY = mph.NemaBody()
 GRID = mph.Grid.centered((158, 122, 21), (2.0, 2.0, 2.0))
 

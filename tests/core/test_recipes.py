@@ -16,6 +16,8 @@ from mphdrr.core.runs.recipe import Recipe
 from mphdrr.core.runs.run_recipe import euler_degrees, phantom_pose
 from mphdrr.core.runs.settings import SETTINGS
 
+AS_SHIPPED = True  # compared with voxels of every Python
+
 DATA = Path(__file__).parent / "data"
 SMALL = ["--voxels", "12", "--spacing", "8", "--size", "6", "8", "--modules", "3-4"]
 COUNTS = ["--emission", "--isotope", "Tc-99m", "--aperture-mu", "tungsten", "--pixel-points", "3", "--tolerance", "9"]

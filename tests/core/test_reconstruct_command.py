@@ -26,7 +26,7 @@ from mphdrr.core.runs.settings import SETTINGS
 COUNTS = {"model.kind": "emission", "model.time": 600.0, "model.aperture_points": 9, "model.intrinsic_fwhm": 1.0,
           "model.pixel_points": 2, "model.tolerance": 9.0, "detector.rows": 16, "detector.columns": 16,
           "detector.plane": "real", "phantom.kind": "derenzo", "phantom.voxels": 36, "phantom.spacing": 2.5}  # fmt: skip
-SMALL = ["--voxels", "20", "--spacing", "5", "--iterations", "3"]
+SMALL = ["--voxels", "12", "--spacing", "8", "--iterations", "3"]
 
 
 @pytest.fixture(scope="module")
@@ -114,16 +114,16 @@ def test_the_command_does_what_python_does_and_logs_each_iteration(run, file, tm
     A = mph.projector_of_run(run, found.grid, recipe=run.recipe.updated({"model.hole": "auto"}))
     expected = mph.osem(A, run.projections, 3, subsets=4)
     np.testing.assert_allclose(found.array, expected.volume.array, rtol=1e-5, atol=1e-5)
-    assert found.quantity == "activity" and found.grid == mph.Grid.centered(20, 5.0)
+    assert found.quantity == "activity" and found.grid == mph.Grid.centered(12, 8.0)
     logged = [float(re.search(r"log-likelihood ([\d.e+-]+),", line)[1]) for line in lines]
     assert len(lines) == 3 and lines[2].startswith("iteration 3 of 3: ")
     np.testing.assert_allclose(logged, expected.objective, rtol=1e-6)
-    assert printed.out.startswith(f"{output}: OSEM, 3 iterations, 4 subsets, 20 x 20 x 20 voxels of 5 mm, largest ")
+    assert printed.out.startswith(f"{output}: OSEM, 3 iterations, 4 subsets, 12 x 12 x 12 voxels of 8 mm, largest ")
 
 
 def test_a_recipe_says_how_and_options_override_it(run, file, tmp_path, capsys):
     recipe = tmp_path / "how.toml"
-    recipe.write_text('[reconstruction]\nmethod = "mlem"\niterations = 2\nvoxels = [20]\nspacing = [5.0]\n'
+    recipe.write_text('[reconstruction]\nmethod = "mlem"\niterations = 2\nvoxels = [12]\nspacing = [8.0]\n'
                       "[detector]\nrows = 3\n")  # fmt: skip
     one, two, three, again = (tmp_path / f"{name}.npz" for name in ("one", "two", "three", "again"))
     command(file, "--recipe", recipe, "--quiet", "-o", one)
@@ -143,16 +143,16 @@ def test_a_recipe_says_how_and_options_override_it(run, file, tmp_path, capsys):
 
 def test_a_kept_state_goes_on_as_without_a_break(file, tmp_path, capsys):
     pytest.importorskip("h5py")
-    small = ["--voxels", "20", "--spacing", "5", "--subsets", "4"]
+    small = ["--voxels", "12", "--spacing", "8", "--subsets", "4"]
     command(file, *small, "--iterations", "4", "-o", tmp_path / "whole.npz")
     command(file, *small, "--iterations", "1", "-o", tmp_path / "half.npz", "--save-state", tmp_path / "s.h5")
     capsys.readouterr()
     command(file, *small, "--iterations", "3", "-o", tmp_path / "rest.npz", "--resume", tmp_path / "s.h5")
     assert "iteration 2 of 4: " in capsys.readouterr().err
-    other = ["--voxels", "20", "--spacing", "5", "--method", "mlem", "--iterations", "1"]
+    other = ["--voxels", "12", "--spacing", "8", "--method", "mlem", "--iterations", "1"]
     command(file, *other, "-o", tmp_path / "other.npz", "--resume", tmp_path / "s.h5")
     said = capsys.readouterr()
-    assert "iteration 1 of 1: " in said.err and "MLEM, 1 iteration, 20 x" in said.out
+    assert "iteration 1 of 1: " in said.err and "MLEM, 1 iteration, 12 x" in said.out
     whole, rest = (mph.read_volume(tmp_path / f"{name}.npz").array for name in ("whole", "rest"))
     np.testing.assert_array_equal(rest, whole)
 
@@ -413,7 +413,7 @@ def test_the_picture_shows_slices_beside_the_truth_and_the_objective(run, file, 
     for words in (
         "Reconstruction",
         "Error",
-        "Truth, z = 2.5 mm",
+        "Truth, z = 4 mm",
         "Log-likelihood",
         "kBq/mL",
         "error",

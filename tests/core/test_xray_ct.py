@@ -8,6 +8,8 @@ import pytest
 import mphdrr.core as mph
 from mphdrr.core.geometry.frames import affine_matrix, rotations
 
+AS_SHIPPED = True  # its bounds are of these counts
+
 PHOTONS = 1e5
 GRID = mph.Grid.centered(48, 3.0)
 BODY = mph.ShapePhantom(

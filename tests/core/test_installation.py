@@ -19,6 +19,8 @@ from mphdrr.core.version import VERSION
 
 pytestmark = pytest.mark.long
 
+AS_SHIPPED = True  # other processes make the same
+
 ROOT = Path(__file__).parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
 PYTHONS = ("3.11", "3.12", "3.13")

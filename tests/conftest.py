@@ -6,15 +6,14 @@ import atexit
 import functools
 import gc
 import os
+import shutil
+import sys
 from pathlib import Path
-from types import ModuleType
-from typing import Any
 
 import pytest
 
 from mphdrr.core import memory
 from mphdrr.core.phantoms import painting
-from mphdrr.core.reconstruction import counts
 from mphdrr.core.workbook import reader
 
 # No test cuts the power: to wait until each small file is on the disk would be most of what some of them take.
@@ -55,23 +54,19 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
         _file = item.path
         gc.collect()
         gc.freeze()
-        for module, values in (SHIPPED if getattr(item.module, "AS_SHIPPED", False) else SHORT).items():
-            vars(module).update(values)
+        vars(painting).update(SHIPPED if getattr(item.module, "AS_SHIPPED", False) else FEWER)
 
 
-# What takes long and is the subject of few tests: a phantom's voxels take a hundredth of their samples, and nothing asks
-# whether counts are in reversed order. A file that tests these, or compares with another process, says AS_SHIPPED = True.
-SHORT: dict[ModuleType, dict[str, Any]] = {
-    counts: {"_warn_if_reversed": lambda *_: None},
-    painting: {
-        "_MIN_SAMPLES": 16,
-        "_MAX_SAMPLES": 1 << 7,
-        "_SAMPLES_OF_MIXED": 1 << 14,
-        "_SAMPLES_OF_FEW": 1 << 6,
-        "_SAMPLES_OF_OVERLAP": 1 << 13,
-    },
+# A phantom's voxels take a hundredth of their samples. A file of tests of just such numbers, or that compares with another
+# process, says AS_SHIPPED = True.
+FEWER = {
+    "_MIN_SAMPLES": 16,
+    "_MAX_SAMPLES": 1 << 7,
+    "_SAMPLES_OF_MIXED": 1 << 14,
+    "_SAMPLES_OF_FEW": 1 << 6,
+    "_SAMPLES_OF_OVERLAP": 1 << 13,
 }
-SHIPPED = {module: {name: getattr(module, name) for name in short} for module, short in SHORT.items()}
+SHIPPED = {name: getattr(painting, name) for name in FEWER}
 
 
 # Workbooks are read thousands of times in a process: the cells of those read last are kept, and all that two of them give,
@@ -98,5 +93,7 @@ memory.available = functools.cache(memory.available)
 
 
 def pytest_sessionfinish(exitstatus: int) -> None:
-    # Blender's module lists forty lines of leaked functions when Python ends, and may wait for a thread of its own for ever.
-    atexit.register(os._exit, int(exitstatus))
+    if bpy := sys.modules.get("bpy"):
+        # It lists forty lines of leaked functions when Python ends, and may wait for a thread of its own for ever.
+        atexit.register(os._exit, int(exitstatus))
+        atexit.register(shutil.rmtree, bpy.app.tempdir, ignore_errors=True)

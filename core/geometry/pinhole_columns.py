@@ -29,8 +29,6 @@ def _designed(needed: Values) -> Floats:
 
 
 _HOLES = "center of hole, centre of hole, center of pinhole, centre of pinhole, pinhole"
-_REGIONS = "spherical region of interest", "region of interest", "roi"
-_SIDES = "length of side of detector", "side of detector", "side of"
 
 
 def _detector_back(system: Any) -> Floats:
@@ -77,7 +75,13 @@ PINHOLE_COLUMNS = ColumnTable(
         Column(
             "R",
             "roi_radius",
-            headings=("R", *(f"radius of {roi}" for roi in _REGIONS), "roi radius"),
+            headings=(
+                "R",
+                "radius of spherical region of interest",
+                "radius of region of interest",
+                "radius of roi",
+                "roi radius",
+            ),
             help="R: radius of the sphere that the module must see",
             place="Main!Q",
             hints="r radius roi",
@@ -86,7 +90,13 @@ PINHOLE_COLUMNS = ColumnTable(
         Column(
             "Ld",
             "detector_side",
-            headings=("Ld", *(f"{side} crystal" for side in _SIDES), "crystal side"),
+            headings=(
+                "Ld",
+                "length of side of detector crystal",
+                "side of detector crystal",
+                "side of crystal",
+                "crystal side",
+            ),
             help="Ld: side of the square crystal",
             place="Main!S",
             hints="ld side width size edge",

@@ -17,8 +17,17 @@ from ..validation import one_of, radians, shape_text
 with needing(of="rotations"):
     import roma
 
-SIZES = {"axis_angle": 3, "euler_angles": 3, "matrix": 9, "quaternion": 4, "quaternion_adjugate": 10}
-SIZES |= {"rotation_6d": 6, "rotation_9d": 9, "rotation_10d": 10, "se3_log_map": 3}
+SIZES = {
+    "axis_angle": 3,
+    "euler_angles": 3,
+    "matrix": 9,
+    "quaternion": 4,
+    "quaternion_adjugate": 10,
+    "rotation_6d": 6,
+    "rotation_9d": 9,
+    "rotation_10d": 10,
+    "se3_log_map": 3,
+}
 """The parameterisations, and how many numbers each takes for a rotation."""
 
 # A symmetric 4 x 4 matrix from its upper triangle, row by row.

@@ -31,7 +31,7 @@ from .parallel import thread_count
 from .subsets import balanced_subsets
 from .transmittance import Field
 
-_PADDING = (-1024.0, -2000.0, -2048.0, -3024.0)  # what CT scanners write outside of what they scanned
+_PADDING = (-2000.0, -2048.0, -3024.0)  # what CT scanners write outside of what they scanned
 
 
 class Projector(LinearOperator):

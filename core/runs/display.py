@@ -79,6 +79,7 @@ class Display:
         low, high = window
         numbers = np.asarray(values, np.float32)
         if self.scale == "log":
+            low, high = (float(np.float32(end)) for end in window)  # as the numbers: the smallest ones have few digits
             if not 0 < low < high:
                 return (numbers >= high).astype(np.float32) if high > 0 else np.zeros_like(numbers)
             numbers = np.log(np.maximum(numbers, low, dtype=np.float32))

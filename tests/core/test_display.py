@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from PIL import Image
 
@@ -14,6 +14,7 @@ from mphdrr.core.runs.mosaic import sheet, totals, write_png
 numbers = st.lists(st.floats(-1e6, 1e6, width=32), min_size=2, max_size=30)
 
 
+@example([0.0, 1.4909815660416054e-41], "log", "inferno")
 @given(numbers, st.sampled_from(SCALES), st.sampled_from(COLORS))
 def test_larger_numbers_never_have_a_lower_colour_and_the_ends_are_the_windows(values, scale, colors):
     display, values = Display(colors, scale), np.sort(np.float32(values))

@@ -17,8 +17,6 @@ from mphdrr.core.runs.presets import PRESETS
 from .conftest import EVENT_RECIPE, WORKBOOK
 from .small_events import small_recipe
 
-AS_SHIPPED = True  # counts in reversed order are said
-
 GRID = mph.Grid.centered(8, 12.0)
 USUAL = {"hole": "point", "pixel_points": 1, "tolerance": 1e9}
 

@@ -33,8 +33,16 @@ _NODE_ROWS, _GIVEN_ROWS = 4, 16  # in kernels.h
 _READ_ON = 16  # numbers that kernels read beyond the last of what they use
 _MOST_ALONG = 2**12  # where float32 knows the length of a segment to 0.1 %
 
-_FIELDS = {"volume": "(4,3)f8", "mu": "(4,3)f8", "world": "(3,3)f8", "rows": "i8", "columns": "i8", "parallel": "f8"}
-_FAN = np.dtype(list(_FIELDS.items()))
+_FAN = np.dtype(
+    [
+        ("volume", "(4,3)f8"),
+        ("mu", "(4,3)f8"),
+        ("world", "(3,3)f8"),
+        ("rows", "i8"),
+        ("columns", "i8"),
+        ("parallel", "f8"),
+    ]
+)
 
 
 class _Lattice(Structure):
@@ -79,8 +87,12 @@ class _PlacesJob(Structure):
 _KERNELS = {
     _Job: ("forward", "backproject", "differentiate", "differentiate_by_mu"),
     _DepthJob: (
-        *("voxels_to_cells", "cells_to_voxels", "cells_to_pixels", "pixels_to_cells"),
-        *("differentiate_places", "differentiate_taps"),
+        "voxels_to_cells",
+        "cells_to_voxels",
+        "cells_to_pixels",
+        "pixels_to_cells",
+        "differentiate_places",
+        "differentiate_taps",
     ),
     _PlacesJob: ("take_at", "give_at"),
 }

@@ -30,7 +30,7 @@ from ...core.progress import Progress, stages_of
 from ...core.reconstruction.methods import method_of
 from ...core.reconstruction.result import iterations_text
 from ...core.runs.mosaic import png
-from ...core.runs.recipe import recipe_of_tables
+from ...core.runs.recipe import recipe_from_tables
 from ...core.runs.reconstructing import reconstruct_run, reconstruction_grid, voxels_text
 from ...core.runs.run_recipe import truth_of_run
 from ...core.volumes.sights import bright_value, full_slices
@@ -94,7 +94,7 @@ def continuing(context: bpy.types.Context) -> jobs.Job:
         (found.volume,), volumes.pose_of_object(item), storage.absolute(item.data.filepath),
         float(values.min()), float(values.max()), extent,
     )  # fmt: skip
-    recipe = recipe_of_tables(found.settings["recipe"]).updated({"reconstruction.iterations": MORE})
+    recipe = recipe_from_tables(found.settings["recipe"]).updated({"reconstruction.iterations": MORE})
     last = _Last(item.session_uid, found, before)
     return _reconstructing(context, recipe, rendering.file_of(run.file), run.name, last)
 

@@ -10,17 +10,19 @@ from typing import Any
 
 from ..arrays import Array
 from ..errors import InputError, naming
-from ..events.entries import by_key, check_entries, flat, like, required, table
 from ..files import read_bytes
 from ..geometry.grid import Grid
 from ..geometry.system import PinholeSystem, chosen_modules
 from ..phantoms.language import parse_phantom, read_phantom
 from ..phantoms.phantom import ShapePhantom
 from ..projector import Emission, Projector
-from ..runs.recipe import Recipe, Values
+from ..recipes.settings import Setting, settings_by_key, table_names, word_labels
+from ..recipes.tables import check_entries, read_table, require_value, table_entries
+from ..recipes.toml import read_toml
+from ..recipes.values import Values
+from ..runs.recipe import Recipe
 from ..runs.run_recipe import recipe_model
-from ..runs.settings import Setting, named
-from ..toml import read_toml
+from ..runs.settings import SETTINGS
 from ..validation import one_of
 from ..workbook import read_system
 from .objectives import Detail, Lesion, Regions, Sensitivity, ball_points
@@ -41,14 +43,14 @@ _BODIES = (
 _OBJECTIVES: Mapping[str, tuple[Setting, ...]] = {
     "sensitivity": (Setting("resolution", float, None, "Of the image that is wanted", unit="mm", above=0), *_POINTS),
     "detail": (Setting("size", float, None, "Of rods or stripes", unit="mm", above=0), *_POINTS,
-               Setting("hole", str, "disc", "How the hole blurs", words=named(("disc", "gaussian")))),
+               Setting("hole", str, "disc", "How the hole blurs", words=word_labels(("disc", "gaussian")))),
     "lesion": _BODIES,
     "regions": _BODIES,
 }  # fmt: skip
 """The kinds of objectives, and their settings."""
 _OPTICS = "time isotope window energy_fwhm aperture_mu opening_angle_degrees crystal_mu intrinsic_fwhm background"
-_ROWS = by_key((
-    *(like(f"model.{name}", f"model.{name}") for name in _OPTICS.split()),
+_ROWS = settings_by_key((
+    *(SETTINGS[f"model.{name}"].with_key(f"model.{name}") for name in _OPTICS.split()),
     Setting("imaging.voxels", int, 32, "Voxels along x, y and z", least=1),
     Setting("imaging.spacing", float, 5.0, "Voxel size", unit="mm", above=0),
     Setting("imaging.pixels", int, 32, "Pixels along each side of a crystal", least=2),
@@ -74,7 +76,7 @@ _ROWS = by_key((
     Setting("evaluation.subsets", int, None, "Of OSEM", "as many as suit", least=1),
     Setting("evaluation.seed", int, 0, "Of the noise", least=0),
 ))  # fmt: skip
-_TABLES = tuple(dict.fromkeys(key.partition(".")[0] for key in _ROWS))
+_TABLES = table_names(_ROWS)
 
 
 class Objective(Values):
@@ -85,13 +87,13 @@ class Objective(Values):
         """Those of its kind."""
         one_of(self.given.get("kind"), _OBJECTIVES, "kind")
         weight = Setting("weight", float, 1.0, "Its share, each objective being 1 at the start", above=0)
-        return by_key((Setting("kind", str, None, "What is wanted"), weight, *_OBJECTIVES[self.given["kind"]]))
+        return settings_by_key((Setting("kind", str, None, "What is wanted"), weight, *_OBJECTIVES[self.given["kind"]]))
 
     def __post_init__(self) -> None:
         super().__post_init__()
         for key in ("resolution", "size", "body", "parts"):
             if key in self.rows:
-                required(self[key], key, f"expected {self.rows[key].text}")
+                require_value(self[key], key, f"expected {self.rows[key].text}")
 
 
 @dataclass(frozen=True)
@@ -130,7 +132,7 @@ class DesignRecipe(Values):
         given = dict(self.generator)
         kind = given.pop("kind", "ellipse")
         if kind == "workbook":
-            file = required(given.pop("file", None), "generator.file", "name the workbook")
+            file = require_value(given.pop("file", None), "generator.file", "name the workbook")
             system = chosen_modules(read_system(self.folder / file), given.pop("modules", None), "generator.modules")
             given = workbook(system, **given)
         return parameters(kind, given, self.free)
@@ -208,11 +210,9 @@ class DesignRecipe(Values):
 
 def design_recipe(values: Mapping[str, Any], folder: Path = Path()) -> DesignRecipe:
     """The recipe of a design in tables, as TOML gives them; paths in it are relative to `folder`."""
-    rest, own = dict(values), {name: table(values, name) for name in ("generator", "free")}
+    own = {name: read_table(values, name) for name in ("generator", "free")}
     check_entries(values, VERSION, ("version", *own, "objectives", *_TABLES))
-    objectives = rest.pop("objectives", [])
-    settings = flat({name: value for name, value in rest.items() if name not in ("version", *own)}, _ROWS, *_TABLES)
-    return DesignRecipe(settings, **own, objectives=objectives, folder=folder)
+    return DesignRecipe(table_entries(values, _ROWS), **own, objectives=values.get("objectives", []), folder=folder)
 
 
 def read_design_recipe(path: str | os.PathLike[str]) -> DesignRecipe:

@@ -1,110 +1,37 @@
 """The phantoms of an event recipe: their settings, values and draws."""
 
 import functools
-from collections.abc import Collection, Iterable, Mapping
-from contextlib import suppress
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from ..errors import InputError, naming
-from ..geometry.grid import Grid
 from ..phantoms.kinds import KINDS, Kind
 from ..phantoms.settings import setting_names
 from ..phantoms.torso import CardiacTorso
-from ..runs.settings import SETTINGS, Setting, own_settings
+from ..recipes.settings import Setting, settings_by_key
+from ..recipes.tables import flat_entries, require_name
+from ..runs.settings import SETTINGS, phantom_settings
 from .draws import Drawn, DrawnValues, options
-
-
-def like(key: str, known: str, row: type[Setting] = Setting, **changes: Any) -> Setting:
-    """The row of a setting that is another's of projection runs under another key."""
-    return row(**{**vars(SETTINGS[known]), "key": key, "needs": (), **changes})
-
 
 _OF_FILE = ("file",)
 _ROWS = (
     Setting("name", str, None, "What the phantom is called", "its kind"),
     Setting("odds", float, 1.0, "How often it comes, beside the others", least=0),
     Setting("split", str, None, "The split of all its events", "one by the shares of the splits"),
-    like("kind", "phantom.kind", default=None, needs=("no file",)),
+    SETTINGS["phantom.kind"].with_key("kind", default=None, needs=("no file",)),
     Drawn("file", str, None, "A phantom's shapes (.toml) or a volume", needs=("no kind",)),
     Drawn("mu_file", str, None, "What attenuates a volume, which is placed with it", needs=_OF_FILE),
-    like("center", "volume.center", needs=_OF_FILE),
-    like("energy", "volume.energy", needs=_OF_FILE),
+    SETTINGS["volume.center"].with_key("center", needs=_OF_FILE),
+    SETTINGS["volume.energy"].with_key("energy", needs=_OF_FILE),
     Setting("gates", int, 1, "Phases of the beating torso, whose mean the event is", least=1, needs=("kind",)),
-    like("pose.position", "phantom.position", Drawn),
-    like("pose.euler_degrees", "phantom.euler_degrees", Drawn),
+    SETTINGS["phantom.position"].with_key("pose.position", Drawn),
+    SETTINGS["phantom.euler_degrees"].with_key("pose.euler_degrees", Drawn),
     Setting("pose.turn", str, None, "How it is turned", words={"uniform": ("Uniform", "Every rotation is as likely")},
             needs=("no pose.euler_degrees",)),
 )  # fmt: skip
-
-
-def by_key(rows: Iterable[Setting]) -> dict[str, Setting]:
-    """Settings by their keys."""
-    return {row.key: row for row in rows}
-
-
-def table(values: Mapping[str, Any], name: str) -> dict[str, Any]:
-    """A table of a recipe, empty where it is not there; `InputError` where it is none."""
-    found = values.get(name, {})
-    if not isinstance(found, dict):
-        raise InputError(f"{name}: expected a table [{name}]")
-    return found
-
-
-def flat(values: Mapping[str, Any], rows: Mapping[str, Setting], *tables: str) -> dict[str, Any]:
-    """The values of a recipe by the keys of their rows: those in its tables as "table.name"."""
-    found = {key: value for key, value in values.items() if key not in tables}
-    for name in tables:
-        found |= {f"{name}.{key}": value for key, value in table(values, name).items()}
-    return {key: _as_earlier(rows[key], value) if key in rows else value for key, value in found.items()}
-
-
-def required(value: Any, key: str, what: str) -> Any:
-    """A value that has no default; `InputError`, which says what to give, where it is missing."""
-    if value is None:
-        raise InputError(f"{key}: missing; {what}")
-    return value
-
-
-def check_entries(values: Mapping[str, Any], version: int, known: Collection[str]) -> None:
-    """Raise `InputError` where a recipe is of another version of its language, or has what is not `known`."""
-    if "version" not in values:
-        raise InputError(f"version: missing; this mphDRR reads version = {version}")
-    if values["version"] != version or isinstance(values["version"], bool):
-        raise InputError(f"version: expected {version}, got {values['version']!r}; a newer mphDRR may read it")
-    for key in values:
-        if key not in known:
-            raise InputError(f"{key}: no such entry; expected {', '.join(known)}")
-
-
-def grid_of(values: Any, name: str) -> Grid:
-    """The voxels that a table of a recipe says by voxels, spacing and center; `InputError`, which names it, if it cannot."""
-    spacing = required(values[f"{name}.spacing"], f"{name}.spacing", "give the voxel size in mm")
-    with naming(name):
-        voxels = np.broadcast_to(values[f"{name}.voxels"], 3)
-        return Grid.centered(voxels, np.broadcast_to(spacing, 3), values[f"{name}.center"])
-
-
-def _as_earlier(row: Setting, value: Any) -> Any:
-    """A value, other where earlier versions took true for 1.0, "60" for an energy of 60.0, and 8.0 for 8."""
-    if isinstance(value, list):
-        return [_as_earlier(row, each) for each in value]
-    if isinstance(value, dict):
-        return {key: _as_earlier(row, each) if key == "one_of" else each for key, each in value.items()}
-    is_number = isinstance(value, str) and row.words and value not in row.words
-    if row.kind is float and (is_number or isinstance(value, bool)):
-        with suppress(ValueError):
-            return float(value)
-    return int(value) if row.kind is int and isinstance(value, float) and value.is_integer() else value
-
-
-def plain_name(name: Any, what: str) -> str:
-    """A name that may also be that of a file: letters, digits, - and _."""
-    if not isinstance(name, str) or not name.replace("-", "").replace("_", "").isalnum():
-        raise InputError(f"{what}: expected a name of letters, digits, - and _, got {name!r}")
-    return name
 
 
 @dataclass(frozen=True)
@@ -144,11 +71,11 @@ def phantom_entry(values: dict[str, Any], number: int, quantity: str) -> Phantom
             _rows("")["kind"].checked(kind)
         named = {"name": f"file-{number}" if kind is None else str(kind), **values}
         own = {key: value for key, value in values.items() if key not in _rows("") and key != "pose"}
-        entry = PhantomEntry(flat(named, _rows(str(kind)), "pose"), own)
+        entry = PhantomEntry(flat_entries(named, _rows(str(kind)), "pose"), own)
         if not entry.name:
             raise InputError("name: expected a text, got ''")
         if entry["split"] is not None:
-            plain_name(entry["split"], "split")
+            require_name(entry["split"], "split")
         if entry["gates"] > 1 and (entry.kind is None or entry.kind.phantom is not CardiacTorso or "phase" in own):
             raise InputError('gates: they are of kind = "torso" without a phase of its own')
         if kind is None:
@@ -159,7 +86,7 @@ def phantom_entry(values: dict[str, Any], number: int, quantity: str) -> Phantom
 @functools.cache
 def _rows(kind: str) -> Mapping[str, Setting]:
     """The settings of a phantom of a kind, or of a file."""
-    return by_key([*(row for known in KINDS if known.name == kind for row in own_settings(known, Drawn)), *_ROWS])
+    return settings_by_key([*phantom_settings(kind, Drawn), *_ROWS])
 
 
 def _check_files(entry: PhantomEntry, quantity: str) -> None:

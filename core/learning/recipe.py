@@ -5,17 +5,18 @@ import hashlib
 import inspect
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from ..errors import InputError, naming
-from ..events.entries import by_key, check_entries, flat, grid_of, like, required
 from ..files import AnyPath
 from ..geometry.grid import Grid
-from ..runs.recipe import Values
-from ..runs.settings import Setting, named
-from ..toml import parse_toml, toml_text, toml_value
+from ..recipes.settings import Setting, default_setting, settings_by_key, table_names, word_labels
+from ..recipes.tables import check_entries, require_value, table_entries, table_grid
+from ..recipes.toml import parse_toml, toml_text, toml_value
+from ..recipes.values import Values
+from ..runs.settings import SETTINGS
 from ..validation import one_of
 from .networks import NETWORKS
 
@@ -23,7 +24,7 @@ VERSION = 1
 """The version of the recipes' language."""
 _KIND = "after-osem"
 _TEMPLATE = Path(__file__).parent / "templates" / "training.toml"
-_ROWS = by_key((
+_ROWS = settings_by_key((
     Setting("data.events", str, None, "Folder of the event set that is learned from", is_path=True),
     Setting("data.model", str, None, "Whose images, by the model's name in the set's recipe", "the only one of counts"),
     Setting("data.train", str, "train", "The split whose events are learned from"),
@@ -31,9 +32,9 @@ _ROWS = by_key((
     Setting("data.levels", float, None, "Shares of the acquisition time, in turn", "those of the set's recipe", above=0,
             sizes=()),
     Setting("data.draws", int, 1, "How often noise is drawn for each event", least=1),
-    like("grid.voxels", "reconstruction.voxels", default=(64,), absent=""),
-    like("grid.spacing", "reconstruction.spacing", absent=""),
-    like("grid.center", "reconstruction.center"),
+    SETTINGS["reconstruction.voxels"].with_key("grid.voxels", default=(64,), absent=""),
+    SETTINGS["reconstruction.spacing"].with_key("grid.spacing", absent=""),
+    SETTINGS["reconstruction.center"].with_key("grid.center"),
     Setting("osem.subsets", int, 10, "Of the modules", least=1),
     Setting("osem.after", int, (2, 8, 16), "Iterations of OSEM after which the network is given its volume", least=1,
             sizes=()),
@@ -47,14 +48,14 @@ _ROWS = by_key((
     Setting("training.rate", float, 1.5e-3, "Learning rate, at its largest", above=0, most=1),
     Setting("training.seed", int, 0, "Seed of weights, order and noise", least=0, most=2**31 - 1),
     Setting("training.precision", str, None, "Numbers that the network computes in", "bf16-mixed where the processor "
-            "multiplies matrices of it, else 32", words=named(("32", "bf16-mixed", "16-mixed"))),
+            "multiplies matrices of it, else 32", words=word_labels(("32", "bf16-mixed", "16-mixed"))),
     Setting("training.threads", int, None, "Processor threads", "all", least=1),
-    Setting("training.accelerator", str, "auto", "What it computes on", words=named(("auto", "cpu", "gpu"))),
+    Setting("training.accelerator", str, "auto", "What it computes on", words=word_labels(("auto", "cpu", "gpu"))),
     Setting("training.devices", int, 1, "GPUs, or processes of a CPU, on each node", least=1),
     Setting("training.nodes", int, 1, "Machines", least=1),
     Setting("training.strategy", str, "auto", "How devices share the work, by Lightning's name for it, such as ddp"),
 ))  # fmt: skip
-TABLES = tuple(dict.fromkeys(key.partition(".")[0] for key in _ROWS))
+TABLES = table_names(_ROWS)
 
 
 @functools.cache
@@ -67,10 +68,9 @@ def network_settings(kind: str) -> Mapping[str, Setting]:
     for name, argument in inspect.signature(network).parameters.items():
         if argument.kind is argument.KEYWORD_ONLY:
             continue
-        one, sizes = (argument.default[0], ()) if isinstance(argument.default, tuple) else (argument.default, None)
-        least = int(name not in network.may_be_0) if type(one) is int else None
-        found.append(Setting(f"network.{name}", type(one), argument.default, text, least=least, sizes=sizes))
-    return by_key(found)
+        row = default_setting(f"network.{name}", argument.default, text)
+        found.append(replace(row, least=int(name not in network.may_be_0)) if row.kind is int else row)
+    return settings_by_key(found)
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ class TrainingRecipe(Values):
     def __post_init__(self) -> None:
         one_of(_ROWS["network.kind"].checked(self.given.get("network.kind", _KIND)), NETWORKS, "network.kind")
         super().__post_init__()
-        required(self["data.events"], "data.events", "name the folder of an event set")
+        require_value(self["data.events"], "data.events", "name the folder of an event set")
         _ = self.grid
         if list(self["osem.after"]) != sorted(set(self["osem.after"])):
             raise InputError(f"osem.after: expected rising numbers, got {list(self['osem.after'])}")
@@ -107,7 +107,7 @@ class TrainingRecipe(Values):
     @functools.cached_property
     def grid(self) -> Grid:
         """The voxels of the network's volumes."""
-        return grid_of(self, "grid")
+        return table_grid(self, "grid")
 
     @property
     def network(self) -> dict[str, Any]:
@@ -131,8 +131,7 @@ def parsed(text: str, name: str = "recipe", folder: Path | None = None) -> Train
     with naming(name):
         values = parse_toml(text, name)
         check_entries(values, VERSION, ("version", *TABLES))
-        del values["version"]
-        return TrainingRecipe(flat(values, _ROWS, *TABLES), text, folder or Path())
+        return TrainingRecipe(table_entries(values, _ROWS), text, folder or Path())
 
 
 def read_recipe(path: AnyPath) -> TrainingRecipe:

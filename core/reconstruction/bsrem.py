@@ -10,6 +10,7 @@ from ..progress import Progress, tell
 from ..projector import Projector
 from ..projector.subsets import access_order
 from ..validation import at_least_0
+from .arguments import argument
 from .counts import LEAST, CountLoop
 from .loop import IterativeOptions, waiting
 from .priors import Prior
@@ -30,6 +31,7 @@ _MOST_HALVINGS = 20
 """After so many halvings nothing is gained by smaller steps."""
 
 
+@argument("step_decay", float, "Steps are 1 / (1 + this times the number of iterations before)", least=0, slider=1)
 def bsrem(
     A: Projector,
     counts: ArrayLike,

@@ -9,6 +9,7 @@ from ..errors import warn
 from ..progress import Progress, tell
 from ..projector import Projector
 from ..projector.subsets import access_order
+from .arguments import argument
 from .counts import LEAST, CountLoop
 from .loop import IterativeOptions, waiting
 from .priors import Prior
@@ -20,6 +21,14 @@ _TOO_LATE = 0.05
 """Where a prior goes below it in a larger share of the voxels, volumes swing from iteration to iteration."""
 
 
+@argument("iterations", int, "How often all images are used", "what suits the method", least=1, slider=100)
+@argument(
+    "background",
+    float,
+    "Counts expected in each pixel besides those of the volume, such as scatter",
+    least=0,
+    slider=100,
+)
 def mlem(
     A: Projector,
     counts: ArrayLike,
@@ -73,6 +82,8 @@ def mlem(
     return _em(CountLoop("MLEM", A, counts, iterations, 1, prior, background, *options, **named))
 
 
+@argument("subsets", int, "Of the modules: each of an iteration's updates uses one of them",
+          "about a fifth of the modules' number", least=1, slider=80)  # fmt: skip
 def osem(
     A: Projector,
     counts: ArrayLike,

@@ -9,6 +9,7 @@ from ..errors import InputError, warn
 from ..progress import Progress, tell
 from ..projector import Projector
 from ..validation import instance, positive, real_array
+from .arguments import argument
 from .loop import IterativeOptions, Loop, plain, waiting
 from .result import Reconstruction
 
@@ -19,6 +20,8 @@ _DONE = 1e-6
 _LEANS = "CGLS: from iteration {} on rounding puts its volumes up to a few percent beside those of exact numbers"
 
 
+@argument("relaxation", float, "Length of the steps, less than 2", above=0, slider=1.9)
+@argument("nonnegative", bool, "Values below 0 become 0")
 def sirt(
     A: Projector,
     images: ArrayLike,

@@ -10,12 +10,14 @@ from ..progress import Progress, tell
 from ..projector import Projector
 from ..projector.subsets import access_order
 from ..validation import real_array
+from .arguments import argument
 from .least_squares import LeastSquaresLoop, inverse
 from .loop import IterativeOptions, plain, waiting
 from .priors import Prior, penalty_of
 from .result import Reconstruction
 
 
+@argument("photons", float, "Of a pixel where nothing is between", "those of the run, or 1", above=0)
 def ostr(
     A: Projector,
     images: ArrayLike,

@@ -1,6 +1,6 @@
 """Priors: penalties of differences between neighbouring voxels, for reconstructions with noise."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import KW_ONLY, dataclass, fields
 from itertools import product
 from typing import Any, Literal
@@ -15,6 +15,7 @@ from ..projector.lattices import same_lattice
 from ..projector.parallel import run_all, thread_count
 from ..validation import at_least_0, instance, one_of, positive, whole_number
 from ..volumes.volume import Volume
+from .arguments import Choice, argument
 
 # Voxels that are worked on at once: their numbers and some arrays as large stay in a core's cache.
 _SLAB_VOXELS = 2**14
@@ -43,6 +44,8 @@ class Pairs:
         return weight if self.share is None else self.share * np.float32(weight / 2)
 
 
+@argument("weight", float, "How much the penalty counts beside the data", above=0, slider=1)
+@argument("anatomy", str, "Volume across whose edges differences are not penalised, such as a CT", is_path=True)
 @dataclass(frozen=True, eq=False)
 class Prior:
     """A penalty ``weight * sum over pairs of neighbours of w_jk psi(x_j, x_k)``; `psi` is the subclass's.
@@ -152,6 +155,8 @@ class Quadratic(Prior):
         return np.ones_like(a), np.ones_like(a)
 
 
+@argument("gamma", float, "How much large differences are spared", least=0, slider=10)
+@argument("edge", float, "Value below which differences count as noise", "what suits the penalty", above=0, slider=10)
 @dataclass(frozen=True, eq=False)
 class RelativeDifference(Prior):
     """Penalises differences relative to the values: ``psi = (x_j - x_k)^2 / (x_j + x_k + gamma |x_j - x_k| + edge)``.
@@ -352,6 +357,17 @@ class Penalty:
         return shares
 
 
+PRIORS: Mapping[str, Choice] = {
+    "quadratic": Choice("Quadratic", "Smooth everywhere, edges too", Quadratic),
+    "relative-difference": Choice("Relative Difference", "Smooth, but large differences are spared", RelativeDifference),
+    "total-variation": Choice("Total Variation", "Areas of one value with sharp edges", TotalVariation),
+}  # fmt: skip
+"""The priors by their names in recipes and on the command line."""
+
+
+@argument("prior", str, "Penalty on noise", "none", unset="None", words={
+    name: (prior.label, prior.text) for name, prior in PRIORS.items()
+})  # fmt: skip
 def penalty_of(prior: Prior | None, grid: Grid, inside: Bools) -> Penalty | None:
     """The penalty of pairs of voxels inside; None without a prior or weight.
 
@@ -360,8 +376,8 @@ def penalty_of(prior: Prior | None, grid: Grid, inside: Bools) -> Penalty | None
     if prior is None:
         return None
     if not isinstance(prior, Prior):
-        known = "Quadratic, RelativeDifference or TotalVariation"
-        raise InputError(f"prior: expected {known}, got {type(prior).__name__}")
+        *names, last = (choice.function.__name__ for choice in PRIORS.values())
+        raise InputError(f"prior: expected {', '.join(names)} or {last}, got {type(prior).__name__}")
     penalty = prior.on(grid, inside)
     return penalty if prior.weight else None
 

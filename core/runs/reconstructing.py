@@ -17,7 +17,9 @@ from ..physics.performance import resolution
 from ..progress import Stages
 from ..projector.backends import choose
 from ..projector.photon_lines import Mu
-from ..reconstruction.methods import METHODS, PRIORS, Choice, Method, method_of
+from ..reconstruction.arguments import Choice
+from ..reconstruction.methods import METHODS, Method, method_of
+from ..reconstruction.priors import PRIORS
 from ..reconstruction.result import Reconstruction
 from ..reconstruction.stopping import StoppingRule, StopWhen
 from ..volumes.resampling import resample

@@ -17,7 +17,7 @@ from ..projector.models import checked_background
 from ..validation import freeze, real_numbers
 from ..version import VERSION
 from ..volumes.volume import Volume
-from .recipe import Recipe, recipe_of_tables
+from .recipe import Recipe, recipe_from_tables
 
 
 def versions() -> dict[str, str]:
@@ -82,7 +82,7 @@ class ProjectionRun:
         """What was asked for; `InputError` where the run holds no recipe, as those of version 0.1.0."""
         if "recipe" not in self.settings:
             raise InputError("the run holds no recipe: give its model, as by --set model.kind=emission or --recipe")
-        return recipe_of_tables(self.settings["recipe"], recorded=True)
+        return recipe_from_tables(self.settings["recipe"], recorded=True)
 
     def intrinsics(self) -> Floats:
         """Camera matrices K (M, 3, 3), pixels: ``K @ (x_u, x_v, x_k)`` is a multiple of ``(column, row, 1)``.

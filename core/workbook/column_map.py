@@ -12,8 +12,8 @@ from ..errors import InputError
 from ..files import AnyPath, write_bytes
 from ..geometry.columns import ColumnTable
 from ..geometry.scanner import Scanner
+from ..recipes.toml import parse_toml, read_toml, toml_value
 from ..scanner_kinds import scanner_kind
-from ..toml import parse_toml, read_toml, toml_value
 from .headings import unit_of
 from .sheet_xml import MAX_COLUMN, MAX_ROW
 

@@ -18,7 +18,8 @@ from mphdrr.addon.reconstruction.reconstruction_properties import PROPERTIES, dr
 from mphdrr.addon.scanner import scanner
 from mphdrr.addon.volumes import slices, volumes
 from mphdrr.core.progress import Cancelled
-from mphdrr.core.reconstruction.methods import METHOD_FILES, METHODS, Method
+from mphdrr.core.reconstruction.method_files import METHOD_FILES
+from mphdrr.core.reconstruction.methods import METHODS, Method
 from mphdrr.core.runs.files import read_run
 from mphdrr.core.runs.run_recipe import truth_of_run
 from mphdrr.core.runs.settings import SETTINGS

@@ -18,8 +18,10 @@ from mphdrr.addon.cli import main
 from mphdrr.core.cli.reconstruct import settings_line
 from mphdrr.core.figures.page import DARK, Page
 from mphdrr.core.figures.reconstructions import LIGHTS, draw
-from mphdrr.core.reconstruction.methods import METHOD_FILES, METHODS, PRIORS, Method
-from mphdrr.core.runs.recipe import recipe_of_tables
+from mphdrr.core.reconstruction.method_files import METHOD_FILES
+from mphdrr.core.reconstruction.methods import METHODS, Method
+from mphdrr.core.reconstruction.priors import PRIORS
+from mphdrr.core.runs.recipe import recipe_from_tables
 from mphdrr.core.runs.reconstructing import model_of, reconstruction_grid
 from mphdrr.core.runs.settings import SETTINGS
 
@@ -186,7 +188,7 @@ def test_each_method_has_its_own_defaults_wherever_it_is_chosen(name, run, radio
     state, output = tmp_path / "s.h5", ["-o", tmp_path / "v.npz"]
     command(tmp_path / "run.npz", *typed, "--quiet", "--save-state", state, *output)
     by_command, by_recipe = mph.read_reconstruction(state), mph.reconstruct_run(run, recipe)
-    again = mph.reconstruct_run(run, recipe_of_tables(by_command.settings["recipe"]))
+    again = mph.reconstruct_run(run, recipe_from_tables(by_command.settings["recipe"]))
     for found in (by_command, by_recipe, again):
         np.testing.assert_array_equal(found.volume.array, expected.volume.array)
         assert expected.settings.items() <= found.settings.items()

@@ -8,19 +8,28 @@ from pathlib import Path
 from typing import Any
 
 from ...errors import InputError, naming
-from ...events.entries import by_key, check_entries, flat, grid_of, like, plain_name, required, table
 from ...events.event_set import EventSet
 from ...files import AnyPath
 from ...geometry.grid import Grid
-from ...runs.recipe import Values
-from ...runs.settings import Setting, named
-from ...toml import read_toml
+from ...recipes.settings import Setting, settings_by_key, table_names, word_labels
+from ...recipes.tables import (
+    check_entries,
+    flat_entries,
+    read_table,
+    require_name,
+    require_value,
+    table_entries,
+    table_grid,
+)
+from ...recipes.toml import read_toml
+from ...recipes.values import Values
+from ...runs.settings import SETTINGS
 from .methods import Family
 from .scoring import SCORINGS
 
 VERSION = 1
 
-_TEST = by_key((
+_TEST = settings_by_key((
     Setting("events", str, None, "Folder of the set", is_path=True),
     Setting("split", str, None, "Its split that counts", "all events"),
     Setting("model", str, "emission", "Which of its images"),
@@ -28,7 +37,7 @@ _TEST = by_key((
     Setting("name", str, None, "What the table calls it"),
     Setting("models", str, None, "Names of the models that are judged on it", "all", sizes=()),
     Setting("scoring", str, "volumes", "What is scored besides the voxels",
-            words=named(SCORINGS)),
+            words=word_labels(SCORINGS)),
     Setting("levels", float, (1.0,), "Shares of the acquisition time", above=0, sizes=()),
     Setting("believed", str, None, "Workbook of the geometry that methods are told", "that which made the images",
             is_path=True),
@@ -38,10 +47,10 @@ _TEST = by_key((
     Setting("drawn_events", int, 3, "Events, the first ones, that bias and deviation are of", least=1),
     Setting("channel_width", float, 30.0, "Of the observer's channels", unit="mm", above=0),
 ))  # fmt: skip
-_ROWS = by_key((
-    like("grid.voxels", "phantom.voxels"),
-    like("grid.spacing", "phantom.spacing"),
-    like("grid.center", "phantom.position", text="Middle of the volumes, x y z"),
+_ROWS = settings_by_key((
+    SETTINGS["phantom.voxels"].with_key("grid.voxels"),
+    SETTINGS["phantom.spacing"].with_key("grid.spacing"),
+    SETTINGS["phantom.position"].with_key("grid.center", text="Middle of the volumes, x y z"),
     Setting("baselines.subsets", int, 10, "Of OSEM and BSREM", least=1),
     Setting("baselines.stops", int, (2, 4, 8, 12, 16, 24), "Iterations of OSEM to choose from", least=1, sizes=()),
     Setting("baselines.fwhm", float, (0.0, 2.4, 3.6, 4.8, 6.5, 8.0, 10.0), "Widths of the filter after it to choose from",
@@ -49,10 +58,10 @@ _ROWS = by_key((
     Setting("baselines.iterations", int, 15, "Of BSREM", least=1),
     Setting("baselines.weights", float, (0.0003, 0.001, 0.003, 0.01, 0.03, 0.1), "Of BSREM's prior to choose from; it has "
             "relative differences", above=0, sizes=()),
-    Setting("baselines.families", str, ("osem", "bsrem"), "Which there are", words=named(("osem", "bsrem")), sizes=()),
+    Setting("baselines.families", str, ("osem", "bsrem"), "Which there are", words=word_labels(("osem", "bsrem")), sizes=()),
     Setting("judge.seed", int, 0, "Of the bootstrap", least=0),
 ))  # fmt: skip
-_TABLES = ("grid", "baselines", "judge")
+_TABLES = table_names(_ROWS)
 
 
 class Test(Values):
@@ -87,7 +96,7 @@ class JudgeRecipe(Values):
     @cached_property
     def grid(self) -> Grid:
         """The voxels that all methods give."""
-        return grid_of(self, "grid")
+        return table_grid(self, "grid")
 
     @cached_property
     def tests(self) -> list[Test]:
@@ -96,7 +105,7 @@ class JudgeRecipe(Values):
         if not isinstance(entries, list) or not entries or not all(isinstance(entry, dict) for entry in entries):
             raise InputError("tests: expected one [[tests]] or more")
         found = [self._test(entry, f"tests: {entry.get('name', number)}") for number, entry in enumerate(entries, 1)]
-        names = [plain_name(test["name"], "tests: name") for test in found]
+        names = [require_name(test["name"], "tests: name") for test in found]
         if len(set(names)) < len(names):
             raise InputError(f"tests: expected different names, got {', '.join(names)}")
         return found
@@ -104,12 +113,12 @@ class JudgeRecipe(Values):
     @cached_property
     def validation(self) -> Test:
         """The events that baselines are tuned on."""
-        return self._test({"name": "validation", **table(self.values, "validation")}, "validation")
+        return self._test({"name": "validation", **read_table(self.values, "validation")}, "validation")
 
     @cached_property
     def models(self) -> dict[str, Path]:
         """The models' files by the names that the table gives them."""
-        models = table(self.values, "models")
+        models = read_table(self.values, "models")
         for name, file in models.items():
             if not isinstance(file, str) or not file:
                 raise InputError(f"models.{name}: expected a file's name, got {file!r}")
@@ -134,8 +143,8 @@ class JudgeRecipe(Values):
 
     def _test(self, entry: dict[str, Any], name: str) -> Test:
         with naming(name):
-            found = Test(flat(entry, _TEST))
-            required(found["events"], "events", "name the folder of the set")
+            found = Test(flat_entries(entry, _TEST))
+            require_value(found["events"], "events", "name the folder of the set")
             return found
 
 
@@ -144,5 +153,4 @@ def read_judge_recipe(path: AnyPath) -> JudgeRecipe:
     with naming(path):
         values = read_toml(path)
         check_entries(values, VERSION, ("version", "tests", "models", "validation", *_TABLES))
-        given = flat({name: table(values, name) for name in _TABLES}, _ROWS, *_TABLES)
-        return JudgeRecipe(given, values, Path(path).absolute().parent)
+        return JudgeRecipe(table_entries(values, _ROWS), values, Path(path).absolute().parent)

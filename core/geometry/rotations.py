@@ -14,7 +14,7 @@ from torch import Tensor
 from ..errors import InputError, needing
 from ..validation import one_of, radians, shape_text
 
-with needing(of="rotations"):
+with needing(feature="rotations"):
     import roma
 
 SIZES = {

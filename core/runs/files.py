@@ -232,7 +232,7 @@ def _read_pt(path: Path) -> _Contents:
 
 
 def _torch() -> Any:
-    with needing(of=".pt files, unlike .h5 and .npz"):
+    with needing(feature=".pt files, unlike .h5 and .npz"):
         import torch
     return torch
 

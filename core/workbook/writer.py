@@ -174,9 +174,9 @@ def _warn_of_formulas(workbook: WorkbookXml, recalculated: Recalculation) -> Non
     for place in sorted(recalculated.replaced):
         replaced[place[0], place[2]].append(place)
     for places in replaced.values():
-        cells, why = several(map(workbook.text, places), shown=1), recalculated.replaced[places[0]]
+        cells, why = several(map(workbook.text, places), limit=1), recalculated.replaced[places[0]]
         warn(f"{workbook.name}: {cells}: the formula was replaced by the system's number ({why})")
     if recalculated.cleared:
         cleared, first = recalculated.cleared, next(iter(recalculated.cleared.values()))
-        where = f"{workbook.name}: {several(map(workbook.text, cleared), shown=1)}"
+        where = f"{workbook.name}: {several(map(workbook.text, cleared), limit=1)}"
         warn(f"{where}: the formula's new value could not be calculated ({first}); {SAVING} stores the value")

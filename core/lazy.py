@@ -19,9 +19,8 @@ def public(package: str, extra: str = "") -> tuple[Callable[[str], Any], Callabl
     """
     module = sys.modules[package]
     tree = ast.parse(Path(str(module.__file__)).read_text(encoding="utf-8"))
-    (block,) = (statement for statement in tree.body if isinstance(statement, ast.If))
-    imports = (statement for statement in block.body if isinstance(statement, ast.ImportFrom))
-    modules = {alias.name: statement.module for statement in imports for alias in statement.names}
+    (block,) = (node for node in tree.body if isinstance(node, ast.If))
+    modules = {name.name: node.module for node in block.body if isinstance(node, ast.ImportFrom) for name in node.names}
 
     def import_attribute(name: str) -> Any:
         if name not in modules:
@@ -32,5 +31,4 @@ def public(package: str, extra: str = "") -> tuple[Callable[[str], Any], Callabl
         setattr(module, name, attribute)
         return attribute
 
-    exported = [name for name, source in modules.items() if source]
-    return import_attribute, lambda: sorted({*vars(module), *modules}), exported
+    return import_attribute, lambda: sorted({*vars(module), *modules}), [n for n, source in modules.items() if source]

@@ -51,6 +51,4 @@ def in_threads(work: Callable[[Part], None], parts: Sequence[Part], progress: Pr
     """
     with ThreadPoolExecutor(cores()) as pool:
         for n_done, _ in enumerate(pool.map(work, parts), 1):
-            tell(
-                progress, n_done, len(parts)
-            )  # an exception leaves the block, which cancels the parts that have not begun
+            tell(progress, n_done, len(parts))  # an exception leaves the block, which cancels the remaining parts

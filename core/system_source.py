@@ -12,9 +12,7 @@ class QuantityCells:
     quantity: str  # "number", or the name of a column of the scanner's kind (core.geometry), such as "x1"
     sheet: str  # name of the sheet
     column: str  # letters of the column
-    rows: tuple[
-        int, ...
-    ]  # row of each module, in the order of `SystemSource.numbers`; equal rows if one value holds for all
+    rows: tuple[int, ...]  # row of each module, in the order of `SystemSource.numbers`; all equal for a common value
 
 
 @dataclass(frozen=True)

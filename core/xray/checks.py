@@ -104,7 +104,7 @@ def find_in_room(
     for other in others:
         built = other.parts(construction if isinstance(other, PinholeSystem) else None)
         bodies += [(f"module {p.number}'s {p.kind}", p) for p in built if p.kind != "source"]
-    hulls, names = Hulls.of([part for _, part in bodies]), [name for name, _ in bodies]
+    hulls, names = Hulls.from_parts([part for _, part in bodies]), [name for name, _ in bodies]
     depths = [_depths(hulls, m) for m in range(len(system))]
     found: list[Finding] = []
     for m in range(len(system)):
@@ -167,7 +167,7 @@ def _overlaps(
 
 
 def _in_view(system: Scanner, pinholes: PinholeSystem, panels: Sequence[ModulePart]) -> list[Finding]:
-    hulls = Hulls.of(panels)
+    hulls = Hulls.from_parts(panels)
     hulls.numbers[:] = -1 - np.arange(len(panels))  # unlike those of the modules
     blocked = find_blocked(pinholes, hulls)
     return [PanelInView(int(system.numbers[-1 - one.by]), one.module, one.share) for one in blocked]

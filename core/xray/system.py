@@ -12,7 +12,7 @@ from ..geometry.columns import Column, ColumnTable, Values
 from ..geometry.finding import Finding
 from ..geometry.frames import affine_matrix
 from ..geometry.module_parts import BOX_FACES, ModulePart
-from ..geometry.scanner import Detector, Fault, Scanner, first
+from ..geometry.scanner import Detector, Fault, Scanner, first_true
 from ..geometry.views import Views
 from ..system_source import SystemSource
 from ..validation import lengths, positive, real_array, whole_shape
@@ -159,9 +159,9 @@ class XraySystem(Scanner):
     def faults(cls, values: Values, numbers: Sequence[int], place: Callable[[str, int], str]) -> Iterator[Fault]:
         """Pixels that are not rectangles, mirrored panels, and sources in their panel's plane."""
         sources, centers, u, v = (np.stack([values[axis + of] for axis in "xyz"], axis=1) for of in "spuv")
-        for i in first(_skew(u, v)):
+        for i in first_true(_skew(u, v)):
             yield "xu", i, f"to {place('zv', i)}: the steps u and v of module {numbers[i]} must be at right angles"
-        for i in first(_mirrored(sources, centers, u, v)):
+        for i in first_true(_mirrored(sources, centers, u, v)):
             yield "xu", i, f"to {place('zv', i)}: {_MIRRORED}: reverse u or v of module {numbers[i]}"
 
     @property

@@ -17,7 +17,7 @@ Bools = NDArray[np.bool_]
 Indexes = NDArray[np.intp]
 Integers = NDArray[np.int64]
 Bytes = NDArray[np.uint8]
-Array = NDArray[Any]  # of any type
+Array = NDArray[Any]  # an array of any type
 ArrayOrTensor = Any  # a numpy array or a torch tensor; torch may not be installed
 
 

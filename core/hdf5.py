@@ -52,7 +52,7 @@ with h5py.File(sys.argv[1], "r") as file:
 class Seal(NamedTuple):
     """Text at the beginning of a sealed file."""
 
-    kind: str  # what the file holds, such as "mphDRR event"
+    kind: str  # kind of the content, such as "mphDRR event"
     size: int  # number of bytes of HDF5
     fields: dict[str, str]  # further lines of the text, value by name
     sha256: str = ""  # SHA-256 of the text without this line, and of the table of blocks; in version 1, of the HDF5
@@ -149,7 +149,7 @@ def opened(path: AnyPath, offset: int = 0, *, whole: bool = False) -> Iterator[A
             raise sealed.error
 
 
-def numbers(dataset: Any) -> Array:
+def read_numbers(dataset: Any) -> Array:
     """Read all numbers of an open dataset; raise `InputError` unless they, and each chunk of the file, fit into memory."""
     count = max(math.prod(dataset.shape), math.prod(dataset.chunks or ()))
     require(count * dataset.dtype.itemsize, f"{dataset.name} of {' x '.join(map(str, dataset.shape))}")

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from .errors import InputError
 
-_USABLE_SHARE = 0.9  # of the available memory; the rest is left to other programs
+_USABLE_SHARE = 0.9  # share of the available memory; the rest is left to other programs
 
 # Needs of up to so many bytes are checked once alone, because asking the system takes as long as a small projection.
 _LITTLE = 2**20

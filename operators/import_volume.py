@@ -54,7 +54,7 @@ class ReadVolumes(jobs.JobOperator):
         min=1e-6,
     )
 
-    first_properties: tuple[str, ...] = ("name",)  # of the derived operator, drawn before those of this class
+    first_properties: tuple[str, ...] = ("name",)  # properties of a derived class, drawn first
 
     def draw(self: Any, context: bpy.types.Context) -> None:
         layout = layouts.labelled(self.layout)

@@ -112,7 +112,7 @@ def plate_rings(
     if not are_integers or counts.min() < 0 or not 0 < counts.max() <= _MAX_MODULES:
         expected = f"a whole number up to {_MAX_MODULES}, or one for each of the {len(starts)} plates"
         raise InputError(f"modules: expected {expected}, got {modules}")
-    fractions = np.concatenate([(np.arange(n) + 0.5) / n for n in counts if n])[:, None]  # of the way along the plate
+    fractions = np.concatenate([(np.arange(n) + 0.5) / n for n in counts if n])[:, None]  # positions along the plate
     positions = (1 - fractions) * np.repeat(starts, counts, axis=0) + fractions * np.repeat(ends, counts, axis=0)
     sizes = (pinhole_diameter, detector_side, detector_thickness, roi_radius)
     return _system_of_rings(positions, z, mirrored, collimator_length, *sizes)
@@ -145,7 +145,7 @@ def even_azimuths(ellipse: Ellipse, modules: Any, start: float, end: float, spac
     if turn > FULL_TURN + 1e-9:
         raise InputError(f"start and end: expected at most a full turn apart, got {math.degrees(turn):g} degrees")
     closed = turn >= FULL_TURN - 1e-9
-    fractions = np.linspace(0, 1, count, endpoint=not closed)  # of the way from start to end
+    fractions = np.linspace(0, 1, count, endpoint=not closed)  # positions between start and end
     if spacing == "angle":
         return start + fractions * (end - start)
     if spacing != "arc":

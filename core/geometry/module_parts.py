@@ -39,7 +39,7 @@ class ModulePart:
 
     number: int  # number of the module
     kind: PartKind
-    name: str  # such as "Module 07 collimator"; names sort like the modules' numbers
+    name: str  # name such as "Module 07 collimator", which sorts like the module's number
     solid: Solid  # surface in the module's camera space, mm
     pose: Floats  # (4, 4), world from camera space, mm
 
@@ -60,13 +60,13 @@ def collimator_solid(collimator: Collimator) -> Solid:
     Rings of points run along the hole from the plate's front to its back, along the channel to the crystal, and along the
     outside back to the front; quads join each ring to the next and the last to the first.
     """
-    built, l = collimator.construction, collimator.length
+    construction, l = collimator.construction, collimator.length
     rings = (
         *((_CIRCLE, radius, depth) for depth, radius in collimator.hole_profile),
-        (_SQUARE, collimator.channel_half_width, built.back),
+        (_SQUARE, collimator.channel_half_width, construction.back),
         (_SQUARE, collimator.detector_side / 2, l),
-        (_SQUARE, collimator.detector_side / 2 + built.wall_thickness, l),
-        (_SQUARE, collimator.front_half_width, built.front),
+        (_SQUARE, collimator.detector_side / 2 + construction.wall_thickness, l),
+        (_SQUARE, collimator.front_half_width, construction.front),
     )
     vertices = np.empty((len(rings), _N, 3))
     for ring, (points, size, depth) in zip(vertices, rings, strict=True):

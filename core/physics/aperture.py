@@ -95,7 +95,7 @@ def _point_images(points: Floats, shadow: float, pitch: tuple[float, float], blu
     profiles: list[Floats] = []  # fraction of each point's counts in each pixel, along u and v
     n_positions: list[int] = []
     for middles, size, width in zip(points.T * (shadow / 2), pitch, blur, strict=True):
-        extent = 1.2 * shadow + width  # of the image
+        extent = 1.2 * shadow + width  # size of the image on the crystal, mm
         size = min(size, extent)  # a wider pixel cuts the image no more often
         n = math.ceil(_POSITIONS * size / extent)
         half = math.ceil(extent / 2 / size) + 1
@@ -111,7 +111,7 @@ def _point_images(points: Floats, shadow: float, pitch: tuple[float, float], blu
 class KnifeEdge:
     """Double-cone hole in the middle of a plate: material fills r > radius + |z| tan(alpha / 2) between the faces."""
 
-    radius: ArrayOrTensor  # of the hole, mm
+    radius: ArrayOrTensor  # radius of the hole, mm
     mu: ArrayOrTensor  # attenuation coefficient of the plate, 1/mm
     tangent: ArrayOrTensor  # tan(alpha / 2)
     plate: ArrayOrTensor = None  # thickness of the plate, mm; None: infinite

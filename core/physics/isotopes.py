@@ -22,7 +22,7 @@ Window = tuple[float, float]
 class Isotope:
     """Isotope with the photons that are used to image it."""
 
-    name: str  # such as "Tc-99m"
+    name: str  # name such as "Tc-99m"
     half_life: float  # s
     lines: tuple[Line, ...]  # photon lines, in order of energy
 

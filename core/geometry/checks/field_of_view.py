@@ -47,7 +47,7 @@ def unseen_share(middle: Floats, d: float, slope: float, radius: float) -> float
     square of half-width w(x) around the axis, and the sphere is a disc around `middle`.
     """
     u, v, h = middle
-    ends = [h - radius, h + radius, d / (2 * slope)]  # of the sphere, and the apex of the field of view
+    ends = [h - radius, h + radius, d / (2 * slope)]  # ends of the sphere, and the apex of the field of view
     # Depths at which the square's sides and corners cross the disc's rim: (w - a)^2 [+ (w - c)^2] = radius^2 - (x - h)^2.
     sides_and_corners = [(a,) for a in (u, -u, v, -v)] + [(a, c) for a in (u, -u) for c in (v, -v)]
     for coordinates in sides_and_corners:

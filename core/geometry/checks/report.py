@@ -31,7 +31,7 @@ class NearPair(Finding):
 
     first: int  # number of one module
     second: int  # number of the other module
-    distance: float  # from pinhole to pinhole, mm
+    distance: float  # distance from pinhole to pinhole, mm
     message = "modules {0.first} and {0.second}: nearly at one place, pinholes {0.distance:.4g} mm apart"
 
 
@@ -42,7 +42,7 @@ class SwallowedPinhole(Finding):
     module: int  # number of the pinhole's module
     by: int  # number of the other module
     part: PartKind  # the other module's part
-    depth: float  # of the pinhole's centre below the part's surface, mm
+    depth: float  # depth of the pinhole's centre below the part's surface, mm
     message = "module {0.module}: its pinhole lies {0.depth:.4g} mm inside module {0.by}'s {0.part}"
 
 
@@ -50,9 +50,9 @@ class SwallowedPinhole(Finding):
 class Intrusion(Finding):
     """Collimator that reaches into the largest ROI."""
 
-    module: int
+    module: int  # number of the module
     roi_radius: float  # radius of the largest ROI, mm
-    depth: float  # of the collimator's nearest point below the surface of the ROI, mm
+    depth: float  # depth of the collimator's nearest point below the surface of the ROI, mm
     message = "module {0.module}: its collimator reaches {0.depth:.4g} mm into the ROI of {0.roi_radius:.4g} mm"
 
 
@@ -60,7 +60,7 @@ class Intrusion(Finding):
 class Uncovered(Finding):
     """ROI that is partly outside its module's field of view."""
 
-    module: int
+    module: int  # number of the module
     roi_radius: float  # mm
     seen_radius: float  # radius of the largest sphere at the isocentre in the field of view, mm
     unseen_share: float  # fraction of the ROI's volume outside the field of view
@@ -89,7 +89,7 @@ class Blocked(Finding):
 class Vignetted(Finding):
     """Hole that its plate, too thick for the opening angle, shades from part of the ROI."""
 
-    module: int
+    module: int  # number of the module
     open_share: float  # fraction of the hole's area that is open to the steepest rays from the ROI
     plate_thickness: float  # mm
     opening_angle: float  # rad
@@ -109,7 +109,7 @@ class Vignetted(Finding):
 class ThinPlate(Finding):
     """Plate that is too thin to stop the photons beside the hole."""
 
-    module: int
+    module: int  # number of the module
     plate_thickness: float  # mm
     transmission: float  # fraction of the photons along the axis that pass the plate
     share: float  # photons that pass the plate beside the hole, relative to those that pass the hole and its edge
@@ -123,7 +123,7 @@ class ThinPlate(Finding):
 class OpenMesh(Finding):
     """Surface of a part that is not closed, not consistently oriented, or inside out."""
 
-    module: int
+    module: int  # number of the module
     part: PartKind
     fault: str  # the fault as a phrase that follows "mesh" in the message
     message = "module {0.module}: its {0.part}'s mesh {0.fault}"

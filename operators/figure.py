@@ -11,7 +11,7 @@ from ..addon.figures import figures
 from ..addon.scanner import scanner
 from ..addon.volumes import volumes
 from ..core.errors import InputError
-from ..core.figures.kinds import FILMS, PAPERS, SAMPLES, How
+from ..core.figures.kinds import FILMS, PAPERS, SAMPLES, Rendering
 from ..core.figures.page import LARGEST, SUFFIXES
 
 _PIXELS = {"description": "Pixels; 0: what suits the figure", "min": 0, "max": LARGEST, "subtype": "PIXEL"}
@@ -55,7 +55,7 @@ class _Drawing(jobs.ExportJob):
         if bool(own.width) != bool(own.height):
             raise InputError("size: give both width and height, or neither")
         size = (own.width, own.height) if own.width else None
-        how = {name: value for name, value in self.as_keywords().items() if name in How._fields}
+        how = {name: value for name, value in self.as_keywords().items() if name in Rendering._fields}
         name = own.figure.lower().replace("_", "-")
         return figures.figure_job(context, name, [path], size, own.modules or None, **how)
 
@@ -80,6 +80,6 @@ class MPHDRR_OT_render_animation(_Drawing, bpy.types.Operator):
         name="Animation", description="What happens", items=figures.kind_items(True), default="TURNTABLE"
     )
     seconds: FloatProperty(
-        name="Seconds", description="How long it takes", default=How().seconds, min=0.01, soft_max=60.0
+        name="Seconds", description="How long it takes", default=Rendering().seconds, min=0.01, soft_max=60.0
     )
-    fps: IntProperty(name="Frames per Second", default=How().fps, description="Pictures", min=1, max=60)
+    fps: IntProperty(name="Frames per Second", default=Rendering().fps, description="Pictures", min=1, max=60)

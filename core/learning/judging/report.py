@@ -116,11 +116,11 @@ def _ratios(page: Page, rows: list[dict[str, Any]], top: int) -> None:
     axes = Axes(page, (700, top, page.width - 800, _LINE * len(rows)), (low, high), (len(rows), 0), page.em)
     marks = [mark for mark in np.arange(0.1, 10, 0.1) if low <= mark <= high]
     axes.draw(marks if len(marks) < 20 else [1.0], [])
-    page.line([axes.to(1.0, 0), axes.to(1.0, len(rows))], FAINT, 1.5, 6)
+    page.line([axes.point(1.0, 0), axes.point(1.0, len(rows))], FAINT, 1.5, 6)
     for place, row in enumerate(rows):
         (value, start, end), color, y = row["best_baseline"]["ratio"], _COLORS[row["kind"]], place + 0.5
-        page.line([axes.to(start, y), axes.to(end, y)], color, 3)
-        x, middle = axes.to(value, y)
+        page.line([axes.point(start, y), axes.point(end, y)], color, 3)
+        x, middle = axes.point(value, y)
         page.area([(x - 5, middle), (x, middle - 5), (x + 5, middle), (x, middle + 5)], color)
         text = f"{row['test']}, {number(row['level'])} of the counts: {row['method']}"
         page.text(text, 680, middle + 5, 0.65 * page.em, INK, "end")

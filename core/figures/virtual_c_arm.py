@@ -157,8 +157,7 @@ def _draw_fan(drawing: _AxialDrawing, m: _ModuleSizes, fan: _ViewFan) -> None:
 
 def _draw_pinhole(drawing: _AxialDrawing, m: _ModuleSizes, fan: _ViewFan, corner: Point) -> None:
     """Draw the crystal, the pinhole and the distances b and l of the true pinhole."""
-    half = corner[1]
-    back = -m.l - m.thickness
+    half, back = corner[1], -m.l - m.thickness
     drawing.title(corner, "True pinhole", f"Field at the isocentre: {number(m.side * m.b / m.l)} mm")
     drawing.area([(-m.l, m.side / 2), (-m.l, -m.side / 2), (back, -m.side / 2), (back, m.side / 2)], _CRYSTAL)
     for end in (m.side / 2, -m.side / 2):
@@ -177,10 +176,8 @@ def _draw_pinhole(drawing: _AxialDrawing, m: _ModuleSizes, fan: _ViewFan, corner
 
 def _draw_c_arm(drawing: _AxialDrawing, m: _ModuleSizes, fan: _ViewFan, corner: Point) -> None:
     """Draw the source, the fields of view and the distances of the virtual C-arm."""
-    half = corner[1]
-    isocentre_distance, source = m.b - fan.source, fan.source
-    ratio = number(isocentre_distance / m.l)
-    field = 2 * fan.half * isocentre_distance / fan.length
+    half, isocentre_distance, source = corner[1], m.b - fan.source, fan.source
+    ratio, field = number(isocentre_distance / m.l), 2 * fan.half * isocentre_distance / fan.length
     text = f"Wide FOV at the isocentre: {number(field)} mm; FOV, its central half: {number(field / 2)} mm"
     drawing.title(corner, f"Virtual C-arm: source {ratio} l from the isocentre", text)
     for end in (fan.half / 2, -fan.half / 2):

@@ -61,7 +61,7 @@ def draw(
         scale, corners = arrange(sizes, (0.2 * em, 1.5 * em, 0.2 * em, 0.2 * em), room, *arrangements)
         if max(extent) * scale >= _LEGIBLE * em:
             break
-    indices = np.clip(full_slices(values), [part.start for part in box], [part.stop - 1 for part in box])
+    indices = np.clip(full_slices(values), [s.start for s in box], [s.stop - 1 for s in box])
     for i, ((x, y), (width, height), ((axis, _, _), row)) in enumerate(zip(corners, sizes, panels, strict=True)):
         coordinate = grid.center[axis] + (indices[axis] - (grid.shape[axis] - 1) / 2) * grid.spacing[axis]
         position = "" if i % r else f"{'xyz'[axis]} = {number(round(float(coordinate), 2) + 0.0)} mm"

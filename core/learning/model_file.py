@@ -273,16 +273,16 @@ class TrainedNetwork:
         differing = self.contents.differing(setup)
         refused = [name for name in differing if name not in allow]
         if refused:
-            words = " and ".join(refused)
-            raise InputError(f"{self.path}: trained for another {words}; --allow {' '.join(refused)} takes it anyway")
+            names = " and ".join(refused)
+            raise InputError(f"{self.path}: trained for another {names}; --allow {' '.join(refused)} takes it anyway")
         return [f"{self.path.name} was trained for another {name}, which was allowed" for name in differing]
 
     def _count_differences(self, counts: float) -> list[str]:
-        """Return a warning if a scan has far fewer or more counts than the training data."""
-        fewest, most = self.contents.counts
-        if fewest / _COUNTS_FACTOR <= counts <= most * _COUNTS_FACTOR:
+        """Return a list with a warning if a scan has far fewer or more counts than the training data, else an empty one."""
+        smallest, largest = self.contents.counts
+        if smallest / _COUNTS_FACTOR <= counts <= largest * _COUNTS_FACTOR:
             return []
-        return [f"{self.path.name} was trained on {fewest:.3g} to {most:.3g} counts, this scan has {counts:.3g}"]
+        return [f"{self.path.name} was trained on {smallest:.3g} to {largest:.3g} counts, this scan has {counts:.3g}"]
 
 
 def read_model(path: AnyPath) -> TrainedNetwork:

@@ -100,10 +100,10 @@ def backproject(
     if depth is None:
         matrices = _pixel_rows(views) @ to_world
         size = -(-len(points) // _PARTS)
-        parts = range(0, len(points), size)  # in parts, so that a product needs little more memory
-        for number, first in enumerate(parts):
-            inputs, part = [(images[..., None], shifted(matrices, first))], part_of(progress, number, len(parts))
-            _fill(points[first : first + size], kind, planes, inputs, 1, part, flat=True)
+        starts = range(0, len(points), size)  # in parts, so that a product needs little more memory
+        for number, first in enumerate(starts):
+            inputs, stage = [(images[..., None], shifted(matrices, first))], part_of(progress, number, len(starts))
+            _fill(points[first : first + size], kind, planes, inputs, 1, stage, flat=True)
     else:
         inputs = (
             (np.multiply(images[m].T[None, ..., None], array, order="C"), (g.index_matrix @ to_world)[None])
@@ -137,12 +137,12 @@ def views_that_see(views: Views, grid: Grid | PerspectiveGrid, progress: Progres
     instance(views, Views, "views_that_see: views")
     to_world, planes = _world_lattice(grid, "views_that_see: grid")
     require(8.0 * float(np.prod(grid.shape)), "numbers of views at {} x {} x {} places".format(*grid.shape))
-    seen = np.zeros(grid.shape, np.int32)
+    counts = np.zeros(grid.shape, np.int32)
     points, image = np.zeros(grid.shape, np.float32), np.zeros((1, *views.shape, 1), np.float32)
     for m, matrix in enumerate(_pixel_rows(views) @ to_world):
-        part = part_of(progress, m, len(views))
-        gather(points, planes, image, matrix[None], flat=True, seen=seen, progress=part)
-    points[...] = seen
+        view_progress = part_of(progress, m, len(views))
+        gather(points, planes, image, matrix[None], flat=True, seen=counts, progress=view_progress)
+    points[...] = counts
     return _as_volume(points, grid, "modules")
 
 

@@ -221,9 +221,9 @@ def _pair(views: Views, m: Indices, n: Indices, name: str) -> tuple[np.ndarray, 
         distance = np.linalg.norm(views.sources[first] - views.sources[second], axis=-1)
         size = np.abs(views.sources[first]).max(axis=-1) + np.abs(views.sources[second]).max(axis=-1)
         relation = "have the same source"
-    same = ~(distance > _ROUNDING * size)
-    if same.any():
-        i, j = int(first[same].flat[0]), int(second[same].flat[0])
+    is_same = ~(distance > _ROUNDING * size)
+    if is_same.any():
+        i, j = int(first[is_same].flat[0]), int(second[is_same].flat[0])
         pair = f"view {i} twice" if i == j else f"views {i} and {j}, which {relation}"
         raise InputError(f"{name}: expected two views whose rays differ, got {pair}")
     return first, second

@@ -77,6 +77,7 @@ def gather(
     options: Any = {"flat": flat, "by_depth": by_depth, "nearest": nearest}
 
     def work(first: int) -> None:
+        """Gather for the slab of points that starts at index `first`."""
         slab = slice(first, first + size)
         counters = [None if counter is None else counter[slab] for counter in (seen, exponents)]
         kernel(points[slab], planes, arrays, shifted(matrices, first), how, *counters, **options)
@@ -99,8 +100,8 @@ def scatter(points: Array, planes: Floats, array: Array, matrix: Floats, progres
 
 def _run_slabs(slabs: Iterator[None], size: int, total: int, progress: Progress | None) -> None:
     """Run all slabs of work, of `size` planes each, and report the planes done of `total`."""
-    for done, _ in enumerate(slabs, 1):
-        tell(progress, min(done * size, total), total)
+    for n_done, _ in enumerate(slabs, 1):
+        tell(progress, min(n_done * size, total), total)
 
 
 def shifted(matrices: Floats, first: int) -> Floats:

@@ -195,16 +195,20 @@ class _LatticeMap(LinearOperator):
 
     @property
     def shape_in(self) -> tuple[int, int, int]:
+        """Shape of arrays on the source lattice."""
         return self.source.shape
 
     @property
     def shape_out(self) -> tuple[int, int, int]:
+        """Shape of arrays on the target lattice."""
         return self.target.shape
 
     def _run_one(self, x: ArrayOrTensor, progress: Progress | None = None, mu: Any = None) -> ArrayOrTensor:
+        """Apply the map to one array or tensor."""
         return _run(self.forward, x, self.shape_out, progress)
 
     def _run_back(self, y: ArrayOrTensor, progress: Progress | None = None, mu: Any = None) -> ArrayOrTensor:
+        """Apply the adjoint to one array or tensor."""
         return _run(self.adjoint, y, self.shape_in, progress)
 
     @abstractmethod
@@ -233,6 +237,7 @@ class _RayMeans(_LatticeMap):
     target: PerspectiveGrid
 
     def forward(self, x: Array, progress: Progress | None) -> Array:
+        """Return the means (n_u, n_v, n_k) of a volume along the rays, computed plane by plane as images."""
         n, result = self.target.n_k, np.empty(self.shape_out, x.dtype)
         for plane, image in enumerate(self._execution(x).images(x, Bundles(n, self._bundle))):
             result[..., plane] = image
@@ -241,12 +246,14 @@ class _RayMeans(_LatticeMap):
         return result
 
     def adjoint(self, y: Array, progress: Progress | None) -> Array:
+        """Return the backprojection of the cells' values, divided by the rays' lengths in them."""
         n = self.target.n_k
         images = np.moveaxis(y / self.target.ray_lengths().astype(y.dtype), -1, 0)
         bundles = Bundles(n, self._bundle)
         return np.asarray(self._execution(y).backproject(images, bundles, None, lambda done: tell(progress, done, n)))
 
     def _execution(self, array: Array) -> Execution:
+        """Return the projector's execution for arrays of this type."""
         backend = backends.choose("auto")
         float64 = backend.always_float64 or array.dtype == np.float64
         return Execution(backend, self.source, None, float64, thread_count(None))
@@ -273,6 +280,7 @@ class _CellMeans(_LatticeMap):
         self.point_distance = float((steps / self._points).max())  # the greatest, in cells of the source
 
     def forward(self, x: Array, progress: Progress | None) -> Array:
+        """Return the means over the target's cells, each from the source's values at several points."""
         result = np.zeros(self.shape_out, x.dtype)
         for n, (matrix, planes) in enumerate(self._point_lattices()):
             part_progress = part_of(progress, n, int(self._points.prod()))
@@ -280,6 +288,7 @@ class _CellMeans(_LatticeMap):
         return np.asarray(result / self._points.prod(dtype=x.dtype))
 
     def adjoint(self, y: Array, progress: Progress | None) -> Array:
+        """Return the target's values shared out among the source's cells around the same points."""
         result = np.zeros(self.shape_in, y.dtype)
         y = np.asarray(y / self._points.prod(dtype=y.dtype))
         for n, (matrix, planes) in enumerate(self._point_lattices()):

@@ -48,8 +48,8 @@ def view_frames(views: Views) -> Floats:
     instance(views, Views, "frames: views")
     u = views.u_steps / np.linalg.norm(views.u_steps, axis=1, keepdims=True)
     k = np.cross(u, views.v_steps)
-    ahead = np.einsum("mi,mi->m", k, views.detector_centers - views.sources)
-    k *= (np.sign(ahead) / np.linalg.norm(k, axis=1))[:, None]
+    distance = np.einsum("mi,mi->m", k, views.detector_centers - views.sources)
+    k *= (np.sign(distance) / np.linalg.norm(k, axis=1))[:, None]
     return np.stack([u, np.cross(k, u), k], axis=1)
 
 

@@ -53,8 +53,8 @@ def decompose(counts: ArrayLike, m: SpectralTransmission, mAs: ArrayLike, iterat
     rays = values.reshape(n_bins, -1)
     paths, n_lost = np.empty((n, rays.shape[1])), 0
     for start in range(0, rays.shape[1], _RAYS):
-        part = slice(start, start + _RAYS)
-        paths[:, part], n_left = _most_likely(rays[:, part], m, scale[part], whole_number(iterations, "iterations"))
+        batch = slice(start, start + _RAYS)
+        paths[:, batch], n_left = _most_likely(rays[:, batch], m, scale[batch], whole_number(iterations, "iterations"))
         n_lost += n_left
     if n_lost:
         warn(f"decompose: {n_lost} of {rays.shape[1]} rays did not converge, as where bins have no counts", 2)
@@ -82,9 +82,9 @@ def _most_likely(counts: Floats, m: SpectralTransmission, scale: Floats, iterati
         jacobian = np.where(improved, new_jacobian, jacobian)
         likelihood = np.where(improved, new_likelihood, likelihood)
         is_small = np.abs(step).max(axis=0) <= _PRECISION * (1 + np.abs(trial).max(axis=0))
-        again = ~(is_small & (improved | (damping < 1e-6)))
-        damping = np.where(improved, np.minimum(2 * damping, 1), damping / 4)[again]
-        active, mean, jacobian, likelihood = active[again], mean[:, again], jacobian[:, :, again], likelihood[again]
+        todo = ~(is_small & (improved | (damping < 1e-6)))
+        damping = np.where(improved, np.minimum(2 * damping, 1), damping / 4)[todo]
+        active, mean, jacobian, likelihood = active[todo], mean[:, todo], jacobian[:, :, todo], likelihood[todo]
         if not len(active):
             break
     return paths, len(active)

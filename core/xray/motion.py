@@ -84,7 +84,7 @@ class MotionFinder:
         self._photons = None if photons is None else real_array(photons, "photons", None)
         step = reference.grid.spacing.min()
         radius = np.linalg.norm(reference.grid.corners()[0] - self._center) / 2
-        self._steps = np.array([step] * 3 + [step / radius] * 3)
+        self._steps = np.array([step] * 3 + [step / radius] * 3)  # mm and rad that move the body by about a voxel
         self._derivatives_at: dict[int, tuple[Floats, Floats]] = {}  # by block size: motion, and derivatives at it
 
     def __call__(self, images: ArrayLike, start: Motion | None = None, iterations: int = 10) -> Motion:

@@ -87,8 +87,8 @@ class Spectrum:
         low, high = 0.0, -np.log(share) / mu.min()
         target = share * self.kerma
         for _ in range(60):
-            middle = (low + high) / 2
-            low, high = (middle, high) if self._kerma(self.photons * np.exp(-mu * middle)) > target else (low, middle)
+            trial = (low + high) / 2
+            low, high = (trial, high) if self._kerma(self.photons * np.exp(-mu * trial)) > target else (low, trial)
         return float(high)
 
     def _kerma(self, photons: Floats) -> float:

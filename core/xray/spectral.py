@@ -176,8 +176,8 @@ class SpectralTransmission:
         rays = paths.reshape(len(paths), -1)
         sums = np.empty((len(weights), rays.shape[1]))
         for start in range(0, rays.shape[1], _RAYS):
-            part = slice(start, start + _RAYS)
-            sums[:, part] = weights @ np.exp(-(self.mu.T @ rays[:, part]))
+            batch = slice(start, start + _RAYS)
+            sums[:, batch] = weights @ np.exp(-(self.mu.T @ rays[:, batch]))
         return sums.reshape(len(weights), *paths.shape[1:])
 
     def _checked(self, paths: ArrayLike, mAs: ArrayLike) -> tuple[Floats, Floats]:

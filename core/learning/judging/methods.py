@@ -110,6 +110,7 @@ def tune(family: Family, cases: Iterable[Case], progress: Progress | None = None
     for batch in (islice(remaining, _FIRST), remaining):
 
         def choice_errors(case: Case, family: Family = candidates) -> list[float]:
+            """Return the NRMSE of each choice for one event."""
             return [nrmse(volume, case.truth) for volume in family.volumes(case.run, threads=1)]
 
         for case_errors in in_order(choice_errors, batch, thread_count(None)):

@@ -148,5 +148,5 @@ def read_judge_recipe(path: AnyPath) -> JudgeRecipe:
     with naming(path):
         values = read_toml(path)
         check_entries(values, VERSION, ("version", "tests", "models", "validation", *_TABLES))
-        given = flat({name: table(values, name) for name in _TABLES}, _ROWS, *_TABLES)
-        return JudgeRecipe(given, values, Path(path).absolute().parent)
+        settings = flat({name: table(values, name) for name in _TABLES}, _ROWS, *_TABLES)
+        return JudgeRecipe(settings, values, Path(path).absolute().parent)

@@ -159,14 +159,14 @@ def _score_defect(volume: Volume, case: Case) -> Scores:
     The contrast is 1 minus the mean in the defect divided by that on the opposite side.
     """
     lost, opposite = case.missing
-    place = lost @ case.points / lost.sum()
-    result, truth = (
+    center = lost @ case.points / lost.sum()
+    contrast, truth = (
         1 - np.mean(v.array.ravel()[lost > lost.max() / 2]) / np.mean(v.array.ravel()[opposite > opposite.max() / 2])
         for v in (volume, case.truth)
     )
-    outputs = channel_outputs(volume, place, case.width).tolist()
+    outputs = channel_outputs(volume, center, case.width).tolist()
     has_defect = _phantom(case, CardiacTorso).defect_severity > 0
-    return {"channels": outputs, "defect": has_defect} | ({"contrast": float(result / truth)} if has_defect else {})
+    return {"channels": outputs, "defect": has_defect} | ({"contrast": float(contrast / truth)} if has_defect else {})
 
 
 def common_defect(events: Any) -> dict[str, Any]:

@@ -56,6 +56,6 @@ def short_hash(record: Any) -> str:
 def refuse_trained_on(method: str, trained_on: Mapping[str, list[int]], events: EventSet, name: str) -> None:
     """Raise `InputError` if a method was trained on events of a test; `trained_on` is in the form of `events_by_recipe`."""
     tests = events_by_recipe(events)
-    both = [n for recipe, numbers in tests.items() for n in sorted({*numbers} & {*trained_on.get(recipe, ())})]
-    if both:
-        raise InputError(f"{method}: it was trained on events of the test {name}: {several(both)}; judge it on others")
+    hits = [n for recipe, numbers in tests.items() for n in sorted({*numbers} & {*trained_on.get(recipe, ())})]
+    if hits:
+        raise InputError(f"{method}: it was trained on events of the test {name}: {several(hits)}; judge it on others")

@@ -54,8 +54,8 @@ class ViewsAsChannels(Network):
         M, *pixels = setup.A.shape_out
         sizes = M, tuple(pixels), setup.A.shape_in
         if sizes != self.sizes:
-            expected, found = ("{} views of {} pixels and {} voxels".format(*s) for s in (self.sizes, sizes))
-            raise InputError(f"channels: the network is for {expected}, not for {found}")
+            expected, actual = ("{} views of {} pixels and {} voxels".format(*s) for s in (self.sizes, sizes))
+            raise InputError(f"channels: the network is for {expected}, not for {actual}")
         images = sample.counts - sample.background
         x = self.decoder(self.encoder(images / images.mean((1, 2, 3), keepdim=True).clamp(min=1e-9)))
         n_x, n_y, n_z = setup.A.shape_in

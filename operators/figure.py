@@ -11,7 +11,7 @@ from ..addon.figures import figures
 from ..addon.scanner import scanner
 from ..addon.volumes import volumes
 from ..core.errors import InputError
-from ..core.figures.kinds import FILMS, PAPERS, SAMPLES, How
+from ..core.figures.kinds import FILMS, PAPERS, SAMPLES, Rendering
 from ..core.figures.page import LARGEST, SUFFIXES
 
 _PIXELS = {"description": "Pixels; 0: as suits the figure", "min": 0, "max": LARGEST, "subtype": "PIXEL"}
@@ -55,7 +55,7 @@ class FigureOperator(jobs.ExportJob):
         if bool(operator.width) != bool(operator.height):
             raise InputError("size: give both width and height, or neither")
         size = (operator.width, operator.height) if operator.width else None
-        style = {name: value for name, value in self.as_keywords().items() if name in How._fields}
+        style = {name: value for name, value in self.as_keywords().items() if name in Rendering._fields}
         name = operator.figure.lower().replace("_", "-")
         return figures.figure_job(context, name, [path], size, operator.modules or None, **style)
 
@@ -80,6 +80,6 @@ class MPHDRR_OT_render_animation(FigureOperator, bpy.types.Operator):
         name="Animation", description="Kind of the animation", items=figures.kind_items(True), default="TURNTABLE"
     )
     seconds: FloatProperty(
-        name="Seconds", description="Duration of the animation", default=How().seconds, min=0.01, soft_max=60.0
+        name="Seconds", description="Duration of the animation", default=Rendering().seconds, min=0.01, soft_max=60.0
     )
-    fps: IntProperty(name="Frames per Second", default=How().fps, description="Pictures", min=1, max=60)
+    fps: IntProperty(name="Frames per Second", default=Rendering().fps, description="Pictures", min=1, max=60)

@@ -16,15 +16,7 @@ from ..errors import InputError, naming
 from ..files import AnyPath
 from ..geometry.grid import Grid
 from ..recipes.settings import Setting, settings_by_key, table_names, word_labels
-from ..recipes.tables import (
-    check_entries,
-    flat_entries,
-    read_table,
-    require_name,
-    require_value,
-    table_entries,
-    table_grid,
-)
+from ..recipes.tables import check_entries, flat_entries, read_table, require_name, require_value, table_entries
 from ..recipes.toml import parse_toml, toml_text
 from ..runs.recipe import Recipe
 from ..runs.settings import SETTINGS
@@ -148,7 +140,7 @@ class EventRecipe:
     @cached_property
     def grid(self) -> Grid:
         """The voxels of the truth."""
-        return table_grid(self, "truth")
+        return self.settings.table_grid("truth")
 
     @cached_property
     def phantoms(self) -> tuple[PhantomEntry, ...]:

@@ -4,10 +4,7 @@ from collections.abc import Collection, Mapping
 from contextlib import suppress
 from typing import Any
 
-import numpy as np
-
-from ..errors import InputError, naming
-from ..geometry.grid import Grid
+from ..errors import InputError
 from .settings import Setting, table_names
 
 
@@ -69,11 +66,3 @@ def require_name(name: Any, place: str) -> str:
     if not isinstance(name, str) or not name.replace("-", "").replace("_", "").isalnum():
         raise InputError(f"{place}: expected a name of letters, digits, - and _, got {name!r}")
     return name
-
-
-def table_grid(values: Any, table: str) -> Grid:
-    """Return the grid of the settings voxels, spacing and center of a `table`; raise `InputError` if they describe none."""
-    spacing = require_value(values[f"{table}.spacing"], f"{table}.spacing", "give the voxel size in mm")
-    with naming(table):
-        voxels = np.broadcast_to(values[f"{table}.voxels"], 3)
-        return Grid.centered(voxels, np.broadcast_to(spacing, 3), values[f"{table}.center"])

@@ -5,8 +5,12 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from typing import Any
 
-from ..errors import InputError
+import numpy as np
+
+from ..errors import InputError, naming
+from ..geometry.grid import Grid
 from .settings import Setting
+from .tables import require_value
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,6 +52,13 @@ class Values(ABC):
         `choice_setting` declares the setting.
         """
         return table[self[key]] if key in self.rows else next(iter(table.values()))
+
+    def table_grid(self, table: str) -> Grid:
+        """Return the grid of the settings voxels, spacing and center of a `table`; raise `InputError` if it is none."""
+        spacing = require_value(self[f"{table}.spacing"], f"{table}.spacing", "give the voxel size in mm")
+        with naming(table):
+            voxels = np.broadcast_to(self[f"{table}.voxels"], 3)
+            return Grid.centered(voxels, np.broadcast_to(spacing, 3), self[f"{table}.center"])
 
     @staticmethod
     def term_text(term: str) -> str:

@@ -82,6 +82,66 @@ def test_help_imports_nothing_that_commands_work_with():
     assert loaded.strip() == ""
 
 
+BY_NAME = {
+    "core/cli/__init__.py": "the modules of commands, among them those that addon.cli gives",
+    "addon/registration.py": "all operators and panels, found without a list",
+}
+
+
+def test_modules_are_loaded_by_name_only_from_their_own_folder():
+    """A name can hide an import from the tests of circles and rooms: it is one of the own folder, or of another package."""
+    hidden = []
+    for path in SOURCES:
+        for call in nodes_of(path):
+            if ast.unparse(getattr(call, "func", call)).split(".")[-1] in ("import_module", "__import__"):
+                name = call.args[0].values[0] if isinstance(call.args[0], ast.JoinedStr) else call.args[0]
+                text = getattr(name, "value", "") if isinstance(name, ast.Constant) else ""
+                is_shown = re.match(r"\.(?!\.)|(?!mphdrr\b)\w", text)
+                hidden += [] if is_shown else [path.relative_to(ROOT).as_posix()]
+    assert set(hidden) == set(BY_NAME)
+
+
+# Files of core itself that join rooms; all others import none.
+JOINING = {"__init__.py", "diffdrr.py", "method_files.py", "scanner_kinds.py"}
+
+
+def rooms_of_core() -> dict[str, set[str]]:
+    """The rooms that each room, or subpackage, may import, by the table of docs/structure.md."""
+    page = (ROOT / "docs" / "structure.md").read_text(encoding="utf-8")
+    table = page.split("| room | holds | may import |\n|---|---|---|\n")[1].split("\n\n")[0]
+    allowed: dict[str, set[str]] = {}
+    for line in table.splitlines():
+        room, rule = (cell.strip() for cell in line.strip("| ").replace(" | ", "|").split("|")[::2])
+        rule, _, more = rule.partition(" (")
+        above = {name for name in allowed if "." not in name}
+        names = set(re.findall(r"\w+", rule)) & above
+        is_all = rule.startswith("all above")
+        room = room.strip("`")
+        allowed[room] = above - names if is_all else names
+        if more:  # "`checks` also physics"
+            part, _, others = more.rstrip(")").partition(" also ")
+            allowed[f"{room}.{part.strip('`')}"] = allowed[room] | set(re.findall(r"\w+", others))
+    return allowed
+
+
+def test_rooms_of_core_import_only_those_that_the_page_allows():
+    """Imports in functions and those for type checkers count."""
+    allowed = rooms_of_core()
+    assert {path.parent.name for path in (ROOT / "core").glob("*/__init__.py")} == {r for r in allowed if "." not in r}
+    wrong = []
+    for path in sorted((ROOT / "core").rglob("*.py")):
+        *folders, file = path.relative_to(ROOT / "core").parts
+        of_part = allowed.get(".".join(folders[:2]), set())
+        rooms = {module.split(".")[1] for module in imported_modules(path) if module.startswith("core.")}
+        rooms &= {room for room in allowed if "." not in room}
+        if folders:
+            rooms -= {folders[0], *allowed[folders[0]], *of_part}
+        elif file in JOINING:
+            continue
+        wrong += [f"{path.relative_to(ROOT).as_posix()} imports {room}" for room in sorted(rooms)]
+    assert wrong == []
+
+
 @functools.cache
 def nodes_of(path: Path) -> list[ast.AST]:
     """Imports and calls."""

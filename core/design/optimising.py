@@ -18,7 +18,7 @@ from ..recording import recorded_warnings
 from .parameters import Parameters
 from .penalties import faults
 from .recipe import DesignRecipe, read_design_recipe
-from .solvers import scipy_module
+from .solvers import SOLVERS, scipy_module
 
 Shown = Callable[[PinholeSystem, float], None]
 """Called as ``callback(system, objective)`` after each step: the best until then, and what the step has reached."""
@@ -184,9 +184,9 @@ class _Search:
                 self._callback(self._free.build(self._values()), -value)
             self._tell(number)
 
-        options = {"maxiter": steps, "ftol": 1e-10, "gtol": 1e-7}
-        bounds = [(0.0, 1.0)] * len(x0)
-        self._minimize(at, x0, jac=True, method="L-BFGS-B", bounds=bounds, callback=after, options=options)
+        solver = SOLVERS[self._recipe.choice("search.solver", SOLVERS)]
+        options, bounds = {"maxiter": steps, **solver.options}, [(0.0, 1.0)] * len(x0)
+        self._minimize(at, x0, jac=True, method=solver.name, bounds=bounds, callback=after, options=options)
 
     def _drawn(self, number: int) -> Floats:
         """The point that a search begins with: the recipe's, or one at random that is a scanner."""

@@ -16,7 +16,7 @@ from ..geometry.system import PinholeSystem, chosen_modules
 from ..phantoms.language import parse_phantom, read_phantom
 from ..phantoms.phantom import ShapePhantom
 from ..projector import Emission, Projector
-from ..recipes.settings import Setting, settings_by_key, table_names, word_labels
+from ..recipes.settings import Setting, choice_setting, settings_by_key, table_names, word_labels
 from ..recipes.tables import check_entries, read_table, require_value, table_entries
 from ..recipes.toml import read_toml
 from ..recipes.values import Values
@@ -28,6 +28,7 @@ from ..workbook import read_system
 from .objectives import Detail, Lesion, Regions, Sensitivity, ball_points
 from .parameters import Parameters, parameters, workbook
 from .penalties import Clearance, Constraint, CrystalArea, FieldOfView, Overlap, Sight, SmallestHole
+from .solvers import SOLVERS
 
 VERSION = 1
 TEMPLATE = Path(__file__).parent / "templates" / "design.toml"
@@ -65,6 +66,7 @@ _ROWS = settings_by_key((
     Setting("search.coarse", int, 2, "The first search has voxels and pixels so many times as large", least=1),
     Setting("search.coarse_steps", int, 15, "Steps from each start", least=1),
     Setting("search.steps", int, 15, "Steps of each of the three rounds that follow, with ever harder penalties", least=1),
+    *choice_setting("search.solver", SOLVERS, "Algorithm of the search"),
     Setting("pareto.entry", str, None, "The entry that varies, such as generator.modules or objectives.resolution"),
     Setting("pareto.values", float, (), "What it is in turn", sizes=()),
     Setting("pareto.x", str, "resolution", "The column of the table that is across the plot"),

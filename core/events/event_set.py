@@ -18,7 +18,7 @@ from ..files import AnyPath
 from ..geometry.scanner import Scanner
 from ..geometry.views import Views
 from ..physics.isotopes import isotope
-from ..physics.noise import draw_counts
+from ..physics.noise import NOISE_MODELS
 from ..runs.counting import live_shares_of, scaled
 from ..runs.projecting import LINES
 from ..runs.recipe import Recipe, recorded_recipe
@@ -211,7 +211,8 @@ class Event:
         if level != 1.0:
             images *= np.float32(level)
         if noise_seed is not None:
-            draw_counts(images, noise_seed, images)
+            noise = self.recipe.settings.choice("noise.model", NOISE_MODELS)
+            NOISE_MODELS[noise].draw(images, noise_seed, images)
         return images if part else images[modules]
 
     def radon(self, count: int) -> Floats32:

@@ -15,7 +15,8 @@ import numpy as np
 from ..errors import InputError, naming
 from ..files import AnyPath
 from ..geometry.grid import Grid
-from ..recipes.settings import Setting, settings_by_key, table_names, word_labels
+from ..physics.noise import NOISE_MODELS
+from ..recipes.settings import Setting, choice_setting, settings_by_key, table_names, word_labels
 from ..recipes.tables import check_entries, flat_entries, read_table, require_name, require_value, table_entries
 from ..recipes.toml import parse_toml, toml_text
 from ..runs.recipe import Recipe
@@ -54,6 +55,7 @@ _ROWS = settings_by_key((
     Setting("augmentation.module_gain", float, 0.0, "Relative standard deviation of the modules' sensitivities", least=0,
             most=math.nextafter(1, 0)),
     Setting("noise.levels", float, (1.0,), "Shares of the acquisition time at which noise is drawn", above=0, sizes=()),
+    *choice_setting("noise.model", NOISE_MODELS, "How counts vary around their means"),
     Setting("storage.images", str, "float32", "How images are stored", words=word_labels(("float32", "float16"))),
 ))  # fmt: skip
 _SEED = SETTINGS["noise.seed"].with_key("seed", default=0, text="Seed of everything that is random")

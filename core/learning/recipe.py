@@ -12,7 +12,15 @@ from typing import Any
 from ..errors import InputError, naming
 from ..files import AnyPath
 from ..geometry.grid import Grid
-from ..recipes.settings import Setting, default_setting, settings_by_key, table_names, word_labels
+from ..recipes.settings import (
+    LibraryAlgorithm,
+    Setting,
+    choice_setting,
+    default_setting,
+    settings_by_key,
+    table_names,
+    word_labels,
+)
 from ..recipes.tables import check_entries, require_value, table_entries
 from ..recipes.toml import parse_toml, toml_text, toml_value
 from ..recipes.values import Values
@@ -24,6 +32,10 @@ VERSION = 1
 """Version of the recipes' language."""
 _KIND = "after-osem"
 _TEMPLATE = Path(__file__).parent / "templates" / "training.toml"
+OPTIMIZERS: Mapping[str, LibraryAlgorithm] = {
+    "adamw": LibraryAlgorithm("AdamW", "Adam with decoupled weight decay", "AdamW", {"weight_decay": 1e-3}),
+}
+"""Optimisers of `torch.optim` by their names in recipes; a second row makes the choice a setting, ``training.optimizer``."""
 _ROWS = settings_by_key((
     Setting("data.events", str, None, "Folder of the event set to learn from", is_path=True),
     Setting("data.model", str, None, "Model of the set's recipe whose images are used", "the only one of counts"),
@@ -46,6 +58,7 @@ _ROWS = settings_by_key((
     Setting("training.steps", int, 3000, "Number of steps", least=1),
     Setting("training.batch", int, 1, "Scans in each step, on all devices together", least=1),
     Setting("training.rate", float, 1.5e-3, "Largest learning rate", above=0, most=1),
+    *choice_setting("training.optimizer", OPTIMIZERS, "Optimiser of the weights"),
     Setting("training.seed", int, 0, "Seed of weights, order and noise", least=0, most=2**31 - 1),
     Setting("training.precision", str, None, "Precision of the network's computing", "bf16-mixed where the processor "
             "multiplies such matrices, else 32", words=word_labels(("32", "bf16-mixed", "16-mixed"))),

@@ -6,7 +6,7 @@ from collections.abc import Collection, Iterable, Mapping
 from contextlib import suppress
 from numbers import Integral, Real
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from ..errors import InputError
 from ..validation import real_array
@@ -158,10 +158,23 @@ def default_setting(key: str, default: Any, text: str, row: type[Setting] = Sett
     return row(key, type(first), default, text, sizes=sizes, **details)
 
 
+class LibraryAlgorithm(NamedTuple):
+    """Row of a table for `choice_setting`: an algorithm of a library, such as an optimiser of torch."""
+
+    label: str
+    """Name in menus."""
+    text: str
+    """Line of help."""
+    name: str
+    """Name of the algorithm in the library."""
+    options: Mapping[str, float]
+    """Options that the library gets, by its names for them."""
+
+
 def choice_setting(key: str, table: Mapping[str, Any], text: str, **details: Any) -> tuple[Setting, ...]:
     """Return the setting of a choice among the rows of a table, or no setting while the table has a single row.
 
-    The rows have the attributes `label` and `text`; the first one is the default. `Values.chosen_row` gives the chosen row.
+    The rows have the attributes `label` and `text`; the first one is the default. `Values.choice` returns the chosen name.
     """
     words = {name: (row.label, row.text) for name, row in table.items()}
     return (Setting(key, str, next(iter(table)), text, words=words, **details),) if len(table) > 1 else ()

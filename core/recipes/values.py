@@ -2,7 +2,7 @@
 
 import dataclasses
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -46,12 +46,12 @@ class Values(ABC):
     def __getitem__(self, key: str) -> Any:
         return self.given[key] if key in self.given else self.rows[key].default
 
-    def chosen_row(self, key: str, table: Mapping[str, Any]) -> Any:
-        """Return the row of `table` that the setting `key` chooses, or its only row while there is no such setting.
+    def choice(self, key: str, table: Iterable[str]) -> str:
+        """Return the name of the row of `table` that the setting `key` chooses, its only one while there is no such setting.
 
         `choice_setting` declares the setting.
         """
-        return table[self[key]] if key in self.rows else next(iter(table.values()))
+        return str(self[key]) if key in self.rows else next(iter(table))
 
     def table_grid(self, table: str) -> Grid:
         """Return the grid of the settings voxels, spacing and center of a `table`; raise `InputError` if it is none."""

@@ -105,6 +105,7 @@ def project_run(
     noise_seed: int | None = None,
     progress: Progress | None = None,
     dead_time: tuple[float, str] = (0.0, "non-paralysable"),
+    noise: str = "poisson",
 ) -> ProjectionRun:
     """Project `volume` into every module of `system`.
 
@@ -128,6 +129,8 @@ def project_run(
     dead_time
         With an `Emission`: that of each module, s, and its kind, "non-paralysable" or "paralysable". The expected counts,
         before noise, are less by it (`dead_time_counts`); the run's background is what is recorded of it.
+    noise
+        Model of the noise, as for `sample_counts`.
 
     Raises
     ------
@@ -149,7 +152,7 @@ def project_run(
     shares = imaging.recorded_shares(images)
     images *= shares
     if noise_seed is not None:
-        images = sample_counts(images, noise_seed).astype(np.float32)
+        images = sample_counts(images, noise_seed, noise).astype(np.float32)
     record = {
         "detector": detector, "magnification": float(magnification),
         "pitch_mm": None if pitch is None else np.broadcast_to(pitch, 2).tolist(), "model": model.name, **model.record(),

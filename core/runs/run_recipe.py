@@ -21,6 +21,7 @@ from ..phantoms.phantom import Phantom
 from ..phantoms.settings import setting_names
 from ..physics.ct_numbers import hu_to_mu
 from ..physics.isotopes import photon_energy
+from ..physics.noise import NOISE_MODELS
 from ..progress import Progress, Stages
 from ..projector import Emission, InverseSquareSum, Model, Projector, Transmission
 from ..projector.models import each_pixel
@@ -104,6 +105,7 @@ def run_recipe(
             settings={"volume": _volume_name(record), **converted, "recipe": record.tables()},
             model=recipe_model(recipe.updated(times), system, mu_of_it), photons=recipe["model.photons"],
             noise_seed=record["noise.seed"], progress=stages("projecting"), dead_time=dead_time_of(recipe),
+            noise=recipe.choice("noise.model", NOISE_MODELS),
         )  # fmt: skip
 
 

@@ -15,8 +15,17 @@ from ..phantoms.kinds import KINDS
 from ..phantoms.settings import setting_names
 from ..physics.isotopes import ISOTOPES
 from ..physics.materials import APERTURES, CRYSTALS
+from ..physics.noise import NOISE_MODELS
 from ..projector.backends import BACKENDS, OLD_NAMES
-from ..recipes.settings import Setting, UncheckedSetting, alternatives, default_setting, table_names, word_labels
+from ..recipes.settings import (
+    Setting,
+    UncheckedSetting,
+    alternatives,
+    choice_setting,
+    default_setting,
+    table_names,
+    word_labels,
+)
 from ..reconstruction.method_files import METHOD_FILES
 from ..reconstruction.methods import METHODS, argument_settings
 from ..volumes.volume import LINE_INTEGRALS
@@ -242,6 +251,8 @@ _DECLARED = (
     Setting("noise.seed", int, None, "Draw Poisson counts with this seed; of several states or frames with SEED, SEED + 1 …",
             "their expected means", least=0, most=2**64 - 1,
             needs=(f"model.photons or {_PHOTONS}", "no model.panel=energy", _MADE), option="--noise"),
+    *choice_setting("noise.model", NOISE_MODELS, "How counts vary around their means", option="--noise-model",
+                    needs=("noise.seed",)),
     Setting("reconstruction.method", str, "osem", "How the volume is found", endings=METHOD_FILES,
             words={name: (method.label, method.text) for name, method in METHODS.items()}),
     *(_ARGUMENTS.pop(name) for name in ("iterations", "subsets")),

@@ -13,7 +13,7 @@ from ..addon.pictures import images
 from ..addon.runs import projection_properties, rendering, runs
 from ..addon.scanner import scanner
 from ..core.errors import InputError
-from ..core.runs.formats import FORMATS
+from ..core.runs import FORMATS
 from ..core.runs.presets import PRESETS
 
 

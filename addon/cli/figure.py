@@ -16,7 +16,7 @@ from ...core.figures.page import SUFFIXES, Page
 from ...core.figures.subject import NEEDS, FigureSubject, require
 from ...core.phantoms.kinds import KINDS as PHANTOMS
 from ...core.recipes.toml import read_toml
-from ...core.runs.formats import FORMATS
+from ...core.runs import FORMATS
 from . import COMMANDS
 from .scene import new_scene, quiet
 

@@ -15,8 +15,7 @@ from mathutils import Quaternion
 
 from ...core import InputError, PinholeSystem
 from ...core.geometry.collimator import Construction
-from ...core.geometry.finding import Finding
-from ...core.geometry.scanner import Scanner
+from ...core.geometry.scanner import Finding, Scanner
 from ...core.scanner_kinds import SCANNERS
 from ...core.workbook import ColumnMap, QuantityCells, SystemSource
 from ..blender import ids, objects, storage

@@ -13,7 +13,7 @@ from typing import Any
 from ... import core as mph
 from ..phantoms.kinds import KINDS
 from ..physics.ct_numbers import CT_ENERGY
-from ..runs.formats import FORMATS
+from ..runs import FORMATS
 from ..runs.mosaic import write_sheet
 from ..runs.presets import PRESETS
 from ..runs.settings import SETTINGS

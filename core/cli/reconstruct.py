@@ -13,7 +13,7 @@ from ... import core as mph
 from ..figures.page import DARK, SUFFIXES, Page
 from ..reconstruction.methods import Method, method_of
 from ..reconstruction.result import iterations_text
-from ..runs.formats import FORMATS
+from ..runs import FORMATS
 from ..runs.settings import HOW_TABLES, SETTINGS
 from ..volumes.volume_files import VOLUME_FORMATS
 from .options import add_run, output_path, progress_bar, say

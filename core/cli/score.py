@@ -10,7 +10,7 @@ from ... import core as mph
 from ..arrays import Floats
 from ..errors import naming
 from ..figures.page import SUFFIXES, Page
-from ..runs.formats import FORMATS
+from ..runs import FORMATS
 from ..volumes.volume import UNITS
 from .options import add_run, output_path, print_answer, progress_bar, refuse
 from .phantom import Make, add_kinds, add_pose, read_pose

@@ -11,9 +11,8 @@ from ..errors import InputError
 from ..figures.page import LARGEST, Page, box
 from ..figures.parts import number
 from ..runs import letters
-from ..runs.display import Display, unit_text
+from ..runs.display import Display, resize_picture, unit_text
 from ..runs.mosaic import COLUMNS, as_seen, places
-from ..runs.resizing import resized
 from ..volumes.volume import Volume
 from .event_set import Event
 
@@ -205,7 +204,7 @@ def _mosaic(event: ShownEvent, images: Floats32, rings: Integers, share: float) 
     wide = max(1, min(round(tall * n_u / n_v), int(_WIDEST * _SIDE) // across))
     window = 0.0, _bright(images)
     colors = Display("inferno")
-    tiles = colors.colored(resized(as_seen(images).transpose(1, 2, 0), tall, wide), window)
+    tiles = colors.colored(resize_picture(as_seen(images).transpose(1, 2, 0), tall, wide), window)
     sheet = np.empty((down * (tall + 2) - 2, across * (wide + 2) - 2, 3), np.uint8)
     sheet[:] = list(bytes.fromhex(_PAPER.removeprefix("#")))
     for m, (row, column) in enumerate(places(rings, columns)):

@@ -6,8 +6,8 @@ from functools import partial
 import numpy as np
 
 from ..runs import letters
+from ..runs.display import resize_picture
 from ..runs.mosaic import as_seen, places
-from ..runs.resizing import resized
 from .page import Page, box
 from .parts import INK, bar_width, color_bar, heading
 from .subject import FigureSubject
@@ -48,7 +48,7 @@ def _draw(page: Page, subject: FigureSubject, wide: bool) -> None:
     left += max(0, (width - int(extent[1])) // 2)
     top += max(0, (height - int(extent[0])) // 2)
     sheet = np.full((*extent, 3), 255, np.uint8)
-    pictures = subject.display.colored(resized(as_seen(images).transpose(1, 2, 0), *tile), window)
+    pictures = subject.display.colored(resize_picture(as_seen(images).transpose(1, 2, 0), *tile), window)
     for m, (row, column) in enumerate(corners):
         sheet[row : row + tile[0], column : column + tile[1]] = pictures[:, :, m]
     page.image(sheet, left, top, int(extent[1]), int(extent[0]))

@@ -12,8 +12,8 @@ from ..arrays import Array, ArrayLike, Bytes, Floats, Floats32
 from ..errors import InputError
 from ..files import AnyPath, require_ending, write_bytes
 from ..runs import letters
+from ..runs.display import resize_picture
 from ..runs.mosaic import png, write_png
-from ..runs.resizing import resized
 
 SUFFIXES = (".png", ".svg")
 SMALLEST, LARGEST = 120, 16384
@@ -55,7 +55,7 @@ class Page:
         """Put a picture (h, w, 3) into a rectangle; enlarged pixels stay squares."""
         rows, columns = max(1, height), max(1, width)
         self._pixels[top : top + rows, left : left + columns] = (
-            picture if picture.shape[:2] == (rows, columns) else resized(picture, rows, columns)
+            picture if picture.shape[:2] == (rows, columns) else resize_picture(picture, rows, columns)
         )
         encoded = base64.b64encode(png(picture)).decode()
         style = ' style="image-rendering:pixelated"' if picture.shape[1] < columns else ""

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..arrays import ArrayLike, Bytes, Floats32
+from ..arrays import ArrayLike, Bytes, Floats, Floats32
 from ..errors import InputError
 from ..validation import one_of
 
@@ -111,3 +111,19 @@ def _table(colors: str) -> Bytes:
 def unit_text(unit: str) -> str:
     """A unit as people write it: line integrals of mu are numbers."""
     return unit.replace("1/mm mm", "").replace(" mm", " · mm")
+
+
+def resize_picture(picture: ArrayLike, rows: int, columns: int) -> Floats32:
+    """Return a picture (h, w, channels) as (rows, columns, channels): each new pixel is the mean of the area it covers."""
+    tall = _resize_rows(np.asarray(picture, np.float64), rows)
+    return _resize_rows(tall.swapaxes(0, 1), columns).swapaxes(0, 1).astype(np.float32)
+
+
+def _resize_rows(picture: Floats, rows: int) -> Floats:
+    """Return a picture (h, ...) as (rows, ...), by differences of its cumulative sum, interpolated at the new edges."""
+    height = len(picture)
+    sums = np.concatenate([np.zeros_like(picture[:1]), picture.cumsum(axis=0)])
+    edges = np.linspace(0.0, height, rows + 1)
+    below = np.minimum(edges.astype(int), height - 1)
+    at_edges = sums[below] + (edges - below)[:, None, None] * picture[below]
+    return np.diff(at_edges, axis=0) * (rows / height)

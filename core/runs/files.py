@@ -23,7 +23,7 @@ from ..hdf5 import attributes, datasets, opened, pack, read_numbers
 from ..scanner_kinds import scanner_kind
 from ..volumes.formats import numpy_files
 from ..volumes.volume import Volume
-from .formats import FORMATS
+from . import FORMATS
 from .run import ProjectionRun
 
 _FORMAT = "mphDRR run"

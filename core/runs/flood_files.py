@@ -8,8 +8,8 @@ import numpy as np
 from ..errors import InputError
 from ..files import AnyPath, require_ending, write_bytes
 from ..physics.flood import FloodEfficiency, flood_efficiency
+from . import FORMATS
 from .files import read_run
-from .formats import FORMATS
 from .frame_files import read_counts
 
 Places = dict[str, list[list[int]]]

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from ..arrays import Floats32
-from .resizing import resized
+from .display import resize_picture
 
 _CHARACTERS = "".join(map(chr, range(32, 127))) + "µ²³·×°±−–αβθφψΣ∫"
 _EM, _ROWS, _BASELINE = 48, 51, 39
@@ -28,7 +28,7 @@ def lettered(text: str, size: float) -> tuple[Floats32, float]:
     ink = np.concatenate([letters.get(character, letters["?"]) for character in text or " "], axis=1)
     share = size / _EM
     shape = max(1, round(ink.shape[0] * share)), max(1, round(ink.shape[1] * share))
-    return resized(ink[..., None], *shape)[..., 0], _BASELINE * shape[0] / _ROWS
+    return resize_picture(ink[..., None], *shape)[..., 0], _BASELINE * shape[0] / _ROWS
 
 
 def width(text: str, size: float) -> float:

@@ -16,9 +16,8 @@ from ..errors import InputError, several
 from ..geometry.checks.field_of_view import find_blocked, hits, in_cone
 from ..geometry.checks.hulls import TOUCH, Hulls
 from ..geometry.checks.overlaps import penetration_depths
-from ..geometry.finding import Finding
 from ..geometry.module_parts import ModulePart
-from ..geometry.scanner import Scanner
+from ..geometry.scanner import Finding, Scanner
 from ..geometry.system import PinholeSystem
 from ..validation import instance, positive
 

@@ -260,11 +260,7 @@ def _scores(run: ProjectionRun, volume: Volume, progress: Progress | None) -> di
         score = score_volume(volume, *truth_of_run(run), progress)
     except InputError as error:  # such as a truth that is the same everywhere: the reconstruction is worth keeping
         return {"scores": [("No score", str(error))]}
-    lines = [("NRMSE", f"{score.nrmse:.3g}")]
-    for sphere in score.nema or ():
-        score_text = f"{sphere.contrast_recovery:.1f} % contrast, {sphere.background_variability:.1f} % variability"
-        lines.append((f"{sphere.diameter:g} mm sphere", score_text))
-    return {"scores": lines, "rods": [sector.cells for sector in score.derenzo or () if sector.rod_diameter]}
+    return {"scores": score.cells, "rods": [sector.cells for sector in score.derenzo or () if sector.rod_diameter]}
 
 
 def _picture(

@@ -20,7 +20,8 @@ from ...geometry.scanner import Scanner
 from ...phantoms.derenzo import DerenzoPhantom
 from ...phantoms.torso import CardiacTorso
 from ...projector import Projector
-from ...reconstruction.scores.images import nrmse, ssim
+from ...reconstruction.scores.images import nrmse
+from ...reconstruction.scores.summary import JUDGED_SCORES
 from ...runs.reconstructing import model_of
 from ...runs.run import ProjectionRun
 from ...runs.run_recipe import projector_of_run, recipe_views
@@ -84,8 +85,9 @@ class Case:
         A = self.projector
         deviance = relative_deviance(self.run.projections, A(volume.array) + A.background)
         scores: Scores = {"nrmse": nrmse(volume, self.truth), "deviance": deviance}
-        if min(self.grid.shape) >= 11:  # the window's side
-            scores["ssim"] = ssim(volume, self.truth)
+        for row in JUDGED_SCORES:
+            if min(self.grid.shape) >= row.judged_from:
+                scores[row.name] = row.function(volume, self.truth)
         return scores | SCORINGS[scoring](volume, self)
 
     def contrasts(self, volume: Volume, phantom: DerenzoPhantom, rods: Any) -> Any:

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -14,7 +15,7 @@ from ...progress import Progress, tell
 from ...validation import freeze, instance
 from ...volumes.resampling import values_at
 from ...volumes.volume import Volume, require_quantity
-from .rows import Rows, column
+from .rows import Rows, column, json_number
 
 RESOLVED_BELOW = 0.735
 """Valley-to-peak of two points that are just resolved, by Rayleigh's criterion."""
@@ -117,6 +118,23 @@ class DerenzoScore(Rows[DerenzoSector]):
     valley_to_peak = column("valley_to_peak", "Mean valley by mean peak.")
     resolved = column("resolved", "1 or 0.")
     contrast_recovery = column("contrast_recovery", "Of the phantom's contrast.")
+
+    @property
+    def lines(self) -> list[str]:
+        """The scores as lines of text, one for each sector with rods."""
+        texts = ((sector.rod_diameter, ": ".join(filter(None, (sector.light, sector.words)))) for sector in self)
+        return [f"{diameter:g} mm  {text}" for diameter, text in texts if diameter]
+
+    @property
+    def record(self) -> dict[str, Any]:
+        """The scores as JSON can hold them, None for an unknown number."""
+        names = ("rod_diameter", "valley_to_peak", "contrast_recovery", "chance", "pairs_resolved")
+        return {"derenzo": [
+            {**{name: json_number(getattr(sector, name)) for name in names}, "pairs": len(sector.profiles),
+             "note": sector.note, "light": sector.light or None,
+             "resolved": None if np.isnan(sector.resolved) else bool(sector.resolved)}
+            for sector in self
+        ]}  # fmt: skip
 
 
 def derenzo_score(

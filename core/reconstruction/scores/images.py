@@ -16,7 +16,9 @@ from ..stopping import inside
 
 Values = Volume | ArrayLike
 
-_SIGMA, _RADIUS = 1.5, 5  # of the window of Wang et al., voxels
+_SIGMA, _RADIUS = 1.5, 5  # standard deviation and half-width, voxels, of the window of Wang et al.
+WINDOW = 2 * _RADIUS + 1
+"""Side of that window, voxels."""
 _K1, _K2 = 0.01, 0.03  # their constants
 _SLAB = 1 << 18  # voxels at once
 
@@ -86,8 +88,8 @@ def ssim(volume: Values, truth: Values, data_range: float | None = None, progres
     values, true = _pair(volume, truth, "ssim")
     span = _span(true, data_range, "ssim")
     shape = tuple(n for n in values.shape if n > 1)
-    if not shape or min(shape) < 2 * _RADIUS + 1:
-        text = f"one or at least {2 * _RADIUS + 1} voxels along each axis"
+    if not shape or min(shape) < WINDOW:
+        text = f"one or at least {WINDOW} voxels along each axis"
         raise InputError(f"ssim: expected {text}, got {shape_text(values.shape)}")
     values, true = values.reshape(shape), true.reshape(shape)
     c1, c2 = (_K1 * span) ** 2, (_K2 * span) ** 2

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -12,7 +13,7 @@ from ...phantoms.nema import NemaBody, room, sphere_places
 from ...validation import freeze, instance
 from ...volumes.resampling import values_at
 from ...volumes.volume import Volume, require_quantity
-from .rows import Rows, column
+from .rows import Rows, aligned_columns, column, json_number
 
 _SLICES = (-20.0, -10.0, 0.0, 10.0, 20.0)  # of the background regions, mm from the spheres' centres
 _IN_SLICE = 12  # background regions
@@ -49,6 +50,30 @@ class NemaScore(Rows[NemaSphere]):
     diameter = column("diameter", "mm.")
     contrast_recovery = column("contrast_recovery", "Percent.")
     background_variability = column("background_variability", "Percent.")
+
+    @property
+    def lines(self) -> list[str]:
+        """The scores as a table of text, and a line on the lung insert."""
+        percents = ((f"{s.contrast_recovery:.1f} %", f"{s.background_variability:.1f} %") for s in self)
+        rows = [(f"{s.diameter:g} mm", *texts) for s, texts in zip(self, percents, strict=True)]
+        lung = [] if math.isnan(self.lung_residual) else [self.lung_residual]
+        return [
+            *aligned_columns(("Spheres", "contrast recovery", "background variability"), rows),
+            *(f"Lung insert: {percent:.1f} % of the background remain" for percent in lung),
+        ]
+
+    @property
+    def record(self) -> dict[str, Any]:
+        """The scores as JSON can hold them, None for an unknown number."""
+        columns = ("diameter", "contrast_recovery", "background_variability")
+        spheres = [{name: getattr(sphere, name) for name in columns} for sphere in self]
+        return {"nema": spheres, "lung_residual": json_number(self.lung_residual)}
+
+    @property
+    def cells(self) -> list[tuple[str, str]]:
+        """Names and values, as text, for the table of Blender's panel."""
+        form = "{0.contrast_recovery:.1f} % contrast, {0.background_variability:.1f} % variability"
+        return [(f"{sphere.diameter:g} mm sphere", form.format(sphere)) for sphere in self]
 
 
 def nema_score(volume: Volume, phantom: NemaBody, pose: ArrayLike | None = None) -> NemaScore:

@@ -18,7 +18,7 @@ from ...core import PinholeSystem, ProjectionRun, Views, memory
 from ...core.progress import Progress, part_of, tell
 from ...core.runs.display import Display
 from ...core.runs.exr import exr_bytes
-from ...core.runs.mosaic import Sheet, as_seen, labels, png, sheet, smaller
+from ...core.runs.mosaic import MosaicSheet, as_seen, block_means, draw_sheet, module_labels, png_bytes
 from ..blender import ids, jobs, reports, windows
 
 _KEY = "mphdrr_projection"  # custom property: marks the images that a new run replaces; False of those of no run
@@ -46,7 +46,7 @@ class Pictures:
     exact: list[bytes]  # OpenEXR, of float32
     colored: list[bytes]  # PNG
     mosaic: bytes  # PNG
-    drawn: Sheet  # what is where in the mosaic
+    drawn: MosaicSheet  # what is where in the mosaic
 
 
 def pictures(run: ProjectionRun, display: Display, progress: Progress | None = None) -> Pictures:
@@ -54,7 +54,7 @@ def pictures(run: ProjectionRun, display: Display, progress: Progress | None = N
     exact = _in_threads(exr_bytes, as_seen(run.projections), part_of(progress, 0, 2))
     rings = run.system.rings().tolist()
     colored = _colored(run.projections, display, part_of(progress, 1, 2))
-    return Pictures(display, exact, colored, *_mosaic(run.projections, labels(run), rings, run.unit, display))
+    return Pictures(display, exact, colored, *_mosaic(run.projections, module_labels(run), rings, run.unit, display))
 
 
 def storing(run: ProjectionRun, made: Pictures) -> Generator[tuple[str, int, int] | None, None, bpy.types.Image]:
@@ -82,7 +82,7 @@ def storing(run: ProjectionRun, made: Pictures) -> Generator[tuple[str, int, int
     _put_in_place(new)
     mosaic = new[ids.MOSAIC]
     _describe(mosaic, made.drawn, numbers, run.system.rings().tolist(), run.unit, made.display)
-    mosaic[_LABELS] = "\n".join(labels(run))
+    mosaic[_LABELS] = "\n".join(module_labels(run))
     arrays = {name: getattr(run.views, name).ravel().tolist() for name in _ARRAYS}
     system = run.system
     radii = system.roi_radius if isinstance(system, PinholeSystem) else np.full(len(system), system.region_radius())
@@ -200,16 +200,16 @@ def projection_name(number: int, numbers: list[int]) -> str:
 def _colored(projections: NDArray[np.float32], display: Display, progress: Progress | None = None) -> list[bytes]:
     """The pictures of projections (M, n_v, n_u) in one window, as PNG files; `progress` counts them."""
     window = display.window(projections)
-    shown = smaller(as_seen(display.part(projections)), _PIXELS)
-    return _in_threads(lambda picture: png(display.colored(picture, window), _PNG_LEVEL), shown, progress)
+    shown = block_means(as_seen(display.part(projections)), _PIXELS)
+    return _in_threads(lambda picture: png_bytes(display.colored(picture, window), _PNG_LEVEL), shown, progress)
 
 
 def _mosaic(
     projections: NDArray[np.float32], texts: list[str], rings: list[int], unit: str, display: Display
-) -> tuple[bytes, Sheet]:
+) -> tuple[bytes, MosaicSheet]:
     """The mosaic of projections (M, n_v, n_u), with a text in each, as a PNG file, and what is where in it."""
-    drawn = sheet(projections, texts, rings, unit, display)
-    return png(drawn.picture, _PNG_LEVEL), drawn
+    drawn = draw_sheet(projections, texts, rings, unit, display)
+    return png_bytes(drawn.picture, _PNG_LEVEL), drawn
 
 
 def _in_threads(make: Callable[[Any], bytes], pictures: NDArray[np.float32], progress: Progress | None) -> list[bytes]:
@@ -223,7 +223,7 @@ def _in_threads(make: Callable[[Any], bytes], pictures: NDArray[np.float32], pro
 
 
 def _describe(
-    image: bpy.types.Image, drawn: Sheet, numbers: list[int], rings: list[int], unit: str, display: Display | None
+    image: bpy.types.Image, drawn: MosaicSheet, numbers: list[int], rings: list[int], unit: str, display: Display | None
 ) -> None:
     """Note on the mosaic what is where in it, and which display the pictures show; None: not all of them one."""
     image[_TILES] = {
@@ -234,9 +234,9 @@ def _describe(
     }  # fmt: skip
 
 
-def store_difference(drawn: Sheet, numbers: list[int], unit: str, text: str) -> bpy.types.Image:
+def store_difference(drawn: MosaicSheet, numbers: list[int], unit: str, text: str) -> bpy.types.Image:
     """Make the image of a difference of two runs, until other projections are shown; `text` says its numbers."""
-    image = _store(ids.DIFFERENCE, png(drawn.picture, _PNG_LEVEL))
+    image = _store(ids.DIFFERENCE, png_bytes(drawn.picture, _PNG_LEVEL))
     _describe(image, drawn, numbers, [], unit, None)
     image[_TEXT] = text
     return image

@@ -29,7 +29,7 @@ from ...core.figures.reconstructions import SIZE, SIZE_BESIDE_TRUTH, draw
 from ...core.progress import Progress, stages_of
 from ...core.reconstruction.methods import method_of
 from ...core.reconstruction.result import iterations_text
-from ...core.runs.mosaic import png
+from ...core.runs.mosaic import png_bytes
 from ...core.runs.recipe import recipe_from_tables
 from ...core.runs.reconstructing import reconstruct_run, reconstruction_grid, voxels_text
 from ...core.runs.run_recipe import truth_of_run
@@ -273,7 +273,7 @@ def _picture(
     line = ", ".join([record["title"], *map(" ".join, record["scores"][:1]), record["voxels"]])
     lines, title = [line, *record["flatters"]], f"Reconstruction of {name}"
     draw(page, volume, record["objective"], run.volume, title, lines, record["name"], record["rods"])
-    return png(page.picture, _PNG_LEVEL)
+    return png_bytes(page.picture, _PNG_LEVEL)
 
 
 def _readers_of_mu(scene: bpy.types.Scene) -> dict[str, Callable[[], Volume]]:

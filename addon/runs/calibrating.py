@@ -10,7 +10,7 @@ from ...core.design.calibration import Calibration
 from ...core.design.calibration_recipe import run_calibration
 from ...core.errors import InputError
 from ...core.progress import Progress
-from ...core.runs.mosaic import png
+from ...core.runs.mosaic import png_bytes
 from ..blender import ids, jobs
 from ..pictures import images
 from ..scanner import arrows, module_edits, scanner
@@ -31,7 +31,7 @@ def calibrating(context: bpy.types.Context, path: Path, apply: bool = True, exag
 
     def work(progress: Progress) -> tuple[Calibration, bytes]:
         found = run_calibration(path, progress)
-        return found, png(found.residual_sheet().picture)
+        return found, png_bytes(found.residual_sheet().picture)
 
     def finish(result: tuple[Calibration, bytes]) -> str:
         found, picture = result

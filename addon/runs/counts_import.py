@@ -10,7 +10,7 @@ from ...core import InputError, ProjectionRun
 from ...core.geometry.system import chosen_modules
 from ...core.progress import Progress, stages_of
 from ...core.runs.measured import recipe_counts
-from ...core.runs.mosaic import caption
+from ...core.runs.mosaic import counts_caption
 from ..blender import jobs
 from ..phantoms import phantoms
 from ..pictures import images
@@ -55,10 +55,9 @@ def importing(context: bpy.types.Context, paths: list[Path], given: Mapping[str,
         run, made = result
         scene = jobs.scene_again(scene_uid, "the projections are")
         owner = jobs.found_again(bpy.data.collections, scanner_uid)
-        state = runs.state_of(system, run.recipe, None, None) | {"measured": caption(run)}
+        state = runs.state_of(system, run.recipe, None, None) | {"measured": counts_caption(run)}
         images.show_below((yield from rendering.storing(scene, run, path, state, owner, made)), bpy.context)
-        return (
-            f"Imported {float(run.projections.sum(dtype=float)):.6g} counts of {len(run.views)} modules: {caption(run)}"
-        )
+        total = f"{float(run.projections.sum(dtype=float)):.6g} counts of {len(run.views)} modules"
+        return f"Imported {total}: {counts_caption(run)}"
 
     return jobs.Job("Importing counts", work, finish, lambda: path.unlink(missing_ok=True))

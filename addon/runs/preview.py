@@ -20,7 +20,7 @@ from ...core import InputError, PinholeSystem, ProjectionRun, Recipe, Views, Vol
 from ...core.geometry.scanner import Scanner
 from ...core.memory import readable_size
 from ...core.runs.display import Display
-from ...core.runs.mosaic import as_seen, sized, totals
+from ...core.runs.mosaic import as_seen, fit_images, image_totals
 from ...core.runs.run_recipe import recipe_model, recipe_views, run_recipe
 from ..blender import jobs, reports, timers, windows
 from ..phantoms import phantoms
@@ -125,10 +125,10 @@ def make(asked: Request, quick: bool, voxels: dict[Path, Volume]) -> Preview:
     shown = run.projections
     if run.unit == "counts" and quick:  # shown per pixel of the panel's size, as the full picture and the runs are
         shown = shown * np.float32(_pixel_area(recipe_views(recipe, system)) / _pixel_area(run.views))
-    word, (total,) = totals(asked.display.part(run.projections), run.unit)
+    word, (total,) = image_totals(asked.display.part(run.projections), run.unit)
     low, high = window = asked.display.window(shown)
     part = asked.display.part(shown)
-    picture = asked.display.colored(sized(as_seen(part), _SHOWN_PIXELS)[0], window)
+    picture = asked.display.colored(fit_images(as_seen(part), _SHOWN_PIXELS)[0], window)
     bar = [asked.display.value_at(share, window) for share in np.linspace(0.0, 1.0, 256)]
     colors = asked.display.colored([bar], window)
     rows, columns = run.views.shape

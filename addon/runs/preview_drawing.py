@@ -13,7 +13,7 @@ import numpy as np
 from gpu_extras.batch import batch_for_shader
 from numpy.typing import NDArray
 
-from ...core.runs.letters import wrapped
+from ...core.runs.letters import wrap_text
 from ..blender import windows
 
 _WIDTH, _LEAST = 150.0, 60.0  # of the picture in the box, and its least height, in Blender's units of its interface
@@ -92,7 +92,7 @@ def _draw_box(session: Any) -> None:
     def fits(text: str) -> bool:
         return windows.text_width(text, size) <= _WIDTH * unit
 
-    lines = [piece for line in session.lines for piece in wrapped(line, fits)]
+    lines = [piece for line in session.lines for piece in wrap_text(line, fits)]
     if shown is not None:
         rows, columns = shown.picture.shape[:2]
         free = context.region.height - _ABOVE * unit - 2 * margin - (1.4 * len(lines) + 2) * size

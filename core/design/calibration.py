@@ -14,7 +14,7 @@ from ..progress import Progress, stages_of
 from ..projector.emission import Emission
 from ..projector.models import each_pixel
 from ..runs.display import DIVERGING, Display
-from ..runs.mosaic import Sheet, sheet
+from ..runs.mosaic import MosaicSheet, draw_sheet
 from ..validation import instance, one_of, positive, real_array, shape_text
 from .bundle import LENGTH, OFFSET, Bundle, Moved
 from .point_images import Lattice
@@ -103,11 +103,11 @@ class Calibration:
                 weak.setdefault("all modules" if len(numbers) == len(told) else some, []).append(name)
         return [f"{which}: {', '.join(names)}" for which, names in weak.items()]
 
-    def residual_sheet(self) -> Sheet:
+    def residual_sheet(self) -> MosaicSheet:
         """The residuals of all modules, drawn ring by ring: noise without a pattern where the geometry fits."""
         display = Display(colors=DIVERGING, low=-_MOST, high=_MOST)
         residuals = self.residuals.astype(np.float32)
-        return sheet(residuals, self.system.numbers, self.system.rings(), "standard deviations", display)
+        return draw_sheet(residuals, self.system.numbers, self.system.rings(), "standard deviations", display)
 
     def summary(self) -> list[str]:
         """How far modules are from their nominal places and tilts, what does not fit and what is not told, in lines."""

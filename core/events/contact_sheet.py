@@ -12,7 +12,7 @@ from ..figures.page import LARGEST, Page, box
 from ..figures.parts import number
 from ..runs import letters
 from ..runs.display import Display, resize_picture, unit_text
-from ..runs.mosaic import COLUMNS, as_seen, places
+from ..runs.mosaic import COLUMNS, as_seen, tile_places
 from ..volumes.volume import Volume
 from .event_set import Event
 
@@ -190,7 +190,7 @@ def _mosaic(event: ShownEvent, images: Floats32, rings: Integers, share: float) 
     longest = int(np.bincount(rings).max())
 
     def sides(columns: int) -> tuple[float, int, int]:
-        at = places(rings, columns)
+        at = tile_places(rings, columns)
         down, across = int(at[:, 0].max()) + 1, int(at[:, 1].max()) + 1
         tile = _SIDE / down / n_v  # pixels of the page to one of the images
         return across * n_u * tile / _SIDE, down, across
@@ -207,7 +207,7 @@ def _mosaic(event: ShownEvent, images: Floats32, rings: Integers, share: float) 
     tiles = colors.colored(resize_picture(as_seen(images).transpose(1, 2, 0), tall, wide), window)
     sheet = np.empty((down * (tall + 2) - 2, across * (wide + 2) - 2, 3), np.uint8)
     sheet[:] = list(bytes.fromhex(_PAPER.removeprefix("#")))
-    for m, (row, column) in enumerate(places(rings, columns)):
+    for m, (row, column) in enumerate(tile_places(rings, columns)):
         top, left = row * (tall + 2), column * (wide + 2)
         sheet[top : top + tall, left : left + wide] = tiles[:, :, m]
     size = sheet.shape[1], sheet.shape[0]

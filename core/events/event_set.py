@@ -19,7 +19,7 @@ from ..geometry.scanner import Scanner
 from ..geometry.views import Views
 from ..physics.isotopes import isotope
 from ..physics.noise import NOISE_MODELS
-from ..runs.counting import live_shares_of, scaled
+from ..runs.counting import recorded_shares, scale_by_module
 from ..runs.projecting import LINES
 from ..runs.recipe import Recipe, recorded_recipe
 from ..runs.run import ProjectionRun
@@ -242,7 +242,7 @@ class Event:
             settings["recipe"] = record.tables()
         made: Any = recipe_model(self._folder.recipe.placed(recipe), self.system)
         images = self.images(model, noise_seed, level)
-        background = scaled(made.background, live_shares_of(recipe, images))
+        background = scale_by_module(made.background, recorded_shares(recipe, images))
         return ProjectionRun(
             images, self.system, self.views, self.truth, unit=self.unit(model), settings=settings, seed=noise_seed,
             background=background, efficiency=made.efficiency,

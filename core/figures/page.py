@@ -13,7 +13,7 @@ from ..errors import InputError
 from ..files import AnyPath, require_ending, write_bytes
 from ..runs import letters
 from ..runs.display import resize_picture
-from ..runs.mosaic import png, write_png
+from ..runs.mosaic import png_bytes, write_png
 
 SUFFIXES = (".png", ".svg")
 SMALLEST, LARGEST = 120, 16384
@@ -57,7 +57,7 @@ class Page:
         self._pixels[top : top + rows, left : left + columns] = (
             picture if picture.shape[:2] == (rows, columns) else resize_picture(picture, rows, columns)
         )
-        encoded = base64.b64encode(png(picture)).decode()
+        encoded = base64.b64encode(png_bytes(picture)).decode()
         style = ' style="image-rendering:pixelated"' if picture.shape[1] < columns else ""
         self._marks.append(
             f'<image x="{left}" y="{top}" width="{columns}" height="{rows}" preserveAspectRatio="none"{style} '
@@ -97,7 +97,7 @@ class Page:
         upward: bool = False,
     ) -> None:
         """Write a line of text that starts, is centred or ends at (x, y) on its baseline; `upward` turns it by 90°."""
-        coverage, baseline = letters.lettered(text, size)
+        coverage, baseline = letters.text_ink(text, size)
         offset = _STARTS[anchor] * coverage.shape[1]
         if upward:
             coverage, left, top = np.rot90(coverage), x - baseline, y - coverage.shape[1] + offset

@@ -20,7 +20,7 @@ from ..memory import require
 from ..progress import Stages
 from ..projector.models import checked_background, checked_times, each_pixel
 from ..validation import instance, one_of, real_numbers, require_finite, shape_text
-from .counting import live_shares_of, recipe_efficiency, scaled
+from .counting import recipe_efficiency, recorded_shares, scale_by_module
 from .frame_checks import warn_of_frames
 from .frame_files import Counts, differs, read_counts
 from .orientations import ORIENTATIONS, on_crystal
@@ -136,7 +136,7 @@ def counts_run(
     estimate: Any = None
     if scatter is not None:
         estimate, record["scatter"] = scatter.estimate(of_windows, frames_of, found, efficiency)
-    background = scaled(made["model.background"], live_shares_of(made, images, record))
+    background = scale_by_module(made["model.background"], recorded_shares(made, images, record))
     background = background if estimate is None else each_pixel(background) + estimate
     known: Any = {"settings": record, "background": background, "efficiency": efficiency}
     run = ProjectionRun(images, system, views, unit="counts", **known)

@@ -32,7 +32,7 @@ from ..volumes.volume_files import read_volume, read_volume_of
 from ..workbook import read_scanner
 from ..xray.detectors import checked_bins
 from ..xray.scan import SpectralScan
-from .counting import dead_time_of, live_shares_of, recipe_efficiency, scaled
+from .counting import recipe_dead_time, recipe_efficiency, recorded_shares, scale_by_module
 from .measured import recipe_counts
 from .projecting import LINES, Imaging, project_run, warn_of_energy
 from .recipe import Recipe, recorded_recipe
@@ -104,7 +104,7 @@ def run_recipe(
             system, source, **_detector(recipe), backend=recipe["compute.backend"], threads=recipe["compute.threads"],
             settings={"volume": _volume_name(record), **converted, "recipe": record.tables()},
             model=recipe_model(recipe.updated(times), system, mu_of_it), photons=recipe["model.photons"],
-            noise_seed=record["noise.seed"], progress=stages("projecting"), dead_time=dead_time_of(recipe),
+            noise_seed=record["noise.seed"], progress=stages("projecting"), dead_time=recipe_dead_time(recipe),
             noise=recipe.choice("noise.model", NOISE_MODELS),
         )  # fmt: skip
 
@@ -185,8 +185,8 @@ def recipe_model(recipe: Recipe, system: Scanner, mu: Mu | None = None, run: Pro
         else:
             given["efficiency"] = recipe_efficiency(recipe)
         if run is not None and recipe["model.dead_time"]:
-            shares = live_shares_of(recipe, run.projections, run.settings)
-            given |= {name: scaled(given.get(name, 0.0), shares) for name in ("background", "efficiency")}
+            shares = recorded_shares(recipe, run.projections, run.settings)
+            given |= {name: scale_by_module(given.get(name, 0.0), shares) for name in ("background", "efficiency")}
     model: Model = cls(**given) if cls is Transmission else cls(system, **given)
     if isinstance(model, Emission) and len(files := recipe["attenuation.file"] or ()) > 1:
         require_each(len(files), model.photon_lines, "attenuation.file", "file")
@@ -252,7 +252,7 @@ def recipe_imaging(
 ) -> Imaging:
     """What makes a recipe's images of volumes on a grid; `mu` is what attenuates."""
     projector = Projector(grid, views, recipe_model(recipe, system, mu), threads=threads)
-    return Imaging(projector, recipe["model.photons"], dead_time_of(recipe))
+    return Imaging(projector, recipe["model.photons"], recipe_dead_time(recipe))
 
 
 def _volume_name(record: Recipe) -> str:

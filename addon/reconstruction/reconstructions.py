@@ -32,7 +32,7 @@ from ...core.reconstruction.result import iterations_text
 from ...core.runs.mosaic import png_bytes
 from ...core.runs.recipe import recipe_from_tables
 from ...core.runs.reconstructing import reconstruct_run, reconstruction_grid, voxels_text
-from ...core.runs.run_recipe import truth_of_run
+from ...core.runs.run_recipe import run_truth
 from ...core.volumes.sights import bright_value, full_slices
 from ..blender import ids, jobs, objects, storage, windows
 from ..pictures import images
@@ -257,7 +257,7 @@ def _scores(run: ProjectionRun, volume: Volume, progress: Progress | None) -> di
     if run.volume is None:
         return {}
     try:
-        score = score_volume(volume, *truth_of_run(run), progress)
+        score = score_volume(volume, *run_truth(run), progress)
     except InputError as error:  # such as a truth that is the same everywhere: the reconstruction is worth keeping
         return {"scores": [("No score", str(error))]}
     return {"scores": score.cells, "rods": [sector.cells for sector in score.derenzo or () if sector.rod_diameter]}

@@ -131,7 +131,7 @@ def _run(arguments: argparse.Namespace) -> None:
     mphdrr project scanner.xlsx --counts counts.npy --frames 1-80 --orientation front+v --time 600 -o run.h5
         --mosaic check.png
     """
-    from ..runs.run_recipe import frames_of
+    from ..runs.run_recipe import recipe_frames
 
     if arguments.write_recipe:
         path = output_path(arguments.write_recipe, (".toml",))
@@ -144,7 +144,7 @@ def _run(arguments: argparse.Namespace) -> None:
     path = output_path(arguments.output, FORMATS)
     picture = output_path(arguments.mosaic) if arguments.mosaic else None
     recipe, kept = _chosen(arguments)
-    count = len(frames_of(recipe))
+    count = len(recipe_frames(recipe))
     outputs = {numbered_path(path, number, count).resolve() for number in range(1, count + 1)}
     several = (recipe[key] or () for key in ("volume.states", "counts.files", "attenuation.file"))
     for file in (*itertools.chain(*several), recipe["volume.file"]):

@@ -49,14 +49,14 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
 
 
 def _chosen(arguments: argparse.Namespace, run: mph.ProjectionRun) -> mph.Recipe:
-    from ..runs.reconstructing import recipe_of
+    from ..runs.reconstructing import reconstruction_recipe
 
     asked = mph.Recipe() if arguments.recipe is None else mph.read_recipe(arguments.recipe)
     changes = typed_entries(arguments)
     for key in changes:
         if key.partition(".")[0] not in HOW_TABLES:
             raise mph.InputError(f"--set {key}: expected an entry of {', '.join(f'[{table}]' for table in HOW_TABLES)}")
-    recipe = recipe_of(run, asked if "recipe" in run.settings else asked.updated(changes))
+    recipe = reconstruction_recipe(run, asked if "recipe" in run.settings else asked.updated(changes))
     if changes.get("attenuation.file") is not None:  # instead of what attenuated in the run
         changes = {"attenuation.of_phantom": None, "attenuation.object": None} | changes
     return recipe.updated(changes)

@@ -59,9 +59,9 @@ def _run(arguments: argparse.Namespace) -> None:
     volume = mph.read_volume(arguments.volume, arguments.quantity, progress=progress_bar("reading"))
     score = mph.score_volume(volume, truth, pose, progress_bar("truth"))
     if run is not None:
-        from ..runs.reconstructing import flattering
+        from ..runs.reconstructing import inverse_crime_notes
 
-        score = replace(score, notes=(*flattering(run, volume.grid), *score.notes))
+        score = replace(score, notes=(*inverse_crime_notes(run, volume.grid), *score.notes))
     if picture is not None:
         from ..figures.scores import SIZE, draw
 
@@ -86,8 +86,8 @@ def _truth(arguments: argparse.Namespace) -> tuple[mph.Volume | mph.Phantom, Flo
             raise
         run = None
     if run is not None:
-        from ..runs.run_recipe import truth_of_run
+        from ..runs.run_recipe import run_truth
 
         with naming(file):
-            return *truth_of_run(run), run
+            return *run_truth(run), run
     return mph.read_volume(file, arguments.quantity, progress=progress_bar("reading the truth")), None, None

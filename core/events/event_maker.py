@@ -20,7 +20,7 @@ from ..projector.backends import choose
 from ..recording import Remembered, recorded_warnings, remembered
 from ..runs.projecting import Imaging, warn_of_energy
 from ..runs.recipe import Recipe
-from ..runs.run_recipe import mu_of_files, recipe_imaging, recipe_model, recipe_system, recipe_views, require_mu
+from ..runs.run_recipe import read_attenuation, recipe_imaging, recipe_model, recipe_system, recipe_views, require_mu
 from ..validation import freeze
 from ..volumes.rearranging import centered
 from ..volumes.resampling import resample
@@ -169,7 +169,7 @@ class EventMaker:
 
     def _imaging_of(self, recipe: Recipe) -> Imaging:
         grid, placed = self.recipe.grid, self.recipe.placed(recipe)
-        mu = mu_of_files(recipe, recipe_model(placed, self.system), lambda file: self.recipe.input(file).volume())
+        mu = read_attenuation(recipe, recipe_model(placed, self.system), lambda file: self.recipe.input(file).volume())
         if recipe["attenuation.of_phantom"]:  # each event has its own: here, to say on which grid
             mu = Volume(freeze(np.zeros(grid.shape, np.float32)), grid, "mu")
         return recipe_imaging(placed, self.system, self.views, grid, mu, threads=self.threads)

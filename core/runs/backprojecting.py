@@ -15,7 +15,7 @@ from ..projector.models import each_pixel
 from ..validation import instance, one_of
 from ..volumes.volume import Volume
 from .recipe import Recipe
-from .reconstructing import line_integrals, recipe_of, reconstruction_grid
+from .reconstructing import line_integrals, reconstruction_grid, reconstruction_recipe
 from .run import ProjectionRun
 from .run_recipe import recipe_model
 
@@ -66,7 +66,7 @@ def backproject_run(
 
 def backprojection_grid(run: ProjectionRun, recipe: Recipe | None = None) -> Grid:
     """Return the default grid of `backproject_run`, that of a reconstruction of the run."""
-    return reconstruction_grid(run, recipe_of(run, recipe))
+    return reconstruction_grid(run, reconstruction_recipe(run, recipe))
 
 
 def run_line_integrals(run: ProjectionRun) -> Floats32:

@@ -22,7 +22,7 @@ from ...phantoms.torso import CardiacTorso
 from ...projector import Projector
 from ...reconstruction.scores.images import nrmse
 from ...reconstruction.scores.summary import JUDGED_SCORES
-from ...runs.reconstructing import model_of
+from ...runs.reconstructing import reconstruction_model
 from ...runs.run import ProjectionRun
 from ...runs.run_recipe import projector_of_run, recipe_views
 from ...volumes.resampling import resample
@@ -76,7 +76,7 @@ class Case:
     @cached_property
     def projector(self) -> Projector:
         """Projector from the judge's grid to the run's images, with the model that made them."""
-        return projector_of_run(self.run, self.grid, recipe=model_of(self.run, self.run.recipe))
+        return projector_of_run(self.run, self.grid, recipe=reconstruction_model(self.run, self.run.recipe))
 
     def score(self, volume: Volume, scoring: str) -> Scores:
         """Return the scores of a volume in a test of this kind (`SCORINGS`)."""

@@ -14,7 +14,7 @@ from bpy.props import BoolProperty, IntProperty
 
 from ..core import cache
 from ..core.memory import readable_size
-from ..core.projector import backends, parallel
+from ..core.rays import backends, parallel
 from .blender import storage
 from .blender.layouts import invoking
 

@@ -10,9 +10,9 @@ from ..arrays import ArrayLike, Bools, Floats, Indexes
 from ..errors import InputError, several
 from ..geometry.system import PinholeSystem
 from ..geometry.views import Views
+from ..models.emission import Emission
+from ..models.model import each_pixel
 from ..progress import Progress, stages_of
-from ..projector.emission import Emission
-from ..projector.models import each_pixel
 from ..runs.display import DIVERGING, Display
 from ..runs.mosaic import Sheet, sheet
 from ..validation import instance, one_of, positive, real_array, shape_text

@@ -10,8 +10,8 @@ from ..errors import InputError, naming
 from ..events.entries import by_key, flat, required, table
 from ..files import AnyPath
 from ..geometry.system import PinholeSystem
+from ..models.emission import Emission
 from ..progress import Progress
-from ..projector.emission import Emission
 from ..runs.files import read_run
 from ..runs.recipe import Values
 from ..runs.run_recipe import recipe_model

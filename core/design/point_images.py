@@ -14,10 +14,10 @@ import numpy as np
 
 from ..arrays import ArrayLike, Floats
 from ..geometry.views import Views
+from ..models.emission import Emission
+from ..models.model import each_pixel
 from ..physics.crystal import gaussian_blur
 from ..physics.performance import sensitivity
-from ..projector.emission import Emission
-from ..projector.models import each_pixel
 from ..validation import instance, one_for_all, real_array
 
 _FWHM_PER_SIGMA = 2 * math.sqrt(2 * math.log(2))

@@ -16,7 +16,7 @@ from ..geometry.views import Views
 from ..memory import readable_size, require
 from ..progress import Progress, tell
 from ..projector import Emission, Model, Projector
-from ..projector.backends import choose
+from ..rays.backends import choose
 from ..recording import Remembered, recorded_warnings, remembered
 from ..runs.projecting import Imaging, warn_of_energy
 from ..runs.recipe import Recipe

@@ -28,7 +28,7 @@ def orthogonal_sum(volume: Volume, axis: int) -> tuple[Floats32, Floats]:
     ends = np.empty((2, counts[right], counts[up], 3))
     ends[..., right], ends[..., up] = at[right][:, None], at[up]
     ends[0, ..., axis], ends[1, ..., axis] = box[:, axis] + [-1.0, 1.0]
-    from ..projector.tracing import trace_rays  # takes a while, and the list of figures needs neither
+    from ..rays.tracing import trace_rays  # takes a while, and the list of figures needs neither
 
     sums = trace_rays(volume, ends[0].reshape(-1, 3), ends[1].reshape(-1, 3))
     return np.asarray(sums, np.float32).reshape(counts[right], counts[up]), box

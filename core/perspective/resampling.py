@@ -11,12 +11,12 @@ from ..errors import InputError, warn
 from ..geometry.grid import Grid
 from ..memory import require
 from ..progress import Progress, part_of, tell
-from ..projector import backends
-from ..projector.bundles import Beam, Bundle, Bundles
-from ..projector.execution import Execution
-from ..projector.linear_operator import LinearOperator
-from ..projector.parallel import thread_count
-from ..projector.rays import Fan
+from ..rays import backends
+from ..rays.bundles import Beam, Bundle, Bundles
+from ..rays.execution import Execution
+from ..rays.linear_operator import LinearOperator
+from ..rays.parallel import thread_count
+from ..rays.ray_geometry import Fan
 from ..validation import instance, one_of
 from ..volumes.volume import UNITS, Volume, require_quantity
 from .perspective_grid import PerspectiveGrid

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -10,9 +11,8 @@ from numpy.typing import ArrayLike
 from ..arrays import Array, ArrayOrTensor, cast_like
 from ..errors import InputError
 from ..progress import Progress
+from ..rays.linear_operator import LinearOperator
 from ..validation import freeze, instance, real_array, shape_text
-from .emission import Emission
-from .linear_operator import LinearOperator
 from .operator import Projector
 
 
@@ -40,9 +40,10 @@ class FrameProjector(LinearOperator):
 
     def __init__(self, A: Projector, times: ArrayLike, starts: ArrayLike | None = None) -> None:
         instance(A, Projector, "frames")
-        if not isinstance(A.model, Emission):
+        if not A.model.has_times:
             raise InputError(f"frames: expected a projector of Emission, got one of {A.model.name}")
-        self._A, self._model = A, A.model
+        model: Any = A.model
+        self._A, self._model = A, model
         self.times = _of_frames(times, "frames: times", len(A.views))
         """(F, M), s."""
         if starts is None:
@@ -69,7 +70,7 @@ class FrameProjector(LinearOperator):
         """The projector of one frame, for its reconstruction by itself: ``osem(frames.frame(f), counts[f])``."""
         return Projector(self._A.grid, self._A.views, self._of_frame(f), **self._A._settings)
 
-    def _of_frame(self, f: int) -> Emission:
+    def _of_frame(self, f: int) -> Any:
         return replace(self._model, time=self.times[f], start=self.starts[f])
 
     def _run_one(self, x: ArrayOrTensor, progress: Progress | None = None, mu: ArrayOrTensor = None) -> ArrayOrTensor:

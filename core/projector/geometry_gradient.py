@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -10,9 +10,8 @@ from ..arrays import Array, Floats, Floats32, checked
 from ..errors import InputError
 from ..geometry.frames import module_frames, tilted
 from ..geometry.system import PinholeSystem
+from ..models.model import each_pixel
 from ..volumes.volume import Volume
-from .emission import Emission
-from .models import each_pixel
 from .operator import Projector
 
 # Steps of central differences of what is smooth and quickly made: relative, or rad.
@@ -72,8 +71,9 @@ def geometry_gradient(A: Projector, volume: Volume | Floats | Floats32, images: 
     if A._parts:
         of_parts = [geometry_gradient(part, volume, images) for part in A._parts]
         return GeometryGradient(*(np.sum(own, axis=0) for own in zip(*of_parts, strict=True)))
-    holes, model = A._depths, A.model
-    if holes is None or not isinstance(model, Emission):
+    holes = A._depths
+    model: Any = A.model
+    if holes is None or not model.has_geometry_gradient:
         expected = "a projector of Emission by hole 'depth'; those by rays are in `emission_images`"
         raise InputError(f"geometry gradient: expected {expected}")
     if A._close_parts:
@@ -97,7 +97,7 @@ def geometry_gradient(A: Projector, volume: Volume | Floats | Floats32, images: 
     return GeometryGradient(centers, frames, by["length"], diameter, pitch, offset)
 
 
-def _effective_rise(model: Emission) -> Floats:
+def _effective_rise(model: Any) -> Floats:
     """The derivative of the effective diameter by Paix, which the response is made of, by the diameter (M,)."""
     d = model.system.pinhole_diameter
     optics = replace(model.optics, edge="paix", plate_thickness=None)
@@ -107,9 +107,11 @@ def _effective_rise(model: Emission) -> Floats:
 
 def _by_blur(A: Projector, volume: Array, images: Array) -> Array:
     """Derivatives through the detector's blur by the pixels' sizes along u and v, (M, 2)."""
-    by, holes, views, model = np.zeros((len(images), 2)), A._depths, A.views, A.model
+    by, views = np.zeros((len(images), 2)), A.views
+    holes: Any = A._depths
+    model: Any = A.model
     images = images * each_pixel(model.efficiency)
-    if holes is None or not isinstance(model, Emission) or model.response(views, 0) is None:
+    if model.response(views, 0) is None:
         return by
     scales = 1 + _STEP, 1 - _STEP
     wide, narrow = (replace(views, u_steps=a * views.u_steps, v_steps=a * views.v_steps) for a in scales)

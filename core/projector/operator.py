@@ -15,23 +15,25 @@ from ..errors import InputError, warn
 from ..geometry.grid import Grid
 from ..geometry.views import Views
 from ..memory import Requirements
+from ..models.model import Model, Transmission, each_pixel
+from ..pinhole_response.pinhole_operator import depth_functions
+from ..pinhole_response.transmittance import Field
 from ..progress import Progress, part_of, tell
+from ..rays import backends
+from ..rays.bundles import Bundle, Bundles
+from ..rays.execution import Execution
+from ..rays.lattices import require_no_negative, same_lattice
+from ..rays.linear_operator import LinearOperator
+from ..rays.parallel import thread_count
 from ..recording import recorded_warnings
 from ..validation import freeze, shape_text
 from ..volumes.images import Images
 from ..volumes.volume import AIR_HU, CONVERT, Volume
-from . import backends
-from .bundles import Bundle, Bundles
-from .doubts import doubts
-from .execution import Execution
-from .lattices import require_no_negative, same_lattice
-from .linear_operator import LinearOperator
-from .models import Model, Transmission, each_pixel
-from .parallel import thread_count
 from .subsets import balanced_subsets
-from .transmittance import Field
 
 _PADDING = (-2000.0, -2048.0, -3024.0)  # what CT scanners write outside of what they scanned
+
+_NARROW = 1.0  # mm: a body is wider, and what is so many metres wide hardly fits into a scanner
 
 
 class Projector(LinearOperator):
@@ -114,8 +116,8 @@ class Projector(LinearOperator):
             model = model.by_rays()
         self.model = model
         model.check(views)
-        for doubt in doubts(grid, views, model):
-            warn(doubt, 2)
+        for text in _warnings(grid, views, model):
+            warn(text, 2)
         self.threads = thread_count(threads)
         self.which = freeze(np.arange(len(views)))
         self._bundles = Bundles(len(views), self._bundle)
@@ -161,7 +163,7 @@ class Projector(LinearOperator):
         x, mu = promote(x, require_no_negative(checked(mu, "mu", self.model.mu.grid.shape, self._float64)))
         if not getattr(mu, "requires_grad", False):
             return self._apply(x, progress, mu)
-        from . import autograd
+        from ..rays import autograd
 
         def run(needs: Any) -> Any:
             def gradients(images: ArrayOrTensor, needs: Any) -> Any:
@@ -358,8 +360,7 @@ class Projector(LinearOperator):
     def _depth_arguments(self, x: ArrayOrTensor) -> tuple[ArrayOrTensor, Any, int]:
         """What `WholeHoles` takes: the array, the functions and the threads."""
         double = self._float64 or self._backend.always_float64 or is_double(x)
-        has_kernels = self._backend.name != "numpy" and backends.choose("auto").name == "cpu"
-        functions = backends.load("cpu" if has_kernels else "reference_depth")
+        functions = depth_functions(self._backend.name)
         return np.ascontiguousarray(to_numpy(x, np.float64 if double else np.float32)), functions, self.threads
 
     def _depth_mu_gradient(
@@ -425,6 +426,17 @@ class Projector(LinearOperator):
         if self._float64 or is_tensor(result) or is_double(x):
             return result
         return result.astype(np.float32, copy=False)
+
+
+def _warnings(grid: Grid, views: Views, model: Model) -> Iterator[str]:
+    """Yield the warnings about a projector's arguments, each with its number."""
+    if caution := model.caution(views, grid):
+        yield caution
+    wide = float(np.ptp(grid.corners(), axis=0).max())
+    if wide < _NARROW and max(grid.shape) > 3:
+        near = float(np.linalg.norm(views.sources - grid.center, axis=1).min())
+        yield f"the grid is {wide:.3g} mm wide, {near:.3g} mm from the sources: lengths are in mm; is it in metres?"
+    yield from model.coefficient_warnings()
 
 
 def _describe(grid: Grid) -> str:

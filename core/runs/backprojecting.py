@@ -8,10 +8,10 @@ import numpy as np
 from ..arrays import Floats, Floats32
 from ..errors import InputError
 from ..geometry.grid import Grid
+from ..models.model import each_pixel
 from ..perspective.backprojection import HOW, backproject
 from ..progress import Stages
 from ..projector import Emission
-from ..projector.models import each_pixel
 from ..validation import instance, one_of
 from ..volumes.volume import Volume
 from .recipe import Recipe

@@ -11,8 +11,8 @@ from ..arrays import Array, Floats
 from ..errors import InputError, reading
 from ..files import AnyPath, require_file
 from ..hdf5 import datasets, numbers, opened
+from ..models.model import each_pixel
 from ..physics.dead_time import live_shares
-from ..projector.models import each_pixel
 from ..volumes.formats import numpy_files
 from .recipe import Recipe
 

@@ -17,8 +17,8 @@ from ..errors import InputError, expecting, naming, number_ranges, warn
 from ..files import read_text
 from ..geometry.scanner import Detector, Scanner
 from ..memory import require
+from ..models.model import checked_background, checked_times, each_pixel
 from ..progress import Stages
-from ..projector.models import checked_background, checked_times, each_pixel
 from ..validation import instance, one_of, real_numbers, require_finite, shape_text
 from .counting import live_shares_of, recipe_efficiency, scaled
 from .frame_checks import warn_of_frames

@@ -15,6 +15,8 @@ from ..geometry.grid import Grid
 from ..geometry.scanner import Scanner
 from ..geometry.system import chosen_modules
 from ..geometry.views import Views
+from ..models.model import each_pixel
+from ..models.photon_lines import Mu, each_mu, mu_of, require_each
 from ..phantoms.kinds import KINDS
 from ..phantoms.language import parse_phantom, read_phantom
 from ..phantoms.phantom import Phantom
@@ -23,8 +25,6 @@ from ..physics.ct_numbers import hu_to_mu
 from ..physics.isotopes import photon_energy
 from ..progress import Progress, Stages
 from ..projector import Emission, InverseSquareSum, Model, Projector, Transmission
-from ..projector.models import each_pixel
-from ..projector.photon_lines import Mu, each_mu, mu_of, require_each
 from ..volumes.rearranging import centered
 from ..volumes.volume import Volume
 from ..volumes.volume_files import read_volume, read_volume_of

@@ -8,9 +8,9 @@ import numpy as np
 
 from ..arrays import Floats, Floats32
 from ..errors import InputError
+from ..models.model import each_pixel
 from ..physics.energy_window import energy_window_scatter, peak_shares
 from ..physics.isotopes import isotope
-from ..projector.models import each_pixel
 from .frame_files import Counts, differs
 
 _WORDS = ("lower", "peak", "upper")

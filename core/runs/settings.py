@@ -21,7 +21,7 @@ from ..phantoms.kinds import KINDS, Kind
 from ..phantoms.settings import setting_names
 from ..physics.isotopes import ISOTOPES
 from ..physics.materials import APERTURES, CRYSTALS
-from ..projector.backends import BACKENDS, OLD_NAMES
+from ..rays.backends import BACKENDS, OLD_NAMES
 from ..reconstruction.methods import METHOD_FILES, METHODS, PRIORS
 from ..validation import real_array
 from ..volumes.volume import LINE_INTEGRALS

@@ -15,7 +15,7 @@ import pytest
 
 from mphdrr.core import memory
 from mphdrr.core.events.pool import threads_each
-from mphdrr.core.projector.parallel import thread_count
+from mphdrr.core.rays.parallel import thread_count
 
 from .conftest import WORKBOOK, refused, run_python
 
@@ -221,7 +221,7 @@ def test_a_job_with_half_the_memory_that_it_needs_says_so_in_one_line_and_leaves
 def test_tasks_that_have_tasks_end():
     """Each task of as many as there are threads asks the same threads for more, as reconstructions of several events do."""
     code = (
-        "from mphdrr.core.projector.parallel import in_order\n"
+        "from mphdrr.core.rays.parallel import in_order\n"
         "outer = lambda i: sum(in_order(lambda j: i * j, range(50), 2))\n"
         "print(list(in_order(outer, range(20), 2)))"
     )

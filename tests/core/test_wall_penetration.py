@@ -10,8 +10,8 @@ import pytest
 
 import mphdrr.core as mph
 from mphdrr.core.geometry.collimator import Collimator, Construction
+from mphdrr.core.models.wall_penetration import models_with_walls
 from mphdrr.core.physics.aperture import disk_points
-from mphdrr.core.projector.wall_penetration import models_with_walls
 
 from .conftest import WORKBOOK, refused
 

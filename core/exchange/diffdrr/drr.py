@@ -14,7 +14,7 @@ from ...errors import InputError
 from ...geometry.frames import affine_matrix
 from ...geometry.grid import Grid
 from ...geometry.rotations import SIZES
-from ...projector.tracing import trace_fans, trace_rays
+from ...rays.tracing import trace_fans, trace_rays
 from ...validation import one_of, positive, real_array, whole_shape
 from .detector import Detector
 from .poses import RigidTransform, convert, pose_matrices

@@ -10,7 +10,7 @@ import numpy as np
 from ..arrays import ArrayOrTensor, Floats, cropped
 from ..errors import InputError
 from ..geometry.grid import Grid
-from .rays import Attenuation, Rays
+from .ray_geometry import Attenuation, Rays
 
 Index = tuple[int, int, int]
 

@@ -13,13 +13,13 @@ from ..errors import InputError
 from ..geometry.grid import Grid
 from ..geometry.views import Views
 from ..physics.optics import Optics
+from ..pinhole_response.oblique_kernels import Passage
+from ..pinhole_response.pinhole_operator import WholeHoles, depth_functions
+from ..pinhole_response.transmittance import Field
+from ..rays import autograd
+from ..rays.lattices import require_no_negative
+from ..rays.parallel import thread_count
 from ..volumes.volume import Volume
-from . import autograd, backends
-from .hole_nodes import Passage
-from .hole_response import WholeHoles
-from .lattices import require_no_negative
-from .parallel import thread_count
-from .transmittance import Field
 
 
 class Holes(NamedTuple):
@@ -65,7 +65,7 @@ def depth_images(
         if attenuation is not None:
             on_mu = Field(require_no_negative(to_numpy(attenuation, kind)), mu_grid)
         model = _whole_holes(grid, poses, holes, effective, shape, plain, on_mu)
-        functions = backends.load("cpu" if backends.choose("auto").name == "cpu" else "reference_depth")
+        functions = depth_functions()
         threads = thread_count(None)
         images = np.stack(list(model.images(given, functions, threads))).reshape(*cameras, *shape)
 

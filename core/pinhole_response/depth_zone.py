@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from ..arrays import Array
 from ..physics.crystal import share_inside
 from .depth_response import DepthResponse, Index
-from .hole_kernel import KernelNumbers, kernels, kernels_gradient
-from .hole_nodes import NodesGradient, Passage, Slanted, node_kernels, node_places, slanted
+from .oblique_kernels import NodesGradient, Passage, Slanted, node_kernels, node_places, slanted
+from .pixel_kernels import KernelNumbers, kernels, kernels_gradient
 
 # Steps of central differences, relative: their errors are 1e-9 or less of what is differentiated so.
 _STEP = 1e-5

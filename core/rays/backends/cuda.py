@@ -35,7 +35,7 @@ from ... import cache
 from ...arrays import ArrayOrTensor, Floats, is_tensor, to_caller, to_numpy, to_tensor
 from ...errors import InputError
 from ...memory import readable_size
-from ..rays import Attenuation, IndexRays, Rays
+from ..ray_geometry import Attenuation, IndexRays, Rays
 from . import reference
 
 DEVICE_VARIABLE = "MPHDRR_CUDA_DEVICE"

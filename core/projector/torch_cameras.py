@@ -14,12 +14,12 @@ from torch import Tensor
 
 from ..errors import InputError
 from ..geometry.grid import Grid
+from ..models.pixel_points import TOLERANCE, lattice, lattices, points_needed, require_points, shadow_edges
 from ..physics.optics import Optics, chosen_optics
+from ..rays.tracing import trace_fans
 from ..validation import positive, whole_shape
 from ..volumes.volume import Volume, require_quantity
-from .depth_images import Holes, camera_views, depth_images
-from .pixel_points import TOLERANCE, lattice, lattices, points_needed, require_points, shadow_edges
-from .tracing import trace_fans
+from .torch_depth_images import Holes, camera_views, depth_images
 
 # Rays of a camera that are traced at once.
 _RAYS_AT_ONCE = 2**20

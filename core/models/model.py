@@ -13,13 +13,18 @@ from numpy.typing import ArrayLike, NDArray
 from ..arrays import ArrayOrTensor, Floats, is_tensor, namespace
 from ..errors import InputError
 from ..geometry.grid import Grid
+from ..geometry.system import PinholeSystem
 from ..geometry.views import Views
+from ..pinhole_response.pinhole_operator import WholeHoles
+from ..rays.bundles import Beam
+from ..rays.ray_geometry import view_rays
 from ..validation import all_above_0, freeze, none_below_0, positive, real_array, shape_text
 from ..volumes.volume import LINE_INTEGRALS, Volume, require_quantity
-from .bundles import Beam
-from .hole_response import WholeHoles
 from .pixel_points import TOLERANCE, offsets, points_needed, require_points, shadow_edges
-from .rays import view_rays
+
+# Views may differ from their system by a file's rounding (mm; sine of an angle).
+_SAME_PLACE = 1e-3
+_SAME_DIRECTION = 1e-6
 
 
 class Model(ABC):
@@ -46,12 +51,22 @@ class Model(ABC):
     weights_voxels: bool = False
     """Whether each view has its own voxel weights (`voxel_weights`)."""
 
+    has_times: bool = False
+    """Whether images are counts of an acquisition: a dataclass with the fields `time` and `start`, and `effective_time`."""
+
+    has_geometry_gradient: bool = False
+    """Whether `by_depth` follows the modules of `system`; such a model also has `optics` and `crystal_pitch`."""
+
     def check(self, views: Views) -> None:  # noqa: B027  (most models have nothing to check)
         """Raise `InputError` where the model is not for these views."""
 
     def caution(self, views: Views, grid: Grid) -> str | None:
         """A warning for users who project `grid` into `views`, if there is one."""
         return None
+
+    def coefficient_warnings(self) -> Iterator[str]:
+        """Yield a warning for each attenuation coefficient that looks wrong, such as one in 1/cm."""
+        return iter(())
 
     def of_views(self, which: NDArray[np.integer]) -> Model:
         """The model of the views `which` (indices) alone."""
@@ -182,3 +197,24 @@ def each_pixel(values: float | Floats) -> Floats:
     """One number, those of views (M,), or images (M, n_v, n_u), with all three axes."""
     array = np.asarray(values, np.float64)
     return array.reshape(array.shape + (1,) * (3 - array.ndim))
+
+
+def require_views_of(system: PinholeSystem, views: Views, name: str) -> None:
+    """Raise `InputError` unless `views` are those of the system's modules, in their order; `name` is what asks."""
+    if len(views) != len(system):
+        raise InputError(f"{name}: {len(system)} modules but {len(views)} views; give the system whose views they are")
+    views.require_pinholes(name)
+    u, v, k = system.frames().transpose(1, 0, 2)
+    moved = np.linalg.norm(views.sources - system.centers, axis=1) > _SAME_PLACE
+    turned = np.zeros(len(views), dtype=bool)
+    for steps, axis in ((views.u_steps, u), (views.v_steps, v)):
+        sine = np.linalg.norm(np.cross(steps, axis), axis=1) / np.linalg.norm(steps, axis=1)
+        turned |= sine > _SAME_DIRECTION
+    behind = np.einsum("mi,mi->m", views.detector_centers - views.sources, k) <= 0
+    for bad, why in (
+        (moved, "its source is not the module's pinhole"),
+        (turned, "its pixels do not lie along the module's u and v"),
+        (behind, "its detector is not in front of the pinhole (see PinholeSystem.views)"),
+    ):
+        if bad.any():
+            raise InputError(f"{name}: view {int(np.argmax(bad))}: {why}")

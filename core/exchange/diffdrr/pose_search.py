@@ -8,12 +8,12 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-from ..errors import InputError
-from ..geometry.grid import Grid
-from ..geometry.rotations import pose_matrix, se3_exp
-from ..progress import Progress, tell
-from ..volumes.volume import Volume
-from .poses import pinhole_images
+from ...errors import InputError
+from ...geometry.grid import Grid
+from ...geometry.rotations import pose_matrix, se3_exp
+from ...progress import Progress, tell
+from ...projector.torch_cameras import pinhole_images
+from ...volumes.volume import Volume
 
 Similarity = Callable[[Tensor, Tensor], Tensor]
 

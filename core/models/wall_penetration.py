@@ -18,10 +18,10 @@ from ..geometry.grid import Grid
 from ..geometry.views import Views
 from ..physics import aperture
 from ..physics.crystal import absorbed_share, share_inside
-from .bundles import Beam
-from .models import Model
+from ..rays.bundles import Beam
+from ..rays.ray_geometry import Fan, view_rays
+from .model import Model
 from .pixel_points import lattices, offsets, points_needed, shadow_edges
-from .rays import Fan, view_rays
 
 LEAST_SHARE = 1e-4
 """Holes whose lines to a crystal all count less, by the line along the axis of its own hole, are left out."""

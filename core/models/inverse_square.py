@@ -11,11 +11,10 @@ from ..arrays import Floats
 from ..geometry.grid import Grid
 from ..geometry.system import PinholeSystem
 from ..geometry.views import Views
+from ..rays.bundles import Beam
+from ..rays.ray_geometry import view_rays
 from ..validation import instance
-from .bundles import Beam
-from .models import Model
-from .module_views import require_views_of
-from .rays import view_rays
+from .model import Model, require_views_of
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,13 +10,13 @@ import numpy as np
 from ..arrays import Array, Floats
 from ..geometry.grid import Grid
 from ..geometry.views import Views
+from ..rays import backends
+from ..rays.bundles import Beam, Bundle, Bundles
+from ..rays.execution import Execution
+from ..rays.lattices import rounded_up
+from ..rays.ray_geometry import Fan
+from ..rays.tracing import gradient_by_fans
 from ..volumes.volume import Volume
-from . import backends
-from .bundles import Beam, Bundle, Bundles
-from .execution import Execution
-from .lattices import rounded_up
-from .rays import Fan
-from .tracing import gradient_by_fans
 
 # Rays across a voxel, where that is farthest and looks narrowest. Across a voxel of mu there are not fewer than its edges
 # need, nor more than they show; but a ray meets every voxel, since a lattice's holes are sqrt(2) times its step wide.

@@ -14,7 +14,7 @@ from .backends import Backend
 from .bundles import Bundles, Part
 from .lattices import Lattices, filled_lattices
 from .parallel import in_order, run_all, sum_of
-from .rays import Attenuation, Rays, window
+from .ray_geometry import Attenuation, Rays, window
 
 # Rays of a task: with fewer, starting it takes longer than tracing them.
 _FEWEST_RAYS = 2**12

@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from ...arrays import Array
-from ..depth_response import DepthResponse
+from ..arrays import Array
+from .depth_response import DepthResponse
 
 # Steps of central differences, by the largest of their kind.
 _STEP = 1e-6

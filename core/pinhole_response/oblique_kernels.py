@@ -19,7 +19,7 @@ from ..arrays import Array
 from ..physics.aperture import KnifeEdge
 from ..physics.crystal import recorded_depths
 from ..physics.optics import Optics
-from .hole_kernel import Counts, KernelNumbers, Spectra, disc_transform, half_taps
+from .pixel_kernels import Counts, KernelNumbers, Spectra, disc_transform, half_taps
 
 # Attenuation in the edge beyond which what passes is not counted; nodes of Gauss in the crystal.
 _MOST_PASSED, _DEPTHS = 7.5, 32

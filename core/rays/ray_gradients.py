@@ -8,7 +8,7 @@ import numpy as np
 from ..arrays import Floats
 from ..geometry.grid import Grid
 from .bundles import Part
-from .rays import Ends
+from .ray_geometry import Ends
 
 
 def integrals(part: Part, derivatives: Floats) -> Floats:

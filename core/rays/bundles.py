@@ -11,7 +11,7 @@ import numpy as np
 from ..arrays import ArrayOrTensor, Floats, cast_like, is_tensor
 from ..geometry.grid import Grid
 from .lattices import Lattices
-from .rays import Attenuation, Ends, Fan, Rays, index_fans, index_rays
+from .ray_geometry import Attenuation, Ends, Fan, Rays, index_fans, index_rays
 
 KEPT_BYTES = 2**27
 """What a projector keeps of its rays and their weights from call to call takes at most this much memory."""

@@ -31,13 +31,14 @@ from ..errors import InputError
 from ..geometry.frames import moved
 from ..geometry.grid import Grid
 from ..geometry.views import Views
+from ..rays import backends
+from ..rays.lattices import rounded_up
+from ..rays.parallel import in_order, run_all
+from ..rays.ray_geometry import view_rays
 from ..volumes.volume import Volume
 from .depth_response import DepthResponse, Index
-from .hole_nodes import Passage
-from .hole_zone import Sums, ViewNumbers, Zone
-from .lattices import rounded_up
-from .parallel import in_order, run_all
-from .rays import view_rays
+from .depth_zone import Sums, ViewNumbers, Zone
+from .oblique_kernels import Passage
 from .transmittance import Field, VoxelRays
 
 VoxelBox = tuple[tuple[slice, ...], NDArray[np.bool_]]
@@ -376,6 +377,17 @@ class WholeHoles:
         share = round(l / (l + 2 / (1 / near + 1 / far)), 2)
         apart = 1 if passage is None else _pixels_apart(passage, widths[0], float(np.abs(pitch).max()), l)
         return Zone(*of_view, pieces, near, far, planes, steps, limits, share, passage, apart)
+
+
+def depth_functions(backend: str = "auto") -> ModuleType:
+    """Return the module that computes with a `DepthResponse`: `compiled`, or `reference` for numpy and without C kernels."""
+    if backend != "numpy" and backends.choose("auto").name == "cpu":
+        from . import compiled
+
+        return compiled
+    from . import reference
+
+    return reference
 
 
 def _by_taps(image: Array, cells: Array, of: DepthResponse, functions: ModuleType) -> Array:

@@ -6,7 +6,6 @@ float64, all others in float32.
 """
 
 import ctypes
-import math
 import os
 import sys
 from ctypes import POINTER, Structure, c_char_p, c_double, c_int64, c_void_p
@@ -18,8 +17,7 @@ import numpy as np
 from ...arrays import Array, Floats
 from ...errors import InputError
 from ...validation import shape_text
-from ..depth_response import DepthResponse
-from ..rays import Attenuation, IndexFans, IndexRays, Rays
+from ..ray_geometry import Attenuation, IndexFans, IndexRays, Rays
 
 LEVEL_VARIABLE = "MPHDRR_CPU_LEVEL"
 """Environment variable that names a lower level of processor, `levels`, than this one's."""
@@ -29,8 +27,6 @@ _NAMES = {"win32": "siddon.dll", "darwin": "libsiddon.dylib"}
 _MOST_VOXELS = 2**31 - 1  # their indices are of 32 bits
 _PRODUCT = 2  # in kernels.h
 _MOST_PLACES_ALONG = 2**16  # where float32 knows a place to 1/256 of an element; beyond 2^24 it would miss whole ones
-_NODE_ROWS, _GIVEN_ROWS = 4, 16  # in kernels.h
-_READ_ON = 16  # numbers that kernels read beyond the last of what they use
 _MOST_ALONG = 2**12  # where float32 knows the length of a segment to 0.1 %
 
 _FAN = np.dtype(
@@ -45,7 +41,9 @@ _FAN = np.dtype(
 )
 
 
-class _Lattice(Structure):
+class VoxelArray(Structure):
+    """An array of voxels, as kernels.h has it: `Lattice`."""
+
     _fields_ = [("voxels", c_void_p), ("n", c_int64 * 3)]
 
 
@@ -56,15 +54,17 @@ class _RayList(Structure):
 
 class _Job(Structure):
     _fields_ = [
-        ("is_double", c_int64), ("attenuation", c_int64), ("volume", _Lattice), ("mu", _Lattice),
+        ("is_double", c_int64), ("attenuation", c_int64), ("volume", VoxelArray), ("mu", VoxelArray),
         ("fans", c_void_p), ("n_fans", c_int64), ("list", _RayList),
         ("values", c_void_p), ("integrals", c_void_p), ("derivatives", c_void_p), ("gradient", c_void_p),
     ]  # fmt: skip
 
 
-class _DepthJob(Structure):
+class DepthJob(Structure):
+    """A job of the depth-dependent pinhole response, as kernels.h has it."""
+
     _fields_ = [
-        ("is_double", c_int64), ("volume", _Lattice), ("first", c_int64), ("last", c_int64), ("matrix", c_double * 12),
+        ("is_double", c_int64), ("volume", VoxelArray), ("first", c_int64), ("last", c_int64), ("matrix", c_double * 12),
         ("line", c_double * 3), ("shifts", c_void_p), ("pieces", c_int64), ("of_point", c_double), ("of_pair", c_double),
         ("parts_per_cell", c_double), ("nearest", c_double), ("farthest", c_double), ("first_plane", c_double),
         ("planes_per_inverse", c_double), ("passes", c_void_p), ("cells", c_void_p), ("planes", c_int64),
@@ -75,7 +75,9 @@ class _DepthJob(Structure):
     ]  # fmt: skip
 
 
-class _PlacesJob(Structure):
+class PlacesJob(Structure):
+    """A job of the interpolation at the places of another lattice, as kernels.h has it."""
+
     _fields_ = [
         ("is_double", c_int64), ("how", c_int64), ("flat", c_int64), ("by_depth", c_int64), ("points", c_void_p),
         ("n", c_int64 * 3), ("first", c_int64), ("last", c_int64), ("planes", c_void_p), ("middle", c_double),
@@ -86,7 +88,7 @@ class _PlacesJob(Structure):
 
 _KERNELS = {
     _Job: ("forward", "backproject", "differentiate", "differentiate_by_mu"),
-    _DepthJob: (
+    DepthJob: (
         "voxels_to_cells",
         "cells_to_voxels",
         "cells_to_pixels",
@@ -94,7 +96,7 @@ _KERNELS = {
         "differentiate_places",
         "differentiate_taps",
     ),
-    _PlacesJob: ("take_at", "give_at"),
+    PlacesJob: ("take_at", "give_at"),
 }
 
 
@@ -106,7 +108,7 @@ def _load() -> ctypes.CDLL:
     library = ctypes.CDLL(str(path))
     numbers = (c_int64 * 5)()
     library.contract(numbers)
-    sizes = (ctypes.sizeof(_Job), _FAN.itemsize, ctypes.sizeof(_DepthJob), ctypes.sizeof(_PlacesJob))
+    sizes = (ctypes.sizeof(_Job), _FAN.itemsize, ctypes.sizeof(DepthJob), ctypes.sizeof(PlacesJob))
     if tuple(numbers) != (_CONTRACT, *sizes):
         raise ImportError(f"{path} belongs to another version of mphDRR: install it anew")
     library.best_level.restype, library.level_name.restype = c_int64, c_char_p
@@ -118,12 +120,12 @@ def _load() -> ctypes.CDLL:
     return library
 
 
-_library = _load()
+library = _load()
 
 
 def levels() -> list[str]:
     """Names of the levels of processor that this one has, the lowest first."""
-    return [_library.level_name(level).decode() for level in range(_library.best_level() + 1)]
+    return [library.level_name(level).decode() for level in range(library.best_level() + 1)]
 
 
 def _level() -> int:
@@ -140,27 +142,27 @@ level = _level()
 def forward(volume: Array, rays: Rays, attenuation: Attenuation | None = None) -> Array:
     """Line integrals (N,), value x mm, of `volume` (n_x, n_y, n_z) along `rays`, attenuated towards their sources."""
     values = np.empty(len(rays), volume.dtype)
-    _run(_library.forward, volume, rays, attenuation, values)
+    _run(library.forward, volume, rays, attenuation, values)
     return values
 
 
 def backproject(volume: Array, values: Array, rays: Rays, attenuation: Attenuation | None = None) -> None:
     """Add `values` (N,), each along its ray with the weights of `forward`, to `volume` in place."""
-    _run(_library.backproject, volume, rays, attenuation, values)
+    _run(library.backproject, volume, rays, attenuation, values)
 
 
 def derivatives(volume: Array, rays: Rays, attenuation: Attenuation | None = None) -> Array:
     """What the ends of `rays` do to their integrals (N, 7) or (N, 14), as `backends` describes it."""
     integrals = None if attenuation is None else forward(volume, rays, attenuation)
     result = np.empty((7 if attenuation is None else 14, len(rays)))
-    _run(_library.differentiate, volume, rays, attenuation, integrals=integrals, derivatives=result)
+    _run(library.differentiate, volume, rays, attenuation, integrals=integrals, derivatives=result)
     return result.T
 
 
 def mu_gradient(gradient: Array, volume: Array, values: Array, rays: Rays, attenuation: Attenuation) -> None:
     """Add to `gradient`, of mu's shape, in place what mu's voxels do to the sum of `values` (N,) times the integrals."""
     integrals = forward(volume, rays, attenuation)
-    _run(_library.differentiate_by_mu, volume, rays, attenuation, values, integrals=integrals, gradient=gradient)
+    _run(library.differentiate_by_mu, volume, rays, attenuation, values, integrals=integrals, gradient=gradient)
 
 
 def gather(
@@ -181,13 +183,13 @@ def gather(
         raise ValueError("expected exponents, which a product needs")
     others |= {"seen": None if seen is None else seen.ctypes.data, "how": how, "last": len(points)}
     others["exponents"] = None if exponents is None else exponents.ctypes.data
-    _run_places(_library.take_at, points, planes, arrays, matrices, [points, *counts], **others)
+    _run_places(library.take_at, points, planes, arrays, matrices, [points, *counts], **others)
 
 
 def scatter(points: Array, planes: Floats, array: Array, matrix: Floats, slab: slice) -> None:
     """Add to the `slab` of `array` along its first axis, in place, what the adjoint of `gather` gives."""
     first, last, _ = slab.indices(len(array))
-    _run_places(_library.give_at, points, planes, array[None], matrix[None], [array], first=first, last=last)
+    _run_places(library.give_at, points, planes, array[None], matrix[None], [array], first=first, last=last)
 
 
 def _run_places(
@@ -210,7 +212,7 @@ def _run_places(
         raise InputError(f"expected {expected}; got {shape_text(shape)}")
     middle = float(planes[len(planes) // 2])
     relative = np.ascontiguousarray(planes - middle, kind)
-    job = _PlacesJob(
+    job = PlacesJob(
         is_double=kind == np.float64, points=points.ctypes.data, n=points.shape, planes=relative.ctypes.data, middle=middle,
         values=arrays.ctypes.data, arrays=len(arrays), m=shape, matrices=matrices.ctypes.data, **others,
     )  # fmt: skip
@@ -231,8 +233,8 @@ def _run(
     job = _Job(
         is_double=volume.dtype == np.float64,
         attenuation=0 if mu is None else 1 if mu_rays is None else 2,
-        volume=_lattice(volume, volume, kernel is _library.backproject),
-        mu=_Lattice() if mu is None else _lattice(mu, volume),
+        volume=as_lattice(volume, volume, kernel is library.backproject),
+        mu=VoxelArray() if mu is None else as_lattice(mu, volume),
         **{name: array.ctypes.data for name, array in others.items() if array is not None},
     )
     arrays = [_fans(rays, mu_rays)] if isinstance(rays, IndexFans) else _columns(rays, mu_rays)
@@ -263,7 +265,7 @@ def _fans(rays: IndexFans, mu_rays: Any) -> Array:
     return fans
 
 
-def _lattice(voxels: Array, like: Array, written: bool = False) -> _Lattice:
+def as_lattice(voxels: Array, like: Array, written: bool = False) -> VoxelArray:
     """`voxels`, of the same type as `like`."""
     most_along = _MOST_ALONG if voxels.dtype == np.float32 else _MOST_VOXELS
     if voxels.size > _MOST_VOXELS or max(voxels.shape) > most_along:
@@ -274,136 +276,4 @@ def _lattice(voxels: Array, like: Array, written: bool = False) -> _Lattice:
     of_the_kind = kind in (np.float32, np.float64) and kind == like.dtype
     if not of_the_kind or not flags.c_contiguous or written > flags.writeable:
         raise TypeError(f"expected C-ordered voxels of {like.dtype}, got {kind}, strides {voxels.strides}")
-    return _Lattice(voxels.ctypes.data, voxels.shape)
-
-
-def voxels_to_cells(volume: Array, of: DepthResponse, passes: Array | None = None) -> Array:
-    """What `volume` (n_x, n_y, n_z) gives to the cells (planes, rows, columns) of a view's fine image.
-
-    `passes`, of the volume's shape, are the shares of photons that attenuation leaves.
-    """
-    cells = np.zeros(of.shape, volume.dtype)
-    _run_voxels(_library.voxels_to_cells, of, cells, volume, passes)
-    return cells
-
-
-def cells_to_voxels(volume: Array, cells: Array, of: DepthResponse, passes: Array | None, slab: slice) -> None:
-    """Add to the `slab` of `volume` along x, in place, what the adjoint of `voxels_to_cells` gives."""
-    _run_voxels(_library.cells_to_voxels, of, cells, volume, passes, slab)
-
-
-def cells_to_pixels(cells: Array, of: DepthResponse) -> Array:
-    """The image (n_v, n_u) of a view's cells."""
-    image = np.zeros(of.after.shape, cells.dtype)
-    sorted_cells = _sorted_cells(of, cells.dtype)
-    sorted_cells[...] = _by_place(cells * of.before, of)  # faster than products of what is apart
-    _run_pixels(_library.cells_to_pixels, of, sorted_cells, image)
-    image *= of.after
-    return image
-
-
-def pixels_to_cells(image: Array, of: DepthResponse) -> Array:
-    """The adjoint of `cells_to_pixels`."""
-    sorted_cells = _sorted_cells(of, image.dtype)
-    if of.places is not None:
-        sorted_cells[...] = 0
-    _run_pixels(_library.pixels_to_cells, of, sorted_cells, _padded(image, of))
-    cells = np.empty(of.shape, image.dtype)
-    np.multiply(sorted_cells, _by_place(of.before, of), out=_by_place(cells, of), casting="same_kind")
-    return cells
-
-
-def differentiate_places(
-    volume: Array, cells: Array, of: DepthResponse, passes: Array | None = None
-) -> tuple[Floats, Floats]:
-    """Of the sum of `volume` times what `voxels_to_cells`' adjoint gives: by `of.matrix` (3, 4), and by its line (3,)."""
-    gradient = np.zeros(3 + 12 * len(of.pieces))
-    _run_voxels(_library.differentiate_places, of, cells, volume, passes, gradient=gradient)
-    by_shifts = gradient[3:].reshape(-1, 4, 3)  # and times the voxels' indices
-    by_matrix = np.concatenate([by_shifts[:, 1:].sum(axis=0).T, by_shifts[:, 0].sum(axis=0)[:, None]], axis=1)
-    by_matrix[:, :3] += by_shifts[:, 0].T @ of.pieces
-    return by_matrix, gradient[:3]
-
-
-def differentiate_taps(image: Array, cells: Array, of: DepthResponse) -> Floats:
-    """Of the sum of `image` times `cells_to_pixels`: by `of.kernel`, (planes, taps, taps)."""
-    gradient = np.zeros(of.kernel.shape)
-    sorted_cells = _sorted_cells(of, cells.dtype)
-    sorted_cells[...] = _by_place(cells * of.before, of)
-    _run_pixels(_library.differentiate_taps, of, sorted_cells, _padded(image, of), gradient)
-    return gradient
-
-
-def _padded(image: Array, of: DepthResponse) -> Array:
-    """`image` times `of.after`, with the zeros around it that kernels read."""
-    n_v, n_u = image.shape
-    before, together = (of.kernel.shape[-1] - 1) // of.steps[1], of.shape[2] // of.steps[1]
-    padded = np.zeros((n_v, before + -(-together // _READ_ON) * _READ_ON), image.dtype)
-    padded[:, before : before + n_u] = image * of.after
-    return padded[:, before:]
-
-
-def _by_place(cells: Array, of: DepthResponse) -> Array:
-    """`cells` (…, rows, columns) as (…, rows, places in a pixel, pixels)."""
-    return cells.reshape(*cells.shape[:-1], -1, of.steps[1]).swapaxes(-1, -2)
-
-
-def _sorted_cells(of: DepthResponse, kind: Any) -> Array:
-    """Room for cells as `_by_place` has them, in a row, with what kernels read beyond."""
-    planes, rows, columns = of.shape
-    shape = planes, rows, of.steps[1], columns // of.steps[1]
-    room = np.empty(math.prod(shape) + _READ_ON, kind)
-    room[-_READ_ON:] = 0
-    return room[:-_READ_ON].reshape(shape)
-
-
-def _run_voxels(
-    kernel: Any,
-    of: DepthResponse,
-    cells: Array,
-    volume: Array,
-    passes: Array | None,
-    slab: slice = slice(None),
-    gradient: Floats | None = None,
-) -> None:
-    """Run a kernel between the voxels and the cells of one view."""
-    if passes is not None and (passes.shape != volume.shape or passes.dtype != cells.dtype):
-        raise ValueError(f"expected passes of the volume's shape and type, got {passes.shape}, {passes.dtype}")
-    first, last, _ = slab.indices(len(volume))
-    shifts, line = np.ascontiguousarray(of.pieces @ of.matrix[:, :3].T), of.matrix[:, :3] @ of.line
-    job = _DepthJob(
-        is_double=cells.dtype == np.float64, volume=_lattice(volume, cells, kernel is _library.cells_to_voxels),
-        first=first, last=last, matrix=tuple(of.matrix.ravel().tolist()), line=tuple(line.tolist()),
-        shifts=shifts.ctypes.data, pieces=len(shifts), of_point=of.of_point, of_pair=of.of_pair,
-        parts_per_cell=of.parts_per_cell, nearest=of.nearest, farthest=of.farthest, first_plane=of.first_plane,
-        planes_per_inverse=of.planes_per_inverse, passes=None if passes is None else passes.ctypes.data,
-        cells=cells.ctypes.data, planes=of.shape[0], rows=of.shape[1], columns=of.shape[2], step=of.steps,
-        gradient=None if gradient is None else gradient.ctypes.data,
-    )  # fmt: skip
-    kernel(level, job)
-
-
-def _run_pixels(
-    kernel: Any, of: DepthResponse, sorted_cells: Array, image: Array, gradient: Floats | None = None
-) -> None:
-    """Run a kernel between the sorted cells and the pixels of one view."""
-    taps = np.ascontiguousarray(of.padded, image.dtype)
-    if taps.shape[-1] * of.steps[0] < _READ_ON:
-        taps = np.append(taps, np.zeros(_READ_ON, image.dtype))[: taps.size].reshape(taps.shape)
-    nodes: dict[str, Any] = {}
-    if of.places is not None:
-        rows, columns = (np.ascontiguousarray(each) for each in of.places)
-        of_pixels = of.after.shape[1] + 2 * _READ_ON
-        room = np.zeros(_NODE_ROWS * (_GIVEN_ROWS * taps.shape[-1] + of_pixels) + 2 * _READ_ON, image.dtype)
-        columns_of = np.arange(taps.shape[-1]) % of.steps[1] * (of.shape[2] // of.steps[1])
-        columns_of += np.arange(taps.shape[-1]) // of.steps[1]
-        nodes = {"nodes": taps.shape[1:3], "node_rows": rows.ctypes.data, "node_columns": columns.ctypes.data,
-                 "room": room.ctypes.data, "columns_of": columns_of.ctypes.data}  # fmt: skip
-    job = _DepthJob(
-        is_double=image.dtype == np.float64,
-        cells=sorted_cells.ctypes.data, planes=of.shape[0], rows=of.shape[1], columns=of.shape[2],
-        kernel=taps.ctypes.data, bounds=of.bounds.ctypes.data, taps=of.kernel.shape[-2:], step=of.steps,
-        image=image.ctypes.data, row=image.strides[0] // image.itemsize, pixels=of.after.shape,
-        gradient=None if gradient is None else gradient.ctypes.data, **nodes,
-    )  # fmt: skip
-    kernel(level, job)
+    return VoxelArray(voxels.ctypes.data, voxels.shape)

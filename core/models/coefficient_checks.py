@@ -7,38 +7,18 @@ import numpy as np
 
 from ..arrays import Floats32
 from ..geometry.collimator import Construction
-from ..geometry.grid import Grid
-from ..geometry.views import Views
 from ..physics.materials import APERTURES, attenuation
 from ..volumes.volume import Volume
-from .emission import Emission
-from .models import Model
 
 _MOST_THROUGH = 0.005
 """Share of the photons that may pass the solid plate without a word."""
-_NARROW = 1.0
-"""mm: a body is wider, and what is so many metres wide hardly fits into a scanner."""
 _UNNAMED = ((140.5, 1.0),)  # Tc-99m's line, where no isotope is named
 _ABOVE_BONE, _ABOVE_METALS = 2.0, 1.2
 """Times the coefficient of bone, which attenuates most in a body (metal has more, but not much room), and the largest one of
 `APERTURES` (iridium's and platinum's are a little above gold's)."""
 
 
-def doubts(grid: Grid, views: Views, model: Model) -> Iterator[str]:
-    """The warnings about a projector's arguments."""
-    if caution := model.caution(views, grid):
-        yield caution
-    wide = float(np.ptp(grid.corners(), axis=0).max())
-    if wide < _NARROW and max(grid.shape) > 3:
-        near = float(np.linalg.norm(views.sources - grid.center, axis=1).min())
-        yield f"the grid is {wide:.3g} mm wide, {near:.3g} mm from the sources: lengths are in mm; is it in metres?"
-    if not isinstance(model, Emission):
-        return
-    parts: Any = model.parts() if model.is_apart else [model]
-    yield from dict.fromkeys(text for part in parts for text in _doubts_of_coefficients(part))
-
-
-def _doubts_of_coefficients(model: Emission) -> Iterator[str]:
+def coefficient_warnings(model: Any) -> Iterator[str]:
     """Of what attenuates photons of one model's energies."""
     most = max(_largest(model, metal) for metal in APERTURES)
     for name in ("aperture_mu", "crystal_mu"):
@@ -46,12 +26,12 @@ def _doubts_of_coefficients(model: Emission) -> Iterator[str]:
         if value > _ABOVE_METALS * most:
             yield f"{name} is {value:g} 1/mm, more than any material's at its energy ({most:.3g}): is it in 1/cm?"
     if model.plate_thickness is not None and model.wall_thickness is None:
-        yield from _doubts_of_plates(model)
+        yield from _plate_warnings(model)
     if isinstance(model.mu, Volume):
-        yield from doubts_of_mu(model.mu.array, model)
+        yield from mu_warnings(model.mu.array, model)
 
 
-def _doubts_of_plates(model: Emission) -> Iterator[str]:
+def _plate_warnings(model: Any) -> Iterator[str]:
     """Of what passes the solid plates, which only models with walls count."""
     shares = []
     for m in range(len(model.system)):
@@ -65,13 +45,13 @@ def _doubts_of_plates(model: Emission) -> Iterator[str]:
         yield f"emission: photons through the solid plate beside the hole are not counted: {passing}"
 
 
-def doubts_of_mu(mu: Floats32, model: Emission) -> Iterator[str]:
+def mu_warnings(mu: Floats32, model: Any) -> Iterator[str]:
     """Of what attenuates, 1/mm."""
     bone = _largest(model, "bone")
     if (high := mu[mu > _ABOVE_BONE * bone]).sum(dtype=float) > 0.5 * mu.sum(dtype=float):
         yield f"mu is {high.mean():.3g} 1/mm where most photons are lost, bone's is {bone:.3g}: is it in 1/cm?"
 
 
-def _largest(model: Emission, material: str) -> float:
+def _largest(model: Any, material: str) -> float:
     """A material's largest coefficient at the energies that are counted, 1/mm."""
     return max(attenuation(material, energy) for energy, _ in model.photon_lines or _UNNAMED)

@@ -19,7 +19,7 @@ import numpy as np
 
 from ...arrays import ArrayOrTensor as Array
 from ...arrays import is_tensor, namespace
-from ..rays import Attenuation, Rays
+from ..ray_geometry import Attenuation, Rays
 
 # Crossings held at once on a CPU and on a GPU: about ten float64 arrays of this size exist at the same time.
 _CROSSINGS_CPU = 2**17

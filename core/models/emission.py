@@ -22,16 +22,16 @@ from ..physics.crystal import gaussian_blur
 from ..physics.energy_window import FWHM_PER_SIGMA
 from ..physics.isotopes import Isotope
 from ..physics.optics import Edge, Optics
+from ..pinhole_response.oblique_kernels import Passage
+from ..pinhole_response.pinhole_operator import WholeHoles
+from ..rays.bundles import Beam
+from ..rays.ray_geometry import Fan, view_rays
 from ..validation import instance, positive, real_array, strict_whole
 from ..volumes.volume import Volume
-from .bundles import Beam
-from .hole_nodes import Passage
-from .hole_response import WholeHoles
-from .models import Model, checked_background, checked_times
-from .module_views import require_views_of
+from . import coefficient_checks
+from .model import Model, checked_background, checked_times, require_views_of
 from .photon_lines import checked_mu, checked_photons, each_mu, models_of_lines
 from .pixel_points import TOLERANCE, expected_error, lattices, offsets, points_needed, require_points, shadow_edges
-from .rays import Fan, view_rays
 from .wall_penetration import models_with_walls
 
 # A box of this width has the same variance as a Gaussian of sigma 1.
@@ -191,6 +191,8 @@ class Emission(Model):
 
     name = "emission"
     takes = ("activity",)
+    has_times = True
+    has_geometry_gradient = True
 
     def __post_init__(self) -> None:
         instance(self.system, PinholeSystem, "emission")
@@ -446,6 +448,12 @@ class Emission(Model):
         rays = f"{n} point{'s' * (n > 1)} of each pixel"
         off = f"{most} % off (in module {self.system.numbers[module]}), those of larger sources less"
         return f"emission: with {rays} the total counts of a single voxel of {voxel} mm may be {off}; {advice}"
+
+    def coefficient_warnings(self) -> Iterator[str]:
+        """Yield a warning for each attenuation coefficient that looks wrong, of lines apart each text once."""
+        parts: Any = self.parts() if self.is_apart else (self,)
+        checks = coefficient_checks.coefficient_warnings
+        yield from dict.fromkeys(text for part in parts for text in checks(part))
 
     def _pixel_points(self, views: Views, m: int, grid: Grid) -> int:
         """Points of the pixels of view m, for each point of the hole."""

@@ -19,7 +19,7 @@ from .bundles import Beam, Bundle, Bundles, Part
 from .execution import Execution
 from .lattices import require_no_negative
 from .parallel import in_order, thread_count
-from .rays import Ends, Fan
+from .ray_geometry import Ends, Fan
 
 if TYPE_CHECKING:
     from torch import Tensor

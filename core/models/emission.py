@@ -22,8 +22,8 @@ from ..physics.crystal import gaussian_blur
 from ..physics.energy_window import FWHM_PER_SIGMA
 from ..physics.isotopes import Isotope
 from ..physics.optics import Edge, Optics
-from ..pinhole_response.oblique_kernels import Passage
-from ..pinhole_response.pinhole_operator import WholeHoles
+from ..pinhole_response.oblique_kernels import DirectionalEffects
+from ..pinhole_response.pinhole_operator import PinholeOperator
 from ..rays.bundles import Beam
 from ..rays.ray_geometry import Fan, view_rays
 from ..validation import instance, positive, real_array, strict_whole
@@ -407,7 +407,7 @@ class Emission(Model):
         n_v, n_u = views.shape
         return gaussian_blur(n_v, sigma / pitch_v), gaussian_blur(n_u, sigma / pitch_u)
 
-    def by_depth(self, views: Views, grid: Grid) -> WholeHoles | None:
+    def by_depth(self, views: Views, grid: Grid) -> PinholeOperator | None:
         """What projects in place of rays, where the hole's blur is computed without them."""
         if not self._is_by_depth:
             return None
@@ -419,17 +419,18 @@ class Emission(Model):
             within_cone=self.within_cone or self.edge == "path",
         )  # fmt: skip
         sizes = zip(self.system.pinhole_diameter.tolist(), self.system.detector_thickness.tolist(), strict=True)
-        passages = [Passage.of(self._optics_of(m), *size) for m, size in enumerate(sizes)]
-        lengths = self.system.collimator_length + [each.mean_depth for each in passages]
+        effects = [DirectionalEffects.from_optics(self._optics_of(m), *size) for m, size in enumerate(sizes)]
+        lengths = self.system.collimator_length + [module.mean_depth for module in effects]
 
-        def weigh(m: int, u: Floats, v: Floats) -> Floats:
+        def ray_weight(m: int, *, u: Floats, v: Floats) -> Floats:
             (opening,) = everywhere.openings(m, 1)
-            return everywhere.pixel_weights(m, u, v, (1.0, 1.0), float(lengths[m]), opening)
+            # The law depends on u^2 + v^2 alone; in the order v, u the sum has the last digit of earlier versions.
+            return everywhere.pixel_weights(m, v, u, (1.0, 1.0), float(lengths[m]), opening)
 
-        of_modules = self._frames, lengths, everywhere.effective_diameter, sides, weigh
-        slants = None if self.has_one_kernel else passages
+        modules = self._frames, lengths, everywhere.effective_diameter, sides, ray_weight
+        directional = None if self.has_one_kernel else effects
         mu: Any = self.mu  # of models that are computed as a whole one volume
-        return WholeHoles(views, grid, *of_modules, mu, self.hole == "depth", slants)
+        return PinholeOperator(views, grid, *modules, mu, self.hole == "depth", directional)
 
     def caution(self, views: Views, grid: Grid) -> str | None:
         """A warning where there are too few rays for the tolerance."""

@@ -15,7 +15,7 @@ from ..errors import InputError
 from ..geometry.grid import Grid
 from ..geometry.system import PinholeSystem
 from ..geometry.views import Views
-from ..pinhole_response.pinhole_operator import WholeHoles
+from ..pinhole_response.pinhole_operator import PinholeOperator
 from ..rays.bundles import Beam
 from ..rays.ray_geometry import view_rays
 from ..validation import all_above_0, freeze, none_below_0, positive, real_array, shape_text
@@ -96,7 +96,7 @@ class Model(ABC):
         """Factors of the voxels in view m, ``grid.shape``; used if `weights_voxels`."""
         return np.ones(grid.shape)
 
-    def by_depth(self, views: Views, grid: Grid) -> WholeHoles | None:
+    def by_depth(self, views: Views, grid: Grid) -> PinholeOperator | None:
         """What projects in place of rays, if the model is of that kind."""
         return None
 

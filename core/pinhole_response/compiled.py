@@ -1,4 +1,4 @@
-"""The four functions of the depth-dependent pinhole response in C, by the library of the backend cpu."""
+"""Projection, back-projection and gradients with a `DepthResponse` in C; the functions are those of `reference`."""
 
 import math
 from typing import Any
@@ -6,140 +6,158 @@ from typing import Any
 import numpy as np
 
 from ..arrays import Array, Floats
-from ..rays.backends.cpu import DepthJob, as_lattice, level, library
+from ..rays.backends.cpu import DepthJob, as_voxel_array, level, library
 from .depth_response import DepthResponse
 
 _NODE_ROWS, _GIVEN_ROWS = 4, 16  # in kernels.h
-_READ_ON = 16  # numbers that kernels read beyond the last of what they use
+_READ_ON = 16  # numbers that the kernels read beyond the last one that they use
 
 
-def voxels_to_cells(volume: Array, of: DepthResponse, passes: Array | None = None) -> Array:
-    """What `volume` (n_x, n_y, n_z) gives to the cells (planes, rows, columns) of a view's fine image.
+def voxels_to_cells(volume: Array, response: DepthResponse, transmittance: Array | None = None) -> Array:
+    """Return the cells (planes, rows, columns) among which `volume` (n_x, n_y, n_z) is shared out.
 
-    `passes`, of the volume's shape, are the shares of photons that attenuation leaves.
+    `transmittance`, of the volume's shape, is the share of each voxel's photons that attenuation leaves.
     """
-    cells = np.zeros(of.shape, volume.dtype)
-    _run_voxels(library.voxels_to_cells, of, cells, volume, passes)
+    cells = np.zeros(response.shape, volume.dtype)
+    _run_voxels(library.voxels_to_cells, response, cells, volume, transmittance)
     return cells
 
 
-def cells_to_voxels(volume: Array, cells: Array, of: DepthResponse, passes: Array | None, slab: slice) -> None:
-    """Add to the `slab` of `volume` along x, in place, what the adjoint of `voxels_to_cells` gives."""
-    _run_voxels(library.cells_to_voxels, of, cells, volume, passes, slab)
+def cells_to_voxels(
+    volume: Array, cells: Array, response: DepthResponse, transmittance: Array | None, slab: slice
+) -> None:
+    """Add the adjoint of `voxels_to_cells` for `cells` to the `slab` of `volume` along x, in place."""
+    _run_voxels(library.cells_to_voxels, response, cells, volume, transmittance, slab)
 
 
-def cells_to_pixels(cells: Array, of: DepthResponse) -> Array:
-    """The image (n_v, n_u) of a view's cells."""
-    image = np.zeros(of.after.shape, cells.dtype)
-    sorted_cells = _sorted_cells(of, cells.dtype)
-    sorted_cells[...] = _by_place(cells * of.before, of)  # faster than products of what is apart
-    _run_pixels(library.cells_to_pixels, of, sorted_cells, image)
-    image *= of.after
+def cells_to_pixels(cells: Array, response: DepthResponse) -> Array:
+    """Return the image (n_v, n_u) that the pixels sum of the cells."""
+    image = np.zeros(response.pixel_weights.shape, cells.dtype)
+    sorted_cells = _new_sorted_cells(response, cells.dtype)
+    sorted_cells[...] = _by_place(cells * response.cell_weights, response)  # products of strided arrays are slower
+    _run_pixels(library.cells_to_pixels, response, sorted_cells, image)
+    image *= response.pixel_weights
     return image
 
 
-def pixels_to_cells(image: Array, of: DepthResponse) -> Array:
-    """The adjoint of `cells_to_pixels`."""
-    sorted_cells = _sorted_cells(of, image.dtype)
-    if of.places is not None:
+def pixels_to_cells(image: Array, response: DepthResponse) -> Array:
+    """Return the adjoint of `cells_to_pixels` for an image (n_v, n_u), the cells (planes, rows, columns)."""
+    sorted_cells = _new_sorted_cells(response, image.dtype)
+    if response.node_positions is not None:
         sorted_cells[...] = 0
-    _run_pixels(library.pixels_to_cells, of, sorted_cells, _padded(image, of))
-    cells = np.empty(of.shape, image.dtype)
-    np.multiply(sorted_cells, _by_place(of.before, of), out=_by_place(cells, of), casting="same_kind")
+    _run_pixels(library.pixels_to_cells, response, sorted_cells, _padded_image(image, response))
+    cells = np.empty(response.shape, image.dtype)
+    weights = _by_place(response.cell_weights, response)
+    np.multiply(sorted_cells, weights, out=_by_place(cells, response), casting="same_kind")
     return cells
 
 
-def differentiate_places(
-    volume: Array, cells: Array, of: DepthResponse, passes: Array | None = None
+def matrix_gradient(
+    volume: Array, cells: Array, response: DepthResponse, transmittance: Array | None = None
 ) -> tuple[Floats, Floats]:
-    """Of the sum of `volume` times what `voxels_to_cells`' adjoint gives: by `of.matrix` (3, 4), and by its line (3,)."""
-    gradient = np.zeros(3 + 12 * len(of.pieces))
-    _run_voxels(library.differentiate_places, of, cells, volume, passes, gradient=gradient)
-    by_shifts = gradient[3:].reshape(-1, 4, 3)  # and times the voxels' indices
-    by_matrix = np.concatenate([by_shifts[:, 1:].sum(axis=0).T, by_shifts[:, 0].sum(axis=0)[:, None]], axis=1)
-    by_matrix[:, :3] += by_shifts[:, 0].T @ of.pieces
-    return by_matrix, gradient[:3]
+    """Return the gradient of the sum of `volume` times the adjoint of `cells` by the voxels' places.
+
+    It is the gradients by ``response.matrix`` (3, 4) at a constant line, and by the line's vector in (column h, row h, h),
+    (3,).
+    """
+    gradient = np.zeros(3 + 12 * len(response.piece_offsets))
+    _run_voxels(library.differentiate_places, response, cells, volume, transmittance, gradient=gradient)
+    # Of each piece by its shift, and that times the voxels' x, y and z.
+    d_shifts = gradient[3:].reshape(-1, 4, 3)
+    d_matrix = np.concatenate([d_shifts[:, 1:].sum(axis=0).T, d_shifts[:, 0].sum(axis=0)[:, None]], axis=1)
+    d_matrix[:, :3] += d_shifts[:, 0].T @ response.piece_offsets
+    return d_matrix, gradient[:3]
 
 
-def differentiate_taps(image: Array, cells: Array, of: DepthResponse) -> Floats:
-    """Of the sum of `image` times `cells_to_pixels`: by `of.kernel`, (planes, taps, taps)."""
-    gradient = np.zeros(of.kernel.shape)
-    sorted_cells = _sorted_cells(of, cells.dtype)
-    sorted_cells[...] = _by_place(cells * of.before, of)
-    _run_pixels(library.differentiate_taps, of, sorted_cells, _padded(image, of), gradient)
+def kernel_gradient(image: Array, cells: Array, response: DepthResponse) -> Floats:
+    """Return the gradient of the sum of `image` times the pixels of `cells` by ``response.kernels`` (planes, taps, taps)."""
+    gradient = np.zeros(response.kernels.shape)
+    sorted_cells = _new_sorted_cells(response, cells.dtype)
+    sorted_cells[...] = _by_place(cells * response.cell_weights, response)
+    _run_pixels(library.differentiate_taps, response, sorted_cells, _padded_image(image, response), gradient)
     return gradient
 
 
-def _padded(image: Array, of: DepthResponse) -> Array:
-    """`image` times `of.after`, with the zeros around it that kernels read."""
+def _padded_image(image: Array, response: DepthResponse) -> Array:
+    """Return `image` times the pixels' weights, as a view of an array with the zeros around it that the kernels read."""
     n_v, n_u = image.shape
-    before, together = (of.kernel.shape[-1] - 1) // of.steps[1], of.shape[2] // of.steps[1]
-    padded = np.zeros((n_v, before + -(-together // _READ_ON) * _READ_ON), image.dtype)
-    padded[:, before : before + n_u] = image * of.after
-    return padded[:, before:]
+    step, columns = response.cells_per_pixel[1], response.shape[2]
+    zeros_before = (response.kernels.shape[-1] - 1) // step
+    padded = np.zeros((n_v, zeros_before + -(-(columns // step) // _READ_ON) * _READ_ON), image.dtype)
+    padded[:, zeros_before : zeros_before + n_u] = image * response.pixel_weights
+    return padded[:, zeros_before:]
 
 
-def _by_place(cells: Array, of: DepthResponse) -> Array:
-    """`cells` (…, rows, columns) as (…, rows, places in a pixel, pixels)."""
-    return cells.reshape(*cells.shape[:-1], -1, of.steps[1]).swapaxes(-1, -2)
+def _by_place(cells: Array, response: DepthResponse) -> Array:
+    """Return `cells` (…, rows, columns) as a view (…, rows, places in a pixel, pixels)."""
+    return cells.reshape(*cells.shape[:-1], -1, response.cells_per_pixel[1]).swapaxes(-1, -2)
 
 
-def _sorted_cells(of: DepthResponse, kind: Any) -> Array:
-    """Room for cells as `_by_place` has them, in a row, with what kernels read beyond."""
-    planes, rows, columns = of.shape
-    shape = planes, rows, of.steps[1], columns // of.steps[1]
-    room = np.empty(math.prod(shape) + _READ_ON, kind)
-    room[-_READ_ON:] = 0
-    return room[:-_READ_ON].reshape(shape)
+def _new_sorted_cells(response: DepthResponse, dtype: Any) -> Array:
+    """Return an array for cells in the order of `_by_place`, followed in memory by numbers that the kernels read."""
+    planes, rows, columns = response.shape
+    places = response.cells_per_pixel[1]
+    shape = planes, rows, places, columns // places
+    memory = np.empty(math.prod(shape) + _READ_ON, dtype)
+    memory[-_READ_ON:] = 0
+    return memory[:-_READ_ON].reshape(shape)
 
 
 def _run_voxels(
     kernel: Any,
-    of: DepthResponse,
+    response: DepthResponse,
     cells: Array,
     volume: Array,
-    passes: Array | None,
+    transmittance: Array | None,
     slab: slice = slice(None),
     gradient: Floats | None = None,
 ) -> None:
     """Run a kernel between the voxels and the cells of one view."""
-    if passes is not None and (passes.shape != volume.shape or passes.dtype != cells.dtype):
-        raise ValueError(f"expected passes of the volume's shape and type, got {passes.shape}, {passes.dtype}")
+    if transmittance is not None and (transmittance.shape != volume.shape or transmittance.dtype != cells.dtype):
+        shape, dtype = transmittance.shape, transmittance.dtype
+        raise ValueError(f"expected a transmittance of the volume's shape and type, got {shape}, {dtype}")
     first, last, _ = slab.indices(len(volume))
-    shifts, line = np.ascontiguousarray(of.pieces @ of.matrix[:, :3].T), of.matrix[:, :3] @ of.line
+    matrix = response.matrix
+    shifts, line = np.ascontiguousarray(response.piece_offsets @ matrix[:, :3].T), matrix[:, :3] @ response.depth_line
+    planes, rows, columns = response.shape
     job = DepthJob(
-        is_double=cells.dtype == np.float64, volume=as_lattice(volume, cells, kernel is library.cells_to_voxels),
-        first=first, last=last, matrix=tuple(of.matrix.ravel().tolist()), line=tuple(line.tolist()),
-        shifts=shifts.ctypes.data, pieces=len(shifts), of_point=of.of_point, of_pair=of.of_pair,
-        parts_per_cell=of.parts_per_cell, nearest=of.nearest, farthest=of.farthest, first_plane=of.first_plane,
-        planes_per_inverse=of.planes_per_inverse, passes=None if passes is None else passes.ctypes.data,
-        cells=cells.ctypes.data, planes=of.shape[0], rows=of.shape[1], columns=of.shape[2], step=of.steps,
+        is_double=cells.dtype == np.float64, volume=as_voxel_array(volume, cells, kernel is library.cells_to_voxels),
+        first=first, last=last, matrix=tuple(matrix.ravel().tolist()), line=tuple(line.tolist()),
+        shifts=shifts.ctypes.data, pieces=len(shifts), of_point=response.max_point_length,
+        of_pair=response.max_pair_length, parts_per_cell=response.samples_per_cell, nearest=response.nearest,
+        farthest=response.farthest, first_plane=response.first_plane,
+        planes_per_inverse=response.planes_per_inverse_depth,
+        passes=None if transmittance is None else transmittance.ctypes.data,
+        cells=cells.ctypes.data, planes=planes, rows=rows, columns=columns, step=response.cells_per_pixel,
         gradient=None if gradient is None else gradient.ctypes.data,
     )  # fmt: skip
     kernel(level, job)
 
 
 def _run_pixels(
-    kernel: Any, of: DepthResponse, sorted_cells: Array, image: Array, gradient: Floats | None = None
+    kernel: Any, response: DepthResponse, sorted_cells: Array, image: Array, gradient: Floats | None = None
 ) -> None:
     """Run a kernel between the sorted cells and the pixels of one view."""
-    taps = np.ascontiguousarray(of.padded, image.dtype)
-    if taps.shape[-1] * of.steps[0] < _READ_ON:
-        taps = np.append(taps, np.zeros(_READ_ON, image.dtype))[: taps.size].reshape(taps.shape)
+    step_v, step_u = response.cells_per_pixel
+    planes, rows, columns = response.shape
+    kernels = np.ascontiguousarray(response.padded_kernels, image.dtype)
+    if kernels.shape[-1] * step_v < _READ_ON:
+        kernels = np.append(kernels, np.zeros(_READ_ON, image.dtype))[: kernels.size].reshape(kernels.shape)
     nodes: dict[str, Any] = {}
-    if of.places is not None:
-        rows, columns = (np.ascontiguousarray(each) for each in of.places)
-        of_pixels = of.after.shape[1] + 2 * _READ_ON
-        room = np.zeros(_NODE_ROWS * (_GIVEN_ROWS * taps.shape[-1] + of_pixels) + 2 * _READ_ON, image.dtype)
-        columns_of = np.arange(taps.shape[-1]) % of.steps[1] * (of.shape[2] // of.steps[1])
-        columns_of += np.arange(taps.shape[-1]) // of.steps[1]
-        nodes = {"nodes": taps.shape[1:3], "node_rows": rows.ctypes.data, "node_columns": columns.ctypes.data,
-                 "room": room.ctypes.data, "columns_of": columns_of.ctypes.data}  # fmt: skip
+    if response.node_positions is not None:
+        node_rows, node_columns = (np.ascontiguousarray(positions) for positions in response.node_positions)
+        pixel_room = response.pixel_weights.shape[1] + 2 * _READ_ON
+        n_room = _NODE_ROWS * (_GIVEN_ROWS * kernels.shape[-1] + pixel_room) + 2 * _READ_ON
+        room = np.zeros(n_room, image.dtype)
+        columns_of = np.arange(kernels.shape[-1]) % step_u * (columns // step_u)
+        columns_of += np.arange(kernels.shape[-1]) // step_u
+        nodes = {"nodes": kernels.shape[1:3], "node_rows": node_rows.ctypes.data,
+                 "node_columns": node_columns.ctypes.data, "room": room.ctypes.data,
+                 "columns_of": columns_of.ctypes.data}  # fmt: skip
     job = DepthJob(
-        is_double=image.dtype == np.float64,
-        cells=sorted_cells.ctypes.data, planes=of.shape[0], rows=of.shape[1], columns=of.shape[2],
-        kernel=taps.ctypes.data, bounds=of.bounds.ctypes.data, taps=of.kernel.shape[-2:], step=of.steps,
-        image=image.ctypes.data, row=image.strides[0] // image.itemsize, pixels=of.after.shape,
-        gradient=None if gradient is None else gradient.ctypes.data, **nodes,
+        is_double=image.dtype == np.float64, cells=sorted_cells.ctypes.data, planes=planes, rows=rows, columns=columns,
+        kernel=kernels.ctypes.data, bounds=response.tap_bounds.ctypes.data, taps=response.kernels.shape[-2:],
+        step=response.cells_per_pixel, image=image.ctypes.data, row=image.strides[0] // image.itemsize,
+        pixels=response.pixel_weights.shape, gradient=None if gradient is None else gradient.ctypes.data, **nodes,
     )  # fmt: skip
     kernel(level, job)

@@ -1,6 +1,6 @@
-"""Projections without rays: voxels are shared out among the cells of fine images in planes of depth, and back.
+"""The response of one view to the voxels of one depth zone, as numbers that the work is done with.
 
-What the numbers of a view are comes from `hole_response`; the work is done by functions of a backend.
+`zone_response` makes the numbers; `compiled` and `reference` project and back-project with them.
 """
 
 from __future__ import annotations
@@ -21,112 +21,121 @@ Index = tuple[int, ...]
 
 @dataclass(frozen=True, eq=False)
 class DepthResponse:
-    """A view's voxels in a zone of depth: where they lie in a fine image, and what pixels count of the cells there."""
+    """Places of the voxels of a depth zone in a fine image, and the kernels with which pixels sum the cells of that image.
+
+    The image has planes of depth, evenly spaced in 1 / h; docs/pinhole-response.md derives it.
+    """
 
     matrix: Array
-    """(3, 4): of a voxel's indices (x, y, z, 1), to (column h, row h, h)."""
-    pieces: Array
-    """(n, 3): from a voxel's middle to those of its pieces, as indices; each is shared out by itself,"""
-    line: Array
-    """(3,): from end to end, as indices, of the line that a piece is by its depth."""
-    of_point: float
-    """Columns or rows of cells that a line covers up to which it is taken as a point,"""
-    of_pair: float
-    """and as two that share their cells. A longer one is taken as two points"""
-    parts_per_cell: float
-    """and so many more for each cell that it covers, in whole numbers."""
+    """(3, 4), from a voxel's index (x, y, z, 1) to (column h, row h, h): cell column, cell row and depth h, mm."""
+    piece_offsets: Array
+    """(n, 3), centres of the pieces of a voxel relative to its own centre, as indices."""
+    depth_line: Array
+    """(3,), vector from end to end of the line that stands for the depth of a piece, as indices."""
+    max_point_length: float
+    """Length, cells, up to which the line of a piece is sampled by one point."""
+    max_pair_length: float
+    """Length, cells, up to which the line of a piece is sampled by two points on the same 3 x 3 cells."""
+    samples_per_cell: float
+    """Number of points per cell of a longer line, besides two; the product with the length is rounded down."""
     nearest: float
-    """Depth, mm, up to which voxels count nothing,"""
+    """Depth, mm, at or below which a voxel has no weight."""
     farthest: float
-    """and beyond which they count nothing."""
+    """Depth, mm, above which a voxel has no weight."""
     first_plane: float
-    """1 / h of the farthest plane, 1/mm."""
-    planes_per_inverse: float
-    """Planes in 1 / mm of 1 / h."""
-    before: Array
-    """(rows, columns): what a part counts at a cell of the fine image in all, times h^2, and without `after`."""
-    padded: Array
-    """The kernel between rows of zeros, as many as a pixel's rows of cells: the backend cpu reads on into them."""
-    steps: tuple[int, int]
+    """Inverse depth 1 / h of the farthest plane, 1/mm."""
+    planes_per_inverse_depth: float
+    """Number of planes per 1/mm of inverse depth."""
+    cell_weights: Array
+    """(rows, columns), expected counts of a piece of value 1 at a cell, times h^2, without `pixel_weights`."""
+    padded_kernels: Array
+    """`kernels` between rows of zeros, as many as a pixel has rows of cells: the compiled code reads these, too."""
+    cells_per_pixel: tuple[int, int]
     """Rows and columns of cells from a pixel to the next."""
-    after: Array
-    """(n_v, n_u): factors of the pixels."""
-    places: tuple[Array, Array] | None = None
-    """Where the pixels' rows (n_v,) and columns (n_u,) lie on a lattice of nodes, in steps of it.
+    pixel_weights: Array
+    """(n_v, n_u), factors of the pixels."""
+    node_positions: tuple[Array, Array] | None = None
+    """Positions of the pixels' rows (n_v,) and columns (n_u,) in a lattice of nodes, in steps of that lattice.
 
-    Then `padded` has two axes more after the planes', those of the nodes, and a pixel's kernel is mixed linearly from those
-    of the four nodes around it."""
+    With nodes, `padded_kernels` has two axes more after that of the planes, and the kernel of a pixel is mixed linearly from
+    those of the four nodes around it. None where all pixels have the same kernel."""
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        """Planes of depth, and rows and columns of cells in each."""
-        return len(self.padded), *self.before.shape  # type: ignore[return-value]
+        """Number of planes, and rows and columns of cells in each."""
+        return len(self.padded_kernels), *self.cell_weights.shape  # type: ignore[return-value]
 
     @property
-    def kernel(self) -> Array:
-        """(planes, [nodes,] taps, taps): what a pixel counts of the cells from its first on."""
-        return self.padded[..., self.steps[0] : -self.steps[0], :]
+    def kernels(self) -> Array:
+        """(planes, [nodes along v, along u,] taps, taps), weights in a pixel of the cells from its first one on."""
+        return self.padded_kernels[..., self.cells_per_pixel[0] : -self.cells_per_pixel[0], :]
 
     @functools.cached_property
-    def bounds(self) -> NDArray[np.int64]:
-        """(planes, [nodes,] padded rows, 2): where in each row of the kernel taps begin that are not 0, and where they end.
+    def tap_bounds(self) -> NDArray[np.int64]:
+        """(planes, [nodes,] padded rows, 2), the first tap that is not 0 in each row of a kernel, and the end of such taps.
 
-        A node's are those of the next one along v, too.
+        The bounds of a node include those of the next node along v.
         """
-        has = self.padded != 0
-        if self.places is not None:
-            has[:, :-1] |= has[:, 1:]
-        return np.stack([has.argmax(-1), has.shape[-1] - has[..., ::-1].argmax(-1)], -1) * has.any(-1, keepdims=True)
+        has_tap = self.padded_kernels != 0
+        if self.node_positions is not None:
+            has_tap[:, :-1] |= has_tap[:, 1:]
+        ends = np.stack([has_tap.argmax(-1), has_tap.shape[-1] - has_tap[..., ::-1].argmax(-1)], -1)
+        return ends * has_tap.any(-1, keepdims=True)
 
-    def of_nodes(self) -> Iterator[tuple[Index, DepthResponse, tuple[slice, slice], tuple[slice, slice]]]:
-        """Node by node the response of pixels around it by its kernel alone, times its weights; and their part of all.
+    def node_responses(self) -> Iterator[tuple[Index, DepthResponse, tuple[slice, slice], tuple[slice, slice]]]:
+        """Yield each node's number along v and u, the response by its kernel alone, and the pixels and cells concerned.
 
-        Given are the node's number along v and u, and the pixels' and the cells' rows and columns.
+        The response has the pixels between the node and its neighbours, times the node's share in them. Pixels and cells are
+        slices of rows and columns.
         """
-        assert self.places is not None
-        for node in np.ndindex(self.padded.shape[1:3]):
-            shares = [np.maximum(1 - np.abs(at - k), 0) for at, k in zip(self.places, node, strict=True)]
+        assert self.node_positions is not None
+        for node in np.ndindex(self.padded_kernels.shape[1:3]):
+            shares = [np.maximum(1 - np.abs(row - k), 0) for row, k in zip(self.node_positions, node, strict=True)]
             if not (shares[0].any() and shares[1].any()):
                 continue
             pixels, cells = [], []
-            for own, step, size in zip(shares, self.steps, self.before.shape, strict=True):
-                used = np.flatnonzero(own)
+            for share, step, size in zip(shares, self.cells_per_pixel, self.cell_weights.shape, strict=True):
+                used = np.flatnonzero(share)
                 pixels.append(slice(int(used[0]), int(used[-1]) + 1))
-                cells.append(self._cells(pixels[-1], step, len(own), size))
+                cells.append(self._cells(pixels[-1], step, len(share), size))
             rows, columns = pixels
-            after = self.after[rows, columns] * np.outer(shares[0][rows], shares[1][columns])
-            before, padded = np.ascontiguousarray(self.before[tuple(cells)]), self.padded[:, node[0], node[1]]
-            of = replace(self, before=before, padded=np.ascontiguousarray(padded), after=after, places=None)
-            yield node, of, (rows, columns), (cells[0], cells[1])
+            kernels = np.ascontiguousarray(self.padded_kernels[:, node[0], node[1]])
+            weights = self.pixel_weights[rows, columns] * np.outer(shares[0][rows], shares[1][columns])
+            response = replace(self, padded_kernels=kernels, pixel_weights=weights, node_positions=None)
+            response = replace(response, cell_weights=np.ascontiguousarray(self.cell_weights[tuple(cells)]))
+            yield node, response, (rows, columns), (cells[0], cells[1])
 
     @staticmethod
     def _cells(pixels: slice, step: int, n: int, size: int) -> slice:
-        """Cells, of `size` along an axis, that some of n pixels sum."""
+        """Return the cells, of `size` along an axis, that some of its n pixels sum."""
         return slice(step * pixels.start, step * pixels.stop + size - step * n)
 
-    def of_part(self, origin: Index, shape: Index) -> tuple[DepthResponse, tuple[slice, slice]]:
-        """The response to a part of the volume alone, and the rows and columns of pixels that may see it."""
+    def restrict_to_box(self, origin: Index, shape: Index) -> tuple[DepthResponse, tuple[slice, slice]]:
+        """Return the response to a box of the volume alone, and the rows and columns of pixels that may see it."""
         matrix = self.matrix.copy()
         matrix[:, 3] += matrix[:, :3] @ origin
         corners = np.array(list(itertools.product(*((-0.5, n - 0.5) for n in shape), (1,))))
         column, row, depth = matrix @ corners.T
-        if depth.min() <= self.nearest / 2:  # seen from among the voxels, they may be anywhere
+        if depth.min() <= self.nearest / 2:  # the pinhole is among the voxels, which may be seen anywhere
             return replace(self, matrix=matrix), (slice(None), slice(None))
         pixels, cells = [], []
-        sizes = self.kernel.shape[-2:], self.steps, self.after.shape, self.before.shape
-        for at, taps, step, n, size in zip((row, column), *sizes, strict=True):
-            low, high = float((at / depth).min()) - 2, float((at / depth).max()) + 2
+        sizes = self.kernels.shape[-2:], self.cells_per_pixel, self.pixel_weights.shape, self.cell_weights.shape
+        for position, taps, step, n, size in zip((row, column), *sizes, strict=True):
+            low, high = float((position / depth).min()) - 2, float((position / depth).max()) + 2
             start = min(max(math.floor((low - taps) / step) + 1, 0), n - 1)
             stop = max(start, min(math.floor(high / step), n - 1)) + 1
             pixels.append(slice(start, stop))
             cells.append(self._cells(pixels[-1], step, n, size))
-        planes = (1 / depth - self.first_plane) * self.planes_per_inverse
-        nearer = min(max(math.ceil(planes.max()), 1), len(self.padded) - 1)
+        planes = (1 / depth - self.first_plane) * self.planes_per_inverse_depth
+        nearer = min(max(math.ceil(planes.max()), 1), len(self.padded_kernels) - 1)
         farther = min(max(math.floor(planes.min()), 0), nearer - 1)
         matrix[0] -= cells[1].start * matrix[2]
         matrix[1] -= cells[0].start * matrix[2]
-        before, after = self.before[tuple(cells)], self.after[tuple(pixels)]
-        first, padded = self.first_plane + farther / self.planes_per_inverse, self.padded[farther : nearer + 1]
-        places = None if self.places is None else (self.places[0][pixels[0]], self.places[1][pixels[1]])
-        part = replace(self, matrix=matrix, first_plane=first, before=before, padded=padded, after=after, places=places)
-        return part, (pixels[0], pixels[1])
+        positions = self.node_positions
+        response = replace(
+            self, matrix=matrix, first_plane=self.first_plane + farther / self.planes_per_inverse_depth,
+            cell_weights=self.cell_weights[tuple(cells)], padded_kernels=self.padded_kernels[farther : nearer + 1],
+            pixel_weights=self.pixel_weights[tuple(pixels)],
+            node_positions=positions and (positions[0][pixels[0]], positions[1][pixels[1]]),
+        )  # fmt: skip
+        return response, (pixels[0], pixels[1])

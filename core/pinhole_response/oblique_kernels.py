@@ -1,10 +1,10 @@
 """Kernels that depend on the photons' direction: through the knife edge, and into the depth of the crystal.
 
-Where the lines to a pixel pass up to some depth of the edge is an ellipse in the hole's plane. So what the hole lets
-through is a sum of ellipses, each with the Fourier transform of a disc. A photon that is recorded at depth z in the crystal
-would have met the plane at the mean depth elsewhere along its line: the deeper, the nearer to the axis, and the smaller is
-the hole's shadow seen from there. Kernels are made for pixels at nodes, a lattice on the image, and those of a pixel are
-mixed from the four nodes around it.
+The lines to a pixel that cross the edge up to some depth fill an ellipse in the hole's plane. So what the hole lets pass is
+a sum of ellipses, each with the Fourier transform of a disc. A photon that is recorded at depth z in the crystal would have
+met the image's plane, at the mean depth, elsewhere along its line: the deeper, the nearer to the axis, and the smaller is
+the hole's shadow seen from there. Kernels are made for pixels at nodes, a lattice on the image, and the kernel of any pixel
+is mixed from those of the four nodes around it.
 """
 
 import functools
@@ -19,35 +19,35 @@ from ..arrays import Array
 from ..physics.aperture import KnifeEdge
 from ..physics.crystal import recorded_depths
 from ..physics.optics import Optics
-from .pixel_kernels import Counts, KernelNumbers, Spectra, disc_transform, half_taps
+from .pixel_kernels import KernelShape, KernelSpectra, Pair, disc_transform, half_taps
 
-# Attenuation in the edge beyond which what passes is not counted; nodes of Gauss in the crystal.
-_MOST_PASSED, _DEPTHS = 7.5, 32
-# Slopes up to which the edge is a cone's, by the cone's own: steeper lines count nothing.
+# Attenuation in the edge beyond which photons are neglected, and the number of Gauss nodes in the depth of the crystal.
+_MAX_ATTENUATION, _DEPTH_NODES = 7.5, 32
+# Largest slope at which the edge is taken as a cone, in units of the cone's own slope; steeper lines are blocked.
 _STEEPEST = 0.98
-# Taps that are this small, by those inside the shadow, are left out: tails are wide. So are rows and columns at the rim
-# where no tap is more than this, by the largest: ripples of the transform.
-_LEAST, _STRAY = 3e-3, 3e-4
+# Taps below this fraction of those inside the shadow are left out: tails are wide. Rows and columns at the rim in which no
+# tap exceeds the second fraction, of the largest tap, are left out, too: they are ripples of the transform.
+_SMALLEST_TAP, _STRAY_TAP = 3e-3, 3e-4
 
 
 @dataclass(frozen=True)
-class Passage:
-    """What a module's image of a point depends on besides the hole's diameter and the collimator's length."""
+class DirectionalEffects:
+    """Knife edge and crystal of a module, as far as they make its pinhole response depend on the photons' direction."""
 
     knife: KnifeEdge | None
-    """The edge, where it is penetrated by path."""
+    """Edge of the hole, where photons penetrate it by path."""
     crystal_mu: float
-    """1/mm, where photons are recorded at their depth; else 0."""
+    """Attenuation coefficient of the crystal, 1/mm, where photons are recorded at their depth; else 0."""
     thickness: float
-    """The crystal's, mm."""
+    """Thickness of the crystal, mm."""
     mean_depth: float
-    """At which the image's plane lies behind the crystal's front, mm,"""
-    spread: float
-    """and the standard deviation of the depths along the axis."""
+    """Depth of the image's plane behind the crystal's front face, mm: the mean depth of interaction along the axis."""
+    depth_deviation: float
+    """Standard deviation of the depth of interaction along the axis, mm."""
 
     @classmethod
-    def of(cls, optics: Optics, diameter: float, thickness: float) -> Self:
-        """That of a module with a hole of a diameter and a crystal of a thickness, mm."""
+    def from_optics(cls, optics: Optics, diameter: float, thickness: float) -> Self:
+        """Return the effects for a hole of this diameter, mm, and a crystal of this thickness, mm."""
         knife = None
         if optics.edge == "path":
             plate = optics.plate_thickness
@@ -57,304 +57,347 @@ class Passage:
         mu = float(optics.crystal_mu)
         return cls(knife, mu, thickness, *recorded_depths(mu, thickness))
 
-    def of_hole(self, effective: float) -> Self:
-        """The same of a hole of another effective diameter by Paix, mm."""
+    def with_effective_diameter(self, diameter: float) -> Self:
+        """Return the effects for a hole of another effective diameter by Paix, mm."""
         if self.knife is None:
             return self
         depth = self.knife.tangent / self.knife.mu
-        return replace(self, knife=replace(self.knife, radius=(math.hypot(effective, depth) - depth) / 2))
+        return replace(self, knife=replace(self.knife, radius=(math.hypot(diameter, depth) - depth) / 2))
 
     @property
-    def decay(self) -> float:
-        """mm beyond the rim in which what passes along the axis falls by e."""
+    def edge_decay(self) -> float:
+        """Distance beyond the rim, mm, in which the transmittance along the axis falls by a factor of e."""
         return 0.0 if self.knife is None else self.knife.tangent / (2 * self.knife.mu)
 
 
-class Slanted(NamedTuple):
-    """What a pixel's kernel is made of besides `KernelNumbers`; lengths in cells, along v and u."""
+class ObliqueKernel(NamedTuple):
+    """Numbers of one pixel's kernel besides those of `KernelShape`; lengths in cells, along v and u."""
 
-    forms: Array
-    """(n, 3): squared diameters of ellipses as forms f_v^2, f_u^2, f_v f_u,"""
-    centers: Array
-    """(n, 2): their middles,"""
-    shares: Array
-    """(n,): and their shares of what a disc of the hole's diameter would let pass."""
-    shifts: Array
-    """(k, 2): from the pixel to where photons would have been recorded at the mean depth,"""
-    nearer: Array
-    """(k,): how much smaller the hole is, times the part of its shadow that does not grow with l / h,"""
-    weights: Array
-    """(k,): and what of them is,"""
-    mixed: Array
-    """(2,): and the variances of what mixing from node to node does, between nodes and at them on the mean."""
-
-
-def node_places(n: int, apart: int) -> Array:
-    """Numbers of the pixels at the nodes along an axis of n pixels."""
-    return np.arange(max(2, -(-(n - 1) // apart) + 1)) * float(apart)
+    ellipse_forms: Array
+    """(n, 3), squared diameters of the ellipses, as quadratic forms: coefficients of f_v^2, f_u^2 and f_v f_u."""
+    ellipse_centers: Array
+    """(n, 2), centres of the ellipses."""
+    ellipse_weights: Array
+    """(n,), fraction that each ellipse lets pass of what a disc of the hole's diameter would."""
+    depth_shifts: Array
+    """(k, 2), from the pixel to where photons of interaction depth k would have met the image's plane."""
+    hole_scales: Array
+    """(k,), relative change of the constant part d of the hole's shadow d (1 + l / h), seen from interaction depth k."""
+    depth_weights: Array
+    """(k,), fraction of the photons that interact at depth k, by quadrature."""
+    mixing_variance: Array
+    """(2,), variance, cells^2, that mixing between nodes adds to the depth shifts: mean of midway and at the nodes."""
 
 
-def slanted(
-    passage: Passage, diameter: float, length: float, sizes: Array, place: Array, share: float, steps: Array, apart: int
-) -> Slanted:
-    """That of a pixel at a place on the crystal, mm along v and u; cells' `sizes` are in mm, `steps` those of a pixel.
+class NodeLattice(NamedTuple):
+    """Kernels of pixels at the nodes of a lattice on the image."""
 
-    `length` is that to the plane of the image. `share` is the power of the pixels' factors, as in `Zone`; `apart` are
-    pixels from node to node.
+    kernels: list[ObliqueKernel]
+    """Numbers of the nodes' kernels, row by row."""
+    shape: Pair
+    """Number of nodes along v and u."""
+
+
+def node_positions(n: int, spacing: int) -> Array:
+    """Return the pixel numbers of the nodes along an axis of n pixels, `spacing` pixels apart."""
+    return np.arange(max(2, -(-(n - 1) // spacing) + 1)) * float(spacing)
+
+
+def oblique_kernel(
+    effects: DirectionalEffects,
+    diameter: float,
+    length: float,
+    cell_size: Array,
+    position: Array,
+    pixel_exponent: float,
+    cells_per_pixel: Array,
+    node_spacing: int,
+) -> ObliqueKernel:
+    """Return the numbers of the kernel of a pixel at `position`, (2,), mm along v and u on the crystal.
+
+    `length` is from the hole's plane to the image's, mm, `cell_size` (2,) in mm; `pixel_exponent` is that of `DepthZone`,
+    `node_spacing` in pixels.
     """
-    slope = place / length
-    steep = float(np.hypot(*slope))
-    axis = slope / steep if steep > 0 else np.array([1.0, 0.0])
-    parts, across, along, off = np.ones(1), np.full(1, diameter / 2), np.full(1, diameter / 2), np.zeros(1)
-    if passage.knife is not None:
-        soft = passage.decay / float(np.abs(sizes * steps).min())
-        slope_of_edge = min(steep, _STEEPEST * passage.knife.tangent)
-        parts, depths = _layers(passage.knife, slope_of_edge, min(round(6 + 10 * soft), 32))
-        along, off, across = _ellipses(passage.knife, depths, steep, length)
-    shares = parts * along * across / (diameter / 2) ** 2
-    longer = along**2 - across**2
-    forms = 4 * (across**2)[:, None, None] * np.eye(2) + 4 * longer[:, None, None] * np.outer(axis, axis)
-    forms = forms / np.outer(sizes, sizes)
-    shifts, nearer, weights, mixed = np.zeros((1, 2)), np.zeros(1), np.ones(1), np.zeros(2)
-    if passage.crystal_mu:
-        nodes, weights = _gauss(_DEPTHS)
-        z = nodes * passage.thickness
-        stretch = 1 + (z - passage.mean_depth) / length
-        squared = 1 + (steep / stretch) ** 2
-        rate = passage.crystal_mu * np.sqrt(squared)
-        recorded = rate * np.exp(-rate * z) / -np.expm1(-rate * passage.thickness)
-        weights = weights * passage.thickness * recorded / stretch**2
-        weights = weights * ((1 + steep**2) / squared) ** (1.5 * share)  # of the pixel's direction, that of the photon
-        nearer = 1 / stretch - 1
-        shifts = nearer[:, None] * place / sizes
-        mixed = np.average((nearer - np.average(nearer, 0, weights)) ** 2, 0, weights) * (apart * steps) ** 2 / 8
-    each = np.stack([forms[:, 0, 0], forms[:, 1, 1], 2 * forms[:, 0, 1]], -1)
-    return Slanted(each, np.outer(off, axis) / sizes, shares, shifts, nearer, weights, mixed)
+    slope = position / length
+    steepness = float(np.hypot(*slope))
+    axis = slope / steepness if steepness > 0 else np.array([1.0, 0.0])
+    layer_weights, off_center = np.ones(1), np.zeros(1)
+    across, along = np.full(1, diameter / 2), np.full(1, diameter / 2)
+    if effects.knife is not None:
+        softness = effects.edge_decay / float(np.abs(cell_size * cells_per_pixel).min())
+        edge_slope = min(steepness, _STEEPEST * effects.knife.tangent)
+        layer_weights, depths = _edge_layers(effects.knife, edge_slope, min(round(6 + 10 * softness), 32))
+        along, off_center, across = _ellipses(effects.knife, depths, steepness, length)
+    ellipse_weights = layer_weights * along * across / (diameter / 2) ** 2
+    elongation = along**2 - across**2
+    forms = 4 * (across**2)[:, None, None] * np.eye(2) + 4 * elongation[:, None, None] * np.outer(axis, axis)
+    forms = forms / np.outer(cell_size, cell_size)
+    depth_shifts, hole_scales, depth_weights, mixing_variance = np.zeros((1, 2)), np.zeros(1), np.ones(1), np.zeros(2)
+    if effects.crystal_mu:
+        nodes, gauss_weights = _gauss_nodes(_DEPTH_NODES)
+        z = nodes * effects.thickness
+        stretch = 1 + (z - effects.mean_depth) / length
+        squared_secant = 1 + (steepness / stretch) ** 2
+        rate = effects.crystal_mu * np.sqrt(squared_secant)
+        density = rate * np.exp(-rate * z) / -np.expm1(-rate * effects.thickness)
+        depth_weights = gauss_weights * effects.thickness * density / stretch**2
+        # The pixel's factor has the pixel's direction; the photon's own takes its place.
+        depth_weights = depth_weights * ((1 + steepness**2) / squared_secant) ** (1.5 * pixel_exponent)
+        hole_scales = 1 / stretch - 1
+        depth_shifts = hole_scales[:, None] * position / cell_size
+        variance = np.average((hole_scales - np.average(hole_scales, 0, depth_weights)) ** 2, 0, depth_weights)
+        mixing_variance = variance * (node_spacing * cells_per_pixel) ** 2 / 8
+    ellipse_forms = np.stack([forms[:, 0, 0], forms[:, 1, 1], 2 * forms[:, 0, 1]], -1)
+    ellipse_centers = np.outer(off_center, axis) / cell_size
+    ellipses = ellipse_forms, ellipse_centers, ellipse_weights
+    return ObliqueKernel(*ellipses, depth_shifts, hole_scales, depth_weights, mixing_variance)
 
 
-def _layers(knife: KnifeEdge, slope: float, n: int) -> tuple[Array, Array]:
-    """Shares of the photons that pass up to some depths of the edge, and these, mm along the axis."""
+def _edge_layers(knife: KnifeEdge, slope: float, n: int) -> tuple[Array, Array]:
+    """Return weights (n + 1,) and depths of the edge (n + 1,), mm along the axis, of a quadrature over its attenuation.
+
+    The photons that pass are the sum of each weight times the area in which lines cross at most that depth.
+    """
     rate = knife.mu * math.sqrt(1 + slope**2)
-    solid = np.inf if knife.plate is None else rate * knife.plate
-    nodes, weights = _gauss(n)
-    most = min(_MOST_PASSED, solid)
-    parts = most * weights * np.exp(-most * nodes)
-    # The rest: what would pass the solid plate is counted inside the hole alone.
-    return np.append(parts, math.exp(-most)), np.append(most * nodes, most + 0.5 if most < solid else 0.0) / rate
+    plate_attenuation = np.inf if knife.plate is None else rate * knife.plate
+    nodes, gauss_weights = _gauss_nodes(n)
+    largest = min(_MAX_ATTENUATION, plate_attenuation)
+    weights = largest * gauss_weights * np.exp(-largest * nodes)
+    # The last layer is the rest: photons that would pass the solid plate are taken into account inside the hole alone.
+    last_depth = largest + 0.5 if largest < plate_attenuation else 0.0
+    return np.append(weights, math.exp(-largest)), np.append(largest * nodes, last_depth) / rate
 
 
 def _ellipses(knife: KnifeEdge, depths: Array, slope: float, length: float) -> tuple[Array, Array, Array]:
-    """Of ellipses half the axis along the slope, by how much they are off the hole's middle there, and the other half axis.
+    """Return half axis along the slope, offset of the centre along it, and half axis across of ellipses, mm.
 
-    The lines meet in a point `length` behind the hole: their slopes differ from place to place.
+    Each ellipse holds the lines that cross at most one of the `depths` of the edge. They meet in a point `length` behind the
+    hole, so their slopes differ from place to place.
     """
-    found, most = [], _STEEPEST * knife.tangent
-    slope = min(slope, most)
-    for towards, across in ((slope, 0.0), (-slope, 0.0), (0.0, slope)):
+    reaches, steepest = [], _STEEPEST * knife.tangent
+    slope = min(slope, steepest)
+    for outwards, across in ((slope, 0.0), (-slope, 0.0), (0.0, slope)):
         reach = knife.radius + 0 * depths
-        for _ in range(6):
-            along = (towards + reach / length).clip(-most, most)
+        for _ in range(6):  # the slope at the reach depends on the reach
+            along = (outwards + reach / length).clip(-steepest, steepest)
             secant = np.sqrt((1 + along**2 + across**2) / (1 + slope**2))
             reach = knife.reach(depths / secant, along, across)
-        found.append(reach)
-    far, near, side = found
+        reaches.append(reach)
+    far, near, side = reaches
     return (far + near) / 2, (far - near) / 2, side
 
 
 @functools.lru_cache(maxsize=8)
-def _gauss(n: int) -> tuple[Array, Array]:
-    """Nodes and weights from 0 to 1."""
+def _gauss_nodes(n: int) -> tuple[Array, Array]:
+    """Return the n nodes and weights of Gauss's quadrature from 0 to 1."""
     x, w = np.polynomial.legendre.leggauss(n)  # type: ignore[no-untyped-call]
     return (x + 1) / 2, w / 2
 
 
-def node_kernels(numbers: KernelNumbers, steps: Counts, each: list[Slanted], shape: Counts) -> Array:
-    """The kernels (planes, nodes along v, along u, taps, taps) of a lattice of nodes of a `shape`, row by row."""
-    half = _half(numbers, steps, each)
-    spectra, kernels = SlantedSpectra(numbers, steps, half, each, shape), []
-    for spectrum in spectra.of_nodes():
-        image = spectra.spatial(spectrum * spectra.common)
-        kernels.append(_moved(spectra.of_pixels(image)[0], image[1:-1]))
-    found = np.stack(kernels, axis=1)
-    found *= spectra.totals[:, None, None]
-    inside, is_used = [], (found > _STRAY * found.max()).any(axis=(0, 1))
+def node_kernels(shape: KernelShape, cells_per_pixel: Pair, nodes: NodeLattice) -> Array:
+    """Return the kernels (planes, nodes along v, nodes along u, taps, taps)."""
+    half = _half_taps(shape, cells_per_pixel, nodes)
+    spectra, node_list = ObliqueSpectra(shape, cells_per_pixel, half, nodes), []
+    for spectrum in spectra.node_spectra():
+        images = spectra.to_taps(spectrum * spectra.pixel_and_voxel)
+        node_list.append(_restore_centroid(spectra.kernel_taps(images).kernels, images[1:-1]))
+    kernels = np.stack(node_list, axis=1)
+    kernels *= spectra.totals[:, None, None]
+    slices, is_used = [], (kernels > _STRAY_TAP * kernels.max()).any(axis=(0, 1))
     for axis, h in ((-1, half[0]), (-2, half[1])):
         used = np.flatnonzero(is_used.any(axis=axis))
         reach = min(max(h - used[0], used[-1] - h), h)
-        inside.append(slice(h - reach, h + reach + 1))
-    found = found[:, :, inside[0], inside[1]]
-    return found.reshape(len(found), *shape, *found.shape[2:])
+        slices.append(slice(h - reach, h + reach + 1))
+    kernels = kernels[:, :, slices[0], slices[1]]
+    return kernels.reshape(len(kernels), *nodes.shape, *kernels.shape[2:])
 
 
-class NodesGradient:
-    """A sum over nodes' kernels as a linear form of what these are made of: near some numbers, it changes as the sum does.
+class NodeKernelGradient:
+    """A loss that depends on the kernels of nodes, as a linear form of the numbers that these are made of.
 
-    `by` are the sum's derivatives by the kernels of `node_kernels`.
+    Near the numbers given here the form changes as the loss does. `d_kernels` is the gradient by what `node_kernels`
+    returns.
     """
 
-    def __init__(self, numbers: KernelNumbers, steps: Counts, each: list[Slanted], shape: Counts, by: Array) -> None:
-        half = _half(numbers, steps, each)
-        self._given = steps, half
-        spectra = SlantedSpectra(numbers, steps, half, each, shape)
-        self._common = spectra.common
-        more = [(0, 0), *((h - n // 2,) * 2 for h, n in zip(half, by.shape[-2:], strict=True))]
-        self._waves, totals = [], []
-        self._by_common, self._by_bend, self._by_least = np.zeros(spectra.common.shape), np.zeros(2), np.zeros(len(by))
-        of_each = by.reshape(len(by), len(each), *by.shape[-2:]).swapaxes(0, 1)
-        for given, spectrum, total in zip(of_each, spectra.of_nodes(), spectra.totals, strict=True):
-            own, image = np.pad(given, more), spectra.spatial(spectrum * spectra.common)
-            found = spectra.of_pixels(image)
-            totals.append(np.vdot(own, _moved(found[0], image[1:-1])))
-            by_kernel, by_inner = _moved_gradient(own * total, found[0], image[1:-1])
-            by_image, by_bend, by_least = spectra.of_pixels_gradient(by_kernel, image, found)
-            by_image[1:-1] += by_inner
-            wave = spectra.by_spectra(by_image)
-            self._by_common += (wave.conj() * spectrum).real
-            self._by_bend += by_bend
-            self._by_least += by_least
-            self._waves.append(wave)
-        self._by_totals = np.array(totals)
+    def __init__(self, shape: KernelShape, cells_per_pixel: Pair, nodes: NodeLattice, d_kernels: Array) -> None:
+        self._taps = cells_per_pixel, _half_taps(shape, cells_per_pixel, nodes)
+        spectra, n_planes = ObliqueSpectra(shape, *self._taps, nodes), len(d_kernels)
+        left_out = [(0, 0), *((h - n // 2,) * 2 for h, n in zip(spectra.half, d_kernels.shape[-2:], strict=True))]
+        self._d_spectra, d_totals = [], []
+        self._d_pixel_and_voxel = np.zeros(spectra.pixel_and_voxel.shape)
+        self._d_curvature, self._d_smallest_tap = np.zeros(2), np.zeros(n_planes)
+        d_nodes = d_kernels.reshape(n_planes, len(nodes.kernels), *d_kernels.shape[-2:]).swapaxes(0, 1)
+        for d_node, spectrum, total in zip(d_nodes, spectra.node_spectra(), spectra.totals, strict=True):
+            d_padded, images = np.pad(d_node, left_out), spectra.to_taps(spectrum * spectra.pixel_and_voxel)
+            taps = spectra.kernel_taps(images)
+            d_totals.append(np.vdot(d_padded, _restore_centroid(taps.kernels, images[1:-1])))
+            d_taps, d_inner = _restore_centroid_gradient(d_padded * total, taps.kernels, images[1:-1])
+            d_images, d_curvature, d_smallest_tap = spectra.kernel_taps_gradient(d_taps, images, taps)
+            d_images[1:-1] += d_inner
+            d_spectrum = spectra.to_taps_adjoint(d_images)
+            self._d_pixel_and_voxel += (d_spectrum.conj() * spectrum).real
+            self._d_curvature += d_curvature
+            self._d_smallest_tap += d_smallest_tap
+            self._d_spectra.append(d_spectrum)
+        self._d_totals = np.array(d_totals)
 
-    def of_edges(self, numbers: KernelNumbers) -> float:
-        """The form, but for a constant, where only `edges` are others."""
-        return float(np.vdot(self._by_common, Spectra(numbers, *self._given).common))
+    def value_by_edges(self, shape: KernelShape) -> float:
+        """Return the form, up to a constant, for a shape that differs in `voxel_edges` alone."""
+        return float(np.vdot(self._d_pixel_and_voxel, KernelSpectra(shape, *self._taps).pixel_and_voxel))
 
-    def __call__(self, numbers: KernelNumbers, each: list[Slanted], shape: Counts) -> float:
-        """The form."""
-        spectra = SlantedSpectra(numbers, *self._given, each, shape)
-        total = self._by_totals @ spectra.totals + self._by_bend @ numbers.bend
-        total += self._by_least @ spectra.least.ravel()
-        for wave, spectrum in zip(self._waves, spectra.of_nodes(), strict=True):
-            total += np.vdot(wave, spectrum * spectra.common).real
+    def value(self, shape: KernelShape, nodes: NodeLattice) -> float:
+        """Return the form, up to a constant, for other numbers of the kernels."""
+        spectra = ObliqueSpectra(shape, *self._taps, nodes)
+        total = self._d_totals @ spectra.totals + self._d_curvature @ shape.curvature
+        total += self._d_smallest_tap @ spectra.smallest_tap.ravel()
+        for d_spectrum, spectrum in zip(self._d_spectra, spectra.node_spectra(), strict=True):
+            total += np.vdot(d_spectrum, spectrum * spectra.pixel_and_voxel).real
         return float(total)
 
 
-def _half(numbers: KernelNumbers, steps: Counts, each: list[Slanted]) -> Counts:
-    """Taps on each side of the middle one that all nodes need."""
-    shifts = np.max([np.abs(own.shifts).max(axis=0) for own in each], axis=0)
-    return half_taps(numbers._replace(hole=_widest(each)), steps, shifts)
+def _half_taps(shape: KernelShape, cells_per_pixel: Pair, nodes: NodeLattice) -> Pair:
+    """Return the number of taps on each side of the central one that suffices for all nodes."""
+    shifts = np.max([np.abs(node.depth_shifts).max(axis=0) for node in nodes.kernels], axis=0)
+    return half_taps(shape._replace(hole_diameter=_largest_diameters(nodes)), cells_per_pixel, shifts)
 
 
-def _moved(kernel: Array, image: Array) -> Array:
-    """A kernel (planes, taps, taps) with the mean place of the image, from which the faint end of a tail was taken."""
-    tilt = np.ones_like(kernel)
-    for other in (2, 1):
-        along, wanted = (each.sum(axis=other) / each.sum(axis=(1, 2))[:, None] for each in (kernel, image))
-        taps = np.arange(along.shape[1]) - along.shape[1] // 2
-        mean = (along * taps).sum(axis=1, keepdims=True)
-        off = taps - mean
-        missing = (wanted * taps).sum(axis=1, keepdims=True) - mean
-        tilt += np.expand_dims(missing * off / (along * off**2).sum(axis=1, keepdims=True), other)
-    return np.asarray(kernel * tilt.clip(min=0))
+def _restore_centroid(kernels: Array, images: Array) -> Array:
+    """Return kernels (planes, taps, taps) with the centroid of the images; the faint end of a tail was cut off them.
+
+    Each is multiplied by a factor that is linear along v and u, and not negative.
+    """
+    tilt = np.ones_like(kernels)
+    for other_axis in (2, 1):
+        sums = ((array.sum(axis=other_axis), array.sum(axis=(1, 2))[:, None]) for array in (kernels, images))
+        profile, image_profile = (along / total for along, total in sums)
+        taps = np.arange(profile.shape[1]) - profile.shape[1] // 2
+        mean = (profile * taps).sum(axis=1, keepdims=True)
+        off_mean = taps - mean
+        missing = (image_profile * taps).sum(axis=1, keepdims=True) - mean
+        variance = (profile * off_mean**2).sum(axis=1, keepdims=True)
+        tilt += np.expand_dims(missing * off_mean / variance, other_axis)
+    return np.asarray(kernels * tilt.clip(min=0))
 
 
-def _mean(of: Array, values: Array) -> Array:
-    return np.asarray((of * values).sum(axis=(1, 2), keepdims=True) / of.sum(axis=(1, 2), keepdims=True))
+def _weighted_mean(weights: Array, values: Array) -> Array:
+    """Return the mean of `values` over the taps of each plane, (planes, 1, 1)."""
+    total = (weights * values).sum(axis=(1, 2), keepdims=True)
+    return np.asarray(total / weights.sum(axis=(1, 2), keepdims=True))
 
 
-def _moved_gradient(by: Array, kernel: Array, image: Array) -> tuple[Array, Array]:
-    """Derivatives by the kernel and the image of `_moved`, from those by what it gives."""
-    tilt, by_kernel, by_image = np.ones_like(kernel), np.zeros_like(kernel), np.zeros_like(image)
-    places = []
+def _restore_centroid_gradient(d_result: Array, kernels: Array, images: Array) -> tuple[Array, Array]:
+    """Return the gradients by the kernels and by the images from that by the result of `_restore_centroid`."""
+    tilt, d_kernels, d_images = np.ones_like(kernels), np.zeros_like(kernels), np.zeros_like(images)
+    moments = []
     for axis in (1, 2):
-        taps = np.expand_dims(np.arange(kernel.shape[axis]) - kernel.shape[axis] // 2, 2 - axis)
-        off, off_image = taps - _mean(kernel, taps), taps - _mean(image, taps)
-        spread, missing = _mean(kernel, off**2), _mean(image, off)
-        tilt += missing * off / spread
-        places.append((off, off_image, spread, missing))
-    by_tilt = by * kernel * (tilt > 0)
-    for off, off_image, spread, missing in places:
-        first = (by_tilt * off).sum(axis=(1, 2), keepdims=True) / spread
-        by_mean = -first - missing / spread * by_tilt.sum(axis=(1, 2), keepdims=True)
-        by_kernel += by_mean * off - missing / spread * first * (off**2 - spread)
-        by_image += first * off_image
-    by_kernel /= kernel.sum(axis=(1, 2), keepdims=True)
-    by_image /= image.sum(axis=(1, 2), keepdims=True)
-    return by_kernel + by * tilt.clip(min=0), by_image
+        taps = np.expand_dims(np.arange(kernels.shape[axis]) - kernels.shape[axis] // 2, 2 - axis)
+        off_mean, off_image_mean = taps - _weighted_mean(kernels, taps), taps - _weighted_mean(images, taps)
+        variance, missing = _weighted_mean(kernels, off_mean**2), _weighted_mean(images, off_mean)
+        tilt += missing * off_mean / variance
+        moments.append((off_mean, off_image_mean, variance, missing))
+    d_tilt = d_result * kernels * (tilt > 0)
+    for off_mean, off_image_mean, variance, missing in moments:
+        d_missing = (d_tilt * off_mean).sum(axis=(1, 2), keepdims=True) / variance
+        d_mean = -d_missing - missing / variance * d_tilt.sum(axis=(1, 2), keepdims=True)
+        d_kernels += d_mean * off_mean - missing / variance * d_missing * (off_mean**2 - variance)
+        d_images += d_missing * off_image_mean
+    d_kernels /= kernels.sum(axis=(1, 2), keepdims=True)
+    d_images /= images.sum(axis=(1, 2), keepdims=True)
+    return d_kernels + d_result * tilt.clip(min=0), d_images
 
 
-def _widest(each: list[Slanted]) -> Array:
-    """The largest diameters of all ellipses, (2,)."""
-    widest: Array = np.max([(np.sqrt(own.forms[:, :2]) + 2 * np.abs(own.centers)).max(axis=0) for own in each], axis=0)
-    return widest
+def _largest_diameters(nodes: NodeLattice) -> Array:
+    """Return the largest diameters of all ellipses around the hole's centre, (2,), cells."""
+    reaches = [np.sqrt(node.ellipse_forms[:, :2]) + 2 * np.abs(node.ellipse_centers) for node in nodes.kernels]
+    diameters: Array = np.max([reach.max(axis=0) for reach in reaches], axis=0)
+    return diameters
 
 
-class SlantedSpectra(Spectra):
-    """The spectra of nodes' images. What passes the hole is made for 3 x 3 of them, and is quadratic between these."""
+class ObliqueSpectra(KernelSpectra):
+    """Spectra of the images of nodes. What the hole lets pass is computed at 3 x 3 nodes and is quadratic between these."""
 
-    def __init__(self, numbers: KernelNumbers, steps: Counts, half: Counts, each: list[Slanted], shape: Counts) -> None:
-        super().__init__(numbers, steps, half)
-        self.each = each
-        chosen, self.bases = zip(*(_quadratic(n) for n in shape), strict=True)
-        self.holes = np.array([[self._hole(each[i * shape[1] + j]) for j in chosen[1]] for i in chosen[0]])
-        passed = np.reshape([own.shares.sum() for own in each], shape)
-        self.passed = self.bases[0] @ passed[np.ix_(*chosen)] @ self.bases[1].T
+    def __init__(self, shape: KernelShape, cells_per_pixel: Pair, half: Pair, nodes: NodeLattice) -> None:
+        super().__init__(shape, cells_per_pixel, half)
+        self.nodes, columns = nodes, nodes.shape[1]
+        chosen, self._bases = zip(*(_quadratic_basis(n) for n in nodes.shape), strict=True)
+        holes = [[self._hole_spectrum(nodes.kernels[i * columns + j]) for j in chosen[1]] for i in chosen[0]]
+        self._holes: Array = np.array(holes)
+        passed = np.reshape([node.ellipse_weights.sum() for node in nodes.kernels], nodes.shape)
+        self._interpolated_passed = self._bases[0] @ passed[np.ix_(*chosen)] @ self._bases[1].T
         exact = passed - sum(_second_difference(passed, axis) / 12 for axis in (0, 1))
-        self.totals = exact.ravel() * [own.weights.sum() for own in each]
+        self.totals = exact.ravel() * [node.depth_weights.sum() for node in nodes.kernels]
 
     @property
-    def least(self) -> Array:
-        """(planes, 1, 1): by what a tap would be if those in the widest shadow and a pixel were alike."""
-        shadow = np.pi / 4 * _widest(self.each).prod() * (1 + self.numbers.slopes) ** 2
-        return np.asarray(_LEAST / (shadow + math.prod(self.steps)))[:, None, None]
+    def smallest_tap(self) -> Array:
+        """(planes, 1, 1), a fraction of the tap that a uniform kernel over the widest shadow and a pixel would have."""
+        shadow = np.pi / 4 * _largest_diameters(self.nodes).prod() * (1 + self.shape.image_scales) ** 2
+        return np.asarray(_SMALLEST_TAP / (shadow + math.prod(self.cells_per_pixel)))[:, None, None]
 
-    def _hole(self, own: Slanted) -> Array:
-        """What passes the hole; and with depths, how that grows with the shadow's part that is not l / h."""
-        f_v, f_u = self.f
+    def _hole_spectrum(self, node: ObliqueKernel) -> Array:
+        """Return the spectrum of what passes the hole, (1 or 2, planes + 2, f_v, f_u).
+
+        With interaction depths the second array is its derivative by `hole_scales`.
+        """
+        f_v, f_u = self.frequencies
         total: Array = 0.0  # type: ignore[assignment]
-        for form, center, share in zip(own.forms, own.centers, own.shares, strict=True):
+        for form, center, weight in zip(node.ellipse_forms, node.ellipse_centers, node.ellipse_weights, strict=True):
             radius = np.sqrt(np.maximum(form[0] * f_v**2 + form[1] * f_u**2 + form[2] * f_v * f_u, 0))
-            disc, rise = disc_transform((1 + self.slopes) * radius)
-            disc = share * (np.stack([disc, radius * rise]) if own.nearer.any() else disc[None])
+            disc, derivative = disc_transform((1 + self.image_scales) * radius)
+            disc = weight * (np.stack([disc, radius * derivative]) if node.hole_scales.any() else disc[None])
             if center.any():
-                v, u = (np.exp(-2j * np.pi * (1 + self.slopes) * at * f) for at, f in zip(center, self.f, strict=True))
+                along_axes = zip(center, self.frequencies, strict=True)
+                v, u = (np.exp(-2j * np.pi * (1 + self.image_scales) * offset * f) for offset, f in along_axes)
                 disc = disc * v * u
             total = total + disc
         return total
 
-    def _smear(self, own: Slanted) -> Array:
-        """The spectrum of what the depth in the crystal does: to images, and as far as the hole's size is concerned."""
-        waves = [np.exp(-2j * np.pi * np.outer(own.shifts[:, i], f.ravel())) for i, f in enumerate(self.f)]
-        shares = np.stack([own.weights, own.weights * own.nearer]) / own.weights.sum()
-        total: Array = (waves[0] * shares[:, :, None]).swapaxes(1, 2) @ waves[1]
-        return total * (1 + 2 * np.pi**2 * (own.mixed[0] * self.f[0] ** 2 + own.mixed[1] * self.f[1] ** 2))
+    def _depth_spectrum(self, node: ObliqueKernel) -> Array:
+        """Return the factors (2, f_v, f_u) of the interaction depths, on the hole's spectrum and on its derivative."""
+        phases = [
+            np.exp(-2j * np.pi * np.outer(node.depth_shifts[:, i], f.ravel())) for i, f in enumerate(self.frequencies)
+        ]
+        weights = np.stack([node.depth_weights, node.depth_weights * node.hole_scales]) / node.depth_weights.sum()
+        total: Array = (phases[0] * weights[:, :, None]).swapaxes(1, 2) @ phases[1]
+        f_v, f_u = self.frequencies
+        return total * (1 + 2 * np.pi**2 * (node.mixing_variance[0] * f_v**2 + node.mixing_variance[1] * f_u**2))
 
-    def of_nodes(self) -> Iterator[Array]:
-        """The spectra of the nodes' images, without `common`, one by one, row by row."""
-        each = iter(self.each)
-        for of_row, passed in zip(self.bases[0], self.passed, strict=True):
-            row = _mixed(of_row, self.holes)
-            for of_node, share in zip(self.bases[1], passed, strict=True):
-                hole, smear = _mixed(of_node, row), self._smear(next(each)) / share
-                total = hole[0] * smear[0]
+    def node_spectra(self) -> Iterator[Array]:
+        """Yield the spectra (planes + 2, f_v, f_u) of the nodes' images row by row, without `pixel_and_voxel`."""
+        nodes = iter(self.nodes.kernels)
+        for row_basis, passed_row in zip(self._bases[0], self._interpolated_passed, strict=True):
+            row = _weighted_sum(row_basis, self._holes)
+            for column_basis, passed in zip(self._bases[1], passed_row, strict=True):
+                hole, depth = _weighted_sum(column_basis, row), self._depth_spectrum(next(nodes)) / passed
+                total = hole[0] * depth[0]
                 if len(hole) > 1:
-                    total += hole[1] * smear[1]
+                    total += hole[1] * depth[1]
                 yield total
 
 
-def _mixed(shares: Array, of: Array) -> Array:
-    """The sum along the first axis, each by its share: faster than a product of matrices where they are few."""
-    total: Array = of[0] * shares[0]
-    for one, share in zip(of[1:], shares[1:], strict=True):
-        total += one * share
+def _weighted_sum(weights: Array, arrays: Array) -> Array:
+    """Return the weighted sum along the first axis; for few arrays this is faster than a product of matrices."""
+    total: Array = arrays[0] * weights[0]
+    for array, weight in zip(arrays[1:], weights[1:], strict=True):
+        total += array * weight
     return total
 
 
 def _second_difference(values: Array, axis: int) -> Array:
+    """Return the second difference along an axis, of the shape of `values`; 0 along an axis of fewer than three."""
     if values.shape[axis] < 3:
         return np.zeros_like(values)
     ends = [(1, 1) if i == axis else (0, 0) for i in range(values.ndim)]
     return np.pad(np.diff(values, 2, axis=axis), ends, "edge")
 
 
-def _quadratic(n: int) -> tuple[list[int], Array]:
-    """Up to three of n nodes, and what each has to do with those between, (n, 3).
+def _quadratic_basis(n: int) -> tuple[list[int], Array]:
+    """Return up to three of n nodes, and the weights (n, 3) with which quantities of these give those of all nodes.
 
-    Less what linear mixing between nodes adds on the mean.
+    The interpolation is quadratic, less what linear mixing between nodes adds on average.
     """
     if n < 3:
         return list(range(n)), np.eye(n)
     chosen = [0, (n - 1) // 2, n - 1]
-    each = [np.prod([(np.arange(n) - b) / (a - b) for b in chosen if b != a], axis=0) for a in chosen]
-    bases = np.stack(each, axis=-1)
+    factors = [[(np.arange(n) - b) / (a - b) for b in chosen if b != a] for a in chosen]
+    bases = np.stack([np.prod(pair, axis=0) for pair in factors], axis=-1)
     return chosen, bases - np.diff(bases[:3], 2, axis=0) / 12

@@ -16,8 +16,8 @@ from ..geometry.grid import Grid
 from ..geometry.views import Views
 from ..memory import Requirements
 from ..models.model import Model, Transmission, each_pixel
-from ..pinhole_response.pinhole_operator import depth_functions
-from ..pinhole_response.transmittance import Field
+from ..pinhole_response.pinhole_operator import depth_backend
+from ..pinhole_response.transmittance import ArrayOnGrid
 from ..progress import Progress, part_of, tell
 from ..rays import backends
 from ..rays.bundles import Bundle, Bundles
@@ -358,9 +358,9 @@ class Projector(LinearOperator):
         return Execution(backend, self.grid, mu_grid, float64, self.threads)
 
     def _depth_arguments(self, x: ArrayOrTensor) -> tuple[ArrayOrTensor, Any, int]:
-        """What `WholeHoles` takes: the array, the functions and the threads."""
+        """Return what `PinholeOperator` takes: the array, the module that computes, and the threads."""
         double = self._float64 or self._backend.always_float64 or is_double(x)
-        functions = depth_functions(self._backend.name)
+        functions = depth_backend(self._backend.name)
         return np.ascontiguousarray(to_numpy(x, np.float64 if double else np.float32)), functions, self.threads
 
     def _depth_mu_gradient(
@@ -386,7 +386,7 @@ class Projector(LinearOperator):
         """The voxels so close to a pinhole that rays project them: view, a box of the grid, which in it, their projector."""
         parts = []
         for m in range(len(self.views)):
-            found = None if self._depths is None else self._depths.close(m)
+            found = None if self._depths is None else self._depths.close_voxels(m)
             if found is not None:
                 box, close = found
                 grid, which = self.grid.box([each.start for each in box], close.shape), np.array([m])
@@ -395,9 +395,9 @@ class Projector(LinearOperator):
                     parts.append((m, box, close, Projector(grid, self.views[which], model, **self._settings)))
         return parts
 
-    def _mu_field(self, mu: ArrayOrTensor) -> Field | None:
+    def _mu_field(self, mu: ArrayOrTensor) -> ArrayOnGrid | None:
         """`mu` on the grid of the model's."""
-        return None if mu is None else Field(to_numpy(mu, None), self.model.mu.grid)  # type: ignore[union-attr]
+        return None if mu is None else ArrayOnGrid(to_numpy(mu, None), self.model.mu.grid)  # type: ignore[union-attr]
 
     def _mu(self, mu: ArrayOrTensor) -> ArrayOrTensor:
         return self.model.mu.array if mu is None and self.model.mu is not None else mu

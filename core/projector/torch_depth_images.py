@@ -13,9 +13,9 @@ from ..errors import InputError
 from ..geometry.grid import Grid
 from ..geometry.views import Views
 from ..physics.optics import Optics
-from ..pinhole_response.oblique_kernels import Passage
-from ..pinhole_response.pinhole_operator import WholeHoles, depth_functions
-from ..pinhole_response.transmittance import Field
+from ..pinhole_response.oblique_kernels import DirectionalEffects
+from ..pinhole_response.pinhole_operator import PinholeOperator, depth_backend
+from ..pinhole_response.transmittance import ArrayOnGrid
 from ..rays import autograd
 from ..rays.lattices import require_no_negative
 from ..rays.parallel import thread_count
@@ -63,9 +63,9 @@ def depth_images(
         kind = np.float64 if is_double(array) or is_double(positions) else np.float32
         given, on_mu = to_numpy(array, kind), None
         if attenuation is not None:
-            on_mu = Field(require_no_negative(to_numpy(attenuation, kind)), mu_grid)
+            on_mu = ArrayOnGrid(require_no_negative(to_numpy(attenuation, kind)), mu_grid)
         model = _whole_holes(grid, poses, holes, effective, shape, plain, on_mu)
-        functions = depth_functions()
+        functions = depth_backend()
         threads = thread_count(None)
         images = np.stack(list(model.images(given, functions, threads))).reshape(*cameras, *shape)
 
@@ -105,8 +105,8 @@ def _whole_holes(
     effective: Tensor,
     shape: tuple[int, int],
     optics: Optics,
-    mu: Field | None,
-) -> WholeHoles:
+    mu: ArrayOnGrid | None,
+) -> PinholeOperator:
     """The model of cameras that stand still."""
     n = poses[0][..., 0].numel()
 
@@ -118,17 +118,19 @@ def _whole_holes(
     thickness, hole = each(holes.thickness), each(holes.diameter)
     numbers = {name: each(x) if is_tensor(x) else x for name, x in optics.numbers.items()}
     optics = replace(optics.with_numbers(numbers), within_crystal=False, within_walls=False)
-    passages = [Passage.of(optics.of_modules(m, n), float(hole[m]), float(thickness[m])) for m in range(n)]
+    passages = [
+        DirectionalEffects.from_optics(optics.of_modules(m, n), float(hole[m]), float(thickness[m])) for m in range(n)
+    ]
     lengths, plain = each(holes.length) + [each.mean_depth for each in passages], _one_kernel(optics)
 
-    def weigh(m: int, along_v: Any, along_u: Any) -> Any:
+    def ray_weight(m: int, *, u: Any, v: Any) -> Any:
         own = plain.of_modules(m, n)
         (opening,) = own.openings(hole[m])
-        return own.pixel_weights((along_u, along_v), (1.0, 1.0), lengths[m], np.inf, thickness[m], opening)
+        return own.pixel_weights((u, v), (1.0, 1.0), lengths[m], np.inf, thickness[m], opening)
 
     slants = None if optics.edge == "paix" and optics.depth_layers == 1 else passages
-    of_modules = each(poses[1], 3, 3).transpose(0, 2, 1), lengths, each(effective), sides, weigh
-    return WholeHoles(views, grid, *of_modules, mu, True, slants)
+    of_modules = each(poses[1], 3, 3).transpose(0, 2, 1), lengths, each(effective), sides, ray_weight
+    return PinholeOperator(views, grid, *of_modules, mu, True, slants)
 
 
 def camera_views(
@@ -144,7 +146,7 @@ def camera_views(
     return Views(position, centers, size[:, :1] * u, size[:, 1:] * v, shape)
 
 
-def _by_cameras(model: WholeHoles, volume: Any, weights: Any, functions: Any, threads: int) -> list[Any]:
+def _by_cameras(model: PinholeOperator, volume: Any, weights: Any, functions: Any, threads: int) -> list[Any]:
     """Derivatives by positions, rotations, lengths, effective diameters, pitches and offsets."""
     centers, frames, by = model.gradient(volume[None], weights[None], functions, threads)
     pitch, first = (by[name][:, ::-1].copy() for name in ("pitch", "first"))

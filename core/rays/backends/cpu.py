@@ -233,8 +233,8 @@ def _run(
     job = _Job(
         is_double=volume.dtype == np.float64,
         attenuation=0 if mu is None else 1 if mu_rays is None else 2,
-        volume=as_lattice(volume, volume, kernel is library.backproject),
-        mu=VoxelArray() if mu is None else as_lattice(mu, volume),
+        volume=as_voxel_array(volume, volume, kernel is library.backproject),
+        mu=VoxelArray() if mu is None else as_voxel_array(mu, volume),
         **{name: array.ctypes.data for name, array in others.items() if array is not None},
     )
     arrays = [_fans(rays, mu_rays)] if isinstance(rays, IndexFans) else _columns(rays, mu_rays)
@@ -265,7 +265,7 @@ def _fans(rays: IndexFans, mu_rays: Any) -> Array:
     return fans
 
 
-def as_lattice(voxels: Array, like: Array, written: bool = False) -> VoxelArray:
+def as_voxel_array(voxels: Array, like: Array, written: bool = False) -> VoxelArray:
     """`voxels`, of the same type as `like`."""
     most_along = _MOST_ALONG if voxels.dtype == np.float32 else _MOST_VOXELS
     if voxels.size > _MOST_VOXELS or max(voxels.shape) > most_along:

@@ -11,7 +11,7 @@ from ..errors import InputError, several
 from ..geometry.system import PinholeSystem
 from ..geometry.views import Views
 from ..models.emission import Emission
-from ..models.model import each_pixel
+from ..models.model import with_image_axes
 from ..progress import Progress, stages_of
 from ..runs.display import DIVERGING, Display
 from ..runs.mosaic import Sheet, sheet
@@ -201,7 +201,7 @@ def calibrate(
     lattice = Lattice.of(model, views)
     radii = model.effective_diameter / 2 * (1 + system.collimator_length / system.pinhole_distance)
     stages = stages_of(progress)
-    spots = find_spots(images, each_pixel(model.background), lattice, radii, stages("finding spots"))
+    spots = find_spots(images, with_image_axes(model.background), lattice, radii, stages("finding spots"))
     stages("finding modules")
     _require_spots(spots.seen, 2 if points is None else 1)
     places = lattice.first + lattice.step * spots.pixels

@@ -15,7 +15,7 @@ import numpy as np
 from ..arrays import ArrayLike, Floats
 from ..geometry.views import Views
 from ..models.emission import Emission
-from ..models.model import each_pixel
+from ..models.model import with_image_axes
 from ..physics.crystal import gaussian_blur
 from ..physics.performance import sensitivity
 from ..validation import instance, one_for_all, real_array
@@ -84,8 +84,10 @@ def point_images(model: Emission, views: Views, points: ArrayLike, activity: Arr
     totals = 1000 * model.effective_time * activities[:, None] * sensitivity(system, points, optics=model.optics)
     pitch, blurs = np.abs(lattice.step), lattice.blurs(views.shape)
     shares = [disc_shares(at, radius, pitch, views.shape, blurs)[0] for at, radius in zip(pixels, radii, strict=True)]
-    efficiency = each_pixel(model.efficiency)
-    return totals[..., None, None] * shares * efficiency + np.where(efficiency > 0, each_pixel(model.background), 0.0)
+    efficiency = with_image_axes(model.efficiency)
+    return totals[..., None, None] * shares * efficiency + np.where(
+        efficiency > 0, with_image_axes(model.background), 0.0
+    )
 
 
 def disc_shares(

@@ -1,4 +1,4 @@
-"""SPECT: how many photons a pixel of the crystal counts."""
+"""The model of SPECT: expected counts of each pixel of a crystal behind a pinhole."""
 
 import functools
 import math
@@ -30,7 +30,7 @@ from ..validation import instance, positive, real_array, strict_whole
 from ..volumes.volume import Volume
 from . import coefficient_checks
 from .model import Model, checked_background, checked_times, require_views_of
-from .photon_lines import checked_mu, checked_photons, each_mu, models_of_lines
+from .photon_lines import checked_mu, checked_photons, line_models, mu_volumes
 from .pixel_points import TOLERANCE, expected_error, lattices, offsets, points_needed, require_points, shadow_edges
 from .wall_penetration import models_with_walls
 
@@ -39,7 +39,7 @@ _BOX_PER_SIGMA = math.sqrt(12)
 
 Hole = Literal["auto", "depth", "rays", "point"]
 
-# Without a number of points of the hole, rays keep a voxel's image this close to that of the whole hole.
+# Default of `aperture_tolerance`: so close a voxel's image by rays is to that of the whole hole.
 _APERTURE_TOLERANCE = 0.1
 
 
@@ -47,15 +47,15 @@ _APERTURE_TOLERANCE = 0.1
 class Emission(Model):
     """Expected counts per pixel of a volume of activity (kBq/mL, which is decays per s and mm^3).
 
-    A ray of the pixel that leaves the pinhole at an angle psi to the principal ray counts ::
+    A ray of the pixel that leaves the pinhole at an angle psi to the principal ray contributes ::
 
         time * d_e^2 p_u p_v cos^4(psi) / (16 l^2) * efficiency * integral of f exp(-integral of mu) dr
 
-    with p the pixel pitch on the crystal (for a virtual detector that of its image there), d_e the pinhole's
-    effective diameter and l the collimator's length. Summed over the pixels this is the sensitivity to a point source at
+    with p the pixel pitch on the crystal (for a virtual detector that of its image there), d_e the effective diameter of
+    the pinhole and l the collimator's length. Summed over the pixels this is the sensitivity to a point source at
     height h above the pinhole's plane and elevation theta: ``g = d_e^2 sin^3(theta) / (16 h^2)``. The 1/r^2 of that law
     is in the density of the rays. Rays run from the pinhole through the whole grid, wherever a virtual detector stands.
-    By default the hole has its size and its blur, and nothing attenuates, penetrates or is missed.
+    By default the hole has its size and its blur; nothing is attenuated, no photon penetrates the edge or the crystal.
 
     Attributes
     ----------
@@ -63,50 +63,50 @@ class Emission(Model):
         The modules, as many as the views and in their order: ``Emission(system[0:20])`` for
         ``system[0:20].views(...)``.
     mu : Volume, or a sequence of them, optional
-        Attenuation coefficients ("mu", 1/mm) at the energy that is counted, on the activity's grid or any other. The
+        Attenuation coefficients ("mu", 1/mm) at the energy of the detected photons, on the activity's grid or any other. The
         result is exact for piecewise constant volumes: nothing is resampled, the planes of both grids cut the rays, and
-        ``exp(-integral of mu)`` is integrated in closed form inside a voxel. CT numbers ("hu") attenuate each of
-        `photon_lines` as `hu_to_mu` says for its energy; several volumes are of these lines, in their order. None: no
+        ``exp(-integral of mu)`` is integrated in closed form inside a voxel. CT numbers ("hu") become the mu of each of
+        `photon_lines` by `hu_to_mu`; a sequence has one volume of mu for each of these lines, in their order. None: no
         attenuation.
     time : float or array (M,)
-        The acquisition's, s; or those of the modules' frames.
+        Duration of the acquisition, s, or of each module's frame.
     start : float or array (M,)
-        When it starts, or the frames do: s after the reference time of the activity.
+        Start of the acquisition, or of each module's frame, s after the reference time of the activity.
     isotope : Isotope or str, optional
-        Its photons are counted, and the volume is its activity at the reference time, which decays until `start` and
+        Isotope whose photons are detected. The volume is its activity at the reference time, which decays until `start` and
         during `time`. None: one photon per decay, and constant activity.
     window : tuple of (float, float), optional
-        Energies, keV, between which the isotope's photons are counted. None: 10 % around its strongest line.
+        Energy window, keV, in which photons are detected. None: 10 % around the isotope's strongest line.
     energy_fwhm : float, optional
         FWHM of the detector's energy resolution at the strongest line in the window, as a share of its energy; at an energy
-        E the FWHM is in proportion to sqrt(E). So a part of each line is counted, also of those beside the window, but for
-        lines that count less than 1e-4 of the one that counts most. None: all photons of the lines within the window.
+        E the FWHM is in proportion to sqrt(E). So a part of each line is detected, also of lines beside the window; lines
+        with less than 1e-4 of the counts of the strongest are left out. None: all photons of the lines within the window.
     lines : str
-        Several lines ``"together"`` are photons of one kind, with effective coefficients; ``"apart"`` each line has its own
-        mu, aperture and crystal, and the images are the sum of theirs, which takes their number times as long. With CT
-        numbers, or several volumes of mu, they are apart.
+        Several lines ``"together"`` are photons of one kind, with effective coefficients. ``"apart"``: each line has its own
+        mu, aperture and crystal, the images are the sum of the lines' images and take as many times as long. With CT
+        numbers, or several volumes of mu, lines are apart.
     photons_per_decay : float, optional
-        Instead of the isotope's.
+        Number of photons per decay, instead of the isotope's.
     pixel_points : int, optional
-        Points of each pixel's area, for each point of the hole, from which rays start. None: as many as `tolerance`
-        requires: small voxels on large pixels take many. A given number is used as it is, with a warning if it is too
-        small for the tolerance. 1, with one point of the hole: only the pixels' centres.
+        Number of points of each pixel's area, for each point of the hole, from which rays start. None: as many as
+        `tolerance` requires: small voxels on large pixels take many. A number of your own is used as it is, with a warning
+        if it is too small for the tolerance. 1, with one point of the hole: the pixels' centres alone.
     tolerance : float
         Largest relative error of the total counts of a single voxel in any module, wherever it lies between the rays: 2 %
         by default. Larger sources are more accurate.
     hole : str
-        ``"depth"``: the depth-dependent pinhole response, the blur of the whole hole without rays (`hole_response`). Every
-        voxel's image is right to 1 % and its total to 0.1 %; with `depth_layers` to 2 % and 0.5 %. It takes no grid that
-        comes close to a pinhole, and no backend cuda. ``"rays"``: through `aperture_points`. ``"point"``: through the hole's
-        middle, an ideal pinhole without blur. ``"auto"``: the depth-dependent response, voxels close to a pinhole by rays;
-        rays alone where that cannot be or they have numbers.
+        ``"depth"``: the depth-dependent pinhole response, the blur of the whole hole without rays. Every voxel's image is
+        right to 1 % and its total to 0.1 %; with `depth_layers` to 2 % and 0.5 %. It takes no grid that comes close to a
+        pinhole, and no backend cuda. ``"rays"``: lines through `aperture_points`. ``"point"``: lines through the hole's
+        centre, an ideal pinhole without blur. ``"auto"``: the depth-dependent response, and rays for voxels close to a
+        pinhole; rays alone where the response is not available, or where a number of rays is given.
     aperture_points : int, optional
-        Points of the hole's disk that rays pass, all with the same weight: the blur of a hole of diameter d_e.
+        Number of points of the hole's disc that rays pass, all with the same weight: the blur of a hole of diameter d_e.
         With 1 all rays pass the centre and there is no blur; otherwise at least 3. None: by `aperture_tolerance`.
     aperture_tolerance : float, optional
-        Instead of `aperture_points`: as few points as keep the image of one voxel at the isocentre close to that of the
-        whole hole. The absolute differences of the pixels sum to at most this share of the counts; so they do for any
-        activity around the isocentre. None: 0.1.
+        Accuracy that chooses the number of points, instead of `aperture_points`: the absolute differences of the pixels
+        between the images of one voxel at the isocentre through the points and through the whole hole sum to at most this
+        share of the counts; so they do for any activity around the isocentre. None: 0.1.
     aperture_mu : float, array (M,) or str, optional
         Attenuation coefficient of the aperture's material at the photons' energy, 1/mm, or the material's name
         (``"tungsten"``, see `MATERIALS`). Of several lines in the window the coefficient is the one that lets as many
@@ -114,41 +114,43 @@ class Emission(Model):
     opening_angle : float
         Full angle alpha of the knife edge's double cone, rad.
     plate_thickness : float or array (M,), optional
-        With edge "path" the thickness of the plate, mm, in whose middle the knife edge is. What passes it where it is solid,
-        far from the hole, is not counted without `wall_thickness`; a warning says so from 0.5 % on. None: infinite.
+        Thickness of the plate, mm, with the knife edge in its middle; for edge "path". Photons that pass the plate where it
+        is solid, far from the hole, are detected with `wall_thickness` alone; from 0.5 % on a warning says so. None:
+        infinite.
     wall_thickness : float, optional
-        Of the collimators, mm, of the aperture's material. Then photons are counted, too, that pass a module's own walls or
-        plate beside its hole, or a neighbour's hole and then walls: by rays (`wall_penetration`). Neighbours are the other
-        modules of `system`. None: nothing passes walls.
+        Thickness of the collimators' walls, mm, of the aperture's material. Photons are then detected, too, that pass a
+        module's own walls or plate beside its hole, or a neighbour's hole and then walls: by rays (`wall_penetration`).
+        Neighbours are the other modules of `system`. None: nothing passes walls.
     edge : str
-        How photons penetrate the knife edge. ``"paix"``: as if the hole had the diameter d_e with
-        ``d_e^2 = d (d + 2 / mu tan(alpha / 2))`` (Paix 1967), in every direction. ``"path"``: rays beyond the rim are
-        weighted with ``exp(-mu path)`` for their path through the edge, which is as thick as the cone continues; rays
-        steeper than the cone are blocked. On the axis this gives
-        ``d_e^2 = d^2 + 2 d / mu tan(alpha / 2) + 2 / mu^2 tan^2(alpha / 2)`` (Metzler 2001). Neither needs a correction
-        for obliquity: at psi the hole's area is cos(psi) times the disk's, which is in cos^4(psi). By rays
-        through one point the edge changes only the counts; through n, also the blur, with about 4 sqrt(pi n) more rays.
+        Law by which photons penetrate the knife edge. ``"paix"``: as if the hole had the diameter d_e with ``d_e^2 = d (d +
+        2 / mu tan(alpha / 2))`` (Paix 1967), in every direction. ``"path"``: rays beyond the rim are weighted with ``exp(-mu
+        path)`` for their path through the edge, which is as thick as the cone continues; rays steeper than the cone are
+        blocked. On the axis this gives ``d_e^2 = d^2 + 2 d / mu tan(alpha / 2) + 2 / mu^2 tan^2(alpha / 2)`` (Metzler 2001).
+        Neither needs a correction for obliquity: at psi the hole's area is cos(psi) times the disc's, which is in
+        cos^4(psi). By rays through one point the edge changes only the counts; through n points, also the blur, with about 4
+        sqrt(pi n) more rays.
     crystal_mu : float, array (M,) or str, optional
         Attenuation coefficient of the crystal at the photons' energy, 1/mm, or its name (``"NaI"``), as for the aperture.
-        With it ``1 - exp(-crystal_mu Td / cos(psi))`` of the photons are counted. None: all.
+        The fraction ``1 - exp(-crystal_mu Td / cos(psi))`` of the photons is then detected. None: all.
     depth_layers : int
-        Depths in the crystal at which photons are absorbed, with `crystal_mu`: the deeper, the farther out slanted rays are
-        recorded (parallax). From 2 on, counts and mean depth are exact for every angle; the depth-dependent response then
-        has all depths, whatever their number. With 1 all photons are recorded where they enter.
+        Number of depths in the crystal at which photons are absorbed, with `crystal_mu`: the deeper, the farther out oblique
+        rays are recorded (parallax). From 2 on, counts and mean depth are exact for every angle; the depth-dependent
+        response then has all depths, whatever the number. With 1 all photons are recorded where they enter.
     intrinsic_fwhm : float
         FWHM of the detector's Gaussian blur, mm on the crystal. Counts blurred over the image's edge are lost.
     within_crystal : bool
-        Whether pixels, or parts of them, outside the crystal's side Ld count nothing.
+        Whether nothing is detected outside the crystal's side Ld; a pixel across its edge detects with the part inside.
     within_walls : bool
         Whether the collimator's walls stop photons that would enter through the crystal's sides, or miss it. The walls run
         straight from the hole's rim to the edges of the crystal's front, so they stop no others.
     within_cone : bool
-        Whether rays steeper than the knife edge's cone, psi > alpha / 2, count nothing, with either edge.
+        Whether rays steeper than the knife edge's cone, psi > alpha / 2, are blocked, with either edge.
     background : float or array (M,) or (M, n_v, n_u)
-        Counts of each pixel in the whole acquisition besides those of the volume, such as scatter and dark counts. ``A(x)``
-        leaves them out; runs add them before noise is drawn, and reconstructions expect them. Dead pixels have none.
+        Expected counts of each pixel in the whole acquisition besides those of the volume, such as scatter and dark counts.
+        ``A(x)`` leaves them out; runs add them before noise is drawn, and reconstructions expect them. Dead pixels have
+        none.
     efficiency : float or array (M,) or (M, n_v, n_u)
-        Factors of the counts of the volume, of each module or pixel, as `flood_efficiency` gives them. Where it is 0 the
+        Factors of the counts of the volume, for each module or pixel, as `flood_efficiency` gives them. Where it is 0 the
         pixel is dead: nothing is expected there, and reconstructions leave it out.
 
     References
@@ -159,13 +161,13 @@ class Emission(Model):
     """
 
     system: PinholeSystem
-    mu: Volume | Sequence[Volume] | None = None  # type: ignore[assignment]  # several only of several lines
+    mu: Volume | Sequence[Volume] | None = None  # type: ignore[assignment]  # a sequence with several lines alone
     time: float | Floats = 1.0
-    photons_per_decay: float = None  # type: ignore[assignment]  # always a number once made
+    photons_per_decay: float = None  # type: ignore[assignment]  # always a number in a model
     aperture_points: int | None = None
-    aperture_mu: float | str | None = None  # a number once made
+    aperture_mu: float | str | None = None  # a number in a model, not a name
     opening_angle: float = OPENING_ANGLE
-    crystal_mu: float | str | None = None  # likewise
+    crystal_mu: float | str | None = None  # a number in a model, not a name
     intrinsic_fwhm: float = 0.0
     within_crystal: bool = False
     isotope: Isotope | str | None = None
@@ -177,17 +179,17 @@ class Emission(Model):
     within_cone: bool = False
     pixel_points: int | None = None
     tolerance: float = TOLERANCE
-    background: float | Floats = 0.0  # type: ignore[assignment]  # no class of mutable values: checked, and frozen
+    background: float | Floats = 0.0  # type: ignore[assignment]  # arrays are checked, and read-only
     hole: Hole = "auto"
     start: float | Floats = 0.0
-    efficiency: float | Floats = 1.0  # type: ignore[assignment]  # likewise
+    efficiency: float | Floats = 1.0  # type: ignore[assignment]  # arrays are checked, and read-only
     energy_fwhm: float | None = None
     lines: Literal["together", "apart"] = "together"
     plate_thickness: float | None = None
     wall_thickness: float | None = None
 
-    photon_lines: ClassVar[tuple[tuple[float, float], ...]] = ()  # each model's own once made
-    """The isotope's lines that are counted: energies, keV, in order, and counted photons per decay."""
+    photon_lines: ClassVar[tuple[tuple[float, float], ...]] = ()  # set in each model
+    """Detected photon lines of the isotope: energies, keV, in order, and detected photons per decay."""
 
     name = "emission"
     takes = ("activity",)
@@ -220,7 +222,9 @@ class Emission(Model):
             if self.aperture_mu is None:
                 raise InputError("emission: wall_thickness needs aperture_mu, of the walls' material")
         if has_points and self.hole in ("depth", "point"):
-            raise InputError(f"emission: hole {self.hole!r} takes no points of it; use hole 'rays', or leave that out")
+            raise InputError(
+                f"emission: hole {self.hole!r} takes no points; use hole 'rays', or leave their number out"
+            )
 
     @property
     def _is_by_depth(self) -> bool:
@@ -231,11 +235,11 @@ class Emission(Model):
 
     @property
     def has_one_kernel(self) -> bool:
-        """Whether the hole's blur is the same for all directions: no path through the edge, no depth in the crystal."""
+        """Whether the hole's blur is the same for all directions: no path through the edge, no depths in the crystal."""
         return self.edge == "paix" and self.depth_layers == 1
 
     def by_rays(self) -> Self:
-        """The model for what can only be done with rays; `InputError` with hole "depth"."""
+        """Return the model for backends that know rays alone; raise `InputError` with hole "depth"."""
         if self.hole == "depth":
             raise InputError("emission: hole 'depth' takes no backend 'cuda': use hole 'auto'")
         return replace(self, hole="rays") if self.hole == "auto" else self
@@ -244,43 +248,44 @@ class Emission(Model):
         object.__setattr__(self, name, value)
 
     def _set_optics(self) -> None:
-        """Make `isotope` an Isotope, `window` numbers, and the fields that are of `Optics` what those are, numbers."""
+        """Check the fields of photons, mu and `Optics`, and replace names of isotopes and materials by their values."""
         for name, value in checked_photons(self).items():
             self._set(name, value)
         self._set("mu", checked_mu(self.mu, self.photon_lines))
         with naming("emission"):
-            given = {f.name: getattr(self, f.name) for f in fields(Optics)}
-            given = {name: real_array(x, name, None) if is_tensor(x) else x for name, x in given.items()}
-            optics = Optics.of(self.system, self.photon_lines, **given)
-        if self.is_apart:  # coefficients stay as they are given, for each line
+            settings = {f.name: getattr(self, f.name) for f in fields(Optics)}
+            settings = {name: real_array(x, name, None) if is_tensor(x) else x for name, x in settings.items()}
+            optics = Optics.of(self.system, self.photon_lines, **settings)
+        if self.is_apart:
             self._set("optics", optics)
         for f in fields(Optics):
-            if not (self.is_apart and f.name.endswith("_mu") and np.ndim(given[f.name]) == 0):
+            # With lines apart the name of a material stays: each line has its own coefficient.
+            if not (self.is_apart and f.name.endswith("_mu") and np.ndim(settings[f.name]) == 0):
                 self._set(f.name, getattr(optics, f.name))
 
     @property
     def is_apart(self) -> bool:
-        """Whether each line has a model of its own."""
+        """Whether each photon line has a model of its own."""
         is_one = self.mu is None or (isinstance(self.mu, Volume) and self.mu.quantity == "mu")
         return len(self.photon_lines) > 1 and (self.lines == "apart" or not is_one)
 
     def parts(self) -> tuple[Model, ...]:
-        """The model of each line, where they are apart; else what passes walls after the rest, or the model alone."""
+        """Return the models whose images add up: one per line if lines are apart, those with walls, or the model alone."""
         return (self,) if self.wall_thickness is None and not self.is_apart else self._models
 
     @functools.cached_property
     def _models(self) -> tuple[Model, ...]:
-        return models_of_lines(self, self.photon_lines) if self.is_apart else models_with_walls(self)
+        return line_models(self, self.photon_lines) if self.is_apart else models_with_walls(self)
 
     def record(self) -> dict[str, Any]:
-        """The settings, for a run's record: of mu its grid, of the isotope its name, of a background's images a word."""
+        """Return the settings for the record of a run, by name: of mu the grids, of the isotope its name, not images."""
         settings = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("system", "mu")}
         settings["isotope"] = None if self.isotope is None else self.isotope.name  # type: ignore[union-attr]
         settings["window"] = None if self.window is None else list(self.window)
         for name, value in settings.items():
             if isinstance(value, np.ndarray):
                 settings[name] = value.tolist() if value.ndim == 1 else "images"
-        volumes = each_mu(self.mu)  # type: ignore[arg-type]  # a tuple, once made
+        volumes = mu_volumes(self.mu)  # type: ignore[arg-type]  # in a model a tuple, not any sequence
         grids = [{"shape": list(mu.grid.shape), "affine": mu.grid.affine.tolist()} for mu in volumes]
         if grids:
             settings["mu"] = grids if isinstance(self.mu, tuple) else grids[0]
@@ -288,21 +293,22 @@ class Emission(Model):
 
     @property
     def effective_time(self) -> float | Floats:
-        """The time, s, or (M,), in which the activity at the reference time would make as many decays as it makes."""
-        known: Any = self.isotope
-        return self.time if known is None else known.mean_decay_time(self.time, self.start)
+        """Time, s, or (M,), in which constant activity, as at the reference time, would decay as often as it does."""
+        isotope: Any = self.isotope
+        return self.time if isotope is None else isotope.mean_decay_time(self.time, self.start)
 
     def unit(self, volume: Volume) -> str:
-        """Unit of the images of `volume`."""
+        """Return the unit of the images of `volume`."""
         return "counts"
 
     def of_views(self, which: NDArray[np.integer]) -> Self:
-        """The model of the modules `which` (indices) alone."""
-        own = {f.name: getattr(self, f.name) for f in fields(self) if isinstance(getattr(self, f.name), np.ndarray)}
-        changed = replace(self, system=self.system[which], **{name: values[which] for name, values in own.items()})
-        if self.parts() != (self,):  # their attenuation is made only once, and neighbours stay
-            changed._set("_models", tuple(part.of_views(which) for part in self.parts()))
-        return changed
+        """Return the model of the modules with the indices `which` alone."""
+        values = {f.name: getattr(self, f.name) for f in fields(self)}
+        chosen = {name: array[which] for name, array in values.items() if isinstance(array, np.ndarray)}
+        model = replace(self, system=self.system[which], **chosen)
+        if self.parts() != (self,):  # the attenuation of lines is computed once, and neighbours stay neighbours
+            model._set("_models", tuple(part.of_views(which) for part in self.parts()))
+        return model
 
     def check(self, views: Views) -> None:
         """Raise `InputError` unless `views` are of this system."""
@@ -312,7 +318,7 @@ class Emission(Model):
 
     @functools.cached_property
     def optics(self) -> Optics:
-        """What the model says of hole, edge, walls, cone, crystal and photons, for `sensitivity`, maps and cameras."""
+        """Settings of hole, edge, walls, cone, crystal and photons, for `sensitivity`, maps and cameras in torch."""
         return Optics(**{f.name: getattr(self, f.name) for f in fields(Optics)})
 
     @functools.cached_property
@@ -321,46 +327,46 @@ class Emission(Model):
 
     @property
     def effective_diameter(self) -> Floats:
-        """d_e (M,), mm: the opaque hole that lets as many photons pass along the axis."""
+        """Effective diameter d_e (M,), mm, of an opaque hole that lets as many photons pass along the axis."""
         return self.optics.effective_diameter(self.system.pinhole_diameter)
 
     def beams(self, views: Views, m: int, grid: Grid) -> Iterator[Beam]:
-        """Rays from the pinhole through the grid, weighted with counts per (decay / (s mm^3) mm)."""
+        """Yield rays of view m from the pinhole through the grid, weighted with counts per (decay / (s mm^3) mm)."""
         u, v, k = self._frames[m]
         l = self.system.collimator_length[m]
         pinhole, rays, scale = views.sources[m], view_rays(views, m), self._crystal_scale(views, m)
-        # The pixels' places on the crystal, mm along u and v from its centre, point-inverted.
-        middle = scale * (rays.corner - pinhole) - l * k
+        # Position of the first pixel on the crystal, mm from its centre, point-inverted.
+        first = scale * (rays.corner - pinhole) - l * k
         pitch_u, pitch_v = self.crystal_pitch(views, m)
         n_v, n_u = views.shape
-        along_v = (middle @ v + scale * (rays.row_step @ v) * np.arange(n_v))[:, None]
-        along_u = (middle @ u + scale * (rays.column_step @ u) * np.arange(n_u))[None, :]
+        pixels_v = (first @ v + scale * (rays.row_step @ v) * np.arange(n_v))[:, None]
+        pixels_u = (first @ u + scale * (rays.column_step @ u) * np.arange(n_u))[None, :]
         # To the plane through the grid's farthest corner.
         depth = max(float(((grid.corners() - pinhole) @ k).max()), l)
         n_hole = self.hole_points(views, m, grid)
-        holes = self.openings(m, n_hole)
+        openings = self.openings(m, n_hole)
         n = self._pixel_points(views, m, grid)
 
-        def weigh(places: Floats, opening: Opening, layer: int, rows: slice, columns: slice, which: slice) -> Floats:
-            u_places, v_places = places[which].T[:, :, None, None]
-            along, across = along_u[:, columns] + u_places, along_v[rows] + v_places
-            return self.pixel_weights(m, along, across, (pitch_u, pitch_v), l, opening, layer, n * len(holes)) / n
+        def weights(points: Floats, opening: Opening, layer: int, rows: slice, columns: slice, shifts: slice) -> Floats:
+            points_u, points_v = points[shifts].T[:, :, None, None]
+            u_ends, v_ends = pixels_u[:, columns] + points_u, pixels_v[rows] + points_v
+            return self.pixel_weights(m, u_ends, v_ends, (pitch_u, pitch_v), l, opening, layer, n * len(openings)) / n
 
         for layer, z in enumerate(self.optics.depths(self.system.detector_thickness[m])):
             stretch = depth / (l + z)
             steps = stretch * scale * rays.row_step, stretch * scale * rays.column_step
-            for opening, start in zip(holes, lattices(n_hole, len(holes)), strict=True):
+            for opening, start in zip(openings, lattices(n_hole, len(openings)), strict=True):
                 point = opening.x * u + opening.y * v
                 shift = None
-                if len(holes) > 1:
-                    # Seen from the isocentre, the points of all holes together fill the pixel evenly.
-                    seen = (1 + l / self.system.pinhole_distance[m]) * np.array([opening.x, opening.y])
-                    shift = start / math.sqrt(n) - seen / (pitch_u, pitch_v)
-                places = offsets(n, shift) * (pitch_u, pitch_v)
-                corner = pinhole + point + depth * k + stretch * (middle + point)
-                shifts = places[:, ::-1] / (scale * (rays.row_step @ v), scale * (rays.column_step @ u))
+                if len(openings) > 1:
+                    # Seen from the isocentre, the points of all openings together fill the pixel evenly.
+                    shadow = (1 + l / self.system.pinhole_distance[m]) * np.array([opening.x, opening.y])
+                    shift = start / math.sqrt(n) - shadow / (pitch_u, pitch_v)
+                points = offsets(n, shift) * (pitch_u, pitch_v)
+                corner = pinhole + point + depth * k + stretch * (first + point)
+                shifts = points[:, ::-1] / (scale * (rays.row_step @ v), scale * (rays.column_step @ u))
                 fan = Fan(pinhole + point, corner, *steps, views.shape, shifts)
-                yield Beam(fan, partial(weigh, places, opening, layer))
+                yield Beam(fan, partial(weights, points, opening, layer))
 
     def pixel_weights(
         self,
@@ -373,25 +379,25 @@ class Emission(Model):
         layer: int = 0,
         cells: int = 1,
     ) -> ArrayOrTensor:
-        """What pixels of module m count per (decay / (s mm^3) mm) along rays that start from one point of the hole.
+        """Return module m's expected counts per (decay / (s mm^3) mm) along rays through one point of the hole.
 
         Parameters
         ----------
         m
-            The module: its crystal's side and thickness.
+            Number of the module, which determines the crystal's side and thickness.
         along_u, along_v
-            Where in the pixels the rays end on the crystal, mm from its middle and point-inverted: arrays or tensors that
+            Positions on the crystal where the rays end, mm from its centre and point-inverted: arrays or tensors that
             broadcast.
         pitch
-            The pixels' size on the crystal, mm along u and v.
+            Size of a pixel on the crystal, mm along u and v.
         length
             Collimator length l, mm.
         opening
-            The point.
+            The point of the hole.
         layer
-            Which of `depth_layers`, from the front: where photons are recorded.
+            Number of the depth, of `depth_layers` from the front, at which photons are recorded.
         cells
-            Rays of a pixel: along each side, a ray stands for this part of it where the crystal or a wall ends.
+            Number of rays of a pixel: where the crystal or a wall ends, a ray stands for this part of each side.
         """
         side, thickness = self.system.detector_side[m], self.system.detector_thickness[m]
         optics, *along, length = self._optics_of(m).promoted(along_u, along_v, length)
@@ -399,7 +405,7 @@ class Emission(Model):
         return seconds * optics.pixel_weights(along, pitch, length, side, thickness, opening, layer, cells)
 
     def response(self, views: Views, m: int) -> tuple[Floats, Floats] | None:
-        """The intrinsic blur of view m: matrices (n_v, n_v) along v and (n_u, n_u) along u."""
+        """Return the intrinsic blur of view m, matrices (n_v, n_v) along v and (n_u, n_u) along u; None without blur."""
         if not np.any(self.intrinsic_fwhm):
             return None
         sigma = self._optics_of(m).intrinsic_fwhm / FWHM_PER_SIGMA
@@ -408,13 +414,13 @@ class Emission(Model):
         return gaussian_blur(n_v, sigma / pitch_v), gaussian_blur(n_u, sigma / pitch_u)
 
     def by_depth(self, views: Views, grid: Grid) -> PinholeOperator | None:
-        """What projects in place of rays, where the hole's blur is computed without them."""
+        """Return the depth-dependent pinhole response, or None if the hole's blur is computed by rays."""
         if not self._is_by_depth:
             return None
-        within = self.within_crystal or self.within_walls
-        sides = self.system.detector_side if within else np.full(len(self.system), np.inf)
-        # The edge's path, and depths in the crystal, are in the kernels.
-        everywhere = replace(
+        is_bounded = self.within_crystal or self.within_walls
+        sides = self.system.detector_side if is_bounded else np.full(len(self.system), np.inf)
+        # The path through the edge, depths in the crystal and its side are not in the rays' weights: the response has them.
+        plain = replace(
             self, within_crystal=False, within_walls=False, depth_layers=1, edge="paix", plate_thickness=None,
             within_cone=self.within_cone or self.edge == "path",
         )  # fmt: skip
@@ -423,47 +429,47 @@ class Emission(Model):
         lengths = self.system.collimator_length + [module.mean_depth for module in effects]
 
         def ray_weight(m: int, *, u: Floats, v: Floats) -> Floats:
-            (opening,) = everywhere.openings(m, 1)
+            (opening,) = plain.openings(m, 1)
             # The law depends on u^2 + v^2 alone; in the order v, u the sum has the last digit of earlier versions.
-            return everywhere.pixel_weights(m, v, u, (1.0, 1.0), float(lengths[m]), opening)
+            return plain.pixel_weights(m, v, u, (1.0, 1.0), float(lengths[m]), opening)
 
-        modules = self._frames, lengths, everywhere.effective_diameter, sides, ray_weight
+        modules = self._frames, lengths, plain.effective_diameter, sides, ray_weight
         directional = None if self.has_one_kernel else effects
-        mu: Any = self.mu  # of models that are computed as a whole one volume
+        mu: Any = self.mu  # one volume, as lines are not apart
         return PinholeOperator(views, grid, *modules, mu, self.hole == "depth", directional)
 
     def caution(self, views: Views, grid: Grid) -> str | None:
-        """A warning where there are too few rays for the tolerance."""
-        if self._is_by_depth:  # has none
+        """Return a warning if there are too few rays for the tolerance, or None."""
+        if self._is_by_depth:  # there are no rays
             return None
         points = [(self._pixel_points(views, m, grid), self.hole_points(views, m, grid)) for m in range(len(views))]
         errors = [expected_error(shadow_edges(views, m, grid), *points[m]) for m in range(len(views))]
-        worst, module = max(errors), int(np.argmax(errors))
-        if worst <= self.tolerance:
+        error, module = max(errors), int(np.argmax(errors))
+        if error <= self.tolerance:
             return None
         n, voxel = self._pixel_points(views, module, grid), " x ".join(f"{size:.3g}" for size in grid.spacing)
-        most = "more than 100" if worst > 1 else f"up to {100 * worst:.2g}"
+        percent = "more than 100" if error > 1 else f"up to {100 * error:.2g}"
         advice = "take smaller pixels, or larger voxels"
         if self.pixel_points is not None:
             advice = f"pixel_points=None (--pixel-points auto) takes as many as keep {100 * self.tolerance:g} %"
         rays = f"{n} point{'s' * (n > 1)} of each pixel"
-        off = f"{most} % off (in module {self.system.numbers[module]}), those of larger sources less"
+        off = f"{percent} % off (in module {self.system.numbers[module]}), those of larger sources less"
         return f"emission: with {rays} the total counts of a single voxel of {voxel} mm may be {off}; {advice}"
 
     def coefficient_warnings(self) -> Iterator[str]:
-        """Yield a warning for each attenuation coefficient that looks wrong, of lines apart each text once."""
+        """Yield a warning for each attenuation coefficient that looks wrong; with lines apart each text once."""
         parts: Any = self.parts() if self.is_apart else (self,)
         checks = coefficient_checks.coefficient_warnings
         yield from dict.fromkeys(text for part in parts for text in checks(part))
 
     def _pixel_points(self, views: Views, m: int, grid: Grid) -> int:
-        """Points of the pixels of view m, for each point of the hole."""
+        """Return the number of points of each pixel of view m, for each point of the hole."""
         if self.pixel_points is not None:
             return self.pixel_points
         return points_needed(shadow_edges(views, m, grid), self.tolerance, self.hole_points(views, m, grid))
 
     def hole_points(self, views: Views, m: int, grid: Grid) -> int:
-        """Points of the hole that rays of view m pass: `aperture_points`, or what `aperture_tolerance` takes."""
+        """Return the number of points of the hole that rays of view m pass, by `aperture_points` or `aperture_tolerance`."""
         if self.hole == "point" or self.aperture_points is not None:
             return self.aperture_points or 1
         l, b = self.system.collimator_length[m], self.system.pinhole_distance[m]
@@ -476,18 +482,18 @@ class Emission(Model):
         return hole_points_needed(tolerance, float(shadow), (pitch_u, pitch_v), (blur, blur))
 
     def openings(self, m: int, n: int) -> list[Opening]:
-        """Where rays of module m cross the pinhole's plane: n points of the hole, and those of its edge."""
+        """Return the points where rays of module m cross the pinhole's plane: n in the hole, and those of its edge."""
         return self._optics_of(m).openings(self.system.pinhole_diameter[m], n)
 
     def _optics_of(self, m: int) -> Optics:
         return self.optics.of_modules(m, len(self.system))
 
     def _crystal_scale(self, views: Views, m: int) -> float:
-        """A length on the crystal, per length on view m's plane."""
+        """Return the scale from the detector plane of view m to the crystal: mm there per mm on the plane."""
         distance = (views.detector_centers[m] - views.sources[m]) @ self._frames[m, 2]
         return float(self.system.collimator_length[m] / distance)
 
     def crystal_pitch(self, views: Views, m: int) -> tuple[float, float]:
-        """Size of a pixel on the crystal, mm along u and v."""
+        """Return the size of a pixel on the crystal, mm along u and v."""
         scale = self._crystal_scale(views, m)
         return scale * float(np.linalg.norm(views.u_steps[m])), scale * float(np.linalg.norm(views.v_steps[m]))

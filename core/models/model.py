@@ -1,4 +1,4 @@
-"""What a pixel measures: which rays it takes, with which weights."""
+"""The base class of all models of what a pixel measures, and the model of radiographs."""
 
 from __future__ import annotations
 
@@ -22,46 +22,46 @@ from ..validation import all_above_0, freeze, none_below_0, positive, real_array
 from ..volumes.volume import LINE_INTEGRALS, Volume, require_quantity
 from .pixel_points import TOLERANCE, offsets, points_needed, require_points, shadow_edges
 
-# Views may differ from their system by a file's rounding (mm; sine of an angle).
+# Differences between views and their system that are a file's rounding: mm, and the sine of an angle.
 _SAME_PLACE = 1e-3
 _SAME_DIRECTION = 1e-6
 
 
 class Model(ABC):
-    """What a pixel measures: ``response(sum over rays of weight * integral of volume * voxel weight)``.
+    """Model of what a pixel measures: ``response(sum over rays of weight * integral of volume * voxel weight)``.
 
-    It is linear in the volume. A model describes only rays and weights; backends and adjoints are the operator's.
+    It is linear in the volume. A model describes only rays and weights; backends and adjoints are the projector's.
     """
 
     name: str
-    """What a run's record calls it."""
+    """Name of the model in the record of a run."""
 
     mu: Volume | None = None
-    """Attenuation coefficients between each point and the rays' source, 1/mm."""
+    """Attenuation coefficients, 1/mm, between each point and the rays' source; None without attenuation."""
 
     takes: tuple[str, ...] = LINE_INTEGRALS
-    """Quantities of volumes that can be projected; arrays and tensors have none and are not checked."""
+    """Quantities of the volumes that can be projected; arrays and tensors have no quantity and are not checked."""
 
     background: float | Floats = 0.0
-    """What each pixel measures besides the volume: a number, one for each view (M,), or images (M, n_v, n_u)."""
+    """Expected counts of each pixel besides the volume's: a number, one for each view (M,), or images (M, n_v, n_u)."""
 
     efficiency: float | Floats = 1.0
-    """The share of what each pixel would count that it does count, formed like `background`; 0 of dead ones."""
+    """Share of its expected counts that each pixel detects, of the same shapes as `background`; 0 for dead pixels."""
 
     weights_voxels: bool = False
     """Whether each view has its own voxel weights (`voxel_weights`)."""
 
     has_times: bool = False
-    """Whether images are counts of an acquisition: a dataclass with the fields `time` and `start`, and `effective_time`."""
+    """Whether images are counts of an acquisition; a dataclass with `time` and `start`, that has `effective_time`."""
 
     has_geometry_gradient: bool = False
-    """Whether `by_depth` follows the modules of `system`; such a model also has `optics` and `crystal_pitch`."""
+    """Whether `by_depth` follows the modules of the model's `system`; then it also has `optics` and `crystal_pitch`."""
 
     def check(self, views: Views) -> None:  # noqa: B027  (most models have nothing to check)
-        """Raise `InputError` where the model is not for these views."""
+        """Raise `InputError` if the model does not fit these views."""
 
     def caution(self, views: Views, grid: Grid) -> str | None:
-        """A warning for users who project `grid` into `views`, if there is one."""
+        """Return a warning for users who project `grid` into `views`, or None."""
         return None
 
     def coefficient_warnings(self) -> Iterator[str]:
@@ -69,57 +69,57 @@ class Model(ABC):
         return iter(())
 
     def of_views(self, which: NDArray[np.integer]) -> Model:
-        """The model of the views `which` (indices) alone."""
+        """Return the model of the views with the indices `which` alone."""
         return self
 
     def parts(self) -> tuple[Model, ...]:
-        """Models whose images add up to this one's: itself alone, if it is computed as a whole."""
+        """Return the models whose images add up to the images of this one; it alone if it is computed as a whole."""
         return (self,)
 
     def check_volume(self, volume: Volume) -> None:
-        """Raise `InputError` where the model is not for such a volume."""
+        """Raise `InputError` if the model cannot project a volume of this quantity."""
         require_quantity(volume.quantity, self.takes, self.name)
 
     def record(self) -> dict[str, Any]:
-        """The model's own settings, for a run's record: anything JSON can hold."""
+        """Return the model's settings for the record of a run, by name, as JSON can hold them."""
         return {}
 
     def unit(self, volume: Volume) -> str:
-        """Unit of the images of `volume`: of its line integrals, where the weights have none."""
+        """Return the unit of the images of `volume`: that of its line integrals, as weights have no unit."""
         return f"{volume.unit} mm"
 
     @abstractmethod
     def beams(self, views: Views, m: int, grid: Grid) -> Iterator[Beam]:
-        """The rays of view m through `grid`, from the detector's side."""
+        """Yield the rays of view m through `grid`, with their weights."""
 
     def voxel_weights(self, views: Views, m: int, grid: Grid) -> Floats:
-        """Factors of the voxels in view m, ``grid.shape``; used if `weights_voxels`."""
+        """Return the factors of the voxels in view m, ``grid.shape``; used if `weights_voxels`."""
         return np.ones(grid.shape)
 
     def by_depth(self, views: Views, grid: Grid) -> PinholeOperator | None:
-        """What projects in place of rays, if the model is of that kind."""
+        """Return the operator that projects without rays, or None if the model is computed by rays."""
         return None
 
     def by_rays(self) -> Model:
-        """The model for what can only be done with rays; `InputError` where it is not to take any."""
+        """Return the model for backends that know rays alone; raise `InputError` if it must not be computed by rays."""
         return self
 
     def response(self, views: Views, m: int) -> tuple[Floats, Floats] | None:
-        """The detector's response in view m: matrices (n_v, n_v) along v and (n_u, n_u) along u, None if ideal."""
+        """Return the detector's response in view m, matrices (n_v, n_v) along v and (n_u, n_u) along u; None if ideal."""
         return None
 
 
 @dataclass(frozen=True)
 class Transmission(Model):
-    """The line integral of the volume from source to target, value x mm: a digitally reconstructed radiograph.
+    """Line integral of the volume from source to target, value x mm: a digitally reconstructed radiograph.
 
     Attributes
     ----------
     pixel_points : int or None
-        Points of each pixel's area whose line integrals are averaged. 1, the default: the pixel's centre, as in most
-        programs for radiographs. None: as many as `tolerance` requires.
+        Number of points of each pixel's area whose line integrals are averaged. 1, the default: the pixel's centre, as in
+        most programs for radiographs. None: as many as `tolerance` requires.
     tolerance : float
-        With automatic points, the largest relative error of a single voxel's sum over the image, wherever it lies.
+        Largest relative error of a single voxel's sum over the image, wherever the voxel lies, if the points are automatic.
     """
 
     pixel_points: int | None = 1
@@ -132,11 +132,11 @@ class Transmission(Model):
         object.__setattr__(self, "tolerance", positive(self.tolerance, "transmission: tolerance"))
 
     def record(self) -> dict[str, Any]:
-        """The settings, for a run's record."""
+        """Return the settings for the record of a run, by name."""
         return {"pixel_points": self.pixel_points, "tolerance": self.tolerance}
 
     def beams(self, views: Views, m: int, grid: Grid) -> Iterator[Beam]:
-        """The rays of `views`, or to more points of their pixels, weights summing to 1."""
+        """Yield the rays of view m to the pixels' centres, or to several points of each pixel with weights that sum to 1."""
         rays = view_rays(views, m, grid)
         if self.pixel_points == 1:
             yield Beam(rays)
@@ -147,36 +147,40 @@ class Transmission(Model):
 
 
 def intensity(line_integrals: ArrayOrTensor, photons: float) -> ArrayOrTensor:
-    """Photons that pass where attenuation integrates to `line_integrals`: ``photons * exp(-line_integrals)``.
+    """Return the expected photons of a radiograph, ``photons * exp(-line_integrals)``.
 
-    The images of a volume of mu by `Transmission` become a radiograph's expected photons; `core.noise.sample_counts` draws
-    from them.
+    `Transmission` gives the line integrals of a volume of mu; `sample_counts` draws counts with noise.
 
     Parameters
     ----------
     line_integrals
-        Line integrals of mu, without unit: an array, or a tensor (the result is then part of its graph).
+        Line integrals of mu, without unit: an array, or a tensor, of whose graph the result is then a part.
     photons
-        Per pixel, where nothing attenuates (I0).
+        Expected photons of a pixel without attenuation, I0.
     """
     if not is_tensor(line_integrals):
-        kind = np.float32 if getattr(line_integrals, "dtype", None) == np.float32 else np.float64
-        line_integrals = real_array(line_integrals, "line integrals", None, kind)
+        dtype = np.float32 if getattr(line_integrals, "dtype", None) == np.float32 else np.float64
+        line_integrals = real_array(line_integrals, "line integrals", None, dtype)
     return positive(photons, "photons") * namespace(line_integrals).exp(-line_integrals)
 
 
 def checked_background(value: ArrayLike, name: str, n: int, pixels: tuple[int, int] | None = None) -> float | Floats:
-    """Counts besides a volume's, or efficiencies: a number, or read-only those of `n` views (M,), or images (M, n_v, n_u).
+    """Return a background or efficiencies: a number, or read-only one for each of `n` views (M,), or images (M, n_v, n_u).
 
     Parameters
     ----------
     value, name
-        What to check, and how messages call it.
+        Numbers to check, and their name in messages.
     n, pixels
-        Number of views and their shape (n_v, n_u), if that is known.
+        Number of views, and rows and columns (n_v, n_u) of their images, where these are fixed.
+
+    Raises
+    ------
+    InputError
+        A number is negative, or the shape is another.
     """
     array = none_below_0(value, name)
-    real_array(array, name, None, np.float32)  # as which it is added
+    real_array(array, name, None, np.float32)  # it is added to images of float32, which must hold it
     if array.ndim == 2 or array.shape not in ((), (n,), (n, *(pixels or array.shape[1:3]))):
         images = "" if pixels is None else f" of {shape_text(pixels)}"
         expected = f"one number, {n} numbers (one for each view), or {n} images{images}"
@@ -185,7 +189,7 @@ def checked_background(value: ArrayLike, name: str, n: int, pixels: tuple[int, i
 
 
 def checked_times(value: ArrayLike, name: str, n: int, is_positive: bool = True) -> float | Floats:
-    """Times, s: a number, or read-only those of `n` views (M,)."""
+    """Return times, s: a number, or read-only one for each of `n` views (M,). Raise `InputError` for another shape."""
     array = all_above_0(value, name, unit="s") if is_positive else real_array(value, name, None)
     if array.shape not in ((), (n,)):
         expected = f"one number, or {n} numbers (one for each view)"
@@ -193,28 +197,28 @@ def checked_times(value: ArrayLike, name: str, n: int, is_positive: bool = True)
     return freeze(array) if array.ndim else float(array)
 
 
-def each_pixel(values: float | Floats) -> Floats:
-    """One number, those of views (M,), or images (M, n_v, n_u), with all three axes."""
+def with_image_axes(values: float | Floats) -> Floats:
+    """Return a number, numbers of views (M,) or images (M, n_v, n_u) as an array with all three axes of images."""
     array = np.asarray(values, np.float64)
     return array.reshape(array.shape + (1,) * (3 - array.ndim))
 
 
 def require_views_of(system: PinholeSystem, views: Views, name: str) -> None:
-    """Raise `InputError` unless `views` are those of the system's modules, in their order; `name` is what asks."""
+    """Raise `InputError` unless `views` are those of the system's modules, in their order; `name` is the model's."""
     if len(views) != len(system):
         raise InputError(f"{name}: {len(system)} modules but {len(views)} views; give the system whose views they are")
     views.require_pinholes(name)
     u, v, k = system.frames().transpose(1, 0, 2)
-    moved = np.linalg.norm(views.sources - system.centers, axis=1) > _SAME_PLACE
-    turned = np.zeros(len(views), dtype=bool)
+    is_moved = np.linalg.norm(views.sources - system.centers, axis=1) > _SAME_PLACE
+    is_turned = np.zeros(len(views), dtype=bool)
     for steps, axis in ((views.u_steps, u), (views.v_steps, v)):
         sine = np.linalg.norm(np.cross(steps, axis), axis=1) / np.linalg.norm(steps, axis=1)
-        turned |= sine > _SAME_DIRECTION
-    behind = np.einsum("mi,mi->m", views.detector_centers - views.sources, k) <= 0
-    for bad, why in (
-        (moved, "its source is not the module's pinhole"),
-        (turned, "its pixels do not lie along the module's u and v"),
-        (behind, "its detector is not in front of the pinhole (see PinholeSystem.views)"),
+        is_turned |= sine > _SAME_DIRECTION
+    is_behind = np.einsum("mi,mi->m", views.detector_centers - views.sources, k) <= 0
+    for is_wrong, reason in (
+        (is_moved, "its source is not the module's pinhole"),
+        (is_turned, "its pixels do not lie along the module's u and v"),
+        (is_behind, "its detector is not in front of the pinhole (see PinholeSystem.views)"),
     ):
-        if bad.any():
-            raise InputError(f"{name}: view {int(np.argmax(bad))}: {why}")
+        if is_wrong.any():
+            raise InputError(f"{name}: view {int(np.argmax(is_wrong))}: {reason}")

@@ -10,7 +10,7 @@ from ..arrays import Array, Floats, Floats32, checked
 from ..errors import InputError
 from ..geometry.frames import module_frames, tilted
 from ..geometry.system import PinholeSystem
-from ..models.model import each_pixel
+from ..models.model import with_image_axes
 from ..volumes.volume import Volume
 from .operator import Projector
 
@@ -110,7 +110,7 @@ def _by_blur(A: Projector, volume: Array, images: Array) -> Array:
     by, views = np.zeros((len(images), 2)), A.views
     holes: Any = A._depths
     model: Any = A.model
-    images = images * each_pixel(model.efficiency)
+    images = images * with_image_axes(model.efficiency)
     if model.response(views, 0) is None:
         return by
     scales = 1 + _STEP, 1 - _STEP

@@ -15,7 +15,7 @@ from ..errors import InputError, warn
 from ..geometry.grid import Grid
 from ..geometry.views import Views
 from ..memory import Requirements
-from ..models.model import Model, Transmission, each_pixel
+from ..models.model import Model, Transmission, with_image_axes
 from ..pinhole_response.pinhole_operator import depth_backend
 from ..pinhole_response.transmittance import ArrayOnGrid
 from ..progress import Progress, part_of, tell
@@ -195,13 +195,13 @@ class Projector(LinearOperator):
 
         Dead pixels have none.
         """
-        values = each_pixel(self.model.background)
+        values = with_image_axes(self.model.background)
         return freeze(np.where(self.living, values, 0.0)) if values.any() else np.broadcast_to(values, self.shape_out)
 
     @property
     def living(self) -> NDArray[np.bool_]:
         """Which pixels are not dead, (M, n_v, n_u), read-only: those whose efficiency in the model is not 0."""
-        return np.broadcast_to(each_pixel(self.model.efficiency) > 0, self.shape_out)
+        return np.broadcast_to(with_image_axes(self.model.efficiency) > 0, self.shape_out)
 
     def iter_views(self, volume: Volume | ArrayOrTensor) -> Iterator[ArrayOrTensor]:
         """The images one by one, each (n_v, n_u): work between which a job can stop. Gradients are not recorded.
@@ -378,7 +378,7 @@ class Projector(LinearOperator):
     @functools.cached_property
     def _efficiency(self) -> Array | None:
         """That of the model, (M, n_v, n_u) or (M, 1, 1); None where it is 1."""
-        values = each_pixel(self.model.efficiency)
+        values = with_image_axes(self.model.efficiency)
         return None if np.all(values == 1) else np.broadcast_to(values, (len(self.views), *values.shape[1:]))
 
     @functools.cached_property

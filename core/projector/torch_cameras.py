@@ -1,7 +1,7 @@
-"""Pinhole images from poses in torch, so that poses can be optimised.
+"""Pinhole cameras in torch: rays, radiographs and counts that are differentiable by the cameras' poses. Needs torch.
 
-`Views` and `Emission` describe cameras that stand still, in numpy; the rays and counts made here from torch tensors are
-the same, part of torch's graph. Needs torch.
+`Views` and `Emission` describe cameras that stand still, in numpy; the rays and counts computed here from torch tensors are
+the same, as part of torch's graph.
 """
 
 import functools
@@ -19,7 +19,7 @@ from ..physics.optics import Optics, chosen_optics
 from ..rays.tracing import trace_fans
 from ..validation import positive, whole_shape
 from ..volumes.volume import Volume, require_quantity
-from .torch_depth_images import Holes, camera_views, depth_images
+from .torch_depth_images import CameraTensors, camera_views, depth_images
 
 # Rays of a camera that are traced at once.
 _RAYS_AT_ONCE = 2**20
@@ -35,24 +35,24 @@ def pinhole_rays(
     shape: tuple[int, int],
     offset: Numbers = (0.0, 0.0),
 ) -> tuple[Tensor, Tensor]:
-    """Rays of pinhole cameras, differentiable in everything that is a number of theirs.
+    """Return the rays of pinhole cameras (...), differentiable by all numbers of the cameras.
 
     Parameters
     ----------
     positions
-        Pinholes (..., 3), world mm.
+        Positions of the pinholes, (..., 3), world mm.
     rotations
-        World from camera, (..., 3, 3), columns u, v, k as in ``system.poses()``: k looks from the pinhole to the detector's
-        plane, columns of the image grow along u, rows along v.
+        Rotations from camera to world, (..., 3, 3), columns u, v, k as in ``system.poses()``: k looks from the pinhole to
+        the detector's plane, columns of the image grow along u, rows along v.
     distance
-        Pinhole to the detector's plane along k, mm, (...) or one number: magnification times collimator length for a
-        virtual detector.
+        Distance from the pinhole to the detector's plane along k, mm, (...) or one number: magnification times collimator
+        length for a virtual detector.
     pitch
-        From pixel to pixel on that plane, mm, (..., 2) for u and v, or one number for both.
+        Step from pixel to pixel on that plane, mm, (..., 2) for u and v, or one number for both.
     shape
-        Pixels (n_v, n_u): rows, columns.
+        Number of pixels (n_v, n_u): rows, columns.
     offset
-        (..., 2): u and v, mm, of the image's middle on that plane, seen from where k meets it (the principal point).
+        Position u and v, (..., 2), mm, of the image's middle on that plane, from where k meets it (the principal point).
 
     Returns
     -------
@@ -70,17 +70,16 @@ def pinhole_rays(
 
 
 def _cameras(positions: Tensor, rotations: Numbers, *numbers: Numbers) -> list[Tensor]:
-    """The numbers of cameras (...) as tensors of one type: positions (..., 3), rotations (..., 3, 3), numbers (...).
+    """Return the numbers of cameras as tensors of one type: positions (..., 3), rotations (..., 3, 3), numbers (...).
 
-    The last two of the numbers are pitch and offset, (..., 2).
+    The last two of the numbers are pitch and offset, (..., 2). Raise `InputError` where their axes do not fit.
     """
     if not isinstance(positions, Tensor) or positions.shape[-1:] != (3,) or not positions.is_floating_point():
         raise InputError("positions: expected a tensor of real numbers, ... x 3")
-    given = (positions, rotations, *numbers)
-    kinds = [x.dtype for x in given if isinstance(x, Tensor) and x.is_floating_point()]
-    kind = functools.reduce(torch.promote_types, kinds)
-    place: Any = {"device": positions.device, "dtype": kind}
-    tensors = [x.to(**place) if isinstance(x, Tensor) else torch.tensor(x, **place) for x in given]
+    values = (positions, rotations, *numbers)
+    dtypes = [x.dtype for x in values if isinstance(x, Tensor) and x.is_floating_point()]
+    options: Any = {"device": positions.device, "dtype": functools.reduce(torch.promote_types, dtypes)}
+    tensors = [x.to(**options) if isinstance(x, Tensor) else torch.tensor(x, **options) for x in values]
     if tensors[1].shape[-2:] != (3, 3):
         raise InputError(f"rotations: expected ... x 3 x 3, got {' x '.join(map(str, tensors[1].shape))}")
     tensors[-2:] = (x if x.ndim else x.expand(2) for x in tensors[-2:])  # pitch, offset: one number for both
@@ -93,7 +92,7 @@ def _cameras(positions: Tensor, rotations: Numbers, *numbers: Numbers) -> list[T
 
 
 def _pixels(pitch: Tensor, offset: Tensor, shape: tuple[int, int]) -> tuple[Tensor, Tensor]:
-    """Where the rows' and the columns' middles lie, mm along v (..., n_v) and along u (..., n_u)."""
+    """Return the centres of rows along v (..., n_v) and of columns along u (..., n_u), mm."""
     row, column = (torch.arange(n).to(pitch) - (n - 1) / 2 for n in shape)
     return row * pitch[..., 1:] + offset[..., 1:], column * pitch[..., :1] + offset[..., :1]
 
@@ -101,7 +100,7 @@ def _pixels(pitch: Tensor, offset: Tensor, shape: tuple[int, int]) -> tuple[Tens
 def _fans(
     shape: tuple[int, int], positions: Tensor, rotations: Tensor, distance: Tensor, pitch: Tensor, offset: Tensor
 ) -> Tensor:
-    """The rays of `pinhole_rays` as the vectors (..., 4, 3) of `trace_fans`, rows and columns as in the image."""
+    """Return the rays of `pinhole_rays` as the vectors (..., 4, 3) of `trace_fans`, rows and columns as in the image."""
     u, v, k = rotations.unbind(dim=-1)
     pitch_u, pitch_v = pitch[..., :1], pitch[..., 1:]
     first_u, first_v = (offset - pitch * (pitch.new_tensor([shape[1], shape[0]]) - 1) / 2).split(1, dim=-1)
@@ -121,9 +120,10 @@ def pinhole_images(
     backend: str = "auto",
     grid: Grid | None = None,
 ) -> Tensor:
-    """Line integrals (..., n_v, n_u), value x mm, of a volume seen by the cameras of `pinhole_rays`.
+    """Return line integrals (..., n_v, n_u), value x mm, of a volume seen by the cameras of `pinhole_rays`.
 
-    Differentiable by the volume (a tensor on `grid`) and by all the cameras' numbers; `backend` is one of `Projector`'s.
+    They are differentiable by the volume (a tensor on `grid`) and by all numbers of the cameras; `backend` is one of
+    `Projector`'s.
 
     Examples
     --------
@@ -161,9 +161,9 @@ def emission_images(
     optics: Optics | None = None,
     **settings: Any,
 ) -> Tensor:
-    """Expected counts (..., n_v, n_u) of pinhole cameras, by the law of `Emission`.
+    """Return the expected counts (..., n_v, n_u) of pinhole cameras, by the law of `Emission`.
 
-    Differentiable by the volume, by mu, and by all the cameras' numbers. Images stand upright, as on a virtual
+    They are differentiable by the volume, by mu, and by all numbers of the cameras. Images are upright, as on a virtual
     detector of magnification 1: those of a real detector are point-inverted. For an intrinsic blur multiply them by the
     matrices of `gaussian_blur`.
 
@@ -172,32 +172,35 @@ def emission_images(
     volume
         Activity, kBq/mL: a `Volume`, or a tensor on `grid`.
     positions, rotations
-        Pinholes and world from camera, as in `pinhole_rays`.
+        Positions of the pinholes and rotations from camera to world, as in `pinhole_rays`.
     collimator_length
-        Pinhole to crystal, mm, (...) or one number.
+        Distance from pinhole to crystal, mm, (...) or one number.
     pitch, offset
-        Those of `pinhole_rays`, on the upright image at `collimator_length` in front of the pinhole: mm of the crystal.
+        Pitch and offset of `pinhole_rays`, on the upright image at `collimator_length` in front of the pinhole: mm of the
+        crystal.
     shape
-        Pixels (n_v, n_u): rows, columns.
+        Number of pixels (n_v, n_u): rows, columns.
     diameter
-        The hole's, mm, (...) or one number: the effective one, unless `aperture_mu` says how photons penetrate the edge.
+        Diameter of the hole, mm, (...) or one number: the effective one, unless `aperture_mu` says how photons penetrate
+        the edge.
     aperture_points, pixel_points, tolerance
-        Those of `Emission`; without a number of pixel points all cameras get as many as the one that needs most. All rays of
-        a camera are in the graph: many points of small images take less memory than few of large ones.
+        Settings of rays as in `Emission`; without a number of pixel points all cameras get as many as the one that needs
+        most. All rays of a camera are in the graph: many points of small images take less memory than few of large ones.
     crystal_thickness, crystal_side
-        The crystal's, mm, (...) or one number: needed with `crystal_mu`, and with `within_crystal` or `within_walls`.
+        Thickness and side of the crystal, mm, (...) or one number: needed with `crystal_mu`, and with `within_crystal` or
+        `within_walls`.
     time
-        The acquisition's, s, (...) or one number.
+        Duration of the acquisition, s, (...) or one number.
     mu, mu_grid
-        What attenuates, as in `trace_rays`.
+        Attenuation coefficients, 1/mm, and their grid, as in `trace_rays`.
     hole
-        "rays": through its points. "depth": the depth-dependent response, with the blur of the whole hole and the limits
-        that it has in `Emission`; on the processor. It has no derivatives by what the crystal stops and where it ends, nor
-        with edge "path" by what the edge lets pass.
+        "rays": lines through points of the hole. "depth": the depth-dependent response, with the blur of the whole hole and
+        its limits in `Emission`; on the processor. It has no derivatives by `crystal_mu`, `crystal_thickness` and
+        `crystal_side`, nor with edge "path" by `aperture_mu` and `opening_angle`.
     backend, grid
-        The same as in `trace_rays`.
+        Backend of the rays, and grid of a volume that is a tensor, as in `trace_rays`.
     optics, settings
-        The same as in `sensitivity`: `crystal_mu`, `photons_per_decay` and so on, each (...) or one number, without
+        Optics as in `sensitivity`: `crystal_mu`, `photons_per_decay` and so on, each (...) or one number, without
         `intrinsic_fwhm`.
 
     Examples
@@ -210,8 +213,8 @@ def emission_images(
     n_v, n_u = whole_shape(shape, "image shape", 2)
     if isinstance(volume, Volume):
         require_quantity(volume.quantity, ("activity",), "emission images")
-    within = volume.grid if isinstance(volume, Volume) else grid
-    if not isinstance(within, Grid):
+    volume_grid = volume.grid if isinstance(volume, Volume) else grid
+    if not isinstance(volume_grid, Grid):
         raise InputError(f"emission images: expected a Volume, or also a grid, got {type(volume).__name__}")
     optics = chosen_optics(optics, settings)
     if (optics.crystal_mu is None) != (crystal_thickness is None):
@@ -222,11 +225,12 @@ def emission_images(
         raise InputError(f"emission images: aperture_points: expected 1, 3 or more, got {aperture_points}")
     if not isinstance(optics.intrinsic_fwhm, float) or optics.intrinsic_fwhm > 0:
         raise InputError("emission images: intrinsic_fwhm: expected 0; `gaussian_blur` makes the matrices of a blur")
-    given = optics.numbers
+    settings_by_name = optics.numbers
     crystal = [0.0 if x is None else x for x in (crystal_thickness, crystal_side)]
-    positions, rotations, l, diameter, thickness, side, time, *own, pitch, offset = _cameras(
-        positions, rotations, collimator_length, diameter, *crystal, time, *given.values(), pitch, offset
+    positions, rotations, l, diameter, thickness, side, time, *optics_numbers, pitch, offset = _cameras(
+        positions, rotations, collimator_length, diameter, *crystal, time, *settings_by_name.values(), pitch, offset
     )
+    named_numbers = dict(zip(settings_by_name, optics_numbers, strict=True))
     for name, x in (("collimator_length", l), ("diameter", diameter), ("pitch", pitch)):
         if bool((x <= 0).any()):
             raise InputError(f"emission images: {name}: expected more than 0 mm, got {float(x.min()):g}")
@@ -236,48 +240,51 @@ def emission_images(
     if hole == "depth":
         if aperture_points != 1 or pixel_points is not None:
             raise InputError("emission images: hole 'depth' takes no aperture_points and pixel_points")
-        sided = side if optics.within_crystal or optics.within_walls else None
-        optics = optics.with_numbers(dict(zip(given, own, strict=True)))
-        holes = Holes(l, diameter, sided, thickness, pitch, offset)
-        return depth_images(volume, within, (positions, rotations), holes, (n_v, n_u), time, mu, mu_grid, optics)
+        bounded_side = side if optics.within_crystal or optics.within_walls else None
+        optics, poses = optics.with_numbers(named_numbers), (positions, rotations)
+        cameras = CameraTensors(l, diameter, bounded_side, thickness, pitch, offset)
+        return depth_images(volume, volume_grid, poses, cameras, (n_v, n_u), time, mu, mu_grid, optics)
 
-    # To the plane through the grid's farthest corner, in pinhole to crystal distances.
-    corners = positions.new_tensor(within.corners()) - positions.detach()[..., None, :]
+    # Depth of the plane through the grid's farthest corner, in units of the distance from pinhole to crystal.
+    corners = positions.new_tensor(volume_grid.corners()) - positions.detach()[..., None, :]
     depth = ((corners @ rotations.detach()[..., 2:])[..., 0].amax(dim=-1) / l.detach()).clamp(min=1.0)
     n = require_points(pixel_points, "emission images: pixel_points")
     if n is None:
         views = camera_views(positions, rotations, l, pitch, offset, (n_v, n_u))
-        edges, error = [shadow_edges(views, m, within) for m in range(len(views))], positive(tolerance, "tolerance")
-        n = max(points_needed(of_view, error, aperture_points) for of_view in edges)
-    # For rays, rows and columns of each camera: (..., 1, 1, 1).
-    optics = optics.with_numbers({name: x[..., None, None, None] for name, x in zip(given, own, strict=True)})
-    of_cameras = l, diameter, side, thickness, time, *pitch.unbind(dim=-1)
-    length, hole, side, thickness, seconds, pitch_u, pitch_v = (x[..., None, None, None] for x in of_cameras)
-    openings = optics.openings(hole, aperture_points)
+        edges, error = (
+            [shadow_edges(views, m, volume_grid) for m in range(len(views))],
+            positive(tolerance, "tolerance"),
+        )
+        n = max(points_needed(view_edges, error, aperture_points) for view_edges in edges)
+    # Numbers of cameras get axes for rays, rows and columns: (..., 1, 1, 1).
+    optics = optics.with_numbers({name: x[..., None, None, None] for name, x in named_numbers.items()})
+    numbers = l, diameter, side, thickness, time, *pitch.unbind(dim=-1)
+    length, d, side, thickness, seconds, pitch_u, pitch_v = (x[..., None, None, None] for x in numbers)
+    openings = optics.openings(d, aperture_points)
     starts = zip(openings, lattices(aperture_points, len(openings)), strict=True)
     distance = positions.norm(dim=-1)  # to the isocentre
     images: Any = 0.0
     for (layer, z), (opening, start) in itertools.product(enumerate(optics.depths(thickness)), starts):
-        point = torch.stack([(place + 0 * hole)[..., 0, 0, 0] for place in (opening.x, opening.y)], dim=-1)
+        point = torch.stack([(x + 0 * d)[..., 0, 0, 0] for x in (opening.x, opening.y)], dim=-1)
         sources = positions + (rotations[..., :2] @ point[..., None])[..., 0]
-        places = pitch.new_tensor(lattice(n)).expand(*pitch.shape[:-1], n, 2)
+        points = pitch.new_tensor(lattice(n)).expand(*pitch.shape[:-1], n, 2)
         if len(openings) > 1:  # as in `Emission`: seen from the isocentre they fill the pixel evenly
             shift = pitch.new_tensor(start) / math.sqrt(n) - (1 + l / distance)[..., None] * point / pitch
-            places = (places + shift[..., None, :] + 0.5) % 1 - 0.5
+            points = (points + shift[..., None, :] + 0.5) % 1 - 0.5
         stretch = depth * l / (l + z[..., 0, 0, 0])
-        for some in places.split(max(1, _RAYS_AT_ONCE // (n_v * n_u)), dim=-2):
-            ends = offset[..., None, :] + pitch[..., None, :] * some
+        for chunk in points.split(max(1, _RAYS_AT_ONCE // (n_v * n_u)), dim=-2):
+            ends = offset[..., None, :] + pitch[..., None, :] * chunk
             v, u = _pixels(pitch[..., None, :], ends, (n_v, n_u))
             along = u[..., None, :], v[..., :, None]
             cells = n * len(openings)
-            counted = optics.pixel_weights(along, (pitch_u, pitch_v), length, side, thickness, opening, layer, cells)
-            weights = counted * seconds / n
+            rates = optics.pixel_weights(along, (pitch_u, pitch_v), length, side, thickness, opening, layer, cells)
+            weights = rates * seconds / n
             middle = ends + point[..., None, :]
-            each = middle.shape[:-1]
-            pinholes, turned = sources[..., None, :].expand(*each, 3), rotations[..., None, :, :].expand(*each, 3, 3)
-            distances, pitches = (depth * l)[..., None].expand(each), (stretch[..., None] * pitch)[..., None, :]
-            off_axis = stretch[..., None, None] * middle
-            vectors = _fans((n_v, n_u), pinholes, turned, distances, pitches.expand(middle.shape), off_axis)
+            axes = middle.shape[:-1]
+            pinholes, frames = sources[..., None, :].expand(*axes, 3), rotations[..., None, :, :].expand(*axes, 3, 3)
+            distances, pitches = (depth * l)[..., None].expand(axes), (stretch[..., None] * pitch)[..., None, :]
+            offsets = stretch[..., None, None] * middle
+            vectors = _fans((n_v, n_u), pinholes, frames, distances, pitches.expand(middle.shape), offsets)
             integrals = trace_fans(volume, vectors, (n_v, n_u), backend, grid, mu, mu_grid)
             images = images + (weights.to(integrals) * integrals).sum(dim=-3)
     return images

@@ -1,4 +1,4 @@
-"""Pinhole images by the depth-dependent response in torch, part of its graph. Needs torch."""
+"""Counts of pinhole cameras by the depth-dependent response, as a step of torch's graph. Needs torch."""
 
 import copy
 from dataclasses import replace
@@ -22,132 +22,144 @@ from ..rays.parallel import thread_count
 from ..volumes.volume import Volume
 
 
-class Holes(NamedTuple):
-    """Numbers of cameras (...), as tensors."""
+class CameraTensors(NamedTuple):
+    """Numbers of pinhole cameras, tensors of the cameras' axes (...)."""
 
     length: Tensor
+    """(...), collimator lengths, mm."""
     diameter: Tensor
-    side: Tensor | None  # the crystal's, if nothing is counted beyond
+    """(...), diameters of the holes, mm."""
+    crystal_side: Tensor | None
+    """(...), sides of the crystals, mm; None if their ends are not taken into account."""
     thickness: Tensor
-    pitch: Tensor  # (..., 2): u, v
-    offset: Tensor  # (..., 2)
+    """(...), thicknesses of the crystals, mm."""
+    pitch: Tensor
+    """(..., 2), pixel sizes along u and v, mm."""
+    offset: Tensor
+    """(..., 2), positions of the images' middles along u and v, mm."""
 
 
 def depth_images(
     volume: Volume | Tensor,
     grid: Grid,
     poses: tuple[Tensor, Tensor],
-    holes: Holes,
+    cameras: CameraTensors,
     shape: tuple[int, int],
     time: Tensor,
     mu: Volume | Tensor | None,
     mu_grid: Grid | None,
     optics: Optics,
 ) -> Tensor:
-    """`emission_images` by hole "depth", of numbers that it has checked; `optics` has those of the cameras (...)."""
+    """Return `emission_images` (..., n_v, n_u) by hole "depth", for arguments that it has checked.
+
+    `poses` are positions (..., 3) and rotations (..., 3, 3); the numbers of `optics` are those of the cameras (...).
+    """
     positions, rotations = poses
-    cameras = positions.shape[:-1]
-    by_diameter = () if optics.edge == "path" else ("aperture_mu", "opening_angle")
-    for name, number in {"crystal_thickness": holes.thickness, "crystal_side": holes.side, **optics.numbers}.items():
-        if name not in ("photons_per_decay", *by_diameter) and getattr(number, "requires_grad", False):
-            what = f"hole 'depth' has no derivatives by {name}"
-            raise InputError(f"emission images: {what}: take hole 'rays', or detach it")
+    batch = positions.shape[:-1]
+    diameter_settings = () if optics.edge == "path" else ("aperture_mu", "opening_angle")
+    constants = {"crystal_thickness": cameras.thickness, "crystal_side": cameras.crystal_side, **optics.numbers}
+    for name, number in constants.items():
+        if name not in ("photons_per_decay", *diameter_settings) and getattr(number, "requires_grad", False):
+            reason = f"hole 'depth' has no derivatives by {name}"
+            raise InputError(f"emission images: {reason}: take hole 'rays', or detach it")
     factors = time * optics.photons_per_decay
-    plain = optics.with_numbers({"photons_per_decay": 1.0})
-    effective = _one_kernel(plain).effective_diameter(holes.diameter)
+    unit_optics = optics.with_numbers({"photons_per_decay": 1.0})
+    effective_diameter = _without_directional_effects(unit_optics).effective_diameter(cameras.diameter)
     array: Any = volume.array if isinstance(volume, Volume) else volume
     attenuation: Any = mu.array if isinstance(mu, Volume) else mu
     mu_grid = mu.grid if isinstance(mu, Volume) else mu_grid or grid
 
     def run(needs: Any) -> Any:
-        kind = np.float64 if is_double(array) or is_double(positions) else np.float32
-        given, on_mu = to_numpy(array, kind), None
+        dtype = np.float64 if is_double(array) or is_double(positions) else np.float32
+        voxels, mu_on_grid = to_numpy(array, dtype), None
         if attenuation is not None:
-            on_mu = ArrayOnGrid(require_no_negative(to_numpy(attenuation, kind)), mu_grid)
-        model = _whole_holes(grid, poses, holes, effective, shape, plain, on_mu)
-        functions = depth_backend()
-        threads = thread_count(None)
-        images = np.stack(list(model.images(given, functions, threads))).reshape(*cameras, *shape)
+            mu_on_grid = ArrayOnGrid(require_no_negative(to_numpy(attenuation, dtype)), mu_grid)
+        A = _pinhole_operator(grid, poses, cameras, effective_diameter, shape, unit_optics, mu_on_grid)
+        backend, threads = depth_backend(), thread_count(None)
+        images = np.stack(list(A.images(voxels, backend, threads))).reshape(*batch, *shape)
 
         def gradients(gradient: Tensor, needs: Any) -> list[Tensor | None]:
-            weights = to_numpy(gradient, kind).reshape(-1, *shape)
-            found: list[Any] = [None] * 8
+            weights = to_numpy(gradient, dtype).reshape(-1, *shape)
+            arrays: list[Any] = [None] * 8
             if needs[0]:
-                found[0] = model.backproject(weights, functions, threads, lambda done: None)
-            if needs[1] and on_mu is not None:
-                found[1] = model.mu_gradient(given, weights, functions, threads, on_mu)
+                arrays[0] = A.backproject(weights, backend, threads, lambda n_done: None)
+            if needs[1] and mu_on_grid is not None:
+                arrays[1] = A.mu_gradient(voxels, weights, backend, threads, mu_on_grid)
             if any(needs[2:]):
-                found[2:] = _by_cameras(model, given, weights, functions, threads)
-            wanted = (array, attenuation, positions, rotations, holes.length, effective, holes.pitch, holes.offset)
+                arrays[2:] = _camera_gradients(A, voxels, weights, backend, threads)
             return [
-                torch.as_tensor(own).reshape(like.shape).to(like) if need else None
-                for own, like, need in zip(found, wanted, needs, strict=True)
+                torch.as_tensor(values).reshape(tensor.shape).to(tensor) if need else None
+                for values, tensor, need in zip(arrays, (array, attenuation, *inputs), needs, strict=True)
             ]
 
         return torch.from_numpy(images).to(positions), gradients
 
-    inputs = positions, rotations, holes.length, effective, holes.pitch, holes.offset
+    inputs = positions, rotations, cameras.length, effective_diameter, cameras.pitch, cameras.offset
     return autograd.step(run, array, attenuation, *inputs) * factors[..., None, None]
 
 
-def _one_kernel(optics: Optics) -> Optics:
-    """Without what is in kernels that depend on the direction."""
+def _without_directional_effects(optics: Optics) -> Optics:
+    """Return the optics without path through the edge and depths in the crystal, which kernels have, but with its cone."""
     within_cone = optics.within_cone or optics.edge == "path"
     changed = copy.copy(optics)
     changed.__dict__.update(edge="paix", depth_layers=1, plate_thickness=None, within_cone=within_cone)
     return changed
 
 
-def _whole_holes(
+def _pinhole_operator(
     grid: Grid,
     poses: tuple[Tensor, Tensor],
-    holes: Holes,
-    effective: Tensor,
+    cameras: CameraTensors,
+    effective_diameter: Tensor,
     shape: tuple[int, int],
     optics: Optics,
     mu: ArrayOnGrid | None,
 ) -> PinholeOperator:
-    """The model of cameras that stand still."""
+    """Return the pinhole operator of the cameras as they are now, without gradients."""
     n = poses[0][..., 0].numel()
 
-    def each(number: Tensor, *last: int) -> Any:
+    def to_array(number: Tensor, *last: int) -> Any:
         return number.numpy(force=True).astype(np.float64).reshape(n, *last)
 
-    views = camera_views(*poses, holes.length, holes.pitch, holes.offset, shape)
-    sides = np.full(n, np.inf) if holes.side is None else each(holes.side)
-    thickness, hole = each(holes.thickness), each(holes.diameter)
-    numbers = {name: each(x) if is_tensor(x) else x for name, x in optics.numbers.items()}
+    views = camera_views(*poses, cameras.length, cameras.pitch, cameras.offset, shape)
+    sides = np.full(n, np.inf) if cameras.crystal_side is None else to_array(cameras.crystal_side)
+    thickness, diameter = to_array(cameras.thickness), to_array(cameras.diameter)
+    numbers = {name: to_array(x) if is_tensor(x) else x for name, x in optics.numbers.items()}
     optics = replace(optics.with_numbers(numbers), within_crystal=False, within_walls=False)
-    passages = [
-        DirectionalEffects.from_optics(optics.of_modules(m, n), float(hole[m]), float(thickness[m])) for m in range(n)
-    ]
-    lengths, plain = each(holes.length) + [each.mean_depth for each in passages], _one_kernel(optics)
+    sizes = zip(diameter.tolist(), thickness.tolist(), strict=True)
+    effects = [DirectionalEffects.from_optics(optics.of_modules(m, n), *size) for m, size in enumerate(sizes)]
+    plain = _without_directional_effects(optics)
+    lengths = to_array(cameras.length) + [camera.mean_depth for camera in effects]
 
     def ray_weight(m: int, *, u: Any, v: Any) -> Any:
-        own = plain.of_modules(m, n)
-        (opening,) = own.openings(hole[m])
-        return own.pixel_weights((u, v), (1.0, 1.0), lengths[m], np.inf, thickness[m], opening)
+        camera = plain.of_modules(m, n)
+        (opening,) = camera.openings(diameter[m])
+        return camera.pixel_weights((u, v), (1.0, 1.0), lengths[m], np.inf, thickness[m], opening)
 
-    slants = None if optics.edge == "paix" and optics.depth_layers == 1 else passages
-    of_modules = each(poses[1], 3, 3).transpose(0, 2, 1), lengths, each(effective), sides, ray_weight
-    return PinholeOperator(views, grid, *of_modules, mu, True, slants)
+    directional = None if optics.edge == "paix" and optics.depth_layers == 1 else effects
+    frames = to_array(poses[1], 3, 3).transpose(0, 2, 1)
+    law = lengths, to_array(effective_diameter), sides, ray_weight
+    return PinholeOperator(views, grid, frames, *law, mu, True, directional)
 
 
 def camera_views(
     positions: Tensor, rotations: Tensor, distance: Tensor, pitch: Tensor, offset: Tensor, shape: tuple[int, int]
 ) -> Views:
-    """Cameras (...) as `Views`, one after the other."""
+    """Return cameras (...) as `Views`, one after the other; the arguments are those of `pinhole_rays`, all tensors."""
     numbers = positions, rotations, distance, pitch, offset
-    position, rotation, along, size, middle = (
+    position, rotation, distances, size, middle = (
         x.numpy(force=True).astype(np.float64).reshape(-1, *x.shape[positions.ndim - 1 :]) for x in numbers
     )
     u, v, k = np.moveaxis(rotation, 2, 0)
-    centers = position + along[:, None] * k + middle[:, :1] * u + middle[:, 1:] * v
+    centers = position + distances[:, None] * k + middle[:, :1] * u + middle[:, 1:] * v
     return Views(position, centers, size[:, :1] * u, size[:, 1:] * v, shape)
 
 
-def _by_cameras(model: PinholeOperator, volume: Any, weights: Any, functions: Any, threads: int) -> list[Any]:
-    """Derivatives by positions, rotations, lengths, effective diameters, pitches and offsets."""
-    centers, frames, by = model.gradient(volume[None], weights[None], functions, threads)
-    pitch, first = (by[name][:, ::-1].copy() for name in ("pitch", "first"))
-    return [centers, frames.transpose(0, 2, 1), by["length"], by["diameter"], pitch, first]
+def _camera_gradients(A: PinholeOperator, volume: Any, weights: Any, backend: Any, threads: int) -> list[Any]:
+    """Return the gradients of sum(weights * A(volume)) by positions, rotations, lengths, diameters, pitches and offsets.
+
+    The diameters are the effective ones.
+    """
+    centers, frames, numbers = A.gradient(volume[None], weights[None], backend, threads)
+    pitch, first = (numbers[name][:, ::-1].copy() for name in ("pitch", "first"))
+    return [centers, frames.transpose(0, 2, 1), numbers["length"], numbers["diameter"], pitch, first]

@@ -15,7 +15,7 @@ from ..rays.bundles import Beam, Bundle, Bundles
 from ..rays.execution import Execution
 from ..rays.lattices import rounded_up
 from ..rays.ray_geometry import Fan
-from ..rays.tracing import gradient_by_fans
+from ..rays.tracing import fan_gradient
 from ..volumes.volume import Volume
 
 # Rays across a voxel, where that is farthest and looks narrowest. Across a voxel of mu there are at least as many as its
@@ -122,8 +122,8 @@ class VoxelTransmittance:
     def pinhole_gradient(self, d_transmittance: Array) -> Floats:
         """Return the gradient by the pinhole's position (3,), with which the rays move, from that by the transmittance."""
         _, bundles, execution = self._rays
-        d_fan = gradient_by_fans(execution, bundles, self._by_chords(d_transmittance), self._mu_array)
-        d_fan -= gradient_by_fans(execution, bundles, self._by_chords(d_transmittance * self.transmittance), None)
+        d_fan = fan_gradient(execution, bundles, self._by_chords(d_transmittance), self._mu_array)
+        d_fan -= fan_gradient(execution, bundles, self._by_chords(d_transmittance * self.transmittance), None)
         return d_fan[0] + d_fan[1]
 
     def mu_gradient(self, d_transmittance: Array) -> Array:

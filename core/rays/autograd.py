@@ -1,4 +1,4 @@
-"""Steps in torch's graph, made of plain functions."""
+"""Steps of torch's graph, made of plain functions."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -12,12 +12,12 @@ Gradients = Callable[[Tensor, Sequence[bool]], Sequence[Tensor | None]]
 
 
 def linear(forward: Callable[[Tensor], Tensor], adjoint: Callable[[Tensor], Tensor], x: Tensor) -> Tensor:
-    """``forward(x)``, a linear map with that `adjoint`; differentiable to any order, in both modes."""
+    """Return ``forward(x)``, a linear map with that `adjoint`; differentiable to any order, in both modes."""
     return _Linear.apply(forward, adjoint, x)
 
 
 class _Linear(torch.autograd.Function):
-    """The derivative of a linear map is itself, and its gradient the adjoint's."""
+    """Linear map as a step: its derivative is the map itself, its gradient the adjoint."""
 
     @staticmethod
     def forward(ctx: Any, forward: Any, adjoint: Any, x: Tensor) -> Tensor:
@@ -36,18 +36,20 @@ class _Linear(torch.autograd.Function):
 
 
 def step(run: Callable[[Sequence[bool]], tuple[Tensor, Gradients]], *inputs: Any) -> Tensor:
-    """A result that depends on `inputs`, some of them tensors, with its gradients; these have no gradients themselves.
+    """Return a result that depends on `inputs`, some of them tensors, and is differentiable once by them.
 
     Parameters
     ----------
     run
-        Takes which inputs need a gradient, and returns the result and another function: that takes the result's gradient
-        and which inputs need one, and returns their gradients, None for the others.
+        Function of a sequence that tells which inputs need a gradient. It returns the result and a function of the result's
+        gradient and of such a sequence, which returns the inputs' gradients, None for the other inputs.
     """
     return _Step.apply(run, *inputs)
 
 
 class _Step(torch.autograd.Function):
+    """Plain function with gradients as a step."""
+
     @staticmethod
     def forward(ctx: Any, run: Any, *inputs: Any) -> Tensor:
         result, ctx.gradients = run(ctx.needs_input_grad[1:])
@@ -61,7 +63,7 @@ class _Step(torch.autograd.Function):
 
 
 class _Once(torch.autograd.Function):
-    """Gradients that depend on all inputs of the step: a gradient of them is refused, where it would be wrongly 0."""
+    """Gradients of a step, as a step that depends on all its inputs: their own gradient is refused, and not wrongly 0."""
 
     @staticmethod
     def forward(ctx: Any, gradients: Gradients, needs: Sequence[bool], gradient: Tensor, *inputs: Tensor) -> Any:

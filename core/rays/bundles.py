@@ -1,4 +1,4 @@
-"""The rays of images, and what of them a backend is given at once."""
+"""Rays of images (bundles), and the parts of them that a backend traces in one call."""
 
 from __future__ import annotations
 
@@ -13,108 +13,118 @@ from ..geometry.grid import Grid
 from .lattices import Lattices
 from .ray_geometry import Attenuation, Ends, Fan, Rays, index_fans, index_rays
 
-KEPT_BYTES = 2**27
-"""What a projector keeps of its rays and their weights from call to call takes at most this much memory."""
+STORED_BYTES = 2**27
+"""Largest memory of the rays and weights that a projector stores from call to call."""
 
 
 @dataclass(frozen=True, eq=False)
 class Beam:
-    """Rays for every pixel of an image, as many as its fan has shifts, whose weighted integrals add up."""
+    """Rays for every pixel of an image, one for each shift of a fan, whose weighted integrals add up."""
 
-    rays: Fan  # from the rays' source to the pixels: n_v rows of n_u rays
-    # weights of the integrals: of slices of rows, columns and shifts, an array (shifts, rows, columns), with 1 row or
-    # column where all are the same. None: 1 everywhere.
-    weigh: Callable[[slice, slice, slice], Floats] | None = None
+    rays: Fan
+    """Fan of the rays from their source to the pixels: n_v rows of n_u rays."""
+    weights: Callable[[slice, slice, slice], Floats] | None = None
+    """Function of slices of rows, columns and shifts that returns the weights (shifts, rows, columns); None: 1 everywhere.
+
+    The array may have 1 row or column where all weights along it are the same."""
 
     def transposed(self) -> Beam:
-        """The same rays with rows and columns exchanged."""
-        weigh, rays = self.weigh, self.rays.transposed()
-        if weigh is None:
+        """Return the same rays with rows and columns exchanged."""
+        weights, rays = self.weights, self.rays.transposed()
+        if weights is None:
             return Beam(rays)
-        return Beam(rays, lambda rows, columns, shifts: np.swapaxes(weigh(columns, rows, shifts), -1, -2))
+        return Beam(rays, lambda rows, columns, shifts: np.swapaxes(weights(columns, rows, shifts), -1, -2))
 
 
 @dataclass(frozen=True, eq=False)
 class Bundle:
     """All rays of one image."""
 
-    beams: tuple[Beam, ...] = ()  # of one shape, unless there are `ends`
-    ends: Ends | None = None  # rays from point to point, of which the image (N, 1) has a value each
-    transposed: bool = False  # whether rows of rays are columns of the image
+    beams: tuple[Beam, ...] = ()
+    """Beams of one shape; none with `ends`."""
+    ends: Ends | None = None
+    """Rays from point to point, each with a value in the image (N, 1)."""
+    transposed: bool = False
+    """Whether rows of rays are columns of the image."""
 
     @classmethod
     def along(cls, grid: Grid, *beams: Beam) -> Bundle:
-        """The bundle of `beams` whose rows follow the voxels' contiguous axis as well as they can."""
-        across = beams[0].rays.lies_across(grid)
-        return cls(tuple(beam.transposed() for beam in beams) if across else beams, transposed=across)
+        """Return the bundle of `beams`, transposed if columns follow the voxels' contiguous axis better than rows."""
+        transposed = beams[0].rays.lies_across(grid)
+        return cls(tuple(beam.transposed() for beam in beams) if transposed else beams, transposed=transposed)
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Rows and columns of rays."""
+        """Number of rows and columns of rays."""
         return self.beams[0].rays.shape if self.ends is None else self.ends.shape
 
     @property
     def kind(self) -> tuple[bool, float]:
-        """What images whose rays make one part have in common: their orientation, and how far sources move."""
+        """Orientation, and `Fan.parallel`: images whose rays are traced in one part agree in both."""
         return self.transposed, self.beams[0].rays.parallel if self.ends is None else 0.0
 
     @property
     def rays_of_a_pixel(self) -> int:
-        """How many rays each pixel has."""
+        """Number of rays of each pixel."""
         return sum(len(beam.rays.shifts) for beam in self.beams) if self.ends is None else 1
 
     def n_rays(self, block: tuple[slice, slice] | None = None) -> int:
-        """How many rays there are, or how many of them in some rows and columns."""
-        rows, columns = self.shape if block is None else (which.stop - which.start for which in block)
+        """Return the number of rays, or of those in a block of rows and columns."""
+        rows, columns = self.shape if block is None else (part.stop - part.start for part in block)
         return rows * columns * self.rays_of_a_pixel
 
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """Rays that a backend is given in one call."""
+    """Rays that a backend traces in one call."""
 
-    # numbers of the images to which the fans belong, and how many fans of each follow one another
     images: list[tuple[int, int]]
-    rays: Floats | Ends  # (F, 4, 3), the fans' vectors (`Fan.vectors`); or rays from point to point
-    rows: slice  # the part of an image that each fan covers, of the transposed image if `transposed`
+    """Numbers of the images to which the fans belong, in order, with the number of fans of each."""
+    rays: Floats | Ends
+    """(F, 4, 3), vectors of the fans (`Fan.vectors`), or rays from point to point."""
+    rows: slice
+    """Rows of the image that each fan covers, of the transposed image if `transposed`."""
     columns: slice
+    """Columns of the image that each fan covers, of the transposed image if `transposed`."""
     transposed: bool = False
-    # (F, rows, columns), weights of the integrals, with 1 row or column where all are the same; None: 1 everywhere
+    """Whether rows of rays are columns of the image."""
     weights: Floats | None = None
-    parallel: float = 0.0  # that of `Fan`; fans of one part are all alike in this
+    """(F, rows, columns), weights of the integrals, with 1 row or column where all are the same; None: 1 everywhere."""
+    parallel: float = 0.0
+    """`Fan.parallel` of all fans."""
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Rows and columns of every fan."""
+        """Number of rows and columns of every fan."""
         return self.rows.stop - self.rows.start, self.columns.stop - self.columns.start
 
     def in_index_space(self, lattices: Lattices) -> tuple[Rays, Attenuation | None]:
-        """The rays as a backend takes them, and what attenuates them."""
+        """Return the rays in index space, as a backend takes them, and their attenuation."""
         if isinstance(self.rays, Ends):
             return lattices.mapped(index_rays, self.rays.starts, self.rays.ends)
         return lattices.mapped(index_fans, self.rays, self.shape, self.parallel)
 
     def pixels(self, image: ArrayOrTensor) -> ArrayOrTensor:
-        """The part of an image that the rays belong to, (rows, columns), as a view."""
+        """Return the part of an image that the rays belong to, (rows, columns), as a view of its memory."""
         return (image.T if self.transposed else image)[self.rows, self.columns]
 
     def add_to(self, images: ArrayOrTensor, first: int, integrals: ArrayOrTensor) -> None:
-        """Add the rays' weighted integrals to `images`, whose first has the number `first`."""
+        """Add the rays' weighted integrals to `images`, the first of which has the number `first`."""
         integrals = integrals.reshape(-1, *self.shape)
         if self.weights is not None:
             integrals = cast_like(self.weights, integrals) * integrals
         start = 0
         for number, n in self.images:
-            pixels, own = self.pixels(images[number - first]), integrals[start : start + n]
+            pixels, of_image = self.pixels(images[number - first]), integrals[start : start + n]
             if is_tensor(pixels):
-                pixels += own.sum(0)
-            else:  # one by one: the rounding does not depend on how many fans a part has, and so on the threads
-                for fan in own:
+                pixels += of_image.sum(0)
+            else:  # one by one, so that the rounding does not depend on the number of fans of a part, and so on the threads
+                for fan in of_image:
                     pixels += fan
             start += n
 
     def values(self, images: ArrayOrTensor) -> ArrayOrTensor:
-        """What the rays carry back from `images`: weights times pixels, (rays,)."""
+        """Return the values (rays,) that the rays back-project of `images`: weights times pixels."""
         numbers = [number for number, n in self.images for _ in range(n)]
         if len(self.images) == 1:
             pixels = self.pixels(images[numbers[0]])[None]
@@ -128,14 +138,14 @@ class Part:
 
 
 class Bundles:
-    """The rays of several images of one shape; made when they are asked for and kept while there is room.
+    """Rays of several images of one shape, made when they are needed and stored while there is room.
 
     Parameters
     ----------
     n : int
-        How many images.
+        Number of images.
     make : function
-        Takes an image's number and returns its `Bundle`.
+        Function of an image's number that returns its `Bundle`.
     """
 
     def __init__(self, n: int, make: Callable[[int], Bundle]) -> None:
@@ -143,20 +153,20 @@ class Bundles:
         self._make = make
         self._bundles: dict[int, Bundle] = {}
         self._parts: dict[tuple[Any, ...], list[Part]] = {}
-        self._room = KEPT_BYTES
+        self._free_bytes = STORED_BYTES
 
     def __len__(self) -> int:
         return self._n
 
     @property
     def image_shape(self) -> tuple[int, int]:
-        """Rows and columns of an image."""
+        """Number of rows and columns of an image."""
         if not self._n:
             return 0, 0
         return self[0].shape[::-1] if self[0].transposed else self[0].shape
 
     def __getitem__(self, number: int) -> Bundle:
-        """The rays of an image."""
+        """Return the rays of an image."""
         if number not in self._bundles:
             bundle = self._make(number)
             if not self._has_room(256 * bundle.rays_of_a_pixel):
@@ -164,39 +174,43 @@ class Bundles:
             self._bundles[number] = bundle
         return self._bundles[number]
 
-    def __getstate__(self) -> dict[str, Any]:  # what is kept holds functions that cannot be pickled
-        return self.__dict__ | {"_bundles": {}, "_parts": {}, "_room": KEPT_BYTES}
+    def __getstate__(self) -> dict[str, Any]:  # stored bundles hold functions that cannot be pickled
+        return self.__dict__ | {"_bundles": {}, "_parts": {}, "_free_bytes": STORED_BYTES}
 
-    def parts(self, images: range, block: tuple[slice, slice] | None, most: int) -> Iterable[Part]:
-        """All rays of several images, or those of a block of one: at most `most` in a part unless a fan alone has more."""
-        bounds = () if block is None else tuple((some.start, some.stop) for some in block)
-        key = images.start, images.stop, bounds, most
+    def parts(self, images: range, block: tuple[slice, slice] | None, limit: int) -> Iterable[Part]:
+        """Return all rays of several images, or of a block of one image, in parts.
+
+        A part has at most `limit` rays, unless a fan alone has more.
+        """
+        bounds = () if block is None else tuple((part.start, part.stop) for part in block)
+        key = images.start, images.stop, bounds, limit
         if key not in self._parts:
             bundles = [(number, self[number]) for number in images]
-            parts = self._made_parts(bundles, block, most)
-            kept = sum(8 * bundle.n_rays(block) for _, bundle in bundles if bundle.ends is None)
-            if not kept or not self._has_room(kept):
+            parts = _all_parts(bundles, block, limit)
+            n_bytes = sum(8 * bundle.n_rays(block) for _, bundle in bundles if bundle.ends is None)
+            if not n_bytes or not self._has_room(n_bytes):
                 return parts
             self._parts[key] = list(parts)
         return self._parts[key]
 
-    @staticmethod
-    def _made_parts(bundles: list[tuple[int, Bundle]], block: tuple[slice, slice] | None, most: int) -> Iterator[Part]:
-        for kind in sorted({bundle.kind for _, bundle in bundles}):
-            some = [(number, bundle) for number, bundle in bundles if bundle.kind == kind]
-            rows, columns = block or map(slice, some[0][1].shape)
-            yield from _parts(some, slice(rows.start or 0, rows.stop), slice(columns.start or 0, columns.stop), most)
-
     def _has_room(self, n_bytes: int) -> bool:
-        """Whether so many bytes may be kept; if so, they are counted."""
-        if n_bytes > self._room:
+        """Return whether so many bytes can be stored, and reserve them."""
+        if n_bytes > self._free_bytes:
             return False
-        self._room -= n_bytes
+        self._free_bytes -= n_bytes
         return True
 
 
-def _parts(bundles: list[tuple[int, Bundle]], rows: slice, columns: slice, most: int) -> Iterator[Part]:
-    """Some rows and columns of bundles of one orientation, at most `most` rays in a part unless a fan alone has more."""
+def _all_parts(bundles: list[tuple[int, Bundle]], block: tuple[slice, slice] | None, limit: int) -> Iterator[Part]:
+    """Yield the parts of numbered bundles, kind by kind."""
+    for kind in sorted({bundle.kind for _, bundle in bundles}):
+        alike = [(number, bundle) for number, bundle in bundles if bundle.kind == kind]
+        rows, columns = block or map(slice, alike[0][1].shape)
+        yield from _parts(alike, slice(rows.start or 0, rows.stop), slice(columns.start or 0, columns.stop), limit)
+
+
+def _parts(bundles: list[tuple[int, Bundle]], rows: slice, columns: slice, limit: int) -> Iterator[Part]:
+    """Yield the parts of some rows and columns of bundles of one kind, at most `limit` rays unless a fan alone has more."""
     pixels = (rows.stop - rows.start) * (columns.stop - columns.start)
     if not pixels:
         return
@@ -205,7 +219,7 @@ def _parts(bundles: list[tuple[int, Bundle]], rows: slice, columns: slice, most:
         ends: Any = bundle.ends
         yield Part([(number, 1)], Ends(ends.starts[rows], ends.ends[rows]), rows, columns)
         return
-    fans_at_once = max(1, most // pixels)
+    fans_at_once = max(1, limit // pixels)
     pieces: list[tuple[int, Beam, slice]] = []
     n = 0
     for number, bundle in bundles:
@@ -224,7 +238,7 @@ def _parts(bundles: list[tuple[int, Bundle]], rows: slice, columns: slice, most:
 
 
 def _part(pieces: list[tuple[int, Beam, slice]], rows: slice, columns: slice, transposed: bool) -> Part:
-    """The part of some shifts of some beams."""
+    """Return the part of pieces of beams: each the number of an image, a beam and a slice of its shifts."""
     images: list[tuple[int, int]] = []
     for number, _, shifts in pieces:
         n = shifts.stop - shifts.start
@@ -233,10 +247,10 @@ def _part(pieces: list[tuple[int, Beam, slice]], rows: slice, columns: slice, tr
         images.append((number, n))
     vectors = np.concatenate([beam.rays.part(rows, columns, shifts).vectors() for _, beam, shifts in pieces])
     weights = None
-    if any(beam.weigh for _, beam, _ in pieces):
-        shape, each = (rows.stop - rows.start, columns.stop - columns.start), []
+    if any(beam.weights for _, beam, _ in pieces):
+        shape, arrays = (rows.stop - rows.start, columns.stop - columns.start), []
         for _, beam, shifts in pieces:
-            own = np.ones(1) if beam.weigh is None else beam.weigh(rows, columns, shifts)
-            each.append(np.broadcast_to(own, (shifts.stop - shifts.start, *shape)))
-        weights = each[0] if len(each) == 1 else np.concatenate(each)
+            array = np.ones(1) if beam.weights is None else beam.weights(rows, columns, shifts)
+            arrays.append(np.broadcast_to(array, (shifts.stop - shifts.start, *shape)))
+        weights = arrays[0] if len(arrays) == 1 else np.concatenate(arrays)
     return Part(images, vectors, rows, columns, transposed, weights, pieces[0][1].rays.parallel)

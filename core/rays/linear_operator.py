@@ -1,4 +1,4 @@
-"""Linear operators, and their adjoints."""
+"""Linear operators and their adjoints."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ if TYPE_CHECKING:
 
 
 class LinearOperator(ABC):
-    """``A(x)``, with the exact adjoint ``A.T(y)``; differentiable in torch.
+    """Linear map ``A(x)`` with the exact adjoint ``A.T(y)``; differentiable in torch.
 
-    Both take a batch: whatever axes come before those of `shape_in` come before those of `shape_out`.
+    Both take a batch: the axes before those of `shape_in` come before those of `shape_out`.
     """
 
     def __call__(self, x: Volume | ArrayOrTensor, progress: Progress | None = None) -> ArrayOrTensor:
@@ -32,7 +32,7 @@ class LinearOperator(ABC):
         x
             Numpy array or torch tensor (..., *shape_in); a projector also takes a `Volume`.
         progress
-            Called as ``progress(views done, views)``, of a batch over all of it; what it raises stops the work.
+            Called as ``progress(views done, views)``, for a batch over all of it; an exception from it stops the work.
 
         Returns
         -------
@@ -43,50 +43,51 @@ class LinearOperator(ABC):
         Raises
         ------
         InputError
-            Another grid, or more memory needed than there is.
+            The volume is on another grid, or more memory is needed than there is.
         """
         return self._apply(self._check(x), progress)
 
     def _apply(self, x: ArrayOrTensor, progress: Progress | None = None, mu: ArrayOrTensor = None) -> ArrayOrTensor:
-        """Apply to a checked array or tensor, whose gradient follows; not that of mu."""
+        """Apply to a checked array or tensor, with its gradient in torch but not that of mu."""
         if not is_tensor(x):
             return self._run(x, progress, mu)
         from .autograd import linear
 
         return linear(lambda x: self._run(x, progress, mu), lambda y: self.T._run(y, mu=mu), x)
 
-    _names = ("array", "array")  # what messages call what it takes, and what its adjoint takes
-    _float64 = False  # whether it computes in float64 whatever it is given
+    _names = ("array", "array")  # names in messages of the argument, and of the adjoint's argument
+    _float64 = False  # whether it computes in float64 also from float32
 
     @functools.cached_property
     def T(self) -> LinearOperator:
-        """The exact adjoint, <A x, y> = <x, A.T y>."""
+        """Exact adjoint, <A x, y> = <x, A.T y>."""
         return Adjoint(self)
 
     @property
     @abstractmethod
     def shape_in(self) -> tuple[int, ...]:
-        """Shape of what it takes."""
+        """Shape of the argument."""
 
     @property
     @abstractmethod
     def shape_out(self) -> tuple[int, ...]:
-        """Shape of what it gives."""
+        """Shape of the result."""
 
     def _check(self, x: Any) -> ArrayOrTensor:
+        """Return `x` as an array or tensor; raise `InputError` if it has another shape or is not finite."""
         return checked(x, self._names[0], self.shape_in, self._float64, batch=True)
 
     def _run(self, x: ArrayOrTensor, progress: Progress | None = None, mu: ArrayOrTensor = None) -> ArrayOrTensor:
-        """Apply to a checked array or tensor, one by one to those of a batch; nothing is recorded in a graph."""
+        """Apply to a checked array or tensor, one by one to those of a batch, without recording a graph."""
         batch = tuple(x.shape[: x.ndim - len(self.shape_in)])
         if not batch:
             return self._run_one(x, progress, mu)
         n = math.prod(batch)
-        what = f"a batch of {n} times {shape_text(self.shape_out)} numbers"
-        require(x.itemsize * n * math.prod(self.shape_out), what)
+        work = f"a batch of {n} times {shape_text(self.shape_out)} numbers"
+        require(x.itemsize * n * math.prod(self.shape_out), work)
         results = zeros((*batch, *self.shape_out), x)
-        for done, index in enumerate(np.ndindex(batch)):
-            results[index] = self._run_one(x[index], part_of(progress, done, n), mu)
+        for n_done, index in enumerate(np.ndindex(batch)):
+            results[index] = self._run_one(x[index], part_of(progress, n_done, n), mu)
         return results
 
     @abstractmethod
@@ -99,7 +100,7 @@ class LinearOperator(ABC):
 
 
 class Adjoint(LinearOperator):
-    """The adjoint of an operator, ``A.T``."""
+    """Adjoint of an operator, ``A.T``."""
 
     def __init__(self, operator: LinearOperator) -> None:
         self._operator = operator
@@ -108,17 +109,17 @@ class Adjoint(LinearOperator):
 
     @property
     def T(self) -> LinearOperator:  # type: ignore[override]
-        """The operator."""
+        """Operator whose adjoint this is."""
         return self._operator
 
     @property
     def shape_in(self) -> tuple[int, ...]:
-        """Shape of what the operator gives."""
+        """Shape of the argument, the operator's result."""
         return self._operator.shape_out
 
     @property
     def shape_out(self) -> tuple[int, ...]:
-        """Shape of what the operator takes."""
+        """Shape of the result, the operator's argument."""
         return self._operator.shape_in
 
     def __repr__(self) -> str:

@@ -1,6 +1,6 @@
-"""How line integrals move with the rays: gradients by fans and by ends, from a backend's derivatives.
+"""Gradients of line integrals by the rays, by fans or by ends, from the derivatives that a backend returns.
 
-An integral is length x mean. The mean moves with the planes of either grid, and, attenuated, with the length.
+An integral is length x mean. The mean changes with the planes of either grid, and, with attenuation, with the length.
 """
 
 import numpy as np
@@ -12,92 +12,96 @@ from .ray_geometry import Ends
 
 
 def integrals(part: Part, derivatives: Floats) -> Floats:
-    """Line integrals (rays,) of a part, value x mm."""
-    return np.concatenate([length for _, length in _rays(part)]) * derivatives[0]
+    """Return the line integrals (rays,) of a part, value x mm."""
+    return np.concatenate([length for _, length in _fan_rays(part)]) * derivatives[0]
 
 
-def by_geometry(part: Part, gradient: Floats, derivatives: Floats, *grids: Grid) -> list[tuple[int, Floats]]:
-    """The gradient by the geometry of each image of a part, with the image's number.
+def geometry_gradient(part: Part, gradient: Floats, derivatives: Floats, *grids: Grid) -> list[tuple[int, Floats]]:
+    """Return the gradient by the geometry of each image of a part, with the image's number.
 
     Parameters
     ----------
     part
         Rays without weights, one fan of each image.
     gradient
-        By the images, (images, rows, columns).
+        Gradient by the images, (images, rows, columns).
     derivatives
-        What the backend returned, (7 or 14, rays).
+        Derivatives that the backend has returned, (7 or 14, rays).
     grids
-        The volume's and mu's.
+        Grids of the volume and of mu.
 
     Returns
     -------
     list of (int, array)
-        By source, corner, row step and column step of a fan, (4, 3); by starts and ends, (2, rays, 3).
+        Gradients by source, corner, row step and column step of a fan, (4, 3), or by starts and ends, (2, rays, 3).
     """
-    by = _by_ends if isinstance(part.rays, Ends) else _by_fan
-    each = zip(part.images, np.split(derivatives, len(part.images), axis=1), _rays(part), strict=True)
-    linear = [grid.index_from_world[:3, :3] for grid in grids]
+    image_gradient = _ends_gradient if isinstance(part.rays, Ends) else _fan_gradient
+    images = zip(part.images, np.split(derivatives, len(part.images), axis=1), _fan_rays(part), strict=True)
+    matrices = [grid.index_from_world[:3, :3] for grid in grids]
     return [
-        (number, by(part, part.pixels(gradient[number]).reshape(-1), own, *rays, *linear))
-        for (number, _), own, rays in each
+        (number, image_gradient(part, part.pixels(gradient[number]).reshape(-1), rows, *rays, *matrices))
+        for (number, _), rows, rays in images
     ]
 
 
-def _by_ends(
-    part: Part, values: Floats, derivatives: Floats, along: Floats, lengths: Floats, linear: Floats, of_mu: Floats
+def _ends_gradient(
+    part: Part, values: Floats, derivatives: Floats, vectors: Floats, lengths: Floats, matrix: Floats, mu_matrix: Floats
 ) -> Floats:
-    """The gradient (2, n, 3) by start and end of the rays."""
+    """Return the gradient (2, n, 3) by start and end of the rays.
+
+    `values` (n,) is the gradient by the integrals, `vectors` (3, n) and `lengths` (n,) are the rays', and the matrices (3,
+    3) of the volume and of mu are index from world.
+    """
     weights = values * lengths
     result = np.empty((2, len(values), 3))
     for end in range(2):
-        result[end] = (weights * derivatives[1 + 3 * end : 4 + 3 * end]).T @ linear
+        result[end] = (weights * derivatives[1 + 3 * end : 4 + 3 * end]).T @ matrix
         if len(derivatives) > 7:
-            result[end] += (weights * derivatives[7 + 3 * end : 10 + 3 * end]).T @ of_mu
-    by_length = (_by_length(values, lengths, derivatives) * along).T
-    result[0] -= by_length
-    result[1] += by_length
+            result[end] += (weights * derivatives[7 + 3 * end : 10 + 3 * end]).T @ mu_matrix
+    through_length = (_length_gradient(values, lengths, derivatives) * vectors).T
+    result[0] -= through_length
+    result[1] += through_length
     return result
 
 
-def _by_fan(
-    part: Part, values: Floats, derivatives: Floats, along: Floats, lengths: Floats, linear: Floats, of_mu: Floats
+def _fan_gradient(
+    part: Part, values: Floats, derivatives: Floats, vectors: Floats, lengths: Floats, matrix: Floats, mu_matrix: Floats
 ) -> Floats:
-    """The gradient (4, 3) by source, corner, row step and column step."""
-    numbers = _numbers(part)
-    # Sums over the rays first, times their numbers where a step moves their ends as often.
+    """Return the gradient (4, 3) by source, corner, row step and column step; arguments are those of `_ends_gradient`."""
+    factors = _step_factors(part)
+    # The sums over the rays come first, with the number of steps by which a step moves a ray's end.
     # einsum, not `@`: BLAS would start threads of its own beside ours.
-    by_planes = np.einsum("in,jn->ij", derivatives[1:13], values * lengths * numbers)
-    by_start, by_end = by_planes[:3, 0] @ linear, by_planes[3:6].T @ linear
+    sums = np.einsum("in,jn->ij", derivatives[1:13], values * lengths * factors)
+    d_start, d_end = sums[:3, 0] @ matrix, sums[3:6].T @ matrix
     if len(derivatives) > 7:
-        by_start += by_planes[6:9, 0] @ of_mu
-        by_end += by_planes[9:].T @ of_mu
-    by_length = np.einsum("jn,in->ji", _by_length(values, lengths, derivatives) * numbers, along)
-    result = np.concatenate([by_start[None] - by_length[:1], by_end + by_length])
-    # The part's corner is that of its first row and column.
+        d_start += sums[6:9, 0] @ mu_matrix
+        d_end += sums[9:].T @ mu_matrix
+    through_length = np.einsum("jn,in->ji", _length_gradient(values, lengths, derivatives) * factors, vectors)
+    result = np.concatenate([d_start[None] - through_length[:1], d_end + through_length])
+    # Steps are counted from the part's corner, but are those from the fan's.
     result[2] += part.rows.start * result[1]
     result[3] += part.columns.start * result[1]
     return result[[0, 1, 3, 2]] if part.transposed else result
 
 
-def _by_length(values: Floats, lengths: Floats, derivatives: Floats) -> Floats:
-    """The gradient (n,) by the rays' lengths at constant ends on the lattices, divided by the lengths."""
-    by_length = derivatives[0] if len(derivatives) == 7 else derivatives[0] + lengths * derivatives[13]
-    return values * by_length / np.where(lengths > 0, lengths, 1.0)
+def _length_gradient(values: Floats, lengths: Floats, derivatives: Floats) -> Floats:
+    """Return the gradient (n,) by the rays' lengths at constant ends on the lattices, divided by the lengths."""
+    d_length = derivatives[0] if len(derivatives) == 7 else derivatives[0] + lengths * derivatives[13]
+    return values * d_length / np.where(lengths > 0, lengths, 1.0)
 
 
-def _rays(part: Part) -> list[tuple[Floats, Floats]]:
-    """Source to target of the rays of every fan, (3, n), and their lengths (n,), world mm."""
+def _fan_rays(part: Part) -> list[tuple[Floats, Floats]]:
+    """Return for every fan the vectors from source to target, (3, n), and the lengths (n,) of its rays, world mm."""
     if isinstance(part.rays, Ends):
-        each = (part.rays.ends - part.rays.starts).T[None]
+        fans = (part.rays.ends - part.rays.starts).T[None]
     else:
         rows, columns = map(np.arange, part.shape)
         source, corner, row_step, column_step = part.rays.swapaxes(0, 1)[..., None, None]
-        each = (corner - source + row_step * rows[:, None] + column_step * columns).reshape(len(source), 3, -1)
-    return [(along, np.sqrt(np.einsum("in,in->n", along, along))) for along in each]
+        fans = (corner - source + row_step * rows[:, None] + column_step * columns).reshape(len(source), 3, -1)
+    return [(vectors, np.sqrt(np.einsum("in,in->n", vectors, vectors))) for vectors in fans]
 
 
-def _numbers(part: Part) -> Floats:
-    """For each ray of a fan: 1, the row's number and the column's, (3, n), counted from the part's corner."""
+def _step_factors(part: Part) -> Floats:
+    """Return for each ray of a fan 1, the number of its row and that of its column, (3, n), from the part's corner."""
     rows, columns = np.indices(part.shape, float).reshape(2, -1)
     return np.stack([np.ones_like(rows), rows, columns])

@@ -1,4 +1,4 @@
-"""Rays given by their ends, or fan by fan: line integrals, and in torch their gradients by the volume and by the rays."""
+"""Line integrals along rays given by their ends or as fans; in torch with gradients by the volume and by the rays."""
 
 from __future__ import annotations
 
@@ -34,40 +34,39 @@ def trace_rays(
     mu: Volume | ArrayOrTensor | None = None,
     mu_grid: Grid | None = None,
 ) -> ArrayOrTensor:
-    """Line integrals of a volume along given rays, attenuated towards their sources if there is mu.
+    """Return line integrals of a volume along rays, attenuated towards their sources if `mu` is given.
 
     Parameters
     ----------
     volume
-        The voxels; outside them it is 0. A `Volume` of activity or mu (with `mu`, of activity), or an array or tensor
-        (n_x, n_y, n_z) on `grid`.
+        Volume that is integrated; outside its voxels it is 0. A `Volume` of activity or mu (with `mu`, of activity), or an
+        array or tensor (n_x, n_y, n_z) on `grid`.
     sources, targets
-        Ends of the rays, each (N, 3), or (3,) for all rays the same; world mm. Arrays or torch tensors.
+        Ends of the rays, each (N, 3), or (3,) if it is the same for all rays; world mm. Arrays or torch tensors.
     backend
-        One of `Projector`'s.
+        One of the backends of `Projector`.
     grid
-        Where the voxels are, for a volume that is an array or a tensor.
+        Grid of a volume that is an array or a tensor.
     mu
-        What attenuates, 1/mm: the integrals are of ``volume exp(-integral of mu from the source)``. A `Volume` of mu,
-        or an array or tensor on `mu_grid`.
+        Attenuation coefficients, 1/mm: the integrals are of ``volume exp(-integral of mu from the source)``. A `Volume` of
+        mu, or an array or tensor on `mu_grid`.
     mu_grid
-        Where mu's voxels are; the volume's grid if None.
+        Grid of mu; the volume's grid if None.
 
     Returns
     -------
     array or tensor (N,)
-        Value x mm, from source to target. From arrays: float32, or float64 for ``backend="numpy"``. If anything given
-        is a tensor: a tensor of the ends' type (of the volume's where the ends are arrays), computed in float64 if any
-        tensor is of float64, and part of torch's graph. Its
-        gradients, by the volume, mu and the rays' ends, are exact wherever there are any: by the ends they follow from
-        the jumps of the volume and of mu at the planes crossed, for every backend. A ray of length 0 has gradient 0.
-        Gradients of gradients are refused.
+        Line integrals from source to target, value x mm. From arrays: float32, or float64 for ``backend="numpy"``. If any
+        argument is a tensor: a tensor of the ends' type (of the volume's where the ends are arrays), computed in float64 if
+        any tensor is of float64, and part of torch's graph. Its gradients, by the volume, mu and the rays' ends, are exact
+        wherever they exist: by the ends they follow from the jumps of the volume and of mu at the planes crossed, for every
+        backend. A ray of length 0 has gradient 0. Gradients of gradients are refused.
 
     Raises
     ------
     InputError
-        Not a volume, or one whose line integrals mean nothing (CT numbers, maps); the points' shapes do not fit, or a
-        coordinate, or a voxel that a ray meets, is not finite; mu is negative; no such backend.
+        The volume is none, or one without meaningful line integrals (CT numbers, maps); the points' shapes do not fit; a
+        coordinate, or a voxel that a ray meets, is not finite; mu is negative; or there is no such backend.
 
     Examples
     --------
@@ -83,8 +82,8 @@ def trace_rays(
     n = len(ends) if len(starts) == 1 else len(starts)
     xp = namespace(starts)
     rays = xp.stack([xp.broadcast_to(points, (n, 3)) for points in (starts, ends)])
-    integrals = _traced(array, mu, rays, lambda rays: Bundles(1, lambda _: Bundle(ends=Ends(*rays))), execution)
-    return _of_kind(integrals.reshape(n), array, sources, targets)
+    integrals = _trace(array, mu, rays, lambda rays: Bundles(1, lambda _: Bundle(ends=Ends(*rays))), execution)
+    return _as_input(integrals.reshape(n), array, sources, targets)
 
 
 def trace_fans(
@@ -96,22 +95,23 @@ def trace_fans(
     mu: Volume | ArrayOrTensor | None = None,
     mu_grid: Grid | None = None,
 ) -> ArrayOrTensor:
-    """Line integrals along fans of rays: `trace_rays` for images, whose rays need not be listed.
+    """Return line integrals along fans of rays: `trace_rays` for images, whose rays need not be listed.
 
     Parameters
     ----------
     vectors
-        The fans, (..., 4, 3), world mm: source, corner, row step and column step. The ray of row i and column j goes from
-        the source to ``corner + i row_step + j column_step``. An array or a torch tensor.
+        Vectors of the fans, (..., 4, 3), world mm: source, corner, row step and column step. The ray of row i and column j
+        goes from the source to ``corner + i row_step + j column_step``. An array or a torch tensor.
     shape
-        Rows and columns.
+        Number of rows and columns.
     volume, backend, grid, mu, mu_grid
-        The same as in `trace_rays`.
+        Volume, backend and attenuation, as in `trace_rays`.
 
     Returns
     -------
     array or tensor (..., rows, columns)
-        Value x mm, of the kind that `trace_rays` returns. Gradients by the vectors cost little more than the integrals.
+        Line integrals, value x mm, of the kind that `trace_rays` returns. Gradients by the vectors take little more time
+        than the integrals.
 
     Examples
     --------
@@ -124,16 +124,16 @@ def trace_fans(
     numbers = _numbers(vectors, "vectors", (4, 3), is_tensor(array) or is_tensor(vectors))
 
     def bundles(vectors: Floats) -> Bundles:
-        each = vectors.reshape(-1, 4, 3)
+        fans = vectors.reshape(-1, 4, 3)
 
         def bundle(number: int) -> Bundle:
-            source, corner, row_step, column_step = each[number]
+            source, corner, row_step, column_step = fans[number]
             return Bundle.along(execution.grid, Beam(Fan(source, corner, row_step, column_step, shape)))
 
-        return Bundles(len(each), bundle)
+        return Bundles(len(fans), bundle)
 
-    integrals = _traced(array, mu, numbers, bundles, execution)
-    return _of_kind(integrals.reshape(*numbers.shape[:-2], *shape), array, vectors)
+    integrals = _trace(array, mu, numbers, bundles, execution)
+    return _as_input(integrals.reshape(*numbers.shape[:-2], *shape), array, vectors)
 
 
 def _execution(
@@ -144,16 +144,17 @@ def _execution(
     mu_grid: Grid | None,
     geometry: tuple[Any, ...],
 ) -> tuple[ArrayOrTensor, ArrayOrTensor, Execution]:
-    """Checked numbers of the volume and of mu, both arrays or both tensors, and what traces rays of that `geometry`."""
-    if isinstance(volume, Volume):  # attenuation is not attenuated
+    """Return the volume and mu, checked, both arrays or both tensors, and the execution for rays of that `geometry`."""
+    if isinstance(volume, Volume):  # mu itself is not attenuated
         require_quantity(volume.quantity, LINE_INTEGRALS if mu is None else ("activity",), "line integrals")
     chosen = backends.choose(backend)
-    reference = chosen.always_float64 and backend != "auto"
-    array, grid = _field(volume, "volume", grid, reference)
+    is_reference = chosen.always_float64 and backend != "auto"
+    array, grid = _array_and_grid(volume, "volume", grid, is_reference)
     if mu is not None:
         if isinstance(mu, Volume):
             require_quantity(mu.quantity, ("mu",), "mu")
-        mu, mu_grid = _field(mu, "mu", mu_grid if isinstance(mu, Volume) else mu_grid or grid, reference)
+        mu_grid = mu_grid if isinstance(mu, Volume) else mu_grid or grid
+        mu, mu_grid = _array_and_grid(mu, "mu", mu_grid, is_reference)
         array, mu = promote(array, require_no_negative(mu))
     if is_tensor(array) and array.device.type != "cpu" and backend == "auto":
         chosen = backends.for_tensor(array)
@@ -161,8 +162,10 @@ def _execution(
     return array, mu, Execution(chosen, grid, mu_grid, float64, thread_count(None), whole_for_few=True)
 
 
-def _field(value: Volume | ArrayOrTensor, name: str, grid: Grid | None, float64: bool) -> tuple[ArrayOrTensor, Grid]:
-    """The numbers of a `Volume`, or of an array or tensor on `grid`; and their grid."""
+def _array_and_grid(
+    value: Volume | ArrayOrTensor, name: str, grid: Grid | None, float64: bool
+) -> tuple[ArrayOrTensor, Grid]:
+    """Return the array or tensor of a volume, and its grid; raise `InputError` if it has none or two."""
     if isinstance(value, Volume):
         if grid is not None and grid != value.grid:
             raise InputError(f"{name} is a Volume and has a grid; leave the other out")
@@ -175,7 +178,7 @@ def _field(value: Volume | ArrayOrTensor, name: str, grid: Grid | None, float64:
 
 
 def _numbers(value: Any, name: str, last: tuple[int, ...], in_torch: bool) -> Any:
-    """Numbers (..., *last), as float64; in torch a tensor on the CPU, in its graph."""
+    """Return numbers (..., *last) as float64; with `in_torch` as a tensor on the CPU, part of its graph."""
     value = checked(value, name, last, True, batch=True)
     if not in_torch:
         return value
@@ -185,7 +188,7 @@ def _numbers(value: Any, name: str, last: tuple[int, ...], in_torch: bool) -> An
 
 
 def _points(value: Any, name: str, in_torch: bool) -> Any:
-    """Points (n, 3), of one (3,) or many."""
+    """Return points (n, 3), from one (3,) or many."""
     if isinstance(value, list | tuple) and not len(value):
         value = np.empty((0, 3))
     points = _numbers(value, name, (3,), in_torch)
@@ -194,30 +197,31 @@ def _points(value: Any, name: str, in_torch: bool) -> Any:
     return points.reshape(-1, 3)
 
 
-def _traced(
-    volume: Any, mu: Any, geometry: Any, bundles_of: Callable[[Floats], Bundles], execution: Execution
+def _trace(
+    volume: Any, mu: Any, geometry: Any, make_bundles: Callable[[Floats], Bundles], execution: Execution
 ) -> ArrayOrTensor:
-    """Line integrals (images, rows, columns) of the rays that ``bundles_of(geometry)`` makes, a step of torch's graph if
-    the geometry is a tensor; float32, or float64 where the execution is.
+    """Return the line integrals (images, rows, columns) of the rays ``make_bundles(geometry)``.
+
+    They are float32, or float64 where the execution is. If the geometry is a tensor they are a step of torch's graph.
     """
-    kind = np.float64 if execution.float64 else np.float32
+    dtype = np.float64 if execution.float64 else np.float32
 
     def images(bundles: Bundles, volume: Any, mu: Any) -> Floats:
-        return np.array([to_caller(image, np.empty(0)) for image in execution.images(volume, bundles, mu)], kind)
+        return np.array([to_caller(image, np.empty(0)) for image in execution.images(volume, bundles, mu)], dtype)
 
     if not is_tensor(geometry):
-        return images(bundles_of(geometry), volume, mu)
+        return images(make_bundles(geometry), volume, mu)
     import torch
 
     from . import autograd
 
-    bundles = bundles_of(geometry.numpy(force=True))
+    bundles = make_bundles(geometry.numpy(force=True))
     volume_data, mu_data = (x.detach() if is_tensor(x) else x for x in (volume, mu))
 
     def run(needs: Any) -> Any:
         parts: list[tuple[Part, Floats]] = []
         if needs[2]:
-            integrals = np.zeros((len(bundles), *bundles.image_shape), kind)
+            integrals = np.zeros((len(bundles), *bundles.image_shape), dtype)
             parts = execution.derivatives(volume_data, bundles, mu_data, integrals)
         else:
             integrals = images(bundles, volume_data, mu_data)
@@ -225,50 +229,55 @@ def _traced(
             require_finite(to_caller(volume_data, integrals), "volume")
 
         def gradients(gradient: Tensor, needs: Any) -> list[Tensor | None]:
-            found: list[Tensor | None] = [None, None, None]
+            result: list[Tensor | None] = [None, None, None]
             if needs[0] or needs[1]:
                 values = gradient.to(volume_data)  # the torch backend works on the device of the values
             if needs[0]:
-                found[0] = torch.as_tensor(execution.backproject(values, bundles, mu_data)).to(values)
+                result[0] = torch.as_tensor(execution.backproject(values, bundles, mu_data)).to(values)
             if needs[1]:
-                found[1] = torch.as_tensor(execution.mu_gradient(values, bundles, volume_data, mu_data)).to(values)
+                result[1] = torch.as_tensor(execution.mu_gradient(values, bundles, volume_data, mu_data)).to(values)
             if needs[2]:
-                by_geometry = _by_geometry(gradient.numpy(force=True), parts, bundles, execution)
-                found[2] = torch.from_numpy(by_geometry).reshape(geometry.shape)
-            return found
+                d_geometry = _geometry_gradient(gradient.numpy(force=True), parts, bundles, execution)
+                result[2] = torch.from_numpy(d_geometry).reshape(geometry.shape)
+            return result
 
         return torch.from_numpy(integrals), gradients
 
     return autograd.step(run, volume, mu, geometry)
 
 
-def _by_geometry(gradient: Floats, parts: list[tuple[Part, Floats]], bundles: Bundles, execution: Execution) -> Floats:
-    """The gradient by fans (images, 4, 3), or by starts and ends (2, rays, 3)."""
+def _geometry_gradient(
+    gradient: Floats, parts: list[tuple[Part, Floats]], bundles: Bundles, execution: Execution
+) -> Floats:
+    """Return the gradient by fans (images, 4, 3), or by starts and ends (2, rays, 3), from that by the images."""
     grids = execution.grid, execution.mu_grid or execution.grid
-    results = in_order(lambda of: ray_gradients.by_geometry(of[0], gradient, of[1], *grids), parts, execution.workers)
+
+    def part_gradient(part: tuple[Part, Floats]) -> list[tuple[int, Floats]]:
+        return ray_gradients.geometry_gradient(part[0], gradient, part[1], *grids)
+
+    results = [numbered for result in in_order(part_gradient, parts, execution.workers) for numbered in result]
     if len(bundles) and bundles[0].ends is not None:
-        return np.concatenate([np.empty((2, 0, 3)), *(own for result in results for _, own in result)], axis=1)
+        return np.concatenate([np.empty((2, 0, 3)), *(d_ends for _, d_ends in results)], axis=1)
     total = np.zeros((len(bundles), 4, 3))
-    for result in results:
-        for number, own in result:
-            total[number] += own
+    for number, d_fan in results:
+        total[number] += d_fan
     return total
 
 
-def gradient_by_fans(execution: Execution, bundles: Bundles, volume: Floats, mu: Floats | None) -> Floats:
-    """The gradient (4, 3), by its source, corner, row step and column step, of the sum of a fan's integrals."""
+def fan_gradient(execution: Execution, bundles: Bundles, volume: Floats, mu: Floats | None) -> Floats:
+    """Return the gradient (4, 3) of the sum of a fan's integrals by its source, corner, row step and column step."""
     ones = np.ones((1, *bundles.image_shape))
     parts = execution.derivatives(volume, bundles, mu, np.zeros_like(ones))
-    return _by_geometry(ones, parts, bundles, execution).reshape(4, 3)
+    return _geometry_gradient(ones, parts, bundles, execution).reshape(4, 3)
 
 
-def _of_kind(integrals: ArrayOrTensor, volume: Any, *geometry: Any) -> ArrayOrTensor:
-    """`integrals` of the type of the geometry's tensors, or else of the volume, on the device of the first tensor."""
-    given = [x for x in (volume, *geometry) if is_tensor(x)]
-    if not given:
+def _as_input(integrals: ArrayOrTensor, volume: Any, *geometry: Any) -> ArrayOrTensor:
+    """Return `integrals` in the type of the geometry's tensors, or else of the volume's, on the first tensor's device."""
+    tensors = [x for x in (volume, *geometry) if is_tensor(x)]
+    if not tensors:
         return integrals
     import torch
 
-    kinds = [x.dtype for x in geometry if is_tensor(x) and x.is_floating_point()]
-    kind = functools.reduce(torch.promote_types, kinds or [given[0].dtype])
-    return integrals.to(given[0].device, kind if kind.is_floating_point else torch.float64)
+    dtypes = [x.dtype for x in geometry if is_tensor(x) and x.is_floating_point()]
+    dtype = functools.reduce(torch.promote_types, dtypes or [tensors[0].dtype])
+    return integrals.to(tensors[0].device, dtype if dtype.is_floating_point else torch.float64)

@@ -109,7 +109,7 @@ def _pixel_weights(run: ProjectionRun) -> Floats:
     anywhere = Grid.centered((1, 1, 1), 1.0)  # weights do not depend on it
     every = slice(None)
     return with_image_axes(model.efficiency) * np.array([
-        sum(beam.weigh(every, every, every).sum(axis=0) for beam in middle.beams(run.views, m, anywhere))  # type: ignore[misc]
+        sum(beam.weights(every, every, every).sum(axis=0) for beam in middle.beams(run.views, m, anywhere))  # type: ignore[misc]
         for m in range(len(run.views))
     ])  # fmt: skip
 

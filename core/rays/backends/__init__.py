@@ -1,4 +1,4 @@
-"""The backends: which there are, what they need and are good at, and which one "auto" means.
+"""Table of the backends, ways to compute line integrals, with what they need, and the choice of "auto".
 
 A backend is a row of `BACKENDS` and a module with four functions. Line integrals are
 ``L int_0^1 f(alpha) exp(-L int_0^alpha mu) dalpha`` with L the ray's length in mm, f the volume and mu the attenuation
@@ -36,30 +36,37 @@ from ...errors import InputError, installing, warn
 class Backend:
     """A way to compute line integrals, and how it wants its rays."""
 
-    name: str  # what users call it
-    label: str  # how menus show it
-    text: str  # what it is good for
-    module: str  # the file here that has its functions
-    # rays of a call: enough that a call costs nothing, few enough that their arrays stay in the cache
+    name: str
+    """Name in settings."""
+    label: str
+    """Label in menus."""
+    text: str
+    """Short description for menus."""
+    module: str
+    """Name of the module, in this package, with its functions."""
     rays_at_once: int
-    rays_of_images: int  # small images are traced several at once, up to so many rays
-    # ``(array or tensor, float64) -> array or tensor`` as the backend's functions take it; float32 unless `float64`
+    """Number of rays of a call: large enough that calls take little time, small enough that arrays stay in the cache."""
+    rays_of_images: int
+    """Number of rays up to which several small images are traced in one call."""
     to_backend: Callable[[ArrayOrTensor, bool], ArrayOrTensor]
-    own_threads: bool = False  # whether a call uses the whole machine by itself; others are called on several threads
-    always_float64: bool = False  # whether it computes in float64 whatever it is given
+    """Conversion of an array or tensor, float64 or else float32, to the kind that the functions take."""
+    own_threads: bool = False
+    """Whether a call uses the whole machine by itself; other backends are called on several threads."""
+    always_float64: bool = False
+    """Whether it computes in float64 also from float32."""
 
     @property
     def functions(self) -> ModuleType:
-        """The module with its four functions."""
+        """Module with the four functions."""
         return load(self.module)
 
     def workers(self, threads: int) -> int:
-        """On how many of `threads` it is to be called at the same time."""
+        """Return the number of `threads` that call the backend at the same time."""
         return 1 if self.own_threads else threads
 
 
 def load(module: str) -> ModuleType:
-    """A module of this package; libraries are imported when a backend is first used."""
+    """Return a module of this package; libraries are imported when a backend is first used."""
     return importlib.import_module(f".{module}", __package__)
 
 
@@ -76,7 +83,7 @@ def _on_gpu(x: ArrayOrTensor, float64: bool) -> ArrayOrTensor:
     return load("cuda").to_backend(x)
 
 
-# torch is slow on a CPU, so calls for several small images stay short: between calls a job can stop.
+# torch is slow on a CPU, so its calls for several small images are short: between calls a job can stop.
 _ROWS = (
     Backend("cpu", "CPU", "Compiled, on the processor", "cpu", 2**14, 2**14, _array),
     Backend("torch", "PyTorch", "On the processor or the graphics card", "reference", 2**18, 2**12, _tensor, True),
@@ -86,13 +93,13 @@ _ROWS = (
     ),
 )
 BACKENDS = {backend.name: backend for backend in _ROWS}
-"""The backends by name."""
+"""Backends by name."""
 
 _AUTOMATIC = ("cpu", "torch", "numpy")
-"""What "auto" chooses from for arrays, in order of preference; for a tensor on a GPU see `for_tensor`."""
+"""Backends that "auto" chooses from for arrays, in order of preference; for a tensor on a GPU see `for_tensor`."""
 
 OLD_NAMES = {"numba": "cpu"}
-"""What files and scripts of version 0.1 call a backend."""
+"""Present names of backends by their names in files and scripts of version 0.1."""
 
 _PACKAGES = {"torch": "torch", "cuda": "warp-lang torch"}
 
@@ -101,7 +108,7 @@ _CANNOT_LOAD = (ImportError, OSError)
 
 
 def choose(name: str) -> Backend:
-    """The backend that `name` ("auto", one of `BACKENDS` or an old name) stands for on this machine, loaded.
+    """Return the backend that `name` ("auto", one of `BACKENDS` or an old name) stands for on this machine, loaded.
 
     Raises
     ------
@@ -123,6 +130,7 @@ def choose(name: str) -> Backend:
 
 
 def _automatic() -> Backend:
+    """Return the first backend of `_AUTOMATIC` that can be used, with a warning if it is not the first of all."""
     reason = ""
     for name in _AUTOMATIC:
         try:
@@ -137,7 +145,7 @@ def _automatic() -> Backend:
 
 
 def _require(backend: Backend) -> None:
-    """Load what the backend needs, or raise."""
+    """Load the libraries and the device that a backend needs; raise an error where they are missing."""
     if backend.name == "torch":
         importlib.import_module("torch")
     functions = backend.functions
@@ -146,17 +154,18 @@ def _require(backend: Backend) -> None:
 
 
 def for_tensor(tensor: Any) -> Backend:
-    """What "auto" means for a tensor that is not on the CPU: "cuda" where that works, else "torch"."""
+    """Return the backend of "auto" for a tensor that is not on the CPU: "cuda" where that works, else "torch"."""
     return BACKENDS["cuda" if tensor.is_cuda and _cuda_works() else "torch"]
 
 
 @functools.cache
 def _cuda_works() -> bool:
+    """Return whether the backend "cuda" can be used on this machine."""
     return not _problem("cuda")
 
 
 def _problem(name: str) -> str:
-    """Why a backend cannot be used on this machine, "" where it can; its libraries are loaded for this."""
+    """Return the reason why a backend cannot be used on this machine, "" if it can; its libraries are loaded for this."""
     try:
         _require(BACKENDS[name])
     except (InputError, *_CANNOT_LOAD) as error:
@@ -166,17 +175,19 @@ def _problem(name: str) -> str:
 
 @functools.cache
 def states() -> dict[str, str]:
-    """What each backend is on this machine: used by "auto", there to be chosen, or why it is not there."""
+    """Return the state of each backend on this machine in words: used by "auto", available, or why it is not."""
     problems = {name: _problem(name) for name in BACKENDS}
-    used = next(name for name in _AUTOMATIC if not problems[name])
-    found = {name: f"not found: {problem}" if problem else "found, can be chosen" for name, problem in problems.items()}
-    return {**found, used: "found, used automatically"}
+    automatic = next(name for name in _AUTOMATIC if not problems[name])
+    texts = {name: f"not found: {problem}" if problem else "found, can be chosen" for name, problem in problems.items()}
+    return {**texts, automatic: "found, used automatically"}
 
 
 def _reason(error: BaseException) -> str:
+    """Return the first line of an error."""
     return str(error).splitlines()[0] if str(error) else type(error).__name__
 
 
 @functools.cache
 def _warn_slower(name: str, reason: str) -> None:
+    """Warn, once, that projections run with a slower backend."""
     warn(f"projections run with {name}, many times slower than with the backend cpu ({reason})", 5)

@@ -1,8 +1,9 @@
-"""Siddon's line integrals in C: the default on a CPU.
+"""The backend cpu: Siddon's line integrals in C, the default on a processor.
 
 The kernels are in `kernels`, compiled for each platform and for the levels of its processors; ``kernels.h`` is the contract.
-They run in the thread that calls, without the GIL: the operator calls them on several. Volumes of float64 are traced in
-float64, all others in float32.
+They run in the thread that calls, without the GIL: `Execution` calls them on several threads. Volumes of float64 are traced
+in float64, all others in float32. The same library has the kernels of `pinhole_response.compiled` and of
+`perspective.places`.
 """
 
 import ctypes
@@ -20,25 +21,19 @@ from ...validation import shape_text
 from ..ray_geometry import Attenuation, IndexFans, IndexRays, Rays
 
 LEVEL_VARIABLE = "MPHDRR_CPU_LEVEL"
-"""Environment variable that names a lower level of processor, `levels`, than this one's."""
+"""Environment variable with the name of a lower level of processor, of `levels`, than this one's."""
 
 _CONTRACT = 10
 _NAMES = {"win32": "siddon.dll", "darwin": "libsiddon.dylib"}
-_MOST_VOXELS = 2**31 - 1  # their indices are of 32 bits
+_MAX_VOXELS = 2**31 - 1  # their indices have 32 bits
 _PRODUCT = 2  # in kernels.h
-_MOST_PLACES_ALONG = 2**16  # where float32 knows a place to 1/256 of an element; beyond 2^24 it would miss whole ones
-_MOST_ALONG = 2**12  # where float32 knows the length of a segment to 0.1 %
+_MAX_ELEMENTS_ALONG = 2**16  # where float32 knows a place to 1/256 of an element; beyond 2^24 it would miss whole ones
+_MAX_VOXELS_ALONG = 2**12  # where float32 knows the length of a segment to 0.1 %
 
-_FAN = np.dtype(
-    [
-        ("volume", "(4,3)f8"),
-        ("mu", "(4,3)f8"),
-        ("world", "(3,3)f8"),
-        ("rows", "i8"),
-        ("columns", "i8"),
-        ("parallel", "f8"),
-    ]
-)
+_FAN = np.dtype([
+    ("volume", "(4,3)f8"), ("mu", "(4,3)f8"), ("world", "(3,3)f8"), ("rows", "i8"), ("columns", "i8"),
+    ("parallel", "f8"),
+])  # fmt: skip
 
 
 class VoxelArray(Structure):
@@ -48,11 +43,15 @@ class VoxelArray(Structure):
 
 
 class _RayList(Structure):
+    """Rays one by one, as kernels.h has them: `RayList`."""
+
     _fields_ = [(name, c_void_p) for name in ("starts", "directions", "mu_starts", "mu_directions", "lengths")]
     _fields_ += [("count", c_int64)]
 
 
 class _Job(Structure):
+    """A job of line integrals, as kernels.h has it: `Job`."""
+
     _fields_ = [
         ("is_double", c_int64), ("attenuation", c_int64), ("volume", VoxelArray), ("mu", VoxelArray),
         ("fans", c_void_p), ("n_fans", c_int64), ("list", _RayList),
@@ -88,20 +87,14 @@ class PlacesJob(Structure):
 
 _KERNELS = {
     _Job: ("forward", "backproject", "differentiate", "differentiate_by_mu"),
-    DepthJob: (
-        "voxels_to_cells",
-        "cells_to_voxels",
-        "cells_to_pixels",
-        "pixels_to_cells",
-        "differentiate_places",
-        "differentiate_taps",
-    ),
+    DepthJob: ("voxels_to_cells", "cells_to_voxels", "cells_to_pixels", "pixels_to_cells",
+               "differentiate_places", "differentiate_taps"),
     PlacesJob: ("take_at", "give_at"),
-}
+}  # fmt: skip
 
 
 def _load() -> ctypes.CDLL:
-    """The library in this package."""
+    """Return the library in this package; raise `ImportError` if there is none, or one of another version."""
     path = Path(__file__).with_name("kernels") / _NAMES.get(sys.platform, "libsiddon.so")
     if not path.is_file():
         raise ImportError(f"no compiled kernels for this platform: {path.name} is not in {path.parent}")
@@ -124,23 +117,25 @@ library = _load()
 
 
 def levels() -> list[str]:
-    """Names of the levels of processor that this one has, the lowest first."""
+    """Return the names of the levels of kernels that this processor supports, the lowest first."""
     return [library.level_name(level).decode() for level in range(library.best_level() + 1)]
 
 
 def _level() -> int:
-    has, asked = levels(), os.environ.get(LEVEL_VARIABLE)
-    if asked and asked not in has:
-        raise InputError(f"{LEVEL_VARIABLE}: expected a level that this processor has, {', '.join(has)}; got {asked}")
-    return has.index(asked) if asked else len(has) - 1
+    """Return the index of the level in the environment variable, or of the highest one."""
+    supported, name = levels(), os.environ.get(LEVEL_VARIABLE)
+    if name and name not in supported:
+        expected = f"a level that this processor has, {', '.join(supported)}"
+        raise InputError(f"{LEVEL_VARIABLE}: expected {expected}; got {name}")
+    return supported.index(name) if name else len(supported) - 1
 
 
 level = _level()
-"""The level of the kernels that are used, an index of `levels`."""
+"""Level of the kernels that are used, an index of `levels`."""
 
 
 def forward(volume: Array, rays: Rays, attenuation: Attenuation | None = None) -> Array:
-    """Line integrals (N,), value x mm, of `volume` (n_x, n_y, n_z) along `rays`, attenuated towards their sources."""
+    """Return line integrals (N,), value x mm, of `volume` (n_x, n_y, n_z), attenuated towards the rays' sources."""
     values = np.empty(len(rays), volume.dtype)
     _run(library.forward, volume, rays, attenuation, values)
     return values
@@ -152,7 +147,7 @@ def backproject(volume: Array, values: Array, rays: Rays, attenuation: Attenuati
 
 
 def derivatives(volume: Array, rays: Rays, attenuation: Attenuation | None = None) -> Array:
-    """What the ends of `rays` do to their integrals (N, 7) or (N, 14), as `backends` describes it."""
+    """Return the integrals' derivatives by the ends of `rays`, (N, 7) or (N, 14), as `backends` describes them."""
     integrals = None if attenuation is None else forward(volume, rays, attenuation)
     result = np.empty((7 if attenuation is None else 14, len(rays)))
     _run(library.differentiate, volume, rays, attenuation, integrals=integrals, derivatives=result)
@@ -160,7 +155,7 @@ def derivatives(volume: Array, rays: Rays, attenuation: Attenuation | None = Non
 
 
 def mu_gradient(gradient: Array, volume: Array, values: Array, rays: Rays, attenuation: Attenuation) -> None:
-    """Add to `gradient`, of mu's shape, in place what mu's voxels do to the sum of `values` (N,) times the integrals."""
+    """Add the gradient by mu of the sum of `values` (N,) times the integrals to `gradient`, of mu's shape, in place."""
     integrals = forward(volume, rays, attenuation)
     _run(library.differentiate_by_mu, volume, rays, attenuation, values, integrals=integrals, gradient=gradient)
 
@@ -170,62 +165,63 @@ def gather(
     planes: Floats,
     arrays: Array,
     matrices: Floats,
-    how: int,
-    seen: Array | None,
+    operation: int,
+    counts: Array | None,
     exponents: Array | None,
-    **others: Any,
+    **settings: Any,
 ) -> None:
-    """Combine `points` in place with what `arrays` have at their places, as `perspective.places.gather` describes it."""
-    counts = [each for each in (seen, exponents) if each is not None]
-    if any(each.dtype != np.int32 or each.shape != points.shape for each in counts):
+    """Combine `points` in place with the values of `arrays` at their places, as `perspective.places.gather` describes it."""
+    integers = [array for array in (counts, exponents) if array is not None]
+    if any(array.dtype != np.int32 or array.shape != points.shape for array in integers):
         raise TypeError("expected counts of int32 and of the points' shape")
-    if how == _PRODUCT and exponents is None:
+    if operation == _PRODUCT and exponents is None:
         raise ValueError("expected exponents, which a product needs")
-    others |= {"seen": None if seen is None else seen.ctypes.data, "how": how, "last": len(points)}
-    others["exponents"] = None if exponents is None else exponents.ctypes.data
-    _run_places(library.take_at, points, planes, arrays, matrices, [points, *counts], **others)
+    settings |= {"seen": None if counts is None else counts.ctypes.data, "how": operation, "last": len(points)}
+    settings["exponents"] = None if exponents is None else exponents.ctypes.data
+    _run_places(library.take_at, points, planes, arrays, matrices, [points, *integers], **settings)
 
 
 def scatter(points: Array, planes: Floats, array: Array, matrix: Floats, slab: slice) -> None:
-    """Add to the `slab` of `array` along its first axis, in place, what the adjoint of `gather` gives."""
+    """Add the adjoint of `gather`'s sum to the `slab` of `array` along its first axis, in place."""
     first, last, _ = slab.indices(len(array))
     _run_places(library.give_at, points, planes, array[None], matrix[None], [array], first=first, last=last)
 
 
 def _run_places(
-    kernel: Any, points: Array, planes: Floats, arrays: Array, matrices: Floats, written: list[Array], **others: Any
+    kernel: Any, points: Array, planes: Floats, arrays: Array, matrices: Floats, outputs: list[Array], **settings: Any
 ) -> None:
-    kind, shape = points.dtype, arrays.shape[1:]
-    if kind not in (np.float32, np.float64) or arrays.dtype != kind or matrices.dtype != np.float64:
+    """Run a kernel between points and arrays after checks of all arrays; `outputs` are those that it writes."""
+    dtype, shape = points.dtype, arrays.shape[1:]
+    if dtype not in (np.float32, np.float64) or arrays.dtype != dtype or matrices.dtype != np.float64:
         raise TypeError("expected points and arrays of one type, float32 or float64, and matrices of float64")
-    in_order = all(each.flags.c_contiguous for each in (points, arrays, matrices, *written))
-    if not in_order or not written[0].flags.writeable:
+    is_c_order = all(array.flags.c_contiguous for array in (points, arrays, matrices, *outputs))
+    if not is_c_order or not outputs[0].flags.writeable:
         raise ValueError("expected arrays in C order, that can be written")
-    has_planes = planes.shape == points.shape[2:] and not (others.get("flat") and shape[2] != 1)
+    has_planes = planes.shape == points.shape[2:] and not (settings.get("flat") and shape[2] != 1)
     if matrices.shape != (len(arrays), 5, 4) or not has_planes:
         raise ValueError("expected a matrix (5, 4) for each array, a third coordinate for each plane of points")
     if not points.size or not arrays.size:
         return
-    most_along = _MOST_PLACES_ALONG if kind == np.float32 else _MOST_VOXELS
-    if arrays[0].size > _MOST_VOXELS or max(shape) > most_along:
-        expected = f"an array of at most {_MOST_VOXELS} numbers, and {most_along} along an axis in {kind}"
+    max_along = _MAX_ELEMENTS_ALONG if dtype == np.float32 else _MAX_VOXELS
+    if arrays[0].size > _MAX_VOXELS or max(shape) > max_along:
+        expected = f"an array of at most {_MAX_VOXELS} numbers, and {max_along} along an axis in {dtype}"
         raise InputError(f"expected {expected}; got {shape_text(shape)}")
     middle = float(planes[len(planes) // 2])
-    relative = np.ascontiguousarray(planes - middle, kind)
+    relative = np.ascontiguousarray(planes - middle, dtype)
     job = PlacesJob(
-        is_double=kind == np.float64, points=points.ctypes.data, n=points.shape, planes=relative.ctypes.data, middle=middle,
-        values=arrays.ctypes.data, arrays=len(arrays), m=shape, matrices=matrices.ctypes.data, **others,
+        is_double=dtype == np.float64, points=points.ctypes.data, n=points.shape, planes=relative.ctypes.data,
+        middle=middle, values=arrays.ctypes.data, arrays=len(arrays), m=shape, matrices=matrices.ctypes.data, **settings,
     )  # fmt: skip
     kernel(level, job)
 
 
 def _run(
-    kernel: Any, volume: Array, rays: Rays, attenuation: Attenuation | None, values: Array | None = None, **others: Any
+    kernel: Any, volume: Array, rays: Rays, attenuation: Attenuation | None, values: Array | None = None, **arrays: Any
 ) -> None:
-    """Run a kernel on all rays."""
+    """Run a kernel on all rays; `arrays` are further fields of the job."""
     mu, mu_rays = (None, None) if attenuation is None else (attenuation.mu, attenuation.rays)
     if values is not None:
-        others["values"] = values = np.ascontiguousarray(values, volume.dtype)
+        arrays["values"] = values = np.ascontiguousarray(values, volume.dtype)
         if len(values) != len(rays):
             raise ValueError(f"expected a value for each of {len(rays)} rays, got {len(values)}")
     if mu is not None and mu_rays is None and mu.shape != volume.shape:
@@ -235,10 +231,10 @@ def _run(
         attenuation=0 if mu is None else 1 if mu_rays is None else 2,
         volume=as_voxel_array(volume, volume, kernel is library.backproject),
         mu=VoxelArray() if mu is None else as_voxel_array(mu, volume),
-        **{name: array.ctypes.data for name, array in others.items() if array is not None},
+        **{name: array.ctypes.data for name, array in arrays.items() if array is not None},
     )
-    arrays = [_fans(rays, mu_rays)] if isinstance(rays, IndexFans) else _columns(rays, mu_rays)
-    addresses = [array.ctypes.data for array in arrays]  # of what lives until the kernel is done
+    ray_arrays = [_fans(rays, mu_rays)] if isinstance(rays, IndexFans) else _columns(rays, mu_rays)
+    addresses = [array.ctypes.data for array in ray_arrays]  # the arrays must live until the kernel is done
     if isinstance(rays, IndexFans):
         job.fans, job.n_fans = addresses[0], len(rays.table)
     else:
@@ -247,13 +243,13 @@ def _run(
 
 
 def _columns(rays: IndexRays, mu_rays: Any) -> list[Array]:
-    """Starts, directions and lengths as the kernels take them."""
-    columns = (column.T for each in (rays, mu_rays or rays) for column in (each.starts, each.directions))
+    """Return starts and directions, also in mu's index space, and lengths, as the kernels take them."""
+    columns = (column.T for listed in (rays, mu_rays or rays) for column in (listed.starts, listed.directions))
     return [np.ascontiguousarray(column) for column in (*columns, rays.lengths)]
 
 
 def _fans(rays: IndexFans, mu_rays: Any) -> Array:
-    """Fans as the kernels take them."""
+    """Return fans as the kernels take them."""
     fans = np.zeros(len(rays.table), _FAN)
     fans["volume"], fans["world"] = rays.table[:, :4], rays.table[:, 5:]
     fans["world"][:, 0] -= rays.table[:, 4]
@@ -265,15 +261,18 @@ def _fans(rays: IndexFans, mu_rays: Any) -> Array:
     return fans
 
 
-def as_voxel_array(voxels: Array, like: Array, written: bool = False) -> VoxelArray:
-    """`voxels`, of the same type as `like`."""
-    most_along = _MOST_ALONG if voxels.dtype == np.float32 else _MOST_VOXELS
-    if voxels.size > _MOST_VOXELS or max(voxels.shape) > most_along:
-        most = f"at most {_MOST_VOXELS}, and {_MOST_ALONG} along an axis in float32"
-        found = f"{shape_text(voxels.shape)} voxels, but there can be {most}"
-        raise InputError(f"backend 'cpu': {found}; use the backend numpy")
-    flags, kind = voxels.flags, voxels.dtype
-    of_the_kind = kind in (np.float32, np.float64) and kind == like.dtype
-    if not of_the_kind or not flags.c_contiguous or written > flags.writeable:
-        raise TypeError(f"expected C-ordered voxels of {like.dtype}, got {kind}, strides {voxels.strides}")
+def as_voxel_array(voxels: Array, values: Array, is_output: bool = False) -> VoxelArray:
+    """Return `voxels` as the kernels take them; raise an error if they are too many, or not of the type of `values`.
+
+    Voxels that a kernel writes (`is_output`) must be writable.
+    """
+    max_along = _MAX_VOXELS_ALONG if voxels.dtype == np.float32 else _MAX_VOXELS
+    if voxels.size > _MAX_VOXELS or max(voxels.shape) > max_along:
+        limit = f"at most {_MAX_VOXELS}, and {_MAX_VOXELS_ALONG} along an axis in float32"
+        message = f"{shape_text(voxels.shape)} voxels, but there can be {limit}"
+        raise InputError(f"backend 'cpu': {message}; use the backend numpy")
+    flags, dtype = voxels.flags, voxels.dtype
+    has_type = dtype in (np.float32, np.float64) and dtype == values.dtype
+    if not has_type or not flags.c_contiguous or is_output > flags.writeable:
+        raise TypeError(f"expected C-ordered voxels of {values.dtype}, got {dtype}, strides {voxels.strides}")
     return VoxelArray(voxels.ctypes.data, voxels.shape)

@@ -1,14 +1,14 @@
-"""Siddon's line integrals on an NVIDIA GPU, one thread a ray, several views a launch: the kernels are `warp_kernels`.
+"""The backend cuda: Siddon's line integrals on an NVIDIA GPU, one thread per ray, several views per launch.
 
-No GPU has run them yet: docs/gpu.md says what was tested, and how. Derivatives are those of `reference`, in torch on the
-same device.
+The kernels are in `warp_kernels`. No GPU has run them yet: docs/gpu.md tells what was tested, and how. Derivatives are those
+of `reference`, in torch on the same device.
 
-Why NVIDIA Warp: one wheel for each of Linux, Windows and macOS without bounds on numpy, which brings its own compilers
+NVIDIA Warp has one wheel for each of Linux, Windows and macOS without bounds on numpy, which brings its own compilers
 and runs the very same kernels on the CPU, where they are tested. Triton has no official wheel for Windows, and its programs
 work on blocks, not on single rays.
 
-The volume is on the device as a whole. The rays are made there, from their fans; they are launched in pieces that leave
-half of the free memory alone. Arrays become tensors on the device; these are worked on where they are, on torch's stream.
+The volume is on the device as a whole. The rays are computed there, from their fans; they are launched in pieces that leave
+half of the free memory alone. Arrays become tensors on the device; tensors stay where they are, on torch's stream.
 """
 
 from __future__ import annotations
@@ -39,10 +39,10 @@ from ..ray_geometry import Attenuation, IndexRays, Rays
 from . import reference
 
 DEVICE_VARIABLE = "MPHDRR_CUDA_DEVICE"
-"""Environment variable: the Warp device for arrays, "cuda" if not set. "cpu" runs the kernels without a GPU: for tests."""
+"""Environment variable with the Warp device for arrays, by default "cuda"; "cpu" runs the kernels without a GPU."""
 
 _RAYS_AT_ONCE = 2**24
-_FEWEST_RAYS = 2**14  # some megabytes; torch may hold memory that it does not use
+_FEWEST_RAYS = 2**14  # some megabytes, also if there seems to be less: torch may hold memory that it does not use
 _BYTES_OF_A_FAN = 2 * 9 * 24  # in the index space of the volume and of mu
 _BYTES_OF_A_PLANE = 2**31  # Warp's strides are 32 bits wide; offsets are 64
 
@@ -53,7 +53,7 @@ _loaded: set[str] = set()
 
 
 def forward(volume: ArrayOrTensor, rays: Rays, attenuation: Attenuation | None = None) -> ArrayOrTensor:
-    """Line integrals (N,), value x mm, of `volume` (n_x, n_y, n_z) along `rays`, attenuated towards their sources."""
+    """Return line integrals (N,), value x mm, of `volume` (n_x, n_y, n_z), attenuated towards the rays' sources."""
     with _Call(to_backend(volume), rays, _on_device(attenuation)) as call:
         return to_caller(call.integrals(), volume)
 
@@ -70,14 +70,14 @@ def backproject(
 
 
 def derivatives(volume: ArrayOrTensor, rays: Rays, attenuation: Attenuation | None = None) -> ArrayOrTensor:
-    """Those of the reference, on the device: what the ends of `rays` do to their integrals, (N, 7) or (N, 14)."""
+    """Return the integrals' derivatives by the ends of `rays`, (N, 7) or (N, 14): those of the reference, on the device."""
     return to_caller(reference.derivatives(to_backend(volume), rays, _on_device(attenuation)), volume)
 
 
 def mu_gradient(
     gradient: ArrayOrTensor, volume: ArrayOrTensor, values: ArrayOrTensor, rays: Rays, attenuation: Attenuation
 ) -> None:
-    """That of the reference, on the device: add to `gradient` each of `values` (N,) times its integral's by mu."""
+    """Add the gradient by mu of the sum of `values` (N,) times the integrals to `gradient` in place, on the device."""
     total, mu = to_backend(gradient), replace(attenuation, mu=to_backend(attenuation.mu))
     reference.mu_gradient(total, to_backend(volume), to_backend(values), rays, mu)
     if not is_tensor(gradient):
@@ -85,22 +85,23 @@ def mu_gradient(
 
 
 def _on_device(attenuation: Attenuation | None) -> Attenuation | None:
+    """Return an attenuation with mu on the device."""
     return None if attenuation is None else replace(attenuation, mu=to_backend(attenuation.mu))
 
 
 def to_backend(x: ArrayOrTensor) -> ArrayOrTensor:
-    """`x` as a tensor of float32 on the device; one that is there already is not copied."""
+    """Return `x` as a tensor of float32 on the device; one that is there already is not copied."""
     if is_tensor(x) and (x.is_cuda or (x.device.type == "cpu" and device().is_cpu)):
         return x.detach().float().resolve_neg().contiguous()  # Warp does not see torch's lazy minus sign
-    array, on = to_numpy(x, np.float32), device()
-    if array.nbytes > on.free_memory:
-        needed, free = readable_size(array.nbytes), readable_size(on.free_memory)
-        raise InputError(f"backend 'cuda': {needed} of numbers, but {free} are free on {on.name}")
-    return to_tensor(array).to(wp.device_to_torch(on))
+    array, target = to_numpy(x, np.float32), device()
+    if array.nbytes > target.free_memory:
+        size, free = readable_size(array.nbytes), readable_size(target.free_memory)
+        raise InputError(f"backend 'cuda': {size} of numbers, but {free} are free on {target.name}")
+    return to_tensor(array).to(wp.device_to_torch(target))
 
 
 def device() -> Any:
-    """The device for arrays (a `warp.Device`).
+    """Return the device for arrays (a `warp.Device`).
 
     Raises
     ------
@@ -120,13 +121,14 @@ def device() -> Any:
 
 
 def has_driver() -> bool:
-    """Whether NVIDIA's driver is there; Warp complains on standard error if it has to find that out by itself."""
+    """Return whether there is NVIDIA's driver; Warp complains on standard error if it has to find that out by itself."""
     names = ("nvcuda.dll",) if sys.platform == "win32" else ("libcuda.so", "libcuda.so.1")
     return any(map(_loads, names))
 
 
 @functools.cache
 def _loads(library: str) -> bool:
+    """Return whether a library of this name can be loaded."""
     try:
         ctypes.CDLL(library)
     except OSError:
@@ -135,7 +137,7 @@ def _loads(library: str) -> bool:
 
 
 class _Call:
-    """Rays on their way through the device: what is needed of a call, and its launches."""
+    """Call of the backend: volume, rays and attenuation on the device, and launches of the kernels."""
 
     def __init__(self, volume: Tensor, rays: Rays, attenuation: Attenuation | None) -> None:
         self._device = wp.device_from_torch(volume.device)
@@ -158,17 +160,17 @@ class _Call:
             raise InputError(f"backend 'cuda': {self._device.name} has too little free memory, {free}") from error
 
     def integrals(self) -> Tensor:
-        """What `integrate` writes, (N,)."""
+        """Return the line integrals (N,)."""
         result = self._volume.new_empty((len(self._fans), self._rows, self._columns))
         self._launch(self._kernels.integrate, result)
         return result.reshape(-1)
 
     def add(self, values: Tensor) -> None:
-        """Have `backproject` add the rays' `values` (N,) to the volume."""
+        """Add the rays' `values` (N,) to the volume."""
         self._launch(self._kernels.backproject, values.reshape(len(self._fans), self._rows, self._columns))
 
     def _launch(self, kernel: Any, numbers: Tensor) -> None:
-        """Launch a kernel on the rays and their `numbers`, piece by piece; where there is no mu, with the volume twice."""
+        """Launch a kernel on the rays and their `numbers`, piece by piece; without mu the volume stands in its place."""
         volumes = [_array(self._volume if x is None else x.mu) for x in (None, self._attenuation)]
         for fans, rows in self._pieces():
             rays = wp.array(self._fans[fans], dtype=wp.vec3d, device=self._device)
@@ -180,7 +182,7 @@ class _Call:
             wp.launch(kernel, tuple(piece.shape), inputs=inputs, device=self._device)
 
     def _pieces(self) -> Iterator[tuple[slice, slice]]:
-        """Which fans, and which of their rows, are launched together."""
+        """Yield the fans, and their rows, that are launched together."""
         pixels = self._rows * self._columns
         affordable = max(_FEWEST_RAYS, int(self._device.free_memory / 2 / (4 + _BYTES_OF_A_FAN / pixels)))
         at_once = min(_RAYS_AT_ONCE, affordable)
@@ -192,14 +194,14 @@ class _Call:
 
 
 def _array(volume: Tensor) -> Any:
-    """A tensor on the device as Warp's array, not copied."""
+    """Return a tensor on the device as Warp's array, without a copy."""
     if volume.shape[1] * volume.shape[2] * 4 >= _BYTES_OF_A_PLANE:
         raise InputError(f"backend 'cuda': {volume.shape[1]} x {volume.shape[2]} voxels a plane are too many")
     return wp.from_torch(volume)
 
 
 def _table(rays: Rays) -> tuple[Floats, int, int]:
-    """Rays as the kernels take them: fans (F, 9, 3), their rows and columns. A single ray is a fan, too."""
+    """Return rays as the kernels take them: fans (F, 9, 3), their rows and columns. A listed ray is a fan of one ray."""
     table = np.zeros((len(rays) if isinstance(rays, IndexRays) else len(rays.table), 9, 3))
     if isinstance(rays, IndexRays):
         table[:, 0] = rays.starts
@@ -213,7 +215,7 @@ def _table(rays: Rays) -> tuple[Floats, int, int]:
 
 
 def _kernels(device: Any) -> ModuleType:
-    """The kernels, compiled for `device`: from the cache on disk where that is possible."""
+    """Return the kernels, compiled for `device`, from the cache on disk if possible."""
     from . import warp_kernels
 
     with _loading:
@@ -221,7 +223,7 @@ def _kernels(device: Any) -> ModuleType:
             with _quiet():
                 try:
                     wp.load_module(warp_kernels, device=device)
-                except Exception:  # a full disk, a damaged file: that only costs the time of compiling
+                except Exception:  # of a full disk or a damaged file: compiled anew they need no cache
                     wp.config.kernel_cache_dir = _scratch_folder()
                     wp.get_module(warp_kernels.__name__).unload()
                     wp.load_module(warp_kernels, device=device)
@@ -246,7 +248,7 @@ def _initialize() -> None:
 
 @functools.cache
 def _scratch_folder() -> str:
-    """A folder for the time that Python runs."""
+    """Return a temporary folder that is removed when Python ends."""
     folder = tempfile.mkdtemp(prefix="mphdrr-warp-")
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
     return folder
@@ -254,7 +256,7 @@ def _scratch_folder() -> str:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """No words from Warp but warnings: it tells of every start and of every module."""
+    """Silence Warp's messages but for warnings; it reports every start and every module."""
     level = wp.config.log_level
     wp.config.log_level = max(level, wp.LOG_WARNING)
     try:

@@ -1,8 +1,8 @@
 # mypy: disable-error-code="no-untyped-def, valid-type"
 # ruff: noqa: UP018 -- to Warp 0.0 is a constant and float(0.0) a variable
-"""Kernels of the "cuda" backend, for NVIDIA Warp: one thread per ray, the rays of several fans in one launch.
+"""Kernels of the backend cuda, for NVIDIA Warp: one thread per ray, the rays of several fans in one launch.
 
-A ray goes from voxel to voxel, through the volume and through mu at once; nothing is stored or sorted. Its place, alpha,
+A ray goes from voxel to voxel, through the volume and through mu at once; nothing is stored or sorted. Its parameter alpha
 runs in float64 from 0 at the source to 1 at the target, so segments are as exact far from the source as near it; sums along
 a ray are float32.
 
@@ -18,40 +18,41 @@ import warp as wp
 # Without grid-stride loops the kernels need far fewer registers.
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 
-_SNAP = wp.constant(wp.float64(1e-9))  # as `rays` has it
+_SNAP = wp.constant(wp.float64(1e-9))  # `ray_geometry.SNAP`
 _FAR = wp.constant(wp.float64(2.0))  # an alpha beyond all rays
 
 _Volume: Any = wp.array3d(dtype=wp.float32)
 _Numbers: Any = wp.array3d(dtype=wp.float32)  # one per ray: fan, row, column
 _Fans: Any = wp.array2d(dtype=wp.vec3d)
-"""Source, corner, row step and column step of each fan, in index space and then in world mm; then 1 where its rays are
-parallel, which have no steps in world mm, 0 where they are not."""
+"""Source, corner, row step and column step of each fan, in index space and then in world mm, and whether rays are parallel.
+
+The last is 1 for parallel rays, which have no steps in world mm, else 0."""
 
 
 @wp.struct
 class Walk:
-    """A ray in a lattice: the alphas at which it enters and leaves, where it is, and its next planes."""
+    """A ray in a lattice: the alphas at which it enters and leaves, its voxel, and its next planes."""
 
     enter: wp.float64
     leave: wp.float64
     voxel: wp.vec3i
     step: wp.vec3i  # 1, -1 or 0
     next: wp.vec3d  # alpha of the next plane of each axis
-    gap: wp.vec3d  # between planes
+    gap: wp.vec3d  # alpha from plane to plane
 
 
 @wp.struct
 class Ray:
-    """A ray on its way, and its present segment."""
+    """State of a ray on its way, and its present segment."""
 
     volume: Walk
     mu: Walk
-    attenuated: wp.int32  # 0: no mu; 1: mu shares the volume's lattice; 2: it has its own
+    attenuated: wp.int32  # 0: no mu; 1: mu shares the volume's lattice; 2: mu has its own
     length: wp.float32  # of the whole ray, mm
-    alpha: wp.float64  # where the segment begins, and where it ends
-    end: wp.float64
-    depth: wp.float32  # optical depth from the source to the segment, and its compensated sum's correction
-    correction: wp.float32
+    alpha: wp.float64  # at which the segment begins
+    end: wp.float64  # alpha at which it ends
+    depth: wp.float32  # optical depth from the source to the segment
+    correction: wp.float32  # of the compensated sum of the depth
     weight: wp.float32  # integral of the transmittance over the segment, mm; 0 outside the volume
     thickness: wp.float32  # optical depth of the segment
 
@@ -61,7 +62,7 @@ def _axis(w: Walk, axis: int, n: int, s: wp.float64, e: wp.float64):
     """Narrow the walk to the part of a ray from s to e, along one axis, inside [0, n): the slab method."""
     plane = wp.rint(s)
     d = e - s
-    if wp.abs(s - plane) <= _SNAP and wp.abs(e - plane) <= _SNAP:  # see `rays._snapped`
+    if wp.abs(s - plane) <= _SNAP and wp.abs(e - plane) <= _SNAP:  # see `ray_geometry._snapped`
         s = plane
         d = wp.float64(0.0)
     if wp.abs(d) <= _SNAP:
@@ -75,7 +76,7 @@ def _axis(w: Walk, axis: int, n: int, s: wp.float64, e: wp.float64):
 
 @wp.func
 def _begin(w: Walk, axis: int, n: int, s: wp.float64, d: wp.float64):
-    """The first voxel along one axis, and the planes to come."""
+    """Set the first voxel along one axis, and the planes ahead."""
     voxel = wp.int32(wp.clamp(wp.floor(s + w.enter * d), wp.float64(0.0), wp.float64(n - 1)))
     w.voxel[axis] = voxel
     w.next[axis] = _FAR
@@ -89,7 +90,7 @@ def _begin(w: Walk, axis: int, n: int, s: wp.float64, d: wp.float64):
 
 @wp.func
 def _walk(volume: _Volume, fans: _Fans, f: int, row: int, column: int):
-    """The way of a ray through a lattice; one that misses it leaves before it enters."""
+    """Return the walk of a ray through a lattice; a ray that misses it leaves before it enters."""
     s = fans[f, 0]
     e = fans[f, 1] + fans[f, 2] * wp.float64(row) + fans[f, 3] * wp.float64(column)
     if fans[f, 8][0] != wp.float64(0.0):
@@ -112,7 +113,7 @@ def _walk(volume: _Volume, fans: _Fans, f: int, row: int, column: int):
 
 @wp.func
 def _ahead(w: Walk, alpha: wp.float64):
-    """Where a walk next meets a plane, enters or leaves."""
+    """Return the alpha at which a walk next meets a plane, enters or leaves."""
     if alpha < w.enter:
         return w.enter
     if alpha >= w.leave:
@@ -142,7 +143,7 @@ def _shape(volume: _Volume):
 
 @wp.func
 def _plus(total: float, correction: float, x: float):
-    """``total + x`` and the rounding error so far (Kahan summation): a ray may have thousands of segments."""
+    """Return ``total + x`` and the rounding error so far (Kahan summation): a ray may have thousands of segments."""
     y = x - correction
     result = total + y
     return result, (result - total) - y
@@ -150,7 +151,7 @@ def _plus(total: float, correction: float, x: float):
 
 @wp.func
 def _mean_transmittance(t: float):
-    """Mean of ``exp(-x)`` for x from 0 to t, (1 - exp(-t)) / t; for small t by a series, to 1e-8."""
+    """Return the mean of ``exp(-x)`` for x from 0 to t, (1 - exp(-t)) / t; for small t by a series, to 1e-8."""
     if wp.abs(t) < 0.1:
         return 1.0 - t * (1.0 / 2.0 - t * (1.0 / 6.0 - t * (1.0 / 24.0 - t * (1.0 / 120.0 - t * (1.0 / 720.0)))))
     return (1.0 - wp.exp(-t)) / t
@@ -158,7 +159,7 @@ def _mean_transmittance(t: float):
 
 @wp.func
 def _ray(volume: _Volume, mu: _Volume, fans: _Fans, mu_fans: _Fans, attenuated: int, f: int, row: int, column: int):
-    """A ray where it enters the volume or, before that, mu."""
+    """Return a ray at the point where it enters the volume or, before that, mu."""
     ray = Ray()
     ray.volume = _walk(volume, fans, f, row, column)
     ray.attenuated = attenuated
@@ -173,7 +174,7 @@ def _ray(volume: _Volume, mu: _Volume, fans: _Fans, mu_fans: _Fans, attenuated: 
 
 @wp.func
 def _segment(ray: Ray, mu: _Volume):
-    """The ray with its next segment, up to the next plane of either lattice."""
+    """Return the ray with its next segment, up to the next plane of either lattice."""
     ray.end = _ahead(ray.volume, ray.alpha)
     v = ray.volume.voxel
     has_mu = ray.attenuated == 1
@@ -195,7 +196,7 @@ def _segment(ray: Ray, mu: _Volume):
 
 @wp.func
 def _advance(ray: Ray, shape: wp.vec3i, mu_shape: wp.vec3i):
-    """The ray at the end of its segment."""
+    """Return the ray at the end of its segment."""
     depth, correction = _plus(ray.depth, ray.correction, ray.thickness)
     ray.depth = depth
     ray.correction = correction
@@ -210,7 +211,7 @@ def _advance(ray: Ray, shape: wp.vec3i, mu_shape: wp.vec3i):
 def integrate(
     volume: _Volume, mu: _Volume, fans: _Fans, mu_fans: _Fans, attenuated: int, first_row: int, integrals: _Numbers
 ):
-    """Line integrals, value x mm, attenuated towards the sources."""
+    """Write the line integrals, value x mm, attenuated towards the sources."""
     f, i, j = wp.tid()
     ray = _ray(volume, mu, fans, mu_fans, attenuated, f, first_row + i, j)
     total = float(0.0)

@@ -1,4 +1,4 @@
-// The image of a pinhole blurred depth by depth: voxels to planes of a fine image and back, planes to pixels and back.
+// The depth-dependent pinhole response: voxels to the planes of a fine image and back, planes to pixels and back.
 
 #include "kernels.h"
 #include "lanes.h"
@@ -7,21 +7,21 @@
 #define JOIN(name, level, real) JOIN_(name, level, real)
 #define KERNEL(name) JOIN(name, LEVEL, REAL)
 
-// Where some voxels of a row, neighbours along z, lie in the fine image. In memory: they are taken one by one.
+// Places of some voxels of a row, neighbours along z, in the fine image. They are in memory, since they are read one by one.
 typedef struct {
-    F parts;          // how many
-    F is_pair;        // 1/2: each is two points that share their cells; 0: one point
-    I cell;           // the first of 3 x 3 cells in the farther of two planes, a number in `cells`
-    F along[2];       // columns of the points from the middle one of the three
+    F parts;          // number of points along the line
+    F is_pair;        // 1/2: the point is two points on the same cells; 0: one point
+    I cell;           // index in `cells` of the first of 3 x 3 cells in the farther of two planes
+    F along[2];       // columns of the points from the central one of the three
     F across[2][3];   // shares of their rows: a quadratic B-spline
     F nearer;         // share of the nearer plane
     F weight;         // 1 / depth^2; 0 outside the image
-    // For derivatives: 1 / depth; column and row before rounding, and how many of them the line covers; where on the line the part is;
-    // and how much more than 1 the mean of 1 / depth^2 on a point's line is, by 1 / depth^2.
+    // For derivatives: 1 / depth; column and row before rounding, and the columns and rows that the line covers; the position of the
+    // point on the line; and the mean of 1 / depth^2 on the line of a single point, divided by 1 / depth^2, less 1.
     F inverse, at[2], covers[2], off, deep;
 } Places;
 
-enum { MOST_PARTS = 1 << 12 }; // only close before the pinhole's plane would there be more
+enum { MOST_PARTS = 1 << 12 }; // there would be more only close before the pinhole's plane
 
 INLINE void place_point(Places *p, int point, F along, F offset) {
     const F before = (F)0.5 - offset, after = (F)0.5 + offset;
@@ -31,7 +31,7 @@ INLINE void place_point(Places *p, int point, F along, F offset) {
     p->across[point][2] = after * after * (F)0.5;
 }
 
-// Of each voxel's piece, from its middle by `shift`, one part, a `number`.
+// Find the places of point `number` of each voxel's piece, whose centre is `shift` from the voxel's.
 INLINE void find_places(
     const DepthJob *job, const double row_start[3], F z, const double shift[3], int number, Places *p
 ) {
@@ -66,7 +66,7 @@ INLINE void find_places(
     const I farther = AS(I, MIN(plane, last - 1));
     p->cell = (farther * (I)job->rows + row - 1) * (I)job->columns + column - 1;
     u -= AS(F, column), v -= AS(F, row);
-    const F apart = p->is_pair * (F)0.57735026918962576; // twice the half of a box's standard deviation
+    const F apart = p->is_pair * (F)0.57735026918962576; // times 1/2, the standard deviation of a box, 1 / sqrt(12)
     place_point(p, 0, u - apart * wide, v - apart * high);
     if (ANY(p->is_pair != (F)0)) place_point(p, 1, u + apart * wide, v + apart * high);
     p->nearer = plane - AS(F, farther);
@@ -110,7 +110,7 @@ INLINE void between(const DepthJob *job, const int gathers) {
                 if (passes) p.weight *= some(passes + z, lanes);
                 F value = gathers ? p.weight : p.weight * f;
                 value = p.is_pair != (F)0 ? value * p.is_pair : value;
-                // Each voxel's numbers by their addresses: an element of a vector in a register is dear.
+                // Each voxel's numbers are read by their addresses: to extract an element of a vector in a register takes long.
                 const REAL *values = (const REAL *)&value, *nearer = (const REAL *)&p.nearer, *is_pair = (const REAL *)&p.is_pair;
                 const REAL *along = (const REAL *)&p.along, *across = (const REAL *)p.across;
                 const __typeof__(p.cell[0]) *first = (const void *)&p.cell;
@@ -138,7 +138,7 @@ INLINE void between(const DepthJob *job, const int gathers) {
     }
 }
 
-// What cells have at a point, and by how much more that is from column to column, row to row and plane to plane.
+// Interpolated value of the cells at a point, and its derivatives by column, row and plane.
 typedef struct {
     REAL sum, by[3];
 } Taken;
@@ -161,7 +161,7 @@ INLINE Taken take(const DepthJob *job, const REAL *cells, REAL along, const REAL
 
 INLINE void add_lanes(double *sum, F x) { EACH_LANE(i) *sum += x[i]; }
 
-// Of some voxels' part, all that is summed: by where they are, and by the line.
+// Add the derivatives of some voxels' point: by the voxels' places, and by the line.
 INLINE void add_gradient(const DepthJob *job, const Places *p, F value, const F taken[2][4], double sums[4][3], double xyz[3], F lane) {
     const F deep = (F)(REAL)job->line[2], inverse = p->inverse;
     const F sum = value * (taken[0][0] + taken[1][0]), by_weight = sum / (1 + p->deep);
@@ -184,7 +184,7 @@ INLINE void add_gradient(const DepthJob *job, const Places *p, F value, const F 
     }
 }
 
-// Of the sum of all that voxels take from cells, times their numbers, the derivatives by matrix, shifts and line.
+// Derivatives by matrix, shifts and line of the sum of the voxels times the adjoint of the cells.
 void KERNEL(differentiate_places)(const DepthJob *job) {
     const int64_t *n = job->volume.n;
     F lane;
@@ -223,13 +223,13 @@ void KERNEL(differentiate_places)(const DepthJob *job) {
 void KERNEL(voxels_to_cells)(const DepthJob *job) { between(job, 0); }
 void KERNEL(cells_to_voxels)(const DepthJob *job) { between(job, 1); }
 
-// The sums below run side by side for neighbours in a row, up to `WIDE` vectors of them, and for `TALL` rows, so that what is read
-// counts for several.
+// The sums below run side by side for neighbours in a row, up to `WIDE` vectors of them, and for `TALL` rows, so that each number that
+// is read serves several sums.
 enum { WIDE = 5, TALL = LEVEL ? 2 : 1 };
 
 typedef REAL Run __attribute__((ext_vector_type(LANES), aligned(sizeof(REAL))));
 
-// sums += numbers, and those beside them, times taps of as many rows; the rows' taps lie `apart`.
+// sums += numbers, and their neighbours, times the taps of TALL rows, which are `apart` numbers apart.
 INLINE void add_tapped(F sums[TALL][WIDE], const int wide, const REAL *numbers, const REAL *taps, int64_t apart) {
     REAL tap[TALL];
     UNROLLED for (int r = 0; r < TALL; r++) tap[r] = taps[r * apart];
@@ -239,12 +239,12 @@ INLINE void add_tapped(F sums[TALL][WIDE], const int wide, const REAL *numbers, 
     }
 }
 
-// A row of cells has those with the same place in their pixel side by side, `together` of them.
+// A plane of cells. In a row the cells with the same place in their pixel are side by side, `together` of them.
 typedef struct {
     const DepthJob *job;
     const REAL *kernel;        // the taps of a plane
-    const int64_t (*bounds)[2]; // of its rows
-    REAL *cells;               // of the plane
+    const int64_t (*bounds)[2]; // bounds of the rows of taps
+    REAL *cells;               // cells of the plane
     int64_t together;
 } Plane;
 
@@ -256,7 +256,7 @@ INLINE Plane plane_of(const DepthJob *job, int64_t number) {
     };
 }
 
-// The taps at `place` in a pixel that are not 0 in rows of the kernel, `apart`: from *first on, to before *last.
+// Taps at `place` in a pixel that are not 0 in TALL rows of the kernel, `apart` rows apart: from *first to before *last.
 INLINE void find_taps(const Plane *of, int64_t row, int64_t apart, int64_t place, int64_t *first, int64_t *last) {
     const int64_t step = of->job->step[1];
     *first = of->job->taps[1], *last = 0;
@@ -266,7 +266,7 @@ INLINE void find_taps(const Plane *of, int64_t row, int64_t apart, int64_t place
     *first = place + MAX(*first - place + step - 1, (int64_t)0) / step * step;
 }
 
-// Pixels from (i, j) on: each is a sum over the cells from its first on.
+// Sums of pixels from (i, j) on, each over the cells from its first one on.
 INLINE void sum_cells(const Plane *of, int64_t i, int64_t j, const int wide) {
     const DepthJob *job = of->job;
     const int64_t *taps = job->taps, *step = job->step, first = i * step[0];
@@ -286,7 +286,7 @@ INLINE void sum_cells(const Plane *of, int64_t i, int64_t j, const int wide) {
     }
 }
 
-// The adjoint: cells from row r on, at one place of pixels j on. Rows at the same place in their pixels are done together.
+// The adjoint: cells from row r on, at one place in the pixels from j on. Rows at the same place in their pixels are computed together.
 INLINE void sum_pixels(const Plane *of, int64_t r, int64_t place, int64_t j, const int wide) {
     const DepthJob *job = of->job;
     const int64_t *taps = job->taps, *step = job->step;
@@ -306,7 +306,7 @@ INLINE void sum_pixels(const Plane *of, int64_t r, int64_t place, int64_t j, con
     }
 }
 
-// DO(wide) for every `wide` vectors from j on, until n numbers of a row are done.
+// DO(wide) for runs of `wide` vectors from j on, up to number n of a row.
 #define EACH_RUN(j, from, n, DO)                                 \
     for (int64_t j = from, wide; j < n; j += wide * LANES) {     \
         wide = MIN((n - j - 1) / (int64_t)LANES + 1, WIDE);      \
@@ -319,19 +319,19 @@ INLINE void sum_pixels(const Plane *of, int64_t r, int64_t place, int64_t j, con
         }                                                        \
     }
 
-// Where pixels have kernels of their own, NODE_ROWS rows of them from row i on are done together, for one column of nodes and its shares
-// of the pixels. For each row of cells from row i's first on, the taps of each of these rows are mixed in the job's room, which has place
-// for GIVEN_ROWS rows of cells.
+// If pixels have kernels of their own, NODE_ROWS rows of pixels from row i on are computed together, for one column of nodes and its
+// shares of the pixels. For each row of cells from the first one of row i on, the taps of each of these rows are mixed in the job's room,
+// which is large enough for GIVEN_ROWS rows of cells.
 
 // A node's weight in a pixel along one axis.
 INLINE REAL of_node(double place, int64_t node) { return (REAL)MAX(1 - __builtin_fabs(place - node), 0.0); }
 
-// Rows of cells that NODE_ROWS rows of pixels from row i on reach.
+// Number of rows of cells that NODE_ROWS rows of pixels from row i on sum.
 INLINE int64_t tall_of(const DepthJob *job, int64_t i) {
     return MIN(job->taps[0] + (NODE_ROWS - 1) * job->step[0], job->rows - i * job->step[0]);
 }
 
-// The nodes before NODE_ROWS rows of pixels: their taps, what share the next ones have, and where taps are that are not 0.
+// The nodes before NODE_ROWS rows of pixels: their taps, the shares of the next nodes, and the bounds of taps that are not 0.
 typedef struct {
     const REAL *kernels[NODE_ROWS];
     REAL shares[NODE_ROWS];
@@ -350,7 +350,7 @@ INLINE Nodes nodes_of(const DepthJob *job, int64_t number, int64_t i, int64_t no
     return nodes;
 }
 
-// Mix the taps at row a of the cells from *low on, to before *high, where any of the rows of pixels has some, and up to `beside` beside.
+// Mix the taps at row a of the cells from *low to before *high, the bounds of all NODE_ROWS rows, and up to `beside` taps beside them.
 INLINE void mix(const DepthJob *job, const Nodes *nodes, int64_t a, int64_t beside, REAL *room, int64_t *low, int64_t *high) {
     const int64_t *taps = job->taps, next = job->nodes[1] * (taps[0] + 2 * job->step[0]) * taps[1];
     *low = taps[1], *high = 0;
@@ -366,13 +366,13 @@ INLINE void mix(const DepthJob *job, const Nodes *nodes, int64_t a, int64_t besi
         const int is_there = row >= 0 && row < taps[0];
         const REAL *const one = nodes->kernels[r] + row * taps[1], share = nodes->shares[r];
         REAL *const mixed = room + r * taps[1];
-        for (int64_t b = first; b < last; b += LANES) { // whole vectors: what comes after `last` is written anew, or not used
+        for (int64_t b = first; b < last; b += LANES) { // whole vectors: numbers after `last` are written anew, or not used
             *(Run *)(mixed + b) = is_there ? *(const Run *)(one + b) + share * (*(const Run *)(one + next + b) - *(const Run *)(one + b)) : (Run)0;
         }
     }
 }
 
-// The columns of pixels in which a column of nodes has a share.
+// Columns of pixels in which a column of nodes has a share.
 INLINE void find_columns(const DepthJob *job, int64_t node, int64_t *first, int64_t *last) {
     int64_t j = 0;
     while (j < job->pixels[1] && job->node_columns[j] <= node - 1) j++;
@@ -409,9 +409,10 @@ INLINE void sum_for_node(const DepthJob *job, const Plane *of, const Nodes *node
     }
 }
 
-// The adjoint: `pixels` are those rows, `apart`, by the node's share, with a zero before each. Two taps that are neighbours at a place are
-// given together, so that a cell is read and stored once for both. Neighbouring rows of cells follow each other: what was just stored,
-// a processor cannot read again a column farther on. What lies beyond the node's pixels is 0, and may be added anywhere.
+// The adjoint: `pixels` are NODE_ROWS rows, `apart` numbers apart, times the node's share, with a zero before each. Two neighbouring taps
+// of a place are added together, so that a cell is read and stored once for both. Neighbouring rows of cells follow each other, since a
+// processor cannot read at once, a column farther on, what it has just stored. Numbers beyond the node's pixels are 0, and may be added
+// anywhere.
 INLINE void give_for_node(const DepthJob *job, const Plane *of, const Nodes *nodes, const REAL *pixels, int64_t apart, int64_t i, int64_t j, const int wide) {
     const int64_t *taps = job->taps, *step = job->step, tall = tall_of(job, i);
     REAL *const room = job->room;
@@ -461,7 +462,7 @@ INLINE void sum_for_nodes(const DepthJob *job) {
     }
 }
 
-// The cells are 0 before.
+// The cells must be 0 before.
 INLINE void give_for_nodes(const DepthJob *job) {
     const int64_t apart = (job->pixels[1] + 31) / 16 * 16;
     REAL *const some = (REAL *)job->room + GIVEN_ROWS * NODE_ROWS * job->taps[1] + 16;
@@ -496,7 +497,7 @@ void KERNEL(cells_to_pixels)(const DepthJob *job) {
     }
 }
 
-// Of the sum of the pixels of cells_to_pixels, each times its number in `image`, the derivatives by the taps.
+// Derivatives by the taps of the sum of the pixels of cells_to_pixels, each times its number in `image`.
 void KERNEL(differentiate_taps)(const DepthJob *job) {
     const int64_t *taps = job->taps, *step = job->step;
     for (int64_t number = 0; number < job->planes; number++) {
@@ -521,7 +522,7 @@ void KERNEL(pixels_to_cells)(const DepthJob *job) {
     for (int64_t number = 0; number < job->planes; number++) {
         const Plane plane = plane_of(job, number);
         for (int64_t r = 0; r < job->rows; r++) {
-            if (r / job->step[0] % TALL) continue; // done with the row above
+            if (r / job->step[0] % TALL) continue; // computed with the row above
             for (int64_t place = 0; place < job->step[1]; place++) {
 #define SUM(wide) sum_pixels(&plane, r, place, j, wide)
                 EACH_RUN(j, 0, plane.together, SUM);

@@ -1,5 +1,5 @@
-// Several rays at once, a tile: a variable of these types has a number for each of its rays, its lanes. Clang makes of
-// the vectors what the processor has.
+// Vectors for a tile, several rays at once: a variable of these types has a lane, a number, for each ray. Clang compiles the
+// vectors to those of the processor.
 
 #pragma once
 
@@ -9,8 +9,8 @@
 #define LANES (32 / sizeof(REAL))
 #endif
 
-typedef REAL F __attribute__((ext_vector_type(LANES)));   // what is traversed in: float or double
-typedef double D __attribute__((ext_vector_type(LANES))); // what a traversal is set up in
+typedef REAL F __attribute__((ext_vector_type(LANES)));   // numbers of a traversal: float or double
+typedef double D __attribute__((ext_vector_type(LANES))); // numbers of its set-up
 typedef __typeof__((F)0 < (F)0) I; // whole numbers, and true (-1) or false (0), as wide as F
 typedef __typeof__((D)0 < (D)0) B; // as wide as D
 
@@ -31,7 +31,7 @@ INLINE D whole(D x) {
     return AS(D, AS(Int, x));
 }
 
-// x rounded to the nearest whole number; without effect on what is far too large to have a fraction.
+// x rounded to the nearest whole number; numbers too large for a fraction stay as they are.
 INLINE D rounded(D x) {
     const D shift = 6755399441055744.0; // 1.5 2^52
     return x + shift - shift;

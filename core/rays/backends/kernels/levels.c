@@ -1,8 +1,8 @@
-// Which level of processor this is, and the kernels compiled for it.
+// The level of this processor, and calls of the kernels compiled for it.
 
 #include "kernels.h"
 
-// What every file is compiled to, level by level; and the thread's mode of floating-point numbers, with denormal ones as 0.
+// Names of a kernel's versions, level by level, and the thread's mode of floating-point numbers, with denormal numbers as 0.
 #ifdef __x86_64__
 #define EACH(name) name##_0_float, name##_0_double, name##_1_float, name##_1_double, name##_2_float, name##_2_double
 static const char *const names[] = {"SSE2", "AVX2", "AVX-512"};
@@ -24,8 +24,8 @@ static const char *const names[] = {"NEON"};
 #define EXPORT __attribute__((visibility("default")))
 #endif
 
-// A denormal number takes as long as a hundred others, and volumes that OSEM empties are full of them: they are 0 while a
-// kernel runs. Afterwards the thread has its own mode again.
+// Denormal numbers take a hundred times as long, and volumes that OSEM empties are full of them: they are 0 while a kernel
+// runs. Afterwards the thread has its own mode again.
 #define DISPATCH(name, Task)                                 \
     Kernel##Task EACH(name);                                 \
     EXPORT void name(int64_t level, const Task *job) {       \
@@ -68,13 +68,13 @@ EXPORT void contract(int64_t numbers[5]) {
 #ifdef __x86_64__
 #include <cpuid.h>
 
-// Asked of the processor itself: compilers' own functions for it need a runtime that not all shared libraries have.
+// The processor is asked directly: the compiler's functions for this need a runtime that not all shared libraries have.
 EXPORT int64_t best_level(void) {
     unsigned a, b, c, d, low, high;
     if (!__get_cpuid(1, &a, &b, &c, &d)) return 0;
     const unsigned fma = 1u << 12, osxsave = 1u << 27, avx = 1u << 28;
     if ((c & (fma | osxsave | avx)) != (fma | osxsave | avx)) return 0;
-    __asm__("xgetbv" : "=a"(low), "=d"(high) : "c"(0)); // which registers the system keeps
+    __asm__("xgetbv" : "=a"(low), "=d"(high) : "c"(0)); // which registers the system saves
     if (!__get_cpuid_count(7, 0, &a, &b, &c, &d) || (low & 0x6) != 0x6 || !(b & 1u << 5)) return 0;
     const unsigned avx512 = 1u << 16 | 1u << 17 | 1u << 30 | 1u << 31; // F, DQ, BW, VL
     return (b & avx512) == avx512 && (low & 0xe6) == 0xe6 ? 2 : 1;
@@ -84,6 +84,6 @@ EXPORT int64_t best_level(void) { return 0; }
 #endif
 
 #ifdef _WIN32
-// What Windows calls when it loads a library; elsewhere nothing needs to be there.
+// Windows calls this function when it loads a library; other systems need none.
 int DllMainCRTStartup(void) { return 1; }
 #endif

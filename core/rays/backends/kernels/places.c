@@ -1,5 +1,5 @@
-// Values of arrays at the places of a lattice's points, under homogeneous transforms, and the transpose: what perspective volumes are
-// resampled by, and images backprojected.
+// Values of arrays at the places of a lattice's points, under homogeneous transforms, and the adjoint: for resampling of volumes in
+// the coordinates of views, and for back-projection of images.
 
 #include "lanes.h"
 #include "kernels.h"
@@ -11,10 +11,10 @@
 #define JOIN(name, level, real) JOIN_(name, level, real)
 #define KERNEL(name) JOIN(name, LEVEL, REAL)
 
-// Of one line of points all arrays would be read all over memory, of one array all lines would be written again.
+// For one line of points, all arrays would be read all over memory; for one array, all lines would be written again.
 #define ARRAYS_AT_ONCE 8
 
-// Where some points of a line lie in an array: first of the 2 x 2 x 2 elements around, shares of the second ones.
+// Places of some points of a line in an array: the first of the 2 x 2 x 2 elements around each, and the shares of the second ones.
 typedef struct {
     I inside, at[3];
     F share[3];
@@ -22,11 +22,11 @@ typedef struct {
 } Places;
 
 typedef struct {
-    double at[5], step[5]; // at the line's `middle`, and by the points' third coordinate
+    double at[5], step[5]; // the five numbers p at the job's `middle`, and their change with the points' third coordinate
 } Line;
 
 INLINE Line line_of(const PlacesJob *job, const double *matrix, int64_t i, int64_t j) {
-    // Computed in double where a line begins, and relative to its middle, so that float is enough along it.
+    // The start of a line is computed in double, relative to its middle, so that float is enough along it.
     Line line;
     UNROLLED for (int a = 0; a < 5; a++) {
         const double *row = matrix + 4 * a;
@@ -39,7 +39,7 @@ INLINE F along(const Line *line, int row, F third) { return third * (F)(REAL)lin
 
 INLINE I place(F x, int64_t n, I inside, I *first, F *share) {
     inside &= (x >= (F)-0.5) & (x <= (F)((REAL)n - (REAL)0.5));
-    const F within = MIN(MAX(x, (F)0), (F)(REAL)(n - 1)); // 0 of what is not a number
+    const F within = MIN(MAX(x, (F)0), (F)(REAL)(n - 1)); // 0 for what is not a number
     const F low = MIN(within, (F)(REAL)(n > 1 ? n - 2 : 0));
     *first = AS(I, low);
     *share = within - AS(F, *first);
@@ -99,7 +99,7 @@ INLINE void add(int32_t *numbers, int n, I values) {
     }
 }
 
-// Two neighbours along an axis; where there is only one element, it is both.
+// Interpolation between two neighbours along an axis; a single element is both neighbours.
 INLINE F between(F first, F second, F share) { return first + share * (second - first); }
 
 INLINE F plane_of(const REAL *array, I index, int64_t next, int64_t across, const Places *p) {
@@ -117,8 +117,8 @@ INLINE F value_at(const PlacesJob *job, const REAL *array, const Places *p, cons
                    p->share[2]);
 }
 
-// A product of many numbers is kept as one from 1 to 2 and a power of 2: neither grows too large or too small. What is not finite
-// stays as it is.
+// A product of many numbers is stored as a number from 1 to 2 and a power of 2: neither grows too large or too small. Numbers that are
+// not finite stay as they are.
 #define FRACTION_BITS (sizeof(REAL) == 4 ? 23 : 52)
 #define BIAS (sizeof(REAL) == 4 ? 127 : 1023)
 
@@ -131,7 +131,7 @@ INLINE F normalised(F product, I *exponent) {
     return zero ? (F)0 : usual ? (F)bits : product;
 }
 
-// What is not a number stays so.
+// The smaller one; if x is not a number, x.
 INLINE F least(F x, F y) { return ((x < y) | (x != x)) ? x : y; }
 
 INLINE void combine(const PlacesJob *job, const REAL *array, const double *matrix, int64_t i, int64_t j, const int flat, const int how) {
@@ -174,23 +174,23 @@ void KERNEL(take_at)(const PlacesJob *job) {
     }
 }
 
-// Whether a line may give anything to elements of the array's first axis from `first` to `last`.
+// Whether a line may share numbers out to elements of the array's first axis from `first` to `last`.
 INLINE int may_give(const PlacesJob *job, const Line *line) {
     double place[2];
     UNROLLED for (int end = 0; end < 2; end++) {
         const double third = ((const REAL *)job->planes)[end ? job->n[2] - 1 : 0];
         const double depth = line->at[3] + third * line->step[3];
-        if (!(depth > 0)) return 1; // a part of it may: between points in front, places change in one direction
+        if (!(depth > 0)) return 1; // a part of the line may: places change in one direction only between points in front
         place[end] = (line->at[0] + third * line->step[0]) / depth;
     }
-    const int before = place[0] + 1 < job->first && place[1] + 1 < job->first; // never of what is not a number
+    const int before = place[0] + 1 < job->first && place[1] + 1 < job->first; // never for what is not a number
     return !before && !(place[0] - 1 >= job->last && place[1] - 1 >= job->last);
 }
 
 INLINE void give_all(const PlacesJob *job, const int flat) {
     const int64_t *n = job->n, *m = job->m;
-    // Where there is only one element along an axis, it is both neighbours: the second one's share is 0, but not a number if
-    // the point's number is not finite. Along the first axis the second is no plane of this job's.
+    // A single element along an axis is both neighbours: the share of the second one is 0, but the product is not a number if
+    // the point's number is not finite. Along the first axis the second neighbour is not a plane of this job.
     const int64_t along_axes[3] = {m[1] * m[2], m[1] > 1 ? m[2] : 0, m[2] > 1};
     for (int64_t i = 0; i < n[0]; i++) for (int64_t j = 0; j < n[1]; j++) {
         const Line line = line_of(job, job->matrices, i, j);

@@ -2,7 +2,7 @@
 //
 // A ray crosses a lattice's planes at alphas that are evenly spaced on each axis. From t_enter on, each step goes to the
 // nearest of the next three planes, at t_next, and into the voxel beyond it. Rays are traversed a tile at a time, all
-// lanes in step; a lane that has arrived takes steps of length 0. Everything is set up in double and traversed in REAL,
+// lanes in step; a lane that has arrived takes steps of length 0. A traversal is set up in double and computed in REAL,
 // with t, which is alpha scaled so that the traversal starts at 0 and ends at 1: rounding is relative to the chord in the
 // lattice, however far away the source is.
 //
@@ -16,7 +16,7 @@
 
 #define NEVER 1e30 // t of a plane that is never crossed
 #define FAR 1e15 // voxels
-#define SNAP 1e-9 // as in rays.py: a ray this close to a plane lies in it
+#define SNAP 1e-9 // as in ray_geometry.py: a ray this close to a plane lies in it
 
 // Tiles take turns of TURN steps. Neighbouring tiles then read the same part of the volume at about the same time, and a
 // tile's next voxels, prefetched a turn ahead, come from memory while the other tiles have their turns.
@@ -29,20 +29,20 @@ enum { FORWARD, BACKPROJECT, BY_ENDS, BY_MU };
 typedef struct {
     F t_first[3], t_delta[3]; // the k-th plane ahead is crossed at t_first + k t_delta
     F k[3]; // number of the plane after the next one
-    I stride[3], voxel; // what crossing a plane adds to the index of the voxel
+    I stride[3], voxel; // change of the voxel's index with a plane crossed, and the index
     F t_enter, t_exit;
-    int64_t ahead; // about what TURN steps add to the index
+    int64_t ahead; // approximate change of the index in TURN steps
     I entry_face[3], exit_face[3]; // -1 for the axis of the face through which rays enter and leave
 } Traversal;
 
-// What changes from step to step.
+// State of a traversal that changes from step to step.
 typedef struct {
     F t, sum;
     F transmittance; // from the source to t
     F beyond;        // the part of the integral beyond t
 } State;
 
-// What derivatives by the ends need as well: the voxels' values at t, the optical depth from the source to t, and the
+// Further state for derivatives by the ends: the voxels' values at t, the optical depth from the source to t, and the
 // sums that `add_jump` explains.
 typedef struct {
     F f, mu, depth_before, by_length, jumps[3], moments[3], mu_jumps[3], mu_moments[3];
@@ -51,19 +51,19 @@ typedef struct {
 typedef struct {
     Traversal traversal, mu_traversal;
     State state;
-    F value, length; // of the ray to be backprojected; mm from t = 0 to t = 1
+    F value, length; // value of the ray to be back-projected; mm from t = 0 to t = 1
     D alpha_start, alpha_span, mm; // alpha where t is 0; alpha from t = 0 to t = 1; mm of the whole ray
-    int64_t steps, apart; // to its end; whether neighbouring rays are far apart in memory
+    int64_t steps, apart; // number of steps to the end; whether neighbouring rays are far apart in memory
     int n_rays;
     Jumps jumps;
 } Tile;
 
 typedef struct {
     D start[3], direction[3], mu_start[3], mu_direction[3], mm;
-    B real; // not beyond the last ray
+    B real; // whether a lane has a ray: not beyond the last one
 } Rays;
 
-// One axis of the rays to the points (row, column) of a fan; rays that nearly lie in a plane of voxel faces lie in it.
+// One axis of the rays to the points (row, column) of a fan; rays that nearly lie in a plane of voxel faces are snapped to it.
 INLINE void fan_ray(const double fan[4][3], double parallel, int a, D row, D column, D *start, D *direction) {
     const D to = column * fan[3][a] + (row * fan[2][a] + fan[1][a]);
     const D from = fan[0][a] + parallel * (to - fan[1][a]), plane = rounded(from);
@@ -121,7 +121,7 @@ INLINE void clip(const Lattice *lattice, const D start[3], const D direction[3],
     }
 }
 
-// The traversal from alpha `enter` on, with t = 0 at alpha `begin` and t = 1 after `span`. Returns the largest possible
+// Set up the traversal from alpha `enter` on, with t = 0 at alpha `begin` and t = 1 after `span`. Return the largest possible
 // number of planes crossed.
 //
 // Why a voxel's index never leaves the lattice: from the first voxel, `room` planes can be crossed. Plane k, counted
@@ -156,7 +156,7 @@ INLINE D set_up_traversal(Traversal *traversal, const Lattice *lattice, const D 
     I idle; // lanes that miss get a voxel each, so that they do not wait for each other's memory
     EACH_LANE(i) idle[i] = i < stride ? i : 0;
     traversal->voxel = AS(I, hits) ? traversal->voxel : idle;
-    D ahead = 0; // that of the middle lane serves all: it is only a prefetch
+    D ahead = 0; // that of the middle lane is used for all: it only determines the prefetch
     EACH_AXIS(a) ahead += whole(crossed[a] * (TURN / MAX(crossings, (D)1)) + 0.5) * AS(D, traversal->stride[a]);
     traversal->ahead = (int64_t)ahead[LANES / 2];
     return crossings;
@@ -177,7 +177,7 @@ INLINE void find_faces(Traversal *traversal, B hits, D enter, D leave, const D i
     exclusive(traversal->exit_face);
 }
 
-// Element i of indices, which are never negative. They leave the vector register two at a time: each extraction costs.
+// Element i of indices, which are never negative. They leave the vector register two at a time: each extraction takes time.
 typedef uint64_t Pairs __attribute__((ext_vector_type(LANES * sizeof(REAL) / 8)));
 #define INDEX(pairs, i) (sizeof(REAL) == 8 ? pairs[i] : (i) % 2 ? pairs[(i) / 2] >> 32 : pairs[(i) / 2] & 0xffffffff)
 
@@ -193,7 +193,7 @@ INLINE F gather(const REAL *voxels, I index) {
 #endif
 }
 
-// Lane after lane, since several may add to the same voxel.
+// Lanes are added one after the other, since several may add to the same voxel.
 INLINE void scatter_add(REAL *voxels, I index, F values) {
     const Pairs pairs = (Pairs)index;
     EACH_LANE(i) voxels[INDEX(pairs, i)] += values[i];
@@ -209,11 +209,11 @@ INLINE void prefetch(const REAL *voxels, I index, const Traversal *traversal, in
     if (apart) UNROLLED for (int i = 5; i < (int)LANES - 1; i += 5) FETCH(i);
 }
 
-// Attenuation over a segment: by series for thin segments, as nearly all are.
+// Attenuation over a segment is computed by a series if the segment is thin, as nearly all are.
 #define THIN ((REAL)0.25)
 #define TERMS (sizeof(REAL) == 8 ? 12 : 6)
 
-// The mean of exp(-s) for s from 0 to depth, and exp(-depth). Thick segments are halved; doubling formulas follow.
+// The mean of exp(-s) for s from 0 to depth, and exp(-depth). Thick segments are halved, and doubled back by formulas.
 INLINE F mean_transmittance(F depth, F *transmittance) {
     I halved = 0;
     int most = 0;
@@ -281,11 +281,11 @@ INLINE void set_up_tile(Tile *tile, const Job *job, const Rays *r, const int tas
     tile->steps = (int64_t)__builtin_reduce_max(steps);
 }
 
-// The next plane of each axis. Its t is computed from its number, so that rounding does not accumulate, and one step
+// t of the next plane of each axis. It is computed from the plane's number, so that rounding does not accumulate, and one step
 // early, so that no step waits for it.
 #define NEXT_PLANE(traversal, a) (((traversal).k[a] - 1) * (traversal).t_delta[a] + (traversal).t_first[a])
 
-// Cross planes: go on to the next planes of their axes and to the voxel beyond.
+// Cross planes: move on to the next planes of their axes and to the voxel beyond.
 INLINE void cross(Traversal *traversal, F t_next[3], const I crossed[3]) {
     EACH_AXIS(a) {
         const F after = traversal->k[a] * traversal->t_delta[a] + traversal->t_first[a];
@@ -295,8 +295,8 @@ INLINE void cross(Traversal *traversal, F t_next[3], const I crossed[3]) {
     }
 }
 
-// How an integral changes when planes move: each plane contributes the jump of the value there times the change of its
-// t. Plane k is crossed at alpha = (k - s) / d, d the ray from s to its end e: d alpha / ds = (alpha - 1) / d,
+// Sums for the change of an integral when planes move: each plane contributes the jump of the value there times the change of
+// its t. Plane k is crossed at alpha = (k - s) / d, d the ray from s to its end e: d alpha / ds = (alpha - 1) / d,
 // d alpha / de = -alpha / d. So the sums of jumps, and of jumps times t, of each axis are all that is needed.
 INLINE void add_jump(F jumps[3], F moments[3], I plane[3], F jump, F t) {
     exclusive(plane);
@@ -345,7 +345,7 @@ INLINE void traverse(Tile *tile, const Job *job, int64_t steps, const int task, 
         }
         if (task == FORWARD) w.sum += weight * f;
         if (task == BACKPROJECT) scatter_add(voxels, at, weight * f);
-        if (task == BY_MU) { // more mu weakens what lies beyond the segment, and about half of what is in it
+        if (task == BY_MU) { // more mu attenuates photons from beyond the segment, and about half of those from within
             w.beyond -= weight * f;
             const F within = f * w.transmittance * dt * first_moment(depth, mean);
             const F change = value * dt * (w.beyond + within);
@@ -387,7 +387,7 @@ INLINE void traverse(Tile *tile, const Job *job, int64_t steps, const int task, 
     if (task == BY_ENDS) tile->jumps = d;
 }
 
-// The rest of the chord, t_exit's margin: no more planes are crossed.
+// Set up the last step over the rest of the chord, the margin of t_exit, in which no plane is crossed.
 INLINE void reach_exit(Tile *tile) {
     Traversal *traversal = &tile->traversal, *mu_traversal = &tile->mu_traversal;
     EACH_AXIS(a) traversal->t_first[a] = mu_traversal->t_first[a] = (F)NEVER;
@@ -402,7 +402,7 @@ INLINE F load(const void *numbers, int64_t first, int n_rays) {
     return taken;
 }
 
-// The state at t = 0 of a tile of `n_rays` rays from `first` on.
+// Set the state at t = 0 of a tile of `n_rays` rays from `first` on.
 INLINE void set_up_task(Tile *tile, const Job *job, int64_t first, int n_rays, const int task, const int attenuation) {
     const int own = attenuation == OWN_LATTICE, attenuated = attenuation != NO_MU;
     tile->state.sum = tile->state.beyond = tile->jumps.depth_before = tile->jumps.by_length = 0;
@@ -435,7 +435,7 @@ INLINE void store(double *row, int n_rays, D numbers) {
     for (int i = 0; i < n_rays; i++) row[i] = numbers[i];
 }
 
-// Derivatives by start and end of rays, into rows of n numbers.
+// Store derivatives by start and end of rays in rows of n numbers.
 INLINE void store_by_ends(double *rows, int64_t n, int n_rays, const Tile *t, const F jumps[3], const F moments[3],
                         const D direction[3]) {
     EACH_AXIS(a) {
@@ -446,7 +446,7 @@ INLINE void store_by_ends(double *rows, int64_t n, int n_rays, const Tile *t, co
     }
 }
 
-// Derivatives of a tile of `n_rays` rays from `first` on, out of n.
+// Store the derivatives of a tile of `n_rays` rays from `first` on, out of n.
 INLINE void store_derivatives(Tile *t, const Job *job, const Rays *r, int64_t first, int n_rays, int64_t n,
                             const int attenuation) {
     const int own = attenuation == OWN_LATTICE, attenuated = attenuation != NO_MU;
@@ -454,7 +454,7 @@ INLINE void store_derivatives(Tile *t, const Job *job, const Rays *r, int64_t fi
     const D per_mm = t->mm > (D)0 ? 1 / t->mm : (D)0;
     const D integral = AS(D, load(job->integrals, first, attenuated ? n_rays : 0));
     store(rows, n_rays, attenuated ? integral * per_mm : AS(D, t->state.sum) * t->alpha_span);
-    // The jump at the face through which rays leave.
+    // Add the jump at the face through which rays leave.
     const F last = attenuated ? t->state.transmittance * t->jumps.f : t->jumps.f;
     EACH_AXIS(a) {
         t->jumps.jumps[a] += t->traversal.exit_face[a] ? last : (F)0;
@@ -468,7 +468,7 @@ INLINE void store_derivatives(Tile *t, const Job *job, const Rays *r, int64_t fi
     store(rows + 13 * n, n_rays, -AS(D, t->jumps.by_length) * t->alpha_span * per_mm);
 }
 
-// The rays of a tile, of a fan or of the list, from number `begin` on.
+// Set up the rays of a tile, of a fan or of the list, from number `begin` on.
 INLINE void tile_rays(const Job *job, const Fan *fan, int64_t begin, int64_t count, const int own, Rays *r) {
     D number;
     EACH_LANE(i) number[i] = (double)(begin + i);
@@ -479,7 +479,7 @@ INLINE void tile_rays(const Job *job, const Fan *fan, int64_t begin, int64_t cou
     if (own) make_miss(r->mu_start, r->mu_direction, &r->mm);
 }
 
-// The rays of a fan, or of the list, the first of which is ray `offset` out of n.
+// Trace the rays of a fan, or of the list, the first of which is ray `offset` out of n.
 INLINE void trace_bundle(const Job *job, const Fan *fan, int64_t count, int64_t offset, int64_t n, const int task,
                          const int attenuation) {
     const int own = attenuation == OWN_LATTICE, width = LANES;
@@ -509,7 +509,7 @@ INLINE void trace_bundle(const Job *job, const Fan *fan, int64_t count, int64_t 
                 const F integral = AS(F, AS(D, tiles[i].state.sum) * tiles[i].alpha_span * tiles[i].mm);
                 for (int j = 0; j < n_rays; j++) ((REAL *)job->values)[first + j] = integral[j];
             } else {
-                // Computed again: keeping them takes longer.
+                // The rays are computed again: to store them takes longer.
                 tile_rays(job, fan, starts_at + i * width, count, own, &rays);
                 store_derivatives(tiles + i, job, &rays, first, n_rays, n, attenuation);
             }

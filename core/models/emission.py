@@ -22,7 +22,7 @@ from ..physics.crystal import gaussian_blur
 from ..physics.energy_window import FWHM_PER_SIGMA
 from ..physics.isotopes import Isotope
 from ..physics.optics import Edge, Optics
-from ..pinhole_response.oblique_kernels import DirectionalEffects
+from ..pinhole_response.directional_effects import DirectionalEffects
 from ..pinhole_response.pinhole_operator import PinholeOperator
 from ..rays.bundles import Beam
 from ..rays.ray_geometry import Fan, view_rays
@@ -222,9 +222,7 @@ class Emission(Model):
             if self.aperture_mu is None:
                 raise InputError("emission: wall_thickness needs aperture_mu, of the walls' material")
         if has_points and self.hole in ("depth", "point"):
-            raise InputError(
-                f"emission: hole {self.hole!r} takes no points; use hole 'rays', or leave their number out"
-            )
+            raise InputError(f"emission: hole {self.hole!r} takes no points; leave them out, or use hole 'rays'")
 
     @property
     def _is_by_depth(self) -> bool:
@@ -303,8 +301,8 @@ class Emission(Model):
 
     def of_views(self, which: NDArray[np.integer]) -> Self:
         """Return the model of the modules with the indices `which` alone."""
-        values = {f.name: getattr(self, f.name) for f in fields(self)}
-        chosen = {name: array[which] for name, array in values.items() if isinstance(array, np.ndarray)}
+        arrays = ((f.name, getattr(self, f.name)) for f in fields(self))
+        chosen = {name: array[which] for name, array in arrays if isinstance(array, np.ndarray)}
         model = replace(self, system=self.system[which], **chosen)
         if self.parts() != (self,):  # the attenuation of lines is computed once, and neighbours stay neighbours
             model._set("_models", tuple(part.of_views(which) for part in self.parts()))
@@ -434,9 +432,8 @@ class Emission(Model):
             return plain.pixel_weights(m, v, u, (1.0, 1.0), float(lengths[m]), opening)
 
         modules = self._frames, lengths, plain.effective_diameter, sides, ray_weight
-        directional = None if self.has_one_kernel else effects
-        mu: Any = self.mu  # one volume, as lines are not apart
-        return PinholeOperator(views, grid, *modules, mu, self.hole == "depth", directional)
+        settings: Any = self.mu, self.hole == "depth", None if self.has_one_kernel else effects
+        return PinholeOperator(views, grid, *modules, *settings)
 
     def caution(self, views: Views, grid: Grid) -> str | None:
         """Return a warning if there are too few rays for the tolerance, or None."""

@@ -23,8 +23,7 @@ from ..volumes.volume import LINE_INTEGRALS, Volume, require_quantity
 from .pixel_points import TOLERANCE, offsets, points_needed, require_points, shadow_edges
 
 # Differences between views and their system that are a file's rounding: mm, and the sine of an angle.
-_SAME_PLACE = 1e-3
-_SAME_DIRECTION = 1e-6
+_SAME_PLACE, _SAME_DIRECTION = 1e-3, 1e-6
 
 
 class Model(ABC):

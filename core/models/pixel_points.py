@@ -34,8 +34,7 @@ _FIBONACCI = (1, 2, 3, 5, 8, 13, 21, 34, 55, 89, 144, 233, 377, 610, 987, 1597, 
 # an axis, the worst, have up to 2.9 on average and seldom more than 4.
 _LARGEST_ERROR = 4.0
 # Number of voxels examined along each axis of a grid, and of those, with the smallest shadows, that decide.
-_VOXELS_ALONG = 9
-_VOXELS = 48
+_VOXELS_ALONG, _VOXELS = 9, 48
 # Limits of the vectors k of the dual lattice that are examined: of |k_u k_v| / n, and of |k_u| / n and |k_v| / n.
 _DUAL_NEAR, _DUAL_FAR = 6, 3
 

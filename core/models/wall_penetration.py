@@ -27,6 +27,9 @@ LEAST_SHARE = 1e-4
 """Smallest weight of a hole that is taken into account: the largest one of its lines to a crystal, in units of that of
 the line along the axis of the crystal's own hole."""
 
+Lines = tuple[Floats, Floats]
+"""Points (..., 3, P) on straight lines, world mm, and the unit vectors of the lines."""
+
 _PLATE = 2.0  # mm, thickness of a plate that lets nothing pass, as `Construction` builds it
 _POINTS_BESIDE = 1, 2, 4  # to either side of the hole: before the channel, where its walls begin, and farther out
 _NODES_BESIDE, _NODES_OF_HOLES = 13, 33  # along each side of a crystal, between which weights are interpolated
@@ -36,8 +39,7 @@ _TRIAL_POSITIONS = np.linspace(-0.49, 0.49, 7)  # in units of the crystal's side
 class Solids:
     """Collimators and crystals of M modules, with the paths of straight lines in them.
 
-    Lines are points (..., 3, P) on them, world mm, and their unit vectors. `modules` is an index, or
-    indices in a shape that goes before the lines' two axes.
+    In its methods `modules` is an index, or indices in a shape that goes before the two axes of `lines`.
     """
 
     def __init__(self, model: Any) -> None:
@@ -51,7 +53,7 @@ class Solids:
         self.length, self.half = self.system.collimator_length, self.system.detector_side / 2
         self.frames = self.system.frames()
 
-    def attenuation(self, modules: Any, lines: tuple[Floats, Floats], through_hole: bool = False) -> Floats:
+    def attenuation(self, modules: Any, lines: Lines, through_hole: bool = False) -> Floats:
         """Return mu times the path (..., P) of lines in the walls of modules, and in their plates unless `through_hole`."""
         sizes = (x[modules] for x in (self.plate / 2, self.front, self.channel, self.length, self.half, self.mu))
         back, front, channel, length, half, mu = sizes
@@ -62,15 +64,13 @@ class Solids:
         path -= self._chord(modules, lines, back, length, channel, half)
         return mu[..., None] * path
 
-    def passes_crystal(self, modules: Any, lines: tuple[Floats, Floats]) -> NDArray[np.bool_]:
+    def passes_crystal(self, modules: Any, lines: Lines) -> NDArray[np.bool_]:
         """Return whether lines pass the crystals of modules, (..., P)."""
-        sizes = (x[modules] for x in (self.length, self.length + self.system.detector_thickness, self.half))
-        front, back, half = sizes
+        sizes = self.length, self.length + self.system.detector_thickness, self.half
+        front, back, half = (x[modules] for x in sizes)
         return self._chord(modules, lines, front, back, half, half) > 0
 
-    def _chord(
-        self, modules: Any, lines: tuple[Floats, Floats], first: Array, last: Array, start: Array, end: Array
-    ) -> Floats:
+    def _chord(self, modules: Any, lines: Lines, first: Array, last: Array, start: Array, end: Array) -> Floats:
         """Return lengths of lines, mm, in square frusta from depth `first` to `last` behind the holes.
 
         The frusta have the half-width `start` at the depth `first` and `end` at `last`, mm.
@@ -82,9 +82,7 @@ class Solids:
         (x, y, up), (dx, dy, rise) = (np.moveaxis(frames @ vectors, -2, 0) for vectors in (points, directions))
         half, opening = start - slope * (up + first), -slope * rise
         sides = [(half - sign * p, sign * dp - opening) for p, dp in ((x, dx), (y, dy)) for sign in (1, -1)]
-        enter: Floats
-        leave: Floats
-        enter, leave = np.array(-np.inf), np.array(np.inf)
+        enter, leave = np.full(1, -np.inf), np.full(1, np.inf)
         # Of each bounding plane the distance of the line's point, and by how much it falls per mm of the line.
         for distance, rate in [(last + up, -rise), (-up - first, rise), *sides]:
             crossing, enters = distance / np.where(rate == 0, 1e-30, rate), rate < 0
@@ -201,7 +199,7 @@ class ThroughWalls(Model):
                 shadow = (1 + l / system.pinhole_distance[m]) * np.array([point @ axis for axis in axes]) / pitch
                 shifts = offsets(n, start / n**0.5 - shadow)[:, ::-1]  # from the isocentre all fill the pixel evenly
                 fan = Fan(point, point + far * (point - first_end), *steps, views.shape, shifts)
-                yield Beam(fan, partial(_interpolated_weights, factors, table, n))
+                yield Beam(fan, partial(_node_weights, factors, table, n))
 
     def _weights(self, m: int, layer: int, points: Floats, ends: Floats) -> Floats:
         """Return the expected counts per mm^2 of module m's crystal and mm^2 at each point (N, 3, 1), along lines.
@@ -219,9 +217,7 @@ class ThroughWalls(Model):
         return weights * (seconds * optics.photons_per_decay / (4 * np.pi))
 
 
-def _interpolated_weights(
-    factors: list[Floats], table: Floats, n: int, rows: slice, columns: slice, shifts: slice
-) -> Floats:
+def _node_weights(factors: list[Floats], table: Floats, n: int, rows: slice, columns: slice, shifts: slice) -> Floats:
     """Return the rays' weights (shifts, rows, columns) from their logarithms at the nodes, `table`.
 
     `factors` are the interpolation matrix and the pixels' fraction on the crystal, along u and along v; n is the number of
@@ -270,21 +266,17 @@ def models_with_walls(model: Any) -> tuple[Model, ...]:
         trials = 2 * solids.half[m] * np.stack(np.meshgrid(_TRIAL_POSITIONS, _TRIAL_POSITIONS)).reshape(2, -1)
         ends = (center - solids.length[m] * k)[:, None] + np.stack([u, v], axis=1) @ trials
         on_axis = areas[m] / solids.length[m] ** 2
-        points = solids.points_beside(m, scanner.plate_thickness is not None).T[..., None, None]
-        u_beside, v_beside, area = points
+        u_beside, v_beside, area = solids.points_beside(m, scanner.plate_thickness is not None).T[..., None, None]
         points = center[:, None] + u_beside * u[:, None] + v_beside * v[:, None]
         weights = area[..., 0] * line_weights(scanner, solids, m, m, none, points, ends)
         share_beside = weights.sum(axis=0).max() / on_axis
-        neighbors = np.delete(np.arange(n), m)
-        centers = model.system.centers[..., None]
+        neighbors, centers = np.delete(np.arange(n), m), model.system.centers[..., None]
         weights = line_weights(scanner, solids, m, neighbors, none, centers[neighbors], ends).max(axis=-1)
         neighbor_shares = areas[neighbors] * weights / on_axis
         for hole in neighbors[neighbor_shares > LEAST_SHARE]:
             thirds = neighbors[neighbors != hole]
-            directions = (centers[hole] - ends) / np.linalg.norm(centers[hole] - ends, axis=0)
-            meets = (solids.attenuation(thirds, (ends, directions)) > 0) | solids.passes_crystal(
-                thirds, (ends, directions)
-            )
+            lines = ends, (centers[hole] - ends) / np.linalg.norm(centers[hole] - ends, axis=0)
+            meets = (solids.attenuation(thirds, lines) > 0) | solids.passes_crystal(thirds, lines)
             between[m][hole] = thirds[meets.any(axis=-1)]
             weights = line_weights(scanner, solids, m, hole, between[m][hole], centers[hole], ends)
             shares[m, hole] = areas[hole] * weights.max() / on_axis
@@ -294,8 +286,7 @@ def models_with_walls(model: Any) -> tuple[Model, ...]:
     parts: list[Model] = [scanner]
     for rank, largest in enumerate(shares.max(axis=0).tolist()):
         if largest > LEAST_SHARE:
-            thirds_of_pairs = tuple(between[m][hole] for m, hole in enumerate(holes[:, rank]))
-            modules = np.arange(n), holes[:, rank], thirds_of_pairs
+            modules = np.arange(n), holes[:, rank], tuple(between[m][hole] for m, hole in enumerate(holes[:, rank]))
             parts.append(ThroughWalls(_with_fewer_rays(scanner, largest), scanner, solids, *modules))
     return tuple(parts)
 

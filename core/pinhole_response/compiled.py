@@ -27,7 +27,8 @@ def cells_to_voxels(
     volume: Array, cells: Array, response: DepthResponse, transmittance: Array | None, slab: slice
 ) -> None:
     """Add the adjoint of `voxels_to_cells` for `cells` to the `slab` of `volume` along x, in place."""
-    _run_voxels(library.cells_to_voxels, response, cells, volume, transmittance, slab)
+    first, last, _ = slab.indices(len(volume))
+    _run_voxels(library.cells_to_voxels, response, cells, volume, transmittance, first=first, last=last)
 
 
 def cells_to_pixels(cells: Array, response: DepthResponse) -> Array:
@@ -61,7 +62,7 @@ def matrix_gradient(
     (3,).
     """
     gradient = np.zeros(3 + 12 * len(response.piece_offsets))
-    _run_voxels(library.differentiate_places, response, cells, volume, transmittance, gradient=gradient)
+    _run_voxels(library.differentiate_places, response, cells, volume, transmittance, gradient=gradient.ctypes.data)
     # Of each piece by its shift, and that times the voxels' x, y and z.
     d_shifts = gradient[3:].reshape(-1, 4, 3)
     d_matrix = np.concatenate([d_shifts[:, 1:].sum(axis=0).T, d_shifts[:, 0].sum(axis=0)[:, None]], axis=1)
@@ -104,32 +105,23 @@ def _new_sorted_cells(response: DepthResponse, dtype: Any) -> Array:
 
 
 def _run_voxels(
-    kernel: Any,
-    response: DepthResponse,
-    cells: Array,
-    volume: Array,
-    transmittance: Array | None,
-    slab: slice = slice(None),
-    gradient: Floats | None = None,
+    kernel: Any, response: DepthResponse, cells: Array, volume: Array, transmittance: Array | None, **fields: Any
 ) -> None:
-    """Run a kernel between the voxels and the cells of one view."""
+    """Run a kernel between the voxels and the cells of one view; `fields` are further ones of the job."""
     if transmittance is not None and (transmittance.shape != volume.shape or transmittance.dtype != cells.dtype):
         shape, dtype = transmittance.shape, transmittance.dtype
         raise ValueError(f"expected a transmittance of the volume's shape and type, got {shape}, {dtype}")
-    first, last, _ = slab.indices(len(volume))
-    matrix = response.matrix
+    matrix, fields = response.matrix, {"first": 0, "last": len(volume)} | fields
     shifts, line = np.ascontiguousarray(response.piece_offsets @ matrix[:, :3].T), matrix[:, :3] @ response.depth_line
     planes, rows, columns = response.shape
     job = DepthJob(
         is_double=cells.dtype == np.float64, volume=as_voxel_array(volume, cells, kernel is library.cells_to_voxels),
-        first=first, last=last, matrix=tuple(matrix.ravel().tolist()), line=tuple(line.tolist()),
-        shifts=shifts.ctypes.data, pieces=len(shifts), of_point=response.max_point_length,
-        of_pair=response.max_pair_length, parts_per_cell=response.samples_per_cell, nearest=response.nearest,
-        farthest=response.farthest, first_plane=response.first_plane,
-        planes_per_inverse=response.planes_per_inverse_depth,
-        passes=None if transmittance is None else transmittance.ctypes.data,
-        cells=cells.ctypes.data, planes=planes, rows=rows, columns=columns, step=response.cells_per_pixel,
-        gradient=None if gradient is None else gradient.ctypes.data,
+        matrix=tuple(matrix.ravel().tolist()), line=tuple(line.tolist()), shifts=shifts.ctypes.data,
+        pieces=len(shifts), of_point=response.max_point_length, of_pair=response.max_pair_length,
+        parts_per_cell=response.samples_per_cell, nearest=response.nearest, farthest=response.farthest,
+        first_plane=response.first_plane, planes_per_inverse=response.planes_per_inverse_depth, cells=cells.ctypes.data,
+        passes=None if transmittance is None else transmittance.ctypes.data, planes=planes, rows=rows, columns=columns,
+        step=response.cells_per_pixel, **fields,
     )  # fmt: skip
     kernel(level, job)
 
@@ -146,9 +138,8 @@ def _run_pixels(
     nodes: dict[str, Any] = {}
     if response.node_positions is not None:
         node_rows, node_columns = (np.ascontiguousarray(positions) for positions in response.node_positions)
-        pixel_room = response.pixel_weights.shape[1] + 2 * _READ_ON
-        n_room = _NODE_ROWS * (_GIVEN_ROWS * kernels.shape[-1] + pixel_room) + 2 * _READ_ON
-        room = np.zeros(n_room, image.dtype)
+        row = _GIVEN_ROWS * kernels.shape[-1] + response.pixel_weights.shape[1] + 2 * _READ_ON
+        room = np.zeros(_NODE_ROWS * row + 2 * _READ_ON, image.dtype)
         columns_of = np.arange(kernels.shape[-1]) % step_u * (columns // step_u)
         columns_of += np.arange(kernels.shape[-1]) // step_u
         nodes = {"nodes": kernels.shape[1:3], "node_rows": node_rows.ctypes.data,

@@ -17,6 +17,9 @@ from numpy.typing import NDArray
 from ..arrays import Array
 
 Index = tuple[int, ...]
+"""Index of a voxel or shape of a box (x, y, z), or number of a node (v, u)."""
+Block = tuple[slice, slice]
+"""Rows and columns of pixels or cells."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,13 +79,14 @@ class DepthResponse:
 
         The bounds of a node include those of the next node along v.
         """
-        has_tap = self.padded_kernels != 0
+        used = self.padded_kernels != 0
         if self.node_positions is not None:
-            has_tap[:, :-1] |= has_tap[:, 1:]
-        ends = np.stack([has_tap.argmax(-1), has_tap.shape[-1] - has_tap[..., ::-1].argmax(-1)], -1)
-        return ends * has_tap.any(-1, keepdims=True)
+            used[:, :-1] |= used[:, 1:]
+        return np.stack([used.argmax(-1), used.shape[-1] - used[..., ::-1].argmax(-1)], -1) * used.any(
+            -1, keepdims=True
+        )
 
-    def node_responses(self) -> Iterator[tuple[Index, DepthResponse, tuple[slice, slice], tuple[slice, slice]]]:
+    def node_responses(self) -> Iterator[tuple[Index, DepthResponse, Block, Block]]:
         """Yield each node's number along v and u, the response by its kernel alone, and the pixels and cells concerned.
 
         The response has the pixels between the node and its neighbours, times the node's share in them. Pixels and cells are
@@ -110,7 +114,7 @@ class DepthResponse:
         """Return the cells, of `size` along an axis, that some of its n pixels sum."""
         return slice(step * pixels.start, step * pixels.stop + size - step * n)
 
-    def restrict_to_box(self, origin: Index, shape: Index) -> tuple[DepthResponse, tuple[slice, slice]]:
+    def restrict_to_box(self, origin: Index, shape: Index) -> tuple[DepthResponse, Block]:
         """Return the response to a box of the volume alone, and the rows and columns of pixels that may see it."""
         matrix = self.matrix.copy()
         matrix[:, 3] += matrix[:, :3] @ origin

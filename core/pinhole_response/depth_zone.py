@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ..arrays import Array
 from ..physics.crystal import share_inside
-from .oblique_kernels import DirectionalEffects
+from .directional_effects import DirectionalEffects
 from .pixel_kernels import KernelShape, Pair
 
 

@@ -10,16 +10,15 @@ is mixed from those of the four nodes around it.
 import functools
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
-from typing import NamedTuple, Self
+from typing import NamedTuple
 
 import numpy as np
 
 from ..arrays import Array
 from ..physics.aperture import KnifeEdge
-from ..physics.crystal import recorded_depths
-from ..physics.optics import Optics
-from .pixel_kernels import KernelShape, KernelSpectra, Pair, disc_transform, half_taps
+from .depth_zone import DepthZone
+from .directional_effects import DirectionalEffects
+from .pixel_kernels import KernelSpectra, Pair, disc_transform, half_taps
 
 # Attenuation in the edge beyond which photons are neglected, and the number of Gauss nodes in the depth of the crystal.
 _MAX_ATTENUATION, _DEPTH_NODES = 7.5, 32
@@ -28,46 +27,6 @@ _STEEPEST = 0.98
 # Taps below this fraction of those inside the shadow are left out: tails are wide. Rows and columns at the rim in which no
 # tap exceeds the second fraction, of the largest tap, are left out, too: they are ripples of the transform.
 _SMALLEST_TAP, _STRAY_TAP = 3e-3, 3e-4
-
-
-@dataclass(frozen=True)
-class DirectionalEffects:
-    """Knife edge and crystal of a module, as far as they make its pinhole response depend on the photons' direction."""
-
-    knife: KnifeEdge | None
-    """Edge of the hole, where photons penetrate it by path."""
-    crystal_mu: float
-    """Attenuation coefficient of the crystal, 1/mm, where photons are recorded at their depth; else 0."""
-    thickness: float
-    """Thickness of the crystal, mm."""
-    mean_depth: float
-    """Depth of the image's plane behind the crystal's front face, mm: the mean depth of interaction along the axis."""
-    depth_deviation: float
-    """Standard deviation of the depth of interaction along the axis, mm."""
-
-    @classmethod
-    def from_optics(cls, optics: Optics, diameter: float, thickness: float) -> Self:
-        """Return the effects for a hole of this diameter, mm, and a crystal of this thickness, mm."""
-        knife = None
-        if optics.edge == "path":
-            plate = optics.plate_thickness
-            knife = KnifeEdge(diameter / 2, float(optics.aperture_mu), float(optics.tangent), plate and float(plate))
-        if optics.depth_layers == 1:
-            return cls(knife, 0.0, thickness, 0.0, 0.0)
-        mu = float(optics.crystal_mu)
-        return cls(knife, mu, thickness, *recorded_depths(mu, thickness))
-
-    def with_effective_diameter(self, diameter: float) -> Self:
-        """Return the effects for a hole of another effective diameter by Paix, mm."""
-        if self.knife is None:
-            return self
-        depth = self.knife.tangent / self.knife.mu
-        return replace(self, knife=replace(self.knife, radius=(math.hypot(diameter, depth) - depth) / 2))
-
-    @property
-    def edge_decay(self) -> float:
-        """Distance beyond the rim, mm, in which the transmittance along the axis falls by a factor of e."""
-        return 0.0 if self.knife is None else self.knife.tangent / (2 * self.knife.mu)
 
 
 class ObliqueKernel(NamedTuple):
@@ -103,21 +62,17 @@ def node_positions(n: int, spacing: int) -> Array:
     return np.arange(max(2, -(-(n - 1) // spacing) + 1)) * float(spacing)
 
 
-def oblique_kernel(
-    effects: DirectionalEffects,
-    diameter: float,
-    length: float,
-    cell_size: Array,
-    position: Array,
-    pixel_exponent: float,
-    cells_per_pixel: Array,
-    node_spacing: int,
-) -> ObliqueKernel:
-    """Return the numbers of the kernel of a pixel at `position`, (2,), mm along v and u on the crystal.
+def zone_nodes(zone: DepthZone, effects: DirectionalEffects) -> NodeLattice:
+    """Return the nodes' kernels of a zone with these effects."""
+    nodes = (node_positions(n, zone.node_spacing) for n in zone.image_shape)
+    v, u = (first + pitch * n for first, pitch, n in zip(zone.numbers.first, zone.numbers.pitch, nodes, strict=True))
+    return NodeLattice([oblique_kernel(zone, effects, np.array([a, b])) for a in v for b in u], (len(v), len(u)))
 
-    `length` is from the hole's plane to the image's, mm, `cell_size` (2,) in mm; `pixel_exponent` is that of `DepthZone`,
-    `node_spacing` in pixels.
-    """
+
+def oblique_kernel(zone: DepthZone, effects: DirectionalEffects, position: Array) -> ObliqueKernel:
+    """Return the numbers of the kernel of a pixel at `position`, (2,), mm along v and u on the crystal."""
+    diameter, length, cell_size = zone.numbers.diameter, zone.numbers.length, zone.cell_size
+    cells_per_pixel = np.array(zone.cells_per_pixel)
     slope = position / length
     steepness = float(np.hypot(*slope))
     axis = slope / steepness if steepness > 0 else np.array([1.0, 0.0])
@@ -142,11 +97,11 @@ def oblique_kernel(
         density = rate * np.exp(-rate * z) / -np.expm1(-rate * effects.thickness)
         depth_weights = gauss_weights * effects.thickness * density / stretch**2
         # The pixel's factor has the pixel's direction; the photon's own takes its place.
-        depth_weights = depth_weights * ((1 + steepness**2) / squared_secant) ** (1.5 * pixel_exponent)
+        depth_weights = depth_weights * ((1 + steepness**2) / squared_secant) ** (1.5 * zone.pixel_exponent)
         hole_scales = 1 / stretch - 1
         depth_shifts = hole_scales[:, None] * position / cell_size
         variance = np.average((hole_scales - np.average(hole_scales, 0, depth_weights)) ** 2, 0, depth_weights)
-        mixing_variance = variance * (node_spacing * cells_per_pixel) ** 2 / 8
+        mixing_variance = variance * (zone.node_spacing * cells_per_pixel) ** 2 / 8
     ellipse_forms = np.stack([forms[:, 0, 0], forms[:, 1, 1], 2 * forms[:, 0, 1]], -1)
     ellipse_centers = np.outer(off_center, axis) / cell_size
     ellipses = ellipse_forms, ellipse_centers, ellipse_weights
@@ -194,17 +149,17 @@ def _gauss_nodes(n: int) -> tuple[Array, Array]:
     return (x + 1) / 2, w / 2
 
 
-def node_kernels(shape: KernelShape, cells_per_pixel: Pair, nodes: NodeLattice) -> Array:
-    """Return the kernels (planes, nodes along v, nodes along u, taps, taps)."""
-    half = _half_taps(shape, cells_per_pixel, nodes)
-    spectra, node_list = ObliqueSpectra(shape, cells_per_pixel, half, nodes), []
+def node_kernels(zone: DepthZone, effects: DirectionalEffects) -> Array:
+    """Return the kernels (planes, nodes along v, nodes along u, taps, taps) of a zone with these effects."""
+    nodes, node_list = zone_nodes(zone, effects), []
+    spectra = ObliqueSpectra(zone, nodes, _half_taps(zone, nodes))
     for spectrum in spectra.node_spectra():
         images = spectra.to_taps(spectrum * spectra.pixel_and_voxel)
         node_list.append(_restore_centroid(spectra.kernel_taps(images).kernels, images[1:-1]))
     kernels = np.stack(node_list, axis=1)
     kernels *= spectra.totals[:, None, None]
     slices, is_used = [], (kernels > _STRAY_TAP * kernels.max()).any(axis=(0, 1))
-    for axis, h in ((-1, half[0]), (-2, half[1])):
+    for axis, h in ((-1, spectra.half[0]), (-2, spectra.half[1])):
         used = np.flatnonzero(is_used.any(axis=axis))
         reach = min(max(h - used[0], used[-1] - h), h)
         slices.append(slice(h - reach, h + reach + 1))
@@ -213,15 +168,15 @@ def node_kernels(shape: KernelShape, cells_per_pixel: Pair, nodes: NodeLattice) 
 
 
 class NodeKernelGradient:
-    """A loss that depends on the kernels of nodes, as a linear form of the numbers that these are made of.
+    """A loss that depends on the kernels of a zone's nodes, as a linear form of the numbers that these are made of.
 
-    Near the numbers given here the form changes as the loss does. `d_kernels` is the gradient by what `node_kernels`
-    returns.
+    Near the zone given here the form changes as the loss does. `d_kernels` is the gradient by what `node_kernels` returns.
     """
 
-    def __init__(self, shape: KernelShape, cells_per_pixel: Pair, nodes: NodeLattice, d_kernels: Array) -> None:
-        self._taps = cells_per_pixel, _half_taps(shape, cells_per_pixel, nodes)
-        spectra, n_planes = ObliqueSpectra(shape, *self._taps, nodes), len(d_kernels)
+    def __init__(self, zone: DepthZone, effects: DirectionalEffects, d_kernels: Array) -> None:
+        nodes, n_planes = zone_nodes(zone, effects), len(d_kernels)
+        spectra = ObliqueSpectra(zone, nodes, _half_taps(zone, nodes))
+        self._half = spectra.half
         left_out = [(0, 0), *((h - n // 2,) * 2 for h, n in zip(spectra.half, d_kernels.shape[-2:], strict=True))]
         self._d_spectra, d_totals = [], []
         self._d_pixel_and_voxel = np.zeros(spectra.pixel_and_voxel.shape)
@@ -241,24 +196,26 @@ class NodeKernelGradient:
             self._d_spectra.append(d_spectrum)
         self._d_totals = np.array(d_totals)
 
-    def value_by_edges(self, shape: KernelShape) -> float:
-        """Return the form, up to a constant, for a shape that differs in `voxel_edges` alone."""
-        return float(np.vdot(self._d_pixel_and_voxel, KernelSpectra(shape, *self._taps).pixel_and_voxel))
+    def value_by_edges(self, zone: DepthZone) -> float:
+        """Return the form, up to a constant, for a zone that differs in the voxel's edges alone."""
+        spectra = KernelSpectra(zone.kernel_shape, zone.cells_per_pixel, self._half)
+        return float(np.vdot(self._d_pixel_and_voxel, spectra.pixel_and_voxel))
 
-    def value(self, shape: KernelShape, nodes: NodeLattice) -> float:
-        """Return the form, up to a constant, for other numbers of the kernels."""
-        spectra = ObliqueSpectra(shape, *self._taps, nodes)
-        total = self._d_totals @ spectra.totals + self._d_curvature @ shape.curvature
+    def value(self, zone: DepthZone, effects: DirectionalEffects) -> float:
+        """Return the form, up to a constant, for another zone and other effects."""
+        spectra = ObliqueSpectra(zone, zone_nodes(zone, effects), self._half)
+        total = self._d_totals @ spectra.totals + self._d_curvature @ spectra.shape.curvature
         total += self._d_smallest_tap @ spectra.smallest_tap.ravel()
         for d_spectrum, spectrum in zip(self._d_spectra, spectra.node_spectra(), strict=True):
             total += np.vdot(d_spectrum, spectrum * spectra.pixel_and_voxel).real
         return float(total)
 
 
-def _half_taps(shape: KernelShape, cells_per_pixel: Pair, nodes: NodeLattice) -> Pair:
-    """Return the number of taps on each side of the central one that suffices for all nodes."""
+def _half_taps(zone: DepthZone, nodes: NodeLattice) -> Pair:
+    """Return the number of taps on each side of the central one that suffices for all nodes of a zone."""
     shifts = np.max([np.abs(node.depth_shifts).max(axis=0) for node in nodes.kernels], axis=0)
-    return half_taps(shape._replace(hole_diameter=_largest_diameters(nodes)), cells_per_pixel, shifts)
+    shape = zone.kernel_shape._replace(hole_diameter=_largest_diameters(nodes))
+    return half_taps(shape, zone.cells_per_pixel, shifts)
 
 
 def _restore_centroid(kernels: Array, images: Array) -> Array:
@@ -309,15 +266,14 @@ def _restore_centroid_gradient(d_result: Array, kernels: Array, images: Array) -
 def _largest_diameters(nodes: NodeLattice) -> Array:
     """Return the largest diameters of all ellipses around the hole's centre, (2,), cells."""
     reaches = [np.sqrt(node.ellipse_forms[:, :2]) + 2 * np.abs(node.ellipse_centers) for node in nodes.kernels]
-    diameters: Array = np.max([reach.max(axis=0) for reach in reaches], axis=0)
-    return diameters
+    return np.asarray(np.max([reach.max(axis=0) for reach in reaches], axis=0))
 
 
 class ObliqueSpectra(KernelSpectra):
     """Spectra of the images of nodes. What the hole lets pass is computed at 3 x 3 nodes and is quadratic between these."""
 
-    def __init__(self, shape: KernelShape, cells_per_pixel: Pair, half: Pair, nodes: NodeLattice) -> None:
-        super().__init__(shape, cells_per_pixel, half)
+    def __init__(self, zone: DepthZone, nodes: NodeLattice, half: Pair) -> None:
+        super().__init__(zone.kernel_shape, zone.cells_per_pixel, half)
         self.nodes, columns = nodes, nodes.shape[1]
         chosen, self._bases = zip(*(_quadratic_basis(n) for n in nodes.shape), strict=True)
         holes = [[self._hole_spectrum(nodes.kernels[i * columns + j]) for j in chosen[1]] for i in chosen[0]]
@@ -353,9 +309,8 @@ class ObliqueSpectra(KernelSpectra):
 
     def _depth_spectrum(self, node: ObliqueKernel) -> Array:
         """Return the factors (2, f_v, f_u) of the interaction depths, on the hole's spectrum and on its derivative."""
-        phases = [
-            np.exp(-2j * np.pi * np.outer(node.depth_shifts[:, i], f.ravel())) for i, f in enumerate(self.frequencies)
-        ]
+        axes = zip(node.depth_shifts.T, self.frequencies, strict=True)
+        phases = [np.exp(-2j * np.pi * np.outer(shifts, f.ravel())) for shifts, f in axes]
         weights = np.stack([node.depth_weights, node.depth_weights * node.hole_scales]) / node.depth_weights.sum()
         total: Array = (phases[0] * weights[:, :, None]).swapaxes(1, 2) @ phases[1]
         f_v, f_u = self.frequencies

@@ -17,30 +17,26 @@ discs. M. Unser, A. Aldroubi, M. Eden, "B-spline signal processing", IEEE Transa
 
 import itertools
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import partial
 from types import ModuleType
 from typing import Any
 
 import numpy as np
 
 from ..arrays import Array, cropped
-from ..geometry.grid import Grid
-from ..geometry.views import Views
 from ..rays import backends
 from ..rays.execution import Report
 from ..rays.parallel import in_order, run_all
 from ..volumes.volume import Volume
-from .depth_response import DepthResponse, Index
+from .depth_response import Block, DepthResponse, Index
 from .depth_zone import ViewNumbers
-from .oblique_kernels import DirectionalEffects
-from .pinhole_view import PinholeView, VoxelBox
+from .pinhole_views import PinholeViews
 from .transmittance import ArrayOnGrid, VoxelTransmittance
 from .zone_gradient import ResponseGradient, zone_gradient
 from .zone_response import zone_response
 
-BoxResponse = tuple[DepthResponse, tuple[slice, slice]]
+BoxResponse = tuple[DepthResponse, Block]
 """Response to a box of the volume, and the rows and columns of pixels that may see it."""
 
 # Voxels of a slab of whole layers, which one thread adds to before it takes the next; bytes of the views' cells in memory.
@@ -53,33 +49,11 @@ _TRANSMITTANCE_BYTES = 2**30
 
 
 @dataclass(eq=False)
-class PinholeOperator:
+class PinholeOperator(PinholeViews):
     """Linear map from a volume to the images of all views, through the whole holes of their modules.
 
     Each view has a response for every zone of depth, made when it is first needed.
     """
-
-    views: Views
-    """The views."""
-    grid: Grid
-    """Grid of the volume."""
-    frames: Array
-    """(M, 3, 3), u, v and k of the modules."""
-    lengths: Array
-    """(M,), distances from the holes' planes to the images', mm: collimator lengths plus mean depths of interaction."""
-    diameters: Array
-    """(M,), effective diameters of the holes, mm."""
-    crystal_sides: Array
-    """(M,), sides of the squares on the crystals in which photons are detected, mm."""
-    ray_weight: Callable[..., Array]
-    """``ray_weight(m, u=u, v=v)``, the expected counts per mm^2 of module m's crystal and line integral of 1 (decay /
-    (s mm^3) mm), along lines through the hole's centre to the positions (u, v) on the crystal, mm, point-inverted."""
-    mu: Volume | ArrayOnGrid | None
-    """Attenuation coefficients, 1/mm; None without attenuation."""
-    is_strict: bool
-    """Whether grids that reach too close to a pinhole are refused."""
-    directional_effects: Sequence[DirectionalEffects] | None = None
-    """The modules' knife edges and crystals, where kernels depend on the photons' direction."""
 
     def __post_init__(self) -> None:
         self._responses: dict[tuple[int, float, type], DepthResponse] = {}
@@ -88,33 +62,18 @@ class PinholeOperator:
         self._transmittances: dict[int, tuple[Index, Array]] = {}
         self._free_bytes = _TRANSMITTANCE_BYTES
 
-    def view(self, m: int) -> PinholeView:
-        """Return the pinhole of view m, as its zones of depth are made of it."""
-        l, d, side = (float(values[m]) for values in (self.lengths, self.diameters, self.crystal_sides))
-        weight = partial(self.ray_weight, m)
-        effects = None if self.directional_effects is None else self.directional_effects[m]
-        camera = self.frames[m], l, d, side
-        return PinholeView(self.views, m, self.grid, *camera, weight, effects, self.is_strict)
-
-    def close_voxels(self, m: int) -> VoxelBox | None:
-        """Return the voxels that are too close to view m's pinhole for the response; None where it can see none."""
-        return self.view(m).close_voxels()
-
-    def images(
-        self, volume: Array, backend: ModuleType, workers: int, mu: ArrayOnGrid | None = None
-    ) -> Iterator[Array]:
+    def images(self, volume: Array, backend: ModuleType, workers: int, mu: ArrayOnGrid | None) -> Iterator[Array]:
         """Yield the images (n_v, n_u) of `volume` one by one.
 
-        `backend` is the module that `depth_backend` returns; `mu` attenuates in place of the operator's own.
+        `backend` is the module that `depth_backend` returns; `mu` attenuates in place of the operator's own, if it is not
+        None.
         """
         (filled,), origin = cropped(volume)
         filled, dtype = np.ascontiguousarray(filled), volume.dtype.type
 
         def image(m: int) -> Array:
-            image, responses = (
-                np.zeros(self.views.shape, volume.dtype),
-                self._box_responses(m, origin, filled.shape, dtype),
-            )
+            image = np.zeros(self.views.shape, volume.dtype)
+            responses = self._box_responses(m, origin, filled.shape, dtype)
             transmittance = self._transmittance(m, origin, filled, mu) if responses else None
             for response, pixels in responses:
                 cells = backend.voxels_to_cells(filled, response, transmittance)
@@ -179,7 +138,8 @@ class PinholeOperator:
         shape, affine = filled[0].shape, self.grid.affine[:3]
 
         def view_gradient(m: int) -> tuple[Array, Array, ViewNumbers]:
-            view, numbers = self.view(m), ViewNumbers.zero()
+            pinhole, frame, *_ = self.module(m)
+            numbers = ViewNumbers.zero()
             d_transmittance: Array = np.zeros(shape, dtype)
             responses = self._box_responses(m, origin, shape, dtype)
             transmittance = self._transmittance(m, origin, filled[0], None) if responses else None
@@ -194,14 +154,14 @@ class PinholeOperator:
                         backend.cells_to_voxels(d_voxels, d_cells, response, None, slice(None))
                         d_transmittance += d_voxels * volume
                 if total is not None:
-                    numbers = numbers.plus(zone_gradient(view.zone(*limits), response, pixels, origin, total))
+                    numbers = numbers.plus(zone_gradient(self.zone(m, *limits), response, pixels, origin, total))
             d_camera = numbers.to_camera
-            center: Array = -(d_camera[:, 3] @ view.frame)
-            frame: Array = d_camera[:, :3] @ affine[:, :3].T + np.outer(d_camera[:, 3], affine[:, 3] - view.pinhole)
+            d_center: Array = -(d_camera[:, 3] @ frame)
+            d_frame: Array = d_camera[:, :3] @ affine[:, :3].T + np.outer(d_camera[:, 3], affine[:, 3] - pinhole)
             if transmittance is not None and self.mu is not None:
                 rays = self._voxel_transmittance(m, self.mu, origin, filled[0])
-                center = center + rays.pinhole_gradient(d_transmittance)
-            return center, frame, numbers
+                d_center = d_center + rays.pinhole_gradient(d_transmittance)
+            return d_center, d_frame, numbers
 
         views = in_order(view_gradient, range(len(self.views)), workers)
         centers, frames, numbers = zip(*views, strict=True)
@@ -241,16 +201,16 @@ class PinholeOperator:
 
     def _reached_zones(self, m: int, origin: Index, shape: Index) -> list[tuple[float, float]]:
         """Return the depths (far, near), mm, of the zones of view m that a box of the volume reaches into."""
-        row = self.view(m).depth_row
+        row = self.depth_row(m)
         depths = [row @ (*np.add(origin, corner), 1) for corner in itertools.product(*((0, n - 1) for n in shape))]
         if m not in self._zone_limits:
-            self._zone_limits[m] = self.view(m).zone_limits()
+            self._zone_limits[m] = self.zone_limits(m)
         return [(far, near) for far, near in self._zone_limits[m] if max(depths) > near and min(depths) <= far]
 
     def _response(self, m: int, far: float, near: float, dtype: type) -> DepthResponse:
         """Return view m's response to a zone of depth, made once."""
         if (m, far, dtype) not in self._responses:
-            self._responses[m, far, dtype] = zone_response(self.view(m).zone(far, near), dtype)
+            self._responses[m, far, dtype] = zone_response(self.zone(m, far, near), dtype)
         return self._responses[m, far, dtype]
 
     def _transmittance(self, m: int, origin: Index, box: Array, mu: ArrayOnGrid | None) -> Array | None:
@@ -278,10 +238,10 @@ class PinholeOperator:
 
     def _voxel_transmittance(self, m: int, mu: Volume | ArrayOnGrid, origin: Index, box: Array) -> VoxelTransmittance:
         """Return the rays from view m's pinhole through a box of the volume, an array of whose shape is given."""
-        view = self.view(m)
-        margin = view.diameter / 2 * (1 / view.length + 1 / view.depth_limits()[1])
+        _, frame, l, d = self.module(m)
+        margin = d / 2 * (1 / l + 1 / self.depth_limits(m)[1])
         grid = self.grid.box(origin, box.shape)
-        return VoxelTransmittance(mu, self.grid, grid, self.views, m, view.frame, margin, box.dtype.type)
+        return VoxelTransmittance(mu, self.grid, grid, self.views, m, frame, margin, box.dtype.type)
 
 
 def depth_backend(name: str = "auto") -> ModuleType:

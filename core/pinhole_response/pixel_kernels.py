@@ -201,11 +201,8 @@ class KernelSpectra:
 
     def _phases(self) -> list[tuple[slice, ...]]:
         """Return, for each place of a cell in a pixel, the taps with which cells of that place enter the pixels."""
-        starts = [
-            [(h - a) % step for a in range(step)] for h, step in zip(self.half, self.cells_per_pixel, strict=True)
-        ]
-        steps = zip(starts, self.cells_per_pixel, strict=True)
-        slices = [[slice(start, None, step) for start in starts_of_axis] for starts_of_axis, step in steps]
+        axes = zip(self.half, self.cells_per_pixel, strict=True)
+        slices = [[slice((h - a) % step, None, step) for a in range(step)] for h, step in axes]
         return [(slice(None), *phase) for phase in itertools.product(*slices)]
 
 

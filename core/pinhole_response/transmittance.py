@@ -80,8 +80,7 @@ class VoxelTransmittance:
         far = rounded_up(float(((grid.corners() - pinhole) @ k).max()))
         margin = 2 * round(self.margin + _TURN_MARGIN, 2)
         sides = far * (np.linalg.norm(detector_sides, axis=1) / detector_center[2] + margin)
-        edges = (frame[:2] @ lattice.affine[:3, :3] for lattice in (grid, self.mu.grid))
-        widths = (np.linalg.svd(edges_of_grid, compute_uv=False)[-1] for edges_of_grid in edges)
+        widths = (np.linalg.svd(frame[:2] @ g.affine[:3, :3], compute_uv=False)[-1] for g in (grid, self.mu.grid))
         (width, mu_width), (lower, upper) = map(float, widths), _RAYS_ACROSS_MU
         step = max(min(width / _RAYS_ACROSS, mu_width / lower), min(width / _RAYS_TO_MEET, mu_width / upper))
         turn = np.array([[1, _LATTICE_SLOPE], [-_LATTICE_SLOPE, 1]]) / math.hypot(1, _LATTICE_SLOPE)

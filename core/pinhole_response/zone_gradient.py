@@ -7,11 +7,12 @@ from typing import NamedTuple, Self
 import numpy as np
 
 from ..arrays import Array
-from .depth_response import DepthResponse, Index
+from .depth_response import Block, DepthResponse, Index
 from .depth_zone import DepthZone, ViewNumbers
-from .oblique_kernels import DirectionalEffects, NodeKernelGradient
+from .directional_effects import DirectionalEffects
+from .oblique_kernels import NodeKernelGradient
 from .pixel_kernels import KernelShape, pixel_kernels_gradient
-from .zone_response import correction_numbers, half_widths, second_order_correction, zone_kernels, zone_nodes
+from .zone_response import correction_numbers, half_widths, second_order_correction, zone_kernels
 
 # Relative step of central differences: their errors are 1e-9 or less of the quantities that are differentiated by them.
 _STEP = 1e-5
@@ -40,10 +41,8 @@ class ResponseGradient(NamedTuple):
         `backend` is the module `compiled` or `reference`. The cells (planes, rows, columns) are what `pixels_to_cells` makes
         of the image.
         """
-        cells, d_cells = (
-            backend.voxels_to_cells(volume, response, transmittance),
-            backend.pixels_to_cells(image, response),
-        )
+        cells = backend.voxels_to_cells(volume, response, transmittance)
+        d_cells = backend.pixels_to_cells(image, response)
         matrix, depth_line = backend.matrix_gradient(volume, d_cells, response, transmittance)
         matrix[:, :3] += np.outer(depth_line, response.depth_line)
         pixel_weights = image * backend.cells_to_pixels(cells, response)
@@ -67,7 +66,7 @@ def _kernel_gradient(image: Array, cells: Array, response: DepthResponse, backen
 
 
 def zone_gradient(
-    zone: DepthZone, response: DepthResponse, pixels: tuple[slice, slice], origin: Index, gradient: ResponseGradient
+    zone: DepthZone, response: DepthResponse, pixels: Block, origin: Index, gradient: ResponseGradient
 ) -> ViewNumbers:
     """Return the gradient by the view's numbers from that by the response to a box of the volume.
 
@@ -81,33 +80,30 @@ def zone_gradient(
     gradient
         Gradient of a loss by that response.
     """
-    kernels, d_shape, d_correction, d_nodes = _kernel_chain(zone, response, gradient.kernels)
-    half = half_widths(kernels)
-    first_pixels = [pixel.start or 0 for pixel in pixels]
+    kernels, d_shape, d_correction, d_nodes = _tap_chain(zone, response, gradient.kernels)
+    half, first_pixels = half_widths(kernels), [part.start or 0 for part in pixels]
     first_cells = [zone.cells_per_pixel[i] * first_pixels[i] - half[i] for i in range(2)]
     total, d_cell_size = _matrix_chain(zone, response, origin, first_cells, gradient)
-    d_numbers, d_mean_correction, d_size = _cell_weight_chain(zone, first_cells, gradient.cell_weights)
+    d_numbers, d_mean_correction, d_size = _cell_chain(zone, first_cells, gradient.cell_weights)
     total, d_cell_size = total.plus(d_numbers), d_cell_size + d_size
-    total = total.plus(_pixel_weight_chain(zone, pixels, first_pixels, gradient.pixel_weights))
+    total = total.plus(_pixel_chain(zone, pixels, first_pixels, gradient.pixel_weights))
     # Kernels have the correction less its mean, cells its mean.
     d_correction += d_mean_correction / len(d_correction) - d_correction.mean()
-    d_numbers, d_size = _kernel_shape_chain(zone, d_shape, d_correction)
+    d_numbers, d_size = _shape_chain(zone, d_shape, d_correction)
     total = total.plus(d_nodes)
     pitch = total.pitch + d_numbers.pitch + (d_cell_size + d_size) / zone.cells_per_pixel
     return total.plus(d_numbers)._replace(pitch=pitch)
 
 
-def _kernel_chain(
-    zone: DepthZone, response: DepthResponse, d_box_kernels: Array
-) -> tuple[Array, KernelShape, Array, ViewNumbers]:
+def _tap_chain(zone: DepthZone, response: DepthResponse, d_box: Array) -> tuple[Array, KernelShape, Array, ViewNumbers]:
     """Return the kernels and what their gradient becomes: the gradients by shape, by correction, and by the view's numbers.
 
     The kernels are without the second-order correction, and the gradient by the correction (planes,) is that of
     ``correction - correction.mean()``. With nodes the gradient by the shape is 0, and all flows to the view's numbers.
     """
     first = round((response.first_plane - zone.inverse_depths[0]) * response.planes_per_inverse_depth)
-    d_kernels = np.zeros((len(zone.inverse_depths), *d_box_kernels.shape[1:]))
-    d_kernels[first : first + len(d_box_kernels)] = d_box_kernels
+    d_kernels = np.zeros((len(zone.inverse_depths), *d_box.shape[1:]))
+    d_kernels[first : first + len(d_box)] = d_box
     correction = second_order_correction(zone, *correction_numbers(zone))
     factors = (1 + correction - correction.mean()).reshape(-1, *[1] * (d_kernels.ndim - 1))
     if zone.effects is None:
@@ -115,14 +111,12 @@ def _kernel_chain(
         return kernels, d_shape, (d_kernels * kernels).sum(axis=(1, 2)), ViewNumbers.zero()
     kernels, zero_shape = zone_kernels(zone), KernelShape(*(0 * number for number in zone.kernel_shape))
     d_correction = (d_kernels * kernels).sum(axis=(1, 2, 3, 4))
-    return kernels, zero_shape, d_correction, _node_kernel_chain(zone, zone.effects, d_kernels * factors)
+    return kernels, zero_shape, d_correction, _node_tap_chain(zone, zone.effects, d_kernels * factors)
 
 
-def _node_kernel_chain(zone: DepthZone, effects: DirectionalEffects, d_kernels: Array) -> ViewNumbers:
+def _node_tap_chain(zone: DepthZone, effects: DirectionalEffects, d_kernels: Array) -> ViewNumbers:
     """Return the gradient by the view's numbers that flows through the nodes' kernels, by central differences."""
-    numbers = zone.numbers
-    nodes = zone_nodes(zone, effects)
-    form = NodeKernelGradient(zone.kernel_shape, zone.cells_per_pixel, nodes, d_kernels)
+    numbers, form = zone.numbers, NodeKernelGradient(zone, effects, d_kernels)
 
     def difference(name: str, index: Index, scale: float) -> float:
         """Return the central difference by the element `index` of the number `name`, with a step of 1e-5 `scale`."""
@@ -132,10 +126,9 @@ def _node_kernel_chain(zone: DepthZone, effects: DirectionalEffects, d_kernels: 
             step[index] = sign * _STEP * scale
             moved = replace(zone, numbers=numbers.plus(ViewNumbers.zero()._replace(**{name: step})))
             if name == "to_camera":  # the kernels depend on it by the edges alone
-                values.append(form.value_by_edges(moved.kernel_shape))
+                values.append(form.value_by_edges(moved))
             else:
-                moved_effects = effects.with_effective_diameter(moved.numbers.diameter)
-                values.append(form.value(moved.kernel_shape, zone_nodes(moved, moved_effects)))
+                values.append(form.value(moved, effects.with_effective_diameter(moved.numbers.diameter)))
         return (values[0] - values[1]) / (2 * _STEP * scale)
 
     longest_edge, result = float(np.abs(numbers.to_camera[:, :3]).max()), ViewNumbers.zero()
@@ -174,9 +167,7 @@ def _matrix_chain(
     return result._replace(length=d_length), d_cell_size
 
 
-def _cell_weight_chain(
-    zone: DepthZone, first_cells: list[int], d_log_weights: Array
-) -> tuple[ViewNumbers, float, Array]:
+def _cell_chain(zone: DepthZone, first_cells: list[int], d_log_weights: Array) -> tuple[ViewNumbers, float, Array]:
     """Return the gradients that flow through the cells' weights.
 
     They are those by the view's numbers, by the mean of the second-order correction, and by the cell size (2,).
@@ -195,9 +186,7 @@ def _cell_weight_chain(
     return result, (d_log_weights / denominator).sum(), d_size
 
 
-def _pixel_weight_chain(
-    zone: DepthZone, pixels: tuple[slice, slice], first_pixels: list[int], d_log_weights: Array
-) -> ViewNumbers:
+def _pixel_chain(zone: DepthZone, pixels: Block, first_pixels: list[int], d_log_weights: Array) -> ViewNumbers:
     """Return the gradient by the view's numbers that flows through the pixels' weights.
 
     The fractions of pixels on the crystal are differentiated by central differences.
@@ -208,13 +197,11 @@ def _pixel_weight_chain(
     first, pitch = _position_chain(v, u, d_log_weights * d_log_distance, first_pixels)
     if np.isfinite(zone.crystal_side):
         for i, (fractions, part) in enumerate(zip(zone.fractions_on_crystal(), pixels, strict=True)):
-            d_log_fractions, n = d_log_weights.sum(axis=1 - i), d_log_weights.shape[i]
-            inside = fractions[part] > 0
-            d_fractions = np.divide(d_log_fractions, fractions[part], out=np.zeros(n), where=inside)
+            d_log, inside = d_log_weights.sum(axis=1 - i), fractions[part]
+            d_fractions = np.divide(d_log, inside, out=np.zeros(len(d_log)), where=inside > 0)
             step = _STEP * abs(numbers.pitch[i])
             for result, change in ((first, (step, 0.0)), (pitch, (0.0, step))):
-                upper = zone.fractions_on_crystal(*change)[i]
-                lower = zone.fractions_on_crystal(-change[0], -change[1])[i]
+                upper, lower = (zone.fractions_on_crystal(a * change[0], a * change[1])[i] for a in (1, -1))
                 result[i] += d_fractions @ (upper - lower)[part] / (2 * step)
     length = (d_log_weights * (-2 * s - d_log_distance)).sum() / numbers.length
     diameter = 2 * s * d_log_weights.sum() / numbers.diameter
@@ -240,7 +227,7 @@ def _position_chain(v: Array, u: Array, d_log_distance: Array, first: list[int])
     return np.array([d.sum() for d in d_positions]), np.array(d_step)
 
 
-def _kernel_shape_chain(zone: DepthZone, d_shape: KernelShape, d_correction: Array) -> tuple[ViewNumbers, Array]:
+def _shape_chain(zone: DepthZone, d_shape: KernelShape, d_correction: Array) -> tuple[ViewNumbers, Array]:
     """Return the gradients by the view's numbers and by the cell size (2,) through kernel shapes and correction.
 
     The second-order correction is differentiated by central differences.

@@ -5,13 +5,13 @@ import numpy as np
 from ..arrays import Array
 from .depth_response import DepthResponse
 from .depth_zone import DepthZone
-from .oblique_kernels import DirectionalEffects, NodeLattice, node_kernels, node_positions, oblique_kernel
+from .oblique_kernels import node_kernels
 from .pixel_kernels import Pair, pixel_kernels
 
 
 def zone_response(zone: DepthZone, dtype: type) -> DepthResponse:
     """Return the response of a zone, with numbers of this type."""
-    numbers, cell_size, inverse_depths = zone.numbers, zone.cell_size, zone.inverse_depths
+    numbers, inverse_depths, cell_size, cells = zone.numbers, zone.inverse_depths, zone.cell_size, zone.cells_per_pixel
     correction = second_order_correction(zone, *correction_numbers(zone))
     kernels = zone_kernels(zone)
     kernels *= (1 + correction - correction.mean()).reshape(-1, *[1] * (kernels.ndim - 1))
@@ -20,7 +20,6 @@ def zone_response(zone: DepthZone, dtype: type) -> DepthResponse:
     for row, i in ((0, 1), (1, 0)):  # columns follow u, rows v
         offset = half[i] - numbers.first[i] / cell_size[i]
         matrix[row] = numbers.length / cell_size[i] * numbers.to_camera[row] + offset * numbers.to_camera[2]
-    cells = zone.cells_per_pixel
     n_cells = [cells[i] * (zone.image_shape[i] - 1 - (-kernels.shape[i - 2] - i) // cells[i]) for i in range(2)]
     v, u = zone.crystal_positions([-h for h in half], tuple(n_cells), cell_size)
     squared_secant = 1 + (v**2 + u**2) / numbers.length**2
@@ -75,17 +74,7 @@ def zone_kernels(zone: DepthZone) -> Array:
     """Return the kernels (planes, taps, taps) of all pixels, or (planes, nodes, nodes, taps, taps) of the nodes."""
     if zone.effects is None:
         return pixel_kernels(zone.kernel_shape, zone.cells_per_pixel)
-    return node_kernels(zone.kernel_shape, zone.cells_per_pixel, zone_nodes(zone, zone.effects))
-
-
-def zone_nodes(zone: DepthZone, effects: DirectionalEffects) -> NodeLattice:
-    """Return the nodes' kernels of a zone with these effects."""
-    numbers, spacing = zone.numbers, zone.node_spacing
-    nodes = [node_positions(n, spacing) for n in zone.image_shape]
-    v, u = (numbers.first[i] + numbers.pitch[i] * nodes[i] for i in range(2))
-    optics, cells = (effects, numbers.diameter, numbers.length, zone.cell_size), np.array(zone.cells_per_pixel)
-    settings = zone.pixel_exponent, cells, spacing
-    return NodeLattice([oblique_kernel(*optics, np.array([a, b]), *settings) for a in v for b in u], (len(v), len(u)))
+    return node_kernels(zone, zone.effects)
 
 
 def half_widths(kernels: Array) -> Pair:

@@ -18,24 +18,12 @@ from .frames import FrameProjector
 from .geometry_gradient import GeometryGradient, geometry_gradient
 from .operator import Projector
 
-deprecated_modules(
-    __name__,
-    {
-        "autograd": "rays.autograd",
-        "backends": "rays.backends",
-        "backends.cpu": "rays.backends.cpu",
-        "backends.cuda": "rays.backends.cuda",
-        "backends.reference": "rays.backends.reference",
-        "emission": "models.emission",
-        "inverse_square": "models.inverse_square",
-        "linear_operator": "rays.linear_operator",
-        "models": "models.model",
-        "parallel": "rays.parallel",
-        "photon_lines": "models.photon_lines",
-        "pixel_points": "models.pixel_points",
-        "pose_search": "exchange.diffdrr.pose_search",
-        "poses": "projector.torch_cameras",
-        "rays": "rays.ray_geometry",
-        "tracing": "rays.tracing",
-    },
-)
+deprecated_modules(__name__, {
+    "autograd": "rays.autograd", "backends": "rays.backends", "backends.cpu": "rays.backends.cpu",
+    "backends.cuda": "rays.backends.cuda", "backends.reference": "rays.backends.reference",
+    "emission": "models.emission", "inverse_square": "models.inverse_square",
+    "linear_operator": "rays.linear_operator", "models": "models.model", "parallel": "rays.parallel",
+    "photon_lines": "models.photon_lines", "pixel_points": "models.pixel_points",
+    "pose_search": "exchange.diffdrr.pose_search", "poses": "projector.torch_cameras", "rays": "rays.ray_geometry",
+    "tracing": "rays.tracing",
+})  # fmt: skip

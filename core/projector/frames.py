@@ -50,8 +50,8 @@ class FrameProjector(LinearOperator):
             starts = self._model.start + np.cumsum(self.times, axis=0) - self.times
         self.starts = _frame_numbers(starts, "frames: starts", len(A.views), len(self))
         """Starts (F, M), s after the reference time."""
-        effective_times = [self._frame_model(f).effective_time for f in range(len(self))]
-        ratios = [time / np.asarray(self._model.effective_time) for time in effective_times]
+        time = np.asarray(self._model.effective_time)
+        ratios = [self._frame_model(f).effective_time / time for f in range(len(self))]
         self._count_ratios = np.array(ratios)[..., None, None]
 
     def __len__(self) -> int:

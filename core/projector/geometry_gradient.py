@@ -120,7 +120,7 @@ def _pitch_gradient_of_blur(A: Projector, pinholes: PinholeOperator, volume: Arr
         return gradient
     scales = 1 + _STEP, 1 - _STEP
     wide, narrow = (replace(views, u_steps=a * views.u_steps, v_steps=a * views.v_steps) for a in scales)
-    for m, image in enumerate(pinholes.images(volume, *A._pinhole_arguments(volume)[1:])):
+    for m, image in enumerate(pinholes.images(volume, *A._pinhole_arguments(volume)[1:], None)):
         (v, u), upper, lower = (model.response(scaled, m) for scaled in (views, wide, narrow))
         d_v, d_u = ((a - b) / (2 * _STEP) for a, b in zip(upper, lower, strict=True))
         pitch = model.crystal_pitch(views, m)

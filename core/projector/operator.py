@@ -272,14 +272,12 @@ class Projector(LinearOperator):
         tell(progress, 0, n)
         images = self._response_adjoint(detected)
         if self._pinholes is not None:
-            arguments = *self._pinhole_arguments(images), lambda n_done: tell(progress, n_done, n), self._mu_on_grid(mu)
+            arguments = *self._pinhole_arguments(images), lambda k: tell(progress, k, n), self._mu_on_grid(mu)
             volume = self._pinholes.backproject(*arguments)
             for m, box, is_close, A in self._close_parts:
                 volume[box] += np.where(is_close, A.T._run(to_numpy(detected[m : m + 1], None), mu=mu), 0)
         elif not self.model.weights_voxels:
-            volume = execution.backproject(
-                images, self._bundles, self._mu(mu), lambda n_done: tell(progress, n_done, n)
-            )
+            volume = execution.backproject(images, self._bundles, self._mu(mu), lambda k: tell(progress, k, n))
         else:  # each view's volume is weighted before it is added to the total
             volume = zeros(self.grid.shape, images)
             for m in range(n):
@@ -295,7 +293,7 @@ class Projector(LinearOperator):
             return
         self._require_rays()
         execution = self._execution(x)
-        for m, image in enumerate(self._images_before_response(execution, x, mu)):
+        for m, image in enumerate(self._plain_images(execution, x, mu)):
             response = self.model.response(self.views, m)
             if response is not None:
                 along_v, along_u = (cast_like(matrix, image) for matrix in response)
@@ -307,9 +305,7 @@ class Projector(LinearOperator):
                     image = image + cast_like(A(voxels, mu=mu)[0], image)
             yield self._as_result(image, x)
 
-    def _images_before_response(
-        self, execution: Execution, x: ArrayOrTensor, mu: ArrayOrTensor
-    ) -> Iterator[ArrayOrTensor]:
+    def _plain_images(self, execution: Execution, x: ArrayOrTensor, mu: ArrayOrTensor) -> Iterator[ArrayOrTensor]:
         """Yield the images before the detector's response and efficiency."""
         if self._pinholes is not None:
             yield from self._pinholes.images(*self._pinhole_arguments(x), self._mu_on_grid(mu))
@@ -333,7 +329,13 @@ class Projector(LinearOperator):
             if self._pinholes is None:
                 gradient = execution.mu_gradient(before_response, self._bundles, *volumes)
             else:
-                gradient = self._pinhole_mu_gradient(images[index], before_response, *volumes)
+                volume, *settings = self._pinhole_arguments(volumes[0])
+                arguments = volume, to_numpy(before_response, None), *settings, self._mu_on_grid(volumes[1])
+                gradient = self._pinholes.mu_gradient(*arguments)
+                for m, box, is_close, A in self._close_parts:
+                    voxels = cast_like(np.where(is_close, to_numpy(volumes[0][box], None), 0), volumes[0])
+                    image = cast_like(images[index][m : m + 1], volumes[0])
+                    gradient += to_numpy(A._mu_gradient(image, voxels, volumes[1]), None)
             total += to_caller(self._as_result(gradient, images), images)
         return total
 
@@ -368,18 +370,6 @@ class Projector(LinearOperator):
         double = self._float64 or self._backend.always_float64 or is_double(x)
         array = np.ascontiguousarray(to_numpy(x, np.float64 if double else np.float32))
         return array, depth_backend(self._backend.name), self.threads
-
-    def _pinhole_mu_gradient(
-        self, images: ArrayOrTensor, before_response: ArrayOrTensor, x: ArrayOrTensor, mu: ArrayOrTensor
-    ) -> Array:
-        """Return the gradient by mu of the pinhole response, and of the voxels too close to a pinhole for it."""
-        volume, *settings = self._pinhole_arguments(x)
-        arguments = volume, to_numpy(before_response, None), *settings, self._mu_on_grid(mu)
-        gradient: Array = self._pinholes.mu_gradient(*arguments)  # type: ignore[union-attr]
-        for m, box, is_close, A in self._close_parts:
-            voxels, image = np.where(is_close, to_numpy(x[box], None), 0), cast_like(images[m : m + 1], x)
-            gradient += to_numpy(A._mu_gradient(image, cast_like(voxels, x), mu), None)
-        return gradient
 
     @functools.cached_property
     def _efficiency(self) -> Array | None:

@@ -241,9 +241,9 @@ def emission_images(
         if aperture_points != 1 or pixel_points is not None:
             raise InputError("emission images: hole 'depth' takes no aperture_points and pixel_points")
         bounded_side = side if optics.within_crystal or optics.within_walls else None
-        optics, poses = optics.with_numbers(named_numbers), (positions, rotations)
-        cameras = CameraTensors(l, diameter, bounded_side, thickness, pitch, offset)
-        return depth_images(volume, volume_grid, poses, cameras, (n_v, n_u), time, mu, mu_grid, optics)
+        cameras = CameraTensors(positions, rotations, l, diameter, bounded_side, thickness, pitch, offset)
+        optics = optics.with_numbers(named_numbers)
+        return depth_images(volume, volume_grid, cameras, (n_v, n_u), time, mu, mu_grid, optics)
 
     # Depth of the plane through the grid's farthest corner, in units of the distance from pinhole to crystal.
     corners = positions.new_tensor(volume_grid.corners()) - positions.detach()[..., None, :]

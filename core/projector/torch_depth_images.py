@@ -13,7 +13,7 @@ from ..errors import InputError
 from ..geometry.grid import Grid
 from ..geometry.views import Views
 from ..physics.optics import Optics
-from ..pinhole_response.oblique_kernels import DirectionalEffects
+from ..pinhole_response.directional_effects import DirectionalEffects
 from ..pinhole_response.pinhole_operator import PinholeOperator, depth_backend
 from ..pinhole_response.transmittance import ArrayOnGrid
 from ..rays import autograd
@@ -23,8 +23,12 @@ from ..volumes.volume import Volume
 
 
 class CameraTensors(NamedTuple):
-    """Numbers of pinhole cameras, tensors of the cameras' axes (...)."""
+    """Numbers of pinhole cameras, tensors with the cameras' axes (...)."""
 
+    positions: Tensor
+    """(..., 3), positions of the pinholes, world mm."""
+    rotations: Tensor
+    """(..., 3, 3), rotations from camera to world."""
     length: Tensor
     """(...), collimator lengths, mm."""
     diameter: Tensor
@@ -42,7 +46,6 @@ class CameraTensors(NamedTuple):
 def depth_images(
     volume: Volume | Tensor,
     grid: Grid,
-    poses: tuple[Tensor, Tensor],
     cameras: CameraTensors,
     shape: tuple[int, int],
     time: Tensor,
@@ -52,10 +55,9 @@ def depth_images(
 ) -> Tensor:
     """Return `emission_images` (..., n_v, n_u) by hole "depth", for arguments that it has checked.
 
-    `poses` are positions (..., 3) and rotations (..., 3, 3); the numbers of `optics` are those of the cameras (...).
+    The numbers of `optics` are those of the cameras (...).
     """
-    positions, rotations = poses
-    batch = positions.shape[:-1]
+    positions, batch = cameras.positions, cameras.positions.shape[:-1]
     diameter_settings = () if optics.edge == "path" else ("aperture_mu", "opening_angle")
     constants = {"crystal_thickness": cameras.thickness, "crystal_side": cameras.crystal_side, **optics.numbers}
     for name, number in constants.items():
@@ -74,9 +76,10 @@ def depth_images(
         voxels, mu_on_grid = to_numpy(array, dtype), None
         if attenuation is not None:
             mu_on_grid = ArrayOnGrid(require_no_negative(to_numpy(attenuation, dtype)), mu_grid)
-        A = _pinhole_operator(grid, poses, cameras, effective_diameter, shape, unit_optics, mu_on_grid)
+        views = camera_views(*cameras[:3], cameras.pitch, cameras.offset, shape)
+        A = _pinhole_operator(views, grid, cameras, effective_diameter, unit_optics, mu_on_grid)
         backend, threads = depth_backend(), thread_count(None)
-        images = np.stack(list(A.images(voxels, backend, threads))).reshape(*batch, *shape)
+        images = np.stack(list(A.images(voxels, backend, threads, None))).reshape(*batch, *shape)
 
         def gradients(gradient: Tensor, needs: Any) -> list[Tensor | None]:
             weights = to_numpy(gradient, dtype).reshape(-1, *shape)
@@ -94,7 +97,7 @@ def depth_images(
 
         return torch.from_numpy(images).to(positions), gradients
 
-    inputs = positions, rotations, cameras.length, effective_diameter, cameras.pitch, cameras.offset
+    inputs = *cameras[:3], effective_diameter, cameras.pitch, cameras.offset
     return autograd.step(run, array, attenuation, *inputs) * factors[..., None, None]
 
 
@@ -107,21 +110,14 @@ def _without_directional_effects(optics: Optics) -> Optics:
 
 
 def _pinhole_operator(
-    grid: Grid,
-    poses: tuple[Tensor, Tensor],
-    cameras: CameraTensors,
-    effective_diameter: Tensor,
-    shape: tuple[int, int],
-    optics: Optics,
-    mu: ArrayOnGrid | None,
+    views: Views, grid: Grid, cameras: CameraTensors, effective_diameter: Tensor, optics: Optics, mu: ArrayOnGrid | None
 ) -> PinholeOperator:
-    """Return the pinhole operator of the cameras as they are now, without gradients."""
-    n = poses[0][..., 0].numel()
+    """Return the pinhole operator of the cameras as they are now, without gradients; `views` are the cameras'."""
+    n = len(views)
 
     def to_array(number: Tensor, *last: int) -> Any:
         return number.numpy(force=True).astype(np.float64).reshape(n, *last)
 
-    views = camera_views(*poses, cameras.length, cameras.pitch, cameras.offset, shape)
     sides = np.full(n, np.inf) if cameras.crystal_side is None else to_array(cameras.crystal_side)
     thickness, diameter = to_array(cameras.thickness), to_array(cameras.diameter)
     numbers = {name: to_array(x) if is_tensor(x) else x for name, x in optics.numbers.items()}
@@ -137,9 +133,8 @@ def _pinhole_operator(
         return camera.pixel_weights((u, v), (1.0, 1.0), lengths[m], np.inf, thickness[m], opening)
 
     directional = None if optics.edge == "paix" and optics.depth_layers == 1 else effects
-    frames = to_array(poses[1], 3, 3).transpose(0, 2, 1)
-    law = lengths, to_array(effective_diameter), sides, ray_weight
-    return PinholeOperator(views, grid, frames, *law, mu, True, directional)
+    modules = to_array(cameras.rotations, 3, 3).transpose(0, 2, 1), lengths, to_array(effective_diameter), sides
+    return PinholeOperator(views, grid, *modules, ray_weight, mu, True, directional)
 
 
 def camera_views(

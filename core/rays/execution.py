@@ -129,16 +129,10 @@ class Execution:
         def add(gradient: ArrayOrTensor, *values_and_rays: Any) -> None:
             add_gradient(gradient, lattices.volume, *values_and_rays)
 
-        return self._accumulated(add, self.mu_grid or self.grid, images, bundles, lattices)
+        return self._accumulated(add, self.mu_grid or self.grid, images, bundles, lattices, None)
 
     def _accumulated(
-        self,
-        add: Add,
-        grid: Grid,
-        images: ArrayOrTensor,
-        bundles: Bundles,
-        lattices: Lattices,
-        report: Report | None = None,
+        self, add: Add, grid: Grid, images: ArrayOrTensor, bundles: Bundles, lattices: Lattices, report: Report | None
     ) -> ArrayOrTensor:
         """Return a volume on `grid` with all that `add` adds for the rays of the images."""
         workers = min(self.workers, _MOST_VOLUMES, max(1, available() // (2 * images.itemsize * grid.n_voxels)))

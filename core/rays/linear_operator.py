@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import math
 from abc import ABC, abstractmethod
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -13,9 +13,7 @@ from ..arrays import ArrayOrTensor, checked, is_tensor, zeros
 from ..memory import require
 from ..progress import Progress, part_of
 from ..validation import shape_text
-
-if TYPE_CHECKING:
-    from ..volumes.volume import Volume
+from ..volumes.volume import Volume
 
 
 class LinearOperator(ABC):

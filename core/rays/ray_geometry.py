@@ -17,8 +17,7 @@ from ..geometry.views import Views
 # away).
 SNAP = 1e-9
 
-_UNSHIFTED = np.zeros((1, 2))
-_ALL = slice(None)
+_UNSHIFTED, _ALL = np.zeros((1, 2)), slice(None)
 
 
 @dataclass(frozen=True, eq=False)

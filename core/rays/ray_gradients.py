@@ -16,15 +16,15 @@ def integrals(part: Part, derivatives: Floats) -> Floats:
     return np.concatenate([length for _, length in _fan_rays(part)]) * derivatives[0]
 
 
-def geometry_gradient(part: Part, gradient: Floats, derivatives: Floats, *grids: Grid) -> list[tuple[int, Floats]]:
+def geometry_gradient(gradient: Floats, part: Part, derivatives: Floats, *grids: Grid) -> list[tuple[int, Floats]]:
     """Return the gradient by the geometry of each image of a part, with the image's number.
 
     Parameters
     ----------
-    part
-        Rays without weights, one fan of each image.
     gradient
         Gradient by the images, (images, rows, columns).
+    part
+        Rays without weights, one fan of each image.
     derivatives
         Derivatives that the backend has returned, (7 or 14, rays).
     grids

@@ -14,15 +14,18 @@ from ..errors import InputError
 from ..geometry.grid import Grid
 from ..validation import instance, require_finite, shape_text, whole_shape
 from ..volumes.volume import LINE_INTEGRALS, Volume, require_quantity
-from . import backends, ray_gradients
+from . import backends
 from .bundles import Beam, Bundle, Bundles, Part
 from .execution import Execution
 from .lattices import require_no_negative
 from .parallel import in_order, thread_count
 from .ray_geometry import Ends, Fan
+from .ray_gradients import geometry_gradient
 
 if TYPE_CHECKING:
     from torch import Tensor
+
+AnyVolume = Volume | ArrayOrTensor
 
 
 def trace_rays(
@@ -137,12 +140,7 @@ def trace_fans(
 
 
 def _execution(
-    volume: Volume | ArrayOrTensor,
-    backend: str,
-    grid: Grid | None,
-    mu: Volume | ArrayOrTensor | None,
-    mu_grid: Grid | None,
-    geometry: tuple[Any, ...],
+    volume: AnyVolume, backend: str, grid: Grid | None, mu: AnyVolume, mu_grid: Grid | None, geometry: tuple[Any, ...]
 ) -> tuple[ArrayOrTensor, ArrayOrTensor, Execution]:
     """Return the volume and mu, checked, both arrays or both tensors, and the execution for rays of that `geometry`."""
     if isinstance(volume, Volume):  # mu itself is not attenuated
@@ -162,9 +160,7 @@ def _execution(
     return array, mu, Execution(chosen, grid, mu_grid, float64, thread_count(None), whole_for_few=True)
 
 
-def _array_and_grid(
-    value: Volume | ArrayOrTensor, name: str, grid: Grid | None, float64: bool
-) -> tuple[ArrayOrTensor, Grid]:
+def _array_and_grid(value: AnyVolume, name: str, grid: Grid | None, float64: bool) -> tuple[ArrayOrTensor, Grid]:
     """Return the array or tensor of a volume, and its grid; raise `InputError` if it has none or two."""
     if isinstance(value, Volume):
         if grid is not None and grid != value.grid:
@@ -237,7 +233,7 @@ def _trace(
             if needs[1]:
                 result[1] = torch.as_tensor(execution.mu_gradient(values, bundles, volume_data, mu_data)).to(values)
             if needs[2]:
-                d_geometry = _geometry_gradient(gradient.numpy(force=True), parts, bundles, execution)
+                d_geometry = _rays_gradient(gradient.numpy(force=True), parts, bundles, execution)
                 result[2] = torch.from_numpy(d_geometry).reshape(geometry.shape)
             return result
 
@@ -246,20 +242,17 @@ def _trace(
     return autograd.step(run, volume, mu, geometry)
 
 
-def _geometry_gradient(
+def _rays_gradient(
     gradient: Floats, parts: list[tuple[Part, Floats]], bundles: Bundles, execution: Execution
 ) -> Floats:
     """Return the gradient by fans (images, 4, 3), or by starts and ends (2, rays, 3), from that by the images."""
     grids = execution.grid, execution.mu_grid or execution.grid
-
-    def part_gradient(part: tuple[Part, Floats]) -> list[tuple[int, Floats]]:
-        return ray_gradients.geometry_gradient(part[0], gradient, part[1], *grids)
-
-    results = [numbered for result in in_order(part_gradient, parts, execution.workers) for numbered in result]
+    results = in_order(lambda part: geometry_gradient(gradient, *part, *grids), parts, execution.workers)
+    numbered = [pair for result in results for pair in result]
     if len(bundles) and bundles[0].ends is not None:
-        return np.concatenate([np.empty((2, 0, 3)), *(d_ends for _, d_ends in results)], axis=1)
+        return np.concatenate([np.empty((2, 0, 3)), *(d_ends for _, d_ends in numbered)], axis=1)
     total = np.zeros((len(bundles), 4, 3))
-    for number, d_fan in results:
+    for number, d_fan in numbered:
         total[number] += d_fan
     return total
 
@@ -268,7 +261,7 @@ def fan_gradient(execution: Execution, bundles: Bundles, volume: Floats, mu: Flo
     """Return the gradient (4, 3) of the sum of a fan's integrals by its source, corner, row step and column step."""
     ones = np.ones((1, *bundles.image_shape))
     parts = execution.derivatives(volume, bundles, mu, np.zeros_like(ones))
-    return _geometry_gradient(ones, parts, bundles, execution).reshape(4, 3)
+    return _rays_gradient(ones, parts, bundles, execution).reshape(4, 3)
 
 
 def _as_input(integrals: ArrayOrTensor, volume: Any, *geometry: Any) -> ArrayOrTensor:

@@ -88,10 +88,8 @@ _ROWS = (
     Backend("cpu", "CPU", "Compiled, on the processor", "cpu", 2**14, 2**14, _array),
     Backend("torch", "PyTorch", "On the processor or the graphics card", "reference", 2**18, 2**12, _tensor, True),
     Backend("numpy", "NumPy", "Float64 reference, slow", "reference", 2**12, 2**12, _array, False, True),
-    Backend(
-        "cuda", "CUDA", "On an NVIDIA graphics card; needs warp-lang and torch", "cuda", 2**22, 2**22, _on_gpu, True
-    ),
-)
+    Backend("cuda", "CUDA", "On an NVIDIA graphics card; needs warp-lang and torch", "cuda", 2**22, 2**22, _on_gpu, True),
+)  # fmt: skip
 BACKENDS = {backend.name: backend for backend in _ROWS}
 """Backends by name."""
 

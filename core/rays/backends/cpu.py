@@ -123,11 +123,10 @@ def levels() -> list[str]:
 
 def _level() -> int:
     """Return the index of the level in the environment variable, or of the highest one."""
-    supported, name = levels(), os.environ.get(LEVEL_VARIABLE)
-    if name and name not in supported:
-        expected = f"a level that this processor has, {', '.join(supported)}"
-        raise InputError(f"{LEVEL_VARIABLE}: expected {expected}; got {name}")
-    return supported.index(name) if name else len(supported) - 1
+    names, name = levels(), os.environ.get(LEVEL_VARIABLE)
+    if name and name not in names:
+        raise InputError(f"{LEVEL_VARIABLE}: expected a level that this processor has, {', '.join(names)}; got {name}")
+    return names.index(name) if name else len(names) - 1
 
 
 level = _level()
@@ -165,20 +164,20 @@ def gather(
     planes: Floats,
     arrays: Array,
     matrices: Floats,
-    operation: int,
-    counts: Array | None,
-    exponents: Array | None,
-    **settings: Any,
+    mode: int,
+    counts: Any,
+    exponents: Any,
+    **others: Any,
 ) -> None:
     """Combine `points` in place with the values of `arrays` at their places, as `perspective.places.gather` describes it."""
     integers = [array for array in (counts, exponents) if array is not None]
     if any(array.dtype != np.int32 or array.shape != points.shape for array in integers):
         raise TypeError("expected counts of int32 and of the points' shape")
-    if operation == _PRODUCT and exponents is None:
+    if mode == _PRODUCT and exponents is None:
         raise ValueError("expected exponents, which a product needs")
-    settings |= {"seen": None if counts is None else counts.ctypes.data, "how": operation, "last": len(points)}
-    settings["exponents"] = None if exponents is None else exponents.ctypes.data
-    _run_places(library.take_at, points, planes, arrays, matrices, [points, *integers], **settings)
+    fields = others | {"seen": None if counts is None else counts.ctypes.data, "how": mode, "last": len(points)}
+    fields["exponents"] = None if exponents is None else exponents.ctypes.data
+    _run_places(library.take_at, points, planes, arrays, matrices, [points, *integers], **fields)
 
 
 def scatter(points: Array, planes: Floats, array: Array, matrix: Floats, slab: slice) -> None:
@@ -227,12 +226,11 @@ def _run(
     if mu is not None and mu_rays is None and mu.shape != volume.shape:
         raise ValueError(f"expected mu on the volume's lattice {volume.shape}, got {mu.shape}")
     job = _Job(
-        is_double=volume.dtype == np.float64,
-        attenuation=0 if mu is None else 1 if mu_rays is None else 2,
+        is_double=volume.dtype == np.float64, attenuation=0 if mu is None else 1 if mu_rays is None else 2,
         volume=as_voxel_array(volume, volume, kernel is library.backproject),
         mu=VoxelArray() if mu is None else as_voxel_array(mu, volume),
         **{name: array.ctypes.data for name, array in arrays.items() if array is not None},
-    )
+    )  # fmt: skip
     ray_arrays = [_fans(rays, mu_rays)] if isinstance(rays, IndexFans) else _columns(rays, mu_rays)
     addresses = [array.ctypes.data for array in ray_arrays]  # the arrays must live until the kernel is done
     if isinstance(rays, IndexFans):

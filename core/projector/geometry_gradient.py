@@ -8,7 +8,7 @@ import numpy as np
 
 from ..arrays import Array, Floats, Floats32, checked
 from ..errors import InputError
-from ..geometry.frames import module_frames, tilted
+from ..geometry.frames import module_frames, tilt_frames
 from ..geometry.system import PinholeSystem
 from ..models.model import with_image_axes
 from ..pinhole_response.pinhole_operator import PinholeOperator
@@ -43,11 +43,11 @@ class GeometryGradient(NamedTuple):
         d_centers, d_tilt = self.centers.copy(), np.empty_like(self.centers)
         for axis, step in enumerate(_STEP * np.eye(3)):
             shift = step * system.pinhole_distance[:, None]
-            d_frames = tilted(module_frames(system.centers + shift), system.tilt)
-            d_frames = d_frames - tilted(module_frames(system.centers - shift), system.tilt)
+            d_frames = tilt_frames(module_frames(system.centers + shift), system.tilt)
+            d_frames = d_frames - tilt_frames(module_frames(system.centers - shift), system.tilt)
             d_centers[:, axis] += np.einsum("mij,mij->m", self.frames, d_frames) / (2 * shift[:, axis])
             nominal = module_frames(system.centers)
-            d_frames = tilted(nominal, system.tilt + step) - tilted(nominal, system.tilt - step)
+            d_frames = tilt_frames(nominal, system.tilt + step) - tilt_frames(nominal, system.tilt - step)
             d_tilt[:, axis] = np.einsum("mij,mij->m", self.frames, d_frames) / (2 * _STEP)
         return d_centers, d_tilt
 

@@ -67,8 +67,8 @@ class Model(ABC):
         """Yield a warning for each attenuation coefficient that looks wrong, such as one in 1/cm."""
         return iter(())
 
-    def of_views(self, which: NDArray[np.integer]) -> Model:
-        """Return the model of the views with the indices `which` alone."""
+    def of_views(self, indices: NDArray[np.integer]) -> Model:
+        """Return the model of the views with these indices alone."""
         return self
 
     def parts(self) -> tuple[Model, ...]:

@@ -64,8 +64,10 @@ class PinholeViews:
     crystal_sides: Array
     """(M,), sides of the squares on the crystals in which photons are detected, mm."""
     ray_weight: Callable[..., Array]
-    """``ray_weight(m, u=u, v=v)``, the expected counts per mm^2 of module m's crystal and line integral of 1 (decay /
-    (s mm^3) mm), along lines through the hole's centre to the positions (u, v) on the crystal, mm, point-inverted."""
+    """Weights of the lines through the centre of module m's hole to positions on its crystal, ``ray_weight(m, u=u, v=v)``.
+
+    They are the expected counts per mm^2 of crystal of a line integral of 1, (decay / (s mm^3)) mm. The positions are in mm,
+    point-inverted."""
     mu: Volume | ArrayOnGrid | None
     """Attenuation coefficients, 1/mm; None without attenuation."""
     is_strict: bool

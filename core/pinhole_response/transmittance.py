@@ -11,7 +11,7 @@ from ..arrays import Array, Floats
 from ..geometry.grid import Grid
 from ..geometry.views import Views
 from ..rays import backends
-from ..rays.bundles import Beam, Bundle, Bundles
+from ..rays.bundles import Beam, Bundles, RayBundle
 from ..rays.execution import Execution
 from ..rays.lattices import rounded_up
 from ..rays.ray_geometry import Fan
@@ -38,30 +38,24 @@ class ArrayOnGrid(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class VoxelTransmittance:
-    """Transmittance from each voxel of a box of a grid to the pinhole of view m, by a fan of rays.
-
-    Attributes
-    ----------
-    mu
-        Attenuation coefficients, 1/mm.
-    grid, box
-        All voxels, which determine the rays, and those whose transmittance is computed.
-    views, m, frame
-        The view, and the u, v and k of its module.
-    margin
-        Slope by which rays are cast beyond the outermost pixels: mm per mm of depth.
-    dtype
-        Type of the numbers, numpy's float32 or float64.
-    """
+    """Transmittance from each voxel of a box of a grid to the pinhole of view m, by a fan of rays."""
 
     mu: Volume | ArrayOnGrid
+    """Attenuation coefficients, 1/mm."""
     grid: Grid
+    """Grid of all voxels; the rays depend on it."""
     box: Grid
+    """Grid of the voxels whose transmittance is computed."""
     views: Views
+    """The views."""
     m: int
+    """Number of the view."""
     frame: Floats
+    """(3, 3), u, v and k of its module."""
     margin: float
+    """Slope by which rays are cast beyond the outermost pixels: mm per mm of depth."""
     dtype: type
+    """Type of the numbers, numpy's float32 or float64."""
 
     @functools.cached_property
     def _rays(self) -> tuple[Floats, Bundles, Execution]:
@@ -89,12 +83,13 @@ class VoxelTransmittance:
         corner = far * np.round(detector_center / detector_center[2], 2) @ frame
         corner -= (rows - 1) / 2 * row_step + (columns - 1) / 2 * column_step
         fan = Fan(pinhole, pinhole + corner, row_step, column_step, (rows, columns))
-        bundle = Bundle.along(self.box, Beam(fan))
+        bundle = RayBundle.along(self.box, Beam(fan))
         execution = Execution(backends.choose("auto"), self.box, self.mu.grid, self.dtype is np.float64)
         return np.ones((1, rows, columns), self.dtype), Bundles(1, lambda _: bundle), execution
 
     @property
     def _mu_array(self) -> Array:
+        """Attenuation coefficients as numbers of `dtype`, 1/mm."""
         return np.asarray(self.mu.array.astype(self.dtype, copy=False))
 
     @functools.cached_property

@@ -20,7 +20,7 @@ from ..pinhole_response.pinhole_operator import depth_backend
 from ..pinhole_response.transmittance import ArrayOnGrid
 from ..progress import Progress, part_of, tell
 from ..rays import backends
-from ..rays.bundles import Bundle, Bundles
+from ..rays.bundles import Bundles, RayBundle
 from ..rays.execution import Execution
 from ..rays.lattices import require_no_negative, same_lattice
 from ..rays.linear_operator import LinearOperator
@@ -353,9 +353,9 @@ class Projector(LinearOperator):
             images[m] = along_v.T @ images[m] @ along_u
         return images
 
-    def _bundle(self, m: int) -> Bundle:
+    def _bundle(self, m: int) -> RayBundle:
         """Return the rays of view m."""
-        return Bundle.along(self.grid, *self.model.beams(self.views, m, self.grid))
+        return RayBundle.along(self.grid, *self.model.beams(self.views, m, self.grid))
 
     def _execution(self, x: ArrayOrTensor) -> Execution:
         """Return the execution that traces the rays, for arrays or tensors such as `x`."""

@@ -1,4 +1,4 @@
-"""Rays of images (bundles), and the parts of them that a backend traces in one call."""
+"""Rays of images (bundles), and the batches of them that a backend traces in one call."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Beam:
 
 
 @dataclass(frozen=True, eq=False)
-class Bundle:
+class RayBundle:
     """All rays of one image."""
 
     beams: tuple[Beam, ...] = ()
@@ -48,7 +48,7 @@ class Bundle:
     """Whether rows of rays are columns of the image."""
 
     @classmethod
-    def along(cls, grid: Grid, *beams: Beam) -> Bundle:
+    def along(cls, grid: Grid, *beams: Beam) -> RayBundle:
         """Return the bundle of `beams`, transposed if columns follow the voxels' contiguous axis better than rows."""
         transposed = beams[0].rays.lies_across(grid)
         return cls(tuple(beam.transposed() for beam in beams) if transposed else beams, transposed=transposed)
@@ -60,7 +60,7 @@ class Bundle:
 
     @property
     def kind(self) -> tuple[bool, float]:
-        """Orientation, and `Fan.parallel`: images whose rays are traced in one part agree in both."""
+        """Orientation, and `Fan.parallel`: images whose rays are traced in one batch agree in both."""
         return self.transposed, self.beams[0].rays.parallel if self.ends is None else 0.0
 
     @property
@@ -75,7 +75,7 @@ class Bundle:
 
 
 @dataclass(frozen=True, eq=False)
-class Part:
+class Batch:
     """Rays that a backend traces in one call."""
 
     images: list[tuple[int, int]]
@@ -118,7 +118,7 @@ class Part:
             pixels, of_image = self.pixels(images[number - first]), integrals[start : start + n]
             if is_tensor(pixels):
                 pixels += of_image.sum(0)
-            else:  # one by one, so that the rounding does not depend on the number of fans of a part, and so on the threads
+            else:  # one by one, so that the rounding does not depend on the number of fans of a batch, and so on the threads
                 for fan in of_image:
                     pixels += fan
             start += n
@@ -145,14 +145,14 @@ class Bundles:
     n : int
         Number of images.
     make : function
-        Function of an image's number that returns its `Bundle`.
+        Function of an image's number that returns its `RayBundle`.
     """
 
-    def __init__(self, n: int, make: Callable[[int], Bundle]) -> None:
+    def __init__(self, n: int, make: Callable[[int], RayBundle]) -> None:
         self._n = n
         self._make = make
-        self._bundles: dict[int, Bundle] = {}
-        self._parts: dict[tuple[Any, ...], list[Part]] = {}
+        self._bundles: dict[int, RayBundle] = {}
+        self._batches: dict[tuple[Any, ...], list[Batch]] = {}
         self._free_bytes = STORED_BYTES
 
     def __len__(self) -> int:
@@ -165,7 +165,7 @@ class Bundles:
             return 0, 0
         return self[0].shape[::-1] if self[0].transposed else self[0].shape
 
-    def __getitem__(self, number: int) -> Bundle:
+    def __getitem__(self, number: int) -> RayBundle:
         """Return the rays of an image."""
         if number not in self._bundles:
             bundle = self._make(number)
@@ -175,23 +175,23 @@ class Bundles:
         return self._bundles[number]
 
     def __getstate__(self) -> dict[str, Any]:  # stored bundles hold functions that cannot be pickled
-        return self.__dict__ | {"_bundles": {}, "_parts": {}, "_free_bytes": STORED_BYTES}
+        return self.__dict__ | {"_bundles": {}, "_batches": {}, "_free_bytes": STORED_BYTES}
 
-    def parts(self, images: range, block: tuple[slice, slice] | None, limit: int) -> Iterable[Part]:
-        """Return all rays of several images, or of a block of one image, in parts.
+    def batches(self, images: range, block: tuple[slice, slice] | None, limit: int) -> Iterable[Batch]:
+        """Return all rays of several images, or of a block of one image, in batches.
 
-        A part has at most `limit` rays, unless a fan alone has more.
+        A batch has at most `limit` rays, unless a fan alone has more.
         """
         bounds = () if block is None else tuple((part.start, part.stop) for part in block)
         key = images.start, images.stop, bounds, limit
-        if key not in self._parts:
+        if key not in self._batches:
             bundles = [(number, self[number]) for number in images]
-            parts = _all_parts(bundles, block, limit)
+            batches = _in_batches(bundles, block, limit)
             n_bytes = sum(8 * bundle.n_rays(block) for _, bundle in bundles if bundle.ends is None)
             if not n_bytes or not self._has_room(n_bytes):
-                return parts
-            self._parts[key] = list(parts)
-        return self._parts[key]
+                return batches
+            self._batches[key] = list(batches)
+        return self._batches[key]
 
     def _has_room(self, n_bytes: int) -> bool:
         """Return whether so many bytes can be stored, and reserve them."""
@@ -201,23 +201,23 @@ class Bundles:
         return True
 
 
-def _all_parts(bundles: list[tuple[int, Bundle]], block: tuple[slice, slice] | None, limit: int) -> Iterator[Part]:
-    """Yield the parts of numbered bundles, kind by kind."""
+def _in_batches(bundles: list[tuple[int, RayBundle]], block: tuple[slice, slice] | None, limit: int) -> Iterator[Batch]:
+    """Yield the batches of numbered bundles, kind by kind."""
     for kind in sorted({bundle.kind for _, bundle in bundles}):
         alike = [(number, bundle) for number, bundle in bundles if bundle.kind == kind]
         rows, columns = block or map(slice, alike[0][1].shape)
-        yield from _parts(alike, slice(rows.start or 0, rows.stop), slice(columns.start or 0, columns.stop), limit)
+        yield from _batches(alike, slice(rows.start or 0, rows.stop), slice(columns.start or 0, columns.stop), limit)
 
 
-def _parts(bundles: list[tuple[int, Bundle]], rows: slice, columns: slice, limit: int) -> Iterator[Part]:
-    """Yield the parts of some rows and columns of bundles of one kind, at most `limit` rays unless a fan alone has more."""
+def _batches(bundles: list[tuple[int, RayBundle]], rows: slice, columns: slice, limit: int) -> Iterator[Batch]:
+    """Yield the batches of some rows and columns of bundles of one kind, of at most `limit` rays unless a fan has more."""
     pixels = (rows.stop - rows.start) * (columns.stop - columns.start)
     if not pixels:
         return
     if bundles[0][1].ends is not None:
         number, bundle = bundles[0]
         ends: Any = bundle.ends
-        yield Part([(number, 1)], Ends(ends.starts[rows], ends.ends[rows]), rows, columns)
+        yield Batch([(number, 1)], Ends(ends.starts[rows], ends.ends[rows]), rows, columns)
         return
     fans_at_once = max(1, limit // pixels)
     pieces: list[tuple[int, Beam, slice]] = []
@@ -231,14 +231,14 @@ def _parts(bundles: list[tuple[int, Bundle]], rows: slice, columns: slice, limit
                 n += end - first
                 first = end
                 if n == fans_at_once:
-                    yield _part(pieces, rows, columns, bundle.transposed)
+                    yield _batch(pieces, rows, columns, bundle.transposed)
                     pieces, n = [], 0
     if pieces:
-        yield _part(pieces, rows, columns, bundles[0][1].transposed)
+        yield _batch(pieces, rows, columns, bundles[0][1].transposed)
 
 
-def _part(pieces: list[tuple[int, Beam, slice]], rows: slice, columns: slice, transposed: bool) -> Part:
-    """Return the part of pieces of beams: each the number of an image, a beam and a slice of its shifts."""
+def _batch(pieces: list[tuple[int, Beam, slice]], rows: slice, columns: slice, transposed: bool) -> Batch:
+    """Return the batch of pieces of beams: each the number of an image, a beam and a slice of its shifts."""
     images: list[tuple[int, int]] = []
     for number, _, shifts in pieces:
         n = shifts.stop - shifts.start
@@ -253,4 +253,4 @@ def _part(pieces: list[tuple[int, Beam, slice]], rows: slice, columns: slice, tr
             array = np.ones(1) if beam.weights is None else beam.weights(rows, columns, shifts)
             arrays.append(np.broadcast_to(array, (shifts.stop - shifts.start, *shape)))
         weights = arrays[0] if len(arrays) == 1 else np.concatenate(arrays)
-    return Part(images, vectors, rows, columns, transposed, weights, pieces[0][1].rays.parallel)
+    return Batch(images, vectors, rows, columns, transposed, weights, pieces[0][1].rays.parallel)

@@ -11,7 +11,7 @@ from ..geometry.grid import Grid
 from ..memory import available
 from . import ray_gradients
 from .backends import Backend
-from .bundles import Bundles, Part
+from .bundles import Batch, Bundles
 from .lattices import Lattices, filled_lattices
 from .parallel import in_order, run_all, sum_volumes
 from .ray_geometry import Attenuation, Rays, window
@@ -70,9 +70,9 @@ class Execution:
         forward = self.backend.functions.forward
 
         def run(task: _Task) -> _Task:
-            for part in self._parts(task, bundles):
-                integrals = forward(lattices.volume, *part.in_index_space(lattices))
-                part.add_to(task.result, task.images.start, integrals)
+            for batch in self._batches(task, bundles):
+                integrals = forward(lattices.volume, *batch.in_index_space(lattices))
+                batch.add_to(task.result, task.images.start, integrals)
             return task
 
         def tasks() -> Iterator[_Task]:
@@ -91,17 +91,17 @@ class Execution:
 
     def derivatives(
         self, volume: ArrayOrTensor, bundles: Bundles, mu: ArrayOrTensor, images: Array
-    ) -> list[tuple[Part, Floats]]:
-        """Return the backend's derivatives (7 or 14, rays) of each part of the rays; add the integrals to `images`."""
+    ) -> list[tuple[Batch, Floats]]:
+        """Return the backend's derivatives (7 or 14, rays) of each batch of rays; add the integrals to `images`."""
         lattices = self._lattices(volume, mu, bundles)
         derivatives = self.backend.functions.derivatives
 
-        def run(task: _Task) -> list[tuple[Part, Floats]]:
+        def run(task: _Task) -> list[tuple[Batch, Floats]]:
             results = []
-            for part in self._parts(task, bundles):
-                rows = to_caller(derivatives(lattices.volume, *part.in_index_space(lattices)), np.empty(0)).T
-                part.add_to(images, 0, ray_gradients.integrals(part, rows))
-                results.append((part, rows))
+            for batch in self._batches(task, bundles):
+                rows = to_caller(derivatives(lattices.volume, *batch.in_index_space(lattices)), np.empty(0)).T
+                batch.add_to(images, 0, ray_gradients.integrals(batch, rows))
+                results.append((batch, rows))
             return results
 
         tasks = self._tasks(bundles, lattices, self.workers)
@@ -140,10 +140,10 @@ class Execution:
         for tasks in self._rounds(bundles, lattices, workers):
 
             def work(worker: int, tasks: list[_Task] = tasks) -> None:
-                # A volume gets the same parts in the same order each time, so the result is the same each time.
+                # A volume gets the same batches in the same order each time, so the result is the same each time.
                 for task in tasks[worker::workers]:
-                    for part in self._parts(task, bundles):
-                        add(volumes[worker], part.values(images), *part.in_index_space(lattices))
+                    for batch in self._batches(task, bundles):
+                        add(volumes[worker], batch.values(images), *batch.in_index_space(lattices))
 
             run_all(work, range(workers), workers)
             if report is not None:
@@ -196,9 +196,9 @@ class Execution:
         enough = max(_FEWEST_RAYS // rays, n // (2 * self.workers))
         return max(1, min(self.backend.rays_of_images // rays, enough))
 
-    def _parts(self, task: _Task, bundles: Bundles) -> Iterable[Part]:
-        """Return the rays of a task in parts, each of as many as the backend takes at once."""
-        return bundles.parts(task.images, task.block, self.backend.rays_at_once)
+    def _batches(self, task: _Task, bundles: Bundles) -> Iterable[Batch]:
+        """Return the rays of a task in batches, each of as many as the backend takes at once."""
+        return bundles.batches(task.images, task.block, self.backend.rays_at_once)
 
     def _lattices(self, volume: ArrayOrTensor, mu: ArrayOrTensor, bundles: Bundles, whole_mu: bool = False) -> Lattices:
         """Return the filled parts of volume and mu, as the backend computes with them; for few rays the whole volume."""

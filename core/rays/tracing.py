@@ -15,7 +15,7 @@ from ..geometry.grid import Grid
 from ..validation import instance, require_finite, shape_text, whole_shape
 from ..volumes.volume import LINE_INTEGRALS, Volume, require_quantity
 from . import backends
-from .bundles import Beam, Bundle, Bundles, Part
+from .bundles import Batch, Beam, Bundles, RayBundle
 from .execution import Execution
 from .lattices import require_no_negative
 from .parallel import in_order, thread_count
@@ -85,7 +85,7 @@ def trace_rays(
     n = len(ends) if len(starts) == 1 else len(starts)
     xp = namespace(starts)
     rays = xp.stack([xp.broadcast_to(points, (n, 3)) for points in (starts, ends)])
-    integrals = _trace(array, mu, rays, lambda rays: Bundles(1, lambda _: Bundle(ends=Ends(*rays))), execution)
+    integrals = _trace(array, mu, rays, lambda rays: Bundles(1, lambda _: RayBundle(ends=Ends(*rays))), execution)
     return _as_input(integrals.reshape(n), array, sources, targets)
 
 
@@ -129,9 +129,9 @@ def trace_fans(
     def bundles(vectors: Floats) -> Bundles:
         fans = vectors.reshape(-1, 4, 3)
 
-        def bundle(number: int) -> Bundle:
+        def bundle(number: int) -> RayBundle:
             source, corner, row_step, column_step = fans[number]
-            return Bundle.along(execution.grid, Beam(Fan(source, corner, row_step, column_step, shape)))
+            return RayBundle.along(execution.grid, Beam(Fan(source, corner, row_step, column_step, shape)))
 
         return Bundles(len(fans), bundle)
 
@@ -215,10 +215,10 @@ def _trace(
     volume_data, mu_data = (x.detach() if is_tensor(x) else x for x in (volume, mu))
 
     def run(needs: Any) -> Any:
-        parts: list[tuple[Part, Floats]] = []
+        batches: list[tuple[Batch, Floats]] = []
         if needs[2]:
             integrals = np.zeros((len(bundles), *bundles.image_shape), dtype)
-            parts = execution.derivatives(volume_data, bundles, mu_data, integrals)
+            batches = execution.derivatives(volume_data, bundles, mu_data, integrals)
         else:
             integrals = images(bundles, volume_data, mu_data)
         if not np.isfinite(integrals).all():
@@ -233,7 +233,7 @@ def _trace(
             if needs[1]:
                 result[1] = torch.as_tensor(execution.mu_gradient(values, bundles, volume_data, mu_data)).to(values)
             if needs[2]:
-                d_geometry = _rays_gradient(gradient.numpy(force=True), parts, bundles, execution)
+                d_geometry = _rays_gradient(gradient.numpy(force=True), batches, bundles, execution)
                 result[2] = torch.from_numpy(d_geometry).reshape(geometry.shape)
             return result
 
@@ -243,11 +243,11 @@ def _trace(
 
 
 def _rays_gradient(
-    gradient: Floats, parts: list[tuple[Part, Floats]], bundles: Bundles, execution: Execution
+    gradient: Floats, batches: list[tuple[Batch, Floats]], bundles: Bundles, execution: Execution
 ) -> Floats:
     """Return the gradient by fans (images, 4, 3), or by starts and ends (2, rays, 3), from that by the images."""
     grids = execution.grid, execution.mu_grid or execution.grid
-    results = in_order(lambda part: geometry_gradient(gradient, *part, *grids), parts, execution.workers)
+    results = in_order(lambda batch: geometry_gradient(gradient, *batch, *grids), batches, execution.workers)
     numbered = [pair for result in results for pair in result]
     if len(bundles) and bundles[0].ends is not None:
         return np.concatenate([np.empty((2, 0, 3)), *(d_ends for _, d_ends in numbered)], axis=1)
@@ -260,8 +260,8 @@ def _rays_gradient(
 def fan_gradient(execution: Execution, bundles: Bundles, volume: Floats, mu: Floats | None) -> Floats:
     """Return the gradient (4, 3) of the sum of a fan's integrals by its source, corner, row step and column step."""
     ones = np.ones((1, *bundles.image_shape))
-    parts = execution.derivatives(volume, bundles, mu, np.zeros_like(ones))
-    return _rays_gradient(ones, parts, bundles, execution).reshape(4, 3)
+    batches = execution.derivatives(volume, bundles, mu, np.zeros_like(ones))
+    return _rays_gradient(ones, batches, bundles, execution).reshape(4, 3)
 
 
 def _as_input(integrals: ArrayOrTensor, volume: Any, *geometry: Any) -> ArrayOrTensor:

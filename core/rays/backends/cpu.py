@@ -167,7 +167,7 @@ def gather(
     mode: int,
     counts: Any,
     exponents: Any,
-    **others: Any,
+    **fields: Any,
 ) -> None:
     """Combine `points` in place with the values of `arrays` at their places, as `perspective.places.gather` describes it."""
     integers = [array for array in (counts, exponents) if array is not None]
@@ -175,7 +175,7 @@ def gather(
         raise TypeError("expected counts of int32 and of the points' shape")
     if mode == _PRODUCT and exponents is None:
         raise ValueError("expected exponents, which a product needs")
-    fields = others | {"seen": None if counts is None else counts.ctypes.data, "how": mode, "last": len(points)}
+    fields |= {"seen": None if counts is None else counts.ctypes.data, "how": mode, "last": len(points)}
     fields["exponents"] = None if exponents is None else exponents.ctypes.data
     _run_places(library.take_at, points, planes, arrays, matrices, [points, *integers], **fields)
 

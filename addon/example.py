@@ -61,7 +61,7 @@ def example_job(context: bpy.types.Context, of_xrays: bool = False, replace: boo
 
     def finish(result: Any) -> jobs.Finishing:
         stored, run, made = result
-        scene = jobs.scene_again(scene_uid, "the projections are")
+        scene = jobs.require_scene(scene_uid, "the projections are")
         if of_xrays:
             scene.mphdrr_display.colors, scene.mphdrr_display.scale = "GREY", "LOG"
         mosaic = yield from images.storing(run, made)

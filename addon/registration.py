@@ -94,7 +94,7 @@ def _draw_splash(menu: bpy.types.Menu, context: bpy.types.Context) -> None:
 
 
 MENUS = [(menu, _draw_entries(entries)) for menu, entries in ENTRIES.items()]
-MENUS += [(bpy.types.STATUSBAR_HT_header, draw) for draw in (storage.draw_said, jobs.draw_status)]
+MENUS += [(bpy.types.STATUSBAR_HT_header, draw) for draw in (storage.draw_save_note, jobs.draw_status)]
 MENUS += [(menu, _draw_submenu(*submenu)) for menu, submenu in SUBMENUS.items()]
 MENUS.append((bpy.types.WM_MT_splash, _draw_splash))
 MENUS += [

@@ -41,7 +41,7 @@ def using_ct(context: bpy.types.Context) -> jobs.Job:
     add = job.finish
 
     def finish(result: Any) -> str:
-        scene = jobs.scene_again(uid, "the CT is")
+        scene = jobs.require_scene(uid, "the CT is")
         found, body = chain(scene), runs.projected(scene)
         text = str(add(result))
         if found is not None:

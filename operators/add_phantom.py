@@ -86,7 +86,7 @@ class MPHDRR_OT_import_phantom(PhantomSettings, AddPhantom, bpy.types.Operator):
     asks_for = "filepath"
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        path = self.given_file("set filepath to a phantom's TOML file")
+        path = self.required_file("set filepath to a phantom's TOML file")
         return self.adding(self.name or read_phantom(path).name or path.stem)
 
     def phantom(self) -> Phantom:

@@ -87,7 +87,7 @@ class MPHDRR_OT_clean_volume_files(Reported, bpy.types.Operator):
         if not unused:
             return self.execute(context)
         message = "Neither Undo nor other .blend files that use this folder will find them again."
-        return ask_to_remove(self, context, event, f"Remove {storage.summary(unused)}?", message)
+        return ask_to_remove(self, context, event, f"Remove {storage.summarize_unused(unused)}?", message)
 
     def act(self, context: bpy.types.Context) -> str:
         return storage.remove_unused()
@@ -101,7 +101,7 @@ class MPHDRR_OT_collect_files(Reported, bpy.types.Operator):
     poll = needs((lambda context: bpy.data.filepath, "Save the .blend first: its folder is beside it"))
 
     def act(self, context: bpy.types.Context) -> str:
-        return storage.collect()
+        return storage.collect_files()
 
 
 class MPHDRR_OT_add_looks(Reported, bpy.types.Operator):

@@ -39,7 +39,7 @@ class MPHDRR_OT_export_geometry(jobs.ExportJob, bpy.types.Operator):
         return super().ask(context)
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        path = self.given_file("set filepath to a name ending in .xlsx")
+        path = self.required_file("set filepath to a name ending in .xlsx")
         return scanner_files.exporting_scanner(scanner.required_scanner(context.scene), path, self.use_template)
 
 
@@ -67,7 +67,7 @@ class MPHDRR_OT_export_for_program(jobs.ExportJob, bpy.types.Operator):
         return before != self.filepath
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        path, images = self.given_file("set filepath"), context.scene.mphdrr_projections
+        path, images = self.required_file("set filepath"), context.scene.mphdrr_projections
         shape, magnification = (images.height, images.width), decimals.typed(images.magnification)
         collection, detector = scanner.required_scanner(context.scene), images.detector.lower()
         return scanner_files.exporting_for_program(collection, path, self.format, shape, detector, magnification)

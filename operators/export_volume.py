@@ -24,5 +24,5 @@ class MPHDRR_OT_export_volume(jobs.ExportJob, bpy.types.Operator):
         return super().ask(context)
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        path = self.given_file(f"expected a name ending in {', '.join(WRITTEN_ENDINGS)}")
+        path = self.required_file(f"expected a name ending in {', '.join(WRITTEN_ENDINGS)}")
         return exporting(context.object, path)

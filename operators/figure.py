@@ -51,7 +51,7 @@ class _Drawing(jobs.ExportJob):
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
         own: Any = self
-        path = self.given_file(f"set filepath to a name ending in {' or '.join(self.endings)}")
+        path = self.required_file(f"set filepath to a name ending in {' or '.join(self.endings)}")
         if bool(own.width) != bool(own.height):
             raise InputError("size: give both width and height, or neither")
         size = (own.width, own.height) if own.width else None

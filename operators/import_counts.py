@@ -7,7 +7,7 @@ from bpy.props import FloatProperty, StringProperty
 
 from ..addon.blender import decimals, jobs, layouts, storage
 from ..addon.blender.file_properties import DIRECTORY, file_property, files_property, shown_files
-from ..addon.blender.setting_properties import properties_of, values_of
+from ..addon.blender.setting_properties import make_properties, read_values
 from ..addon.runs import counts_import
 from ..core.runs.frame_files import COUNTS_FORMATS
 from ..core.runs.settings import SETTINGS
@@ -66,7 +66,7 @@ class MPHDRR_OT_import_counts(jobs.JobOperator, bpy.types.Operator):
 
     def _given(self) -> dict[str, Any]:
         """The entries of a recipe that are given; None for the others."""
-        said = values_of(_PROPERTIES, lambda name: getattr(self, name))
+        said = read_values(_PROPERTIES, lambda name: getattr(self, name))
         return {
             **{key: value or None for key, value in said.items()},
             "model.time": decimals.typed(self.time) or None,
@@ -75,4 +75,4 @@ class MPHDRR_OT_import_counts(jobs.JobOperator, bpy.types.Operator):
         }
 
 
-MPHDRR_OT_import_counts.__annotations__.update(properties_of(_PROPERTIES))
+MPHDRR_OT_import_counts.__annotations__.update(make_properties(_PROPERTIES))

@@ -87,7 +87,7 @@ class MPHDRR_OT_import_volume(ReadVolumes, bpy.types.Operator):
     name: StringProperty(name="Name", description="The object's name. Empty: the file's", options={"SKIP_SAVE"})
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        path = self.given_file("set filepath to a volume's file, or to the folder of a DICOM series")
+        path = self.required_file("set filepath to a volume's file, or to the folder of a DICOM series")
         return self.importing([path], self.name)
 
 

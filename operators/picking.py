@@ -28,7 +28,7 @@ class MPHDRR_OT_pick_pixel(eyedropper.Eyedropper, reports.Reported, bpy.types.Op
         options={"SKIP_SAVE"},
     )  # fmt: skip
 
-    asks = "a pixel of a projection"
+    target_words = "a pixel of a projection"
     poll = reports.needs(images.PROJECTED)
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
@@ -45,7 +45,7 @@ class MPHDRR_OT_pick_pixel(eyedropper.Eyedropper, reports.Reported, bpy.types.Op
         column, row = found.pixel
         return f"Module {self.module}, column {column:g}, row {row:g}: {found.seen_by} modules see the marker"
 
-    def under(self, context: bpy.types.Context, event: bpy.types.Event) -> tuple[int, int, int] | None:
+    def target_under(self, context: bpy.types.Context, event: bpy.types.Event) -> tuple[int, int, int] | None:
         """The module's number, and column and row, of the pixel under the mouse."""
         found, run = eyedropper.region_under(context, event), epipolar.run_views(context.scene)
         if found is None or run is None:
@@ -62,12 +62,12 @@ class MPHDRR_OT_pick_pixel(eyedropper.Eyedropper, reports.Reported, bpy.types.Op
         )
         return epipolar_drawing.plane_pixel(context, run, origin, direction)
 
-    def says(self, found: tuple[int, int, int] | None) -> str:
+    def status_text(self, found: tuple[int, int, int] | None) -> str:
         if found is None:
-            return f"Click on {self.asks}, in the Image Editor or on a plane   (Esc: cancel)"
+            return f"Click on {self.target_words}, in the Image Editor or on a plane   (Esc: cancel)"
         return "Module {}, column {}, row {}   (click: pick; Esc: cancel)".format(*found)
 
-    def takes(self, context: bpy.types.Context, found: tuple[int, int, int]) -> bool:
+    def pick(self, context: bpy.types.Context, found: tuple[int, int, int]) -> bool:
         self.module, self.column, self.row = found
         with suppress(InputError):  # a module that is hidden, or not in the scene any more, has its pixel all the same
             tiles.activate(context, self.module)
@@ -103,13 +103,13 @@ class MPHDRR_OT_pick_window(eyedropper.Eyedropper, bpy.types.Operator):
         default="HIGH", options={"SKIP_SAVE"},
     )  # fmt: skip
 
-    asks = "a picture of the projections"
+    target_words = "a picture of the projections"
     poll = reports.needs(
         (lambda context: images.tiles(bpy.data.images.get(ids.MOSAIC)), images.PROJECTED[1]),
         (_has_image_editor, "No Image Editor is open: press Show Mosaic"),
     )
 
-    def under(self, context: bpy.types.Context, event: bpy.types.Event) -> tuple[str, float] | None:
+    def target_under(self, context: bpy.types.Context, event: bpy.types.Event) -> tuple[str, float] | None:
         """The exact number under the mouse, and what it is."""
         found = eyedropper.region_under(context, event)
         if found is None or found[0].type != "IMAGE_EDITOR":
@@ -117,7 +117,7 @@ class MPHDRR_OT_pick_window(eyedropper.Eyedropper, bpy.types.Operator):
         area, region, place = found
         return tiles.value_at(area.spaces.active.image, *region.view2d.region_to_view(*place))
 
-    def takes(self, context: bpy.types.Context, found: tuple[str, float]) -> bool:
+    def pick(self, context: bpy.types.Context, found: tuple[str, float]) -> bool:
         shown = images.tiles(bpy.data.images[ids.MOSAIC]) or {}
         settings = context.scene.mphdrr_display
         window = shown.get("window", (settings.low, settings.high))
@@ -129,9 +129,9 @@ class MPHDRR_OT_pick_window(eyedropper.Eyedropper, bpy.types.Operator):
         self.report({"INFO"}, f"Window {self.end.lower()} is {found[1]:g} {shown['unit']}: {found[0]}")
         return True
 
-    def says(self, found: tuple[str, float] | None) -> str:
+    def status_text(self, found: tuple[str, float] | None) -> str:
         unit = (images.tiles(bpy.data.images.get(ids.MOSAIC)) or {}).get("unit", "")
-        text = f"{found[0]}: {found[1]:g} {unit}" if found else f"Click on {self.asks}"
+        text = f"{found[0]}: {found[1]:g} {unit}" if found else f"Click on {self.target_words}"
         return f"{text}   (click: window {self.end.lower()}; Esc: cancel)"
 
 

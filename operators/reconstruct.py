@@ -34,7 +34,7 @@ class MPHDRR_OT_reconstruct(reconstruction_properties.ReconstructionSettings, jo
         return reconstructions.reconstructing(
             context,
             reconstruction_properties.settings_recipe(
-                self.given_or(context.scene.mphdrr_reconstruction), self.properties.is_property_set
+                self.setting_getter(context.scene.mphdrr_reconstruction), self.properties.is_property_set
             ),
         )
 
@@ -59,7 +59,7 @@ class MPHDRR_OT_backproject(reconstruction_properties.BackprojectionSettings, jo
     poll = needs(_RUN)
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        get = self.given_or(context.scene.mphdrr_reconstruction)
+        get = self.setting_getter(context.scene.mphdrr_reconstruction)
         return backprojections.backprojecting(context, reconstruction_properties.voxels_recipe(get), get("how").lower())
 
 

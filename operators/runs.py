@@ -84,11 +84,11 @@ class MPHDRR_OT_flood_efficiency(jobs.ExportJob, bpy.types.Operator):
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
         flood = storage.absolute(runs.required(context.scene, "take efficiencies from").file)
-        path = self.given_file("expected a name ending in .npy")
+        path = self.required_file("expected a name ending in .npy")
         order, scene_uid = self.order, context.scene.session_uid
 
         def finish(lines: list[str]) -> str:
-            scene = jobs.scene_again(scene_uid, "the efficiencies are")
+            scene = jobs.require_scene(scene_uid, "the efficiencies are")
             scene.mphdrr_projections.efficiency_of_modules = storage.stored_path(path)
             return " ".join(lines)
 

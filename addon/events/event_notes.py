@@ -92,7 +92,7 @@ def _note(path: Path, read: Callable[[Path], Note]) -> Note:
     if known != stamp and path not in _readers:
         _readers[path] = threading.Thread(target=_read, args=(path, stamp, read), name="mphDRR: reading", daemon=True)
         _readers[path].start()
-        timers.soon(_watch, _INTERVAL)
+        timers.schedule(_watch, _INTERVAL)
     return note
 
 

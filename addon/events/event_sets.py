@@ -78,7 +78,7 @@ def trying(context: bpy.types.Context, filepath: str, number: int, folder: str =
 
     def finish(made: tuple[_Phantom, str]) -> str:
         phantom, text = made
-        scene = jobs.scene_again(uid, "the event is")
+        scene = jobs.require_scene(uid, "the event is")
         settings = scene.mphdrr_events
         item = _put(scene, phantom, target)
         settings.phantom, settings.tried, settings.number = item, text, number + 1
@@ -121,7 +121,7 @@ def making(filepath: str, folder: str, count: int) -> jobs.Job:
     def left() -> str:
         return f"{_events(len(made))} made now and kept; Make Event Set goes on from there"
 
-    return jobs.Job("Making an event set", work, finish, left=left)
+    return jobs.Job("Making an event set", work, finish, leftovers=left)
 
 
 @dataclass(frozen=True)
@@ -167,7 +167,7 @@ def opening(context: bpy.types.Context, folder: str, number: int, model: str = "
         run, mosaic = opened.run, None
         if run is not None and opened.pictures is not None:
             mosaic = yield from images.storing(run, opened.pictures)
-        scene = jobs.scene_again(uid, "the event is")
+        scene = jobs.require_scene(uid, "the event is")
         settings = scene.mphdrr_events
         collection = scanner.active_scanner(scene)
         if run is not None and collection is None:
@@ -177,7 +177,7 @@ def opening(context: bpy.types.Context, folder: str, number: int, model: str = "
         if opened.phantom is not None:
             settings.phantom = _put(scene, opened.phantom, target)
             yield None
-        item = jobs.found_again(bpy.data.objects, truth_uid)
+        item = jobs.find_by_uid(bpy.data.objects, truth_uid)
         if item is None:
             item = volumes.add_stored(opened.truth, opened.name, scene.collection)
         else:
@@ -245,7 +245,7 @@ def _times(value: Any, factor: float) -> Any:
 
 def _put(scene: bpy.types.Scene, phantom: _Phantom, target: _Target) -> bpy.types.Object:
     """Give the phantom in the scene an event's settings, voxels and place; a new one where there is none any more."""
-    item = jobs.found_again(bpy.data.objects, target.uid)
+    item = jobs.find_by_uid(bpy.data.objects, target.uid)
     if item is None:
         item = volumes.add_stored(phantom.stored[0], "Event Phantom", scene.collection)
     if phantom.settings is None:

@@ -137,7 +137,7 @@ def figure_job(
         made = reel.pictures
         return f"{len(made)} pictures are in {made[0].parent}" if made else "nothing was changed"
 
-    return jobs.Job("Drawing the figure", work, finish, enough=reel if kind.motion else None, left=left)
+    return jobs.Job("Drawing the figure", work, finish, finish_now=reel if kind.motion else None, leftovers=left)
 
 
 def drawing(
@@ -282,7 +282,7 @@ def before_render(scene: bpy.types.Scene, *_: Any) -> None:
     if bpy.app.background:
         _say_what_is_unseen()
     else:
-        timers.soon(_say_what_is_unseen, _REST)
+        timers.schedule(_say_what_is_unseen, _REST)
 
 
 def _say_what_is_unseen() -> float | None:

@@ -21,7 +21,7 @@ def light(scene: bpy.types.Scene) -> None:
 
 def furnish(scene: bpy.types.Scene) -> None:
     """Put the suns into a scene, in a collection that can be hidden or deleted; and a world where there is none."""
-    home = objects.home(scene, ids.STUDIO)
+    home = objects.ensure_collection(scene, ids.STUDIO)
     for direction, strength, angle in _SUNS:
         sun = bpy.data.lights.new(ids.STUDIO, "SUN")
         sun.energy, sun.angle = strength, angle

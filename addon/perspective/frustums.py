@@ -74,7 +74,7 @@ def showing(context: bpy.types.Context, planes: int, uniform: str) -> jobs.Job:
         return g, files
 
     def finish(made: tuple[PerspectiveGrid, list[bytes]]) -> str:
-        scene, camera = jobs.found_again(bpy.data.scenes, scene_uid), jobs.found_again(bpy.data.objects, asked.camera)
+        scene, camera = jobs.find_by_uid(bpy.data.scenes, scene_uid), jobs.find_by_uid(bpy.data.objects, asked.camera)
         if scene is None or camera is None:
             raise InputError(f"{asked.module} is gone")
         g, files = made
@@ -148,7 +148,7 @@ def colored(values: NDArray[np.float32], quantity: str, low: float, high: float)
 
 def frustums(scene: bpy.types.Scene) -> list[bpy.types.Object]:
     """The frustums in the scene: their lines, which have the layers as children."""
-    homes = objects.homes(scene, ids.PERSPECTIVES)
+    homes = objects.collections_named(scene, ids.PERSPECTIVES)
     return sorted((o for home in homes for o in home.objects if _KEY in o), key=lambda o: o.name)
 
 
@@ -197,7 +197,7 @@ def remove(scene: bpy.types.Scene, modules: list[bpy.types.Object] | None = None
     found = [frustum for frustum in frustums(scene) if modules is None or frustum.parent in modules]
     for frustum in found:
         objects.remove_objects([*frustum.children, frustum])
-    objects.remove_empty_homes(scene, ids.PERSPECTIVES)
+    objects.remove_empty_collections(scene, ids.PERSPECTIVES)
     return len(found)
 
 
@@ -283,7 +283,7 @@ def _build(
     scene: bpy.types.Scene, camera: bpy.types.Object, asked: _Request, g: PerspectiveGrid, files: list[bytes]
 ) -> None:
     """Put a frustum into the scene: lines around the layers and from the pinhole, and a picture for each layer."""
-    home = objects.home(scene, ids.PERSPECTIVES)
+    home = objects.ensure_collection(scene, ids.PERSPECTIVES)
     to_camera = np.linalg.inv(objects.world_matrix(camera))
     corners = _corners(g) @ to_camera[:3, :3].T + to_camera[:3, 3]  # (n_k, 4, 3)
     name = ids.part_name(camera.name, "perspective")

@@ -36,8 +36,8 @@ def settings_changed(item: bpy.types.ID) -> None:
     properties.message = next(iter(caught), "")
     if properties.outdated and settings.n_voxels <= RESTED_VOXELS and windows.has_window():
         _edited = item.name
-        timers.forget(_rested)
-        timers.soon(_rested, _REST)
+        timers.cancel(_rested)
+        timers.schedule(_rested, _REST)
 
 
 def _rested() -> float | None:

@@ -33,7 +33,7 @@ def make(scene: bpy.types.Scene, run: ProjectionRun, collection: bpy.types.Colle
     if collection is None:
         return []
     old = {plane.parent: plane for plane in planes(scene)}  # used again: Blender need not sort the scene's objects anew
-    home = objects.home(scene, ids.PLANES)
+    home = objects.ensure_collection(scene, ids.PLANES)
     cameras = {camera.mphdrr_module.number: camera for camera in scanner.modules(collection)}
     made = []
     numbers = run.system.numbers.tolist()
@@ -61,7 +61,7 @@ def make(scene: bpy.types.Scene, run: ProjectionRun, collection: bpy.types.Colle
 
 def planes(scene: bpy.types.Scene) -> list[bpy.types.Object]:
     """The planes in the scene."""
-    return [o for home in objects.homes(scene, ids.PLANES) for o in home.objects if _KEY in o]
+    return [o for home in objects.collections_named(scene, ids.PLANES) for o in home.objects if _KEY in o]
 
 
 def remove(scene: bpy.types.Scene, modules: list[bpy.types.Object] | None = None) -> None:
@@ -69,7 +69,7 @@ def remove(scene: bpy.types.Scene, modules: list[bpy.types.Object] | None = None
     for plane in planes(scene):
         if modules is None or plane.parent in modules:
             _remove(plane)
-    objects.remove_empty_homes(scene, ids.PLANES)
+    objects.remove_empty_collections(scene, ids.PLANES)
 
 
 def _remove(plane: bpy.types.Object) -> None:

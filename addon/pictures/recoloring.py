@@ -29,7 +29,7 @@ def display_changed(*_: Any) -> None:
         for _step in recoloring():
             pass
     else:
-        timers.soon(_turn, _REST)
+        timers.schedule(_turn, _REST)
 
 
 def check(*_: Any) -> None:

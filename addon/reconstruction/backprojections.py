@@ -34,7 +34,7 @@ def backprojecting(context: bpy.types.Context, recipe: Recipe, how: str) -> jobs
         return stored_volumes.store_volume(volume, folder, None, provenance)
 
     def finish(stored: stored_volumes.StoredVolume) -> str:
-        scene = jobs.scene_again(uid, "the back-projection is")
+        scene = jobs.require_scene(uid, "the back-projection is")
         item = volumes.add_stored(stored, f"{name} {label}", scene.collection)
         volumes.make_active(bpy.context, item)
         slices.add_slices(item)  # it is somewhere everywhere: as smoke, a cloud

@@ -15,7 +15,7 @@ from ...core.runs.recipe import Recipe, fitting_recipe
 from ...core.runs.settings import SETTINGS
 from ..blender import choices
 from ..blender.file_properties import path_property
-from ..blender.setting_properties import drawn_of, properties_of, unset_of, values_of
+from ..blender.setting_properties import make_check_marks, make_properties, properties_to_draw, read_values
 from ..volumes import volumes
 
 _BY_COMMAND_LINE = ("anatomy", "allow", "stop_change", "stop_noise", "stop_region", "stop_seconds")
@@ -44,7 +44,7 @@ class ReconstructionSettings:
 
 
 _FILES = ", ".join(METHOD_FILES)
-ReconstructionSettings.__annotations__ = properties_of(PROPERTIES)
+ReconstructionSettings.__annotations__ = make_properties(PROPERTIES)
 ReconstructionSettings.__annotations__["method_file"] = path_property(
     "Method File", f"A trained network ({_FILES}) instead of the method; it has voxels of its own"
 )
@@ -62,13 +62,13 @@ class BackprojectionSettings:
     """How to back-project; mixed into the operator (scripts)."""
 
 
-BackprojectionSettings.__annotations__ = properties_of({name: PROPERTIES[name] for name in _OF_VOXELS})
+BackprojectionSettings.__annotations__ = make_properties({name: PROPERTIES[name] for name in _OF_VOXELS})
 BackprojectionSettings.__annotations__["how"] = _PUT_TOGETHER
 
 
 def voxels_recipe(get: Callable[[str], Any]) -> Recipe:
     """The recipe's voxels alone; `get` gives a property's value."""
-    values = values_of({name: PROPERTIES[name] for name in _OF_VOXELS}, get)
+    values = read_values({name: PROPERTIES[name] for name in _OF_VOXELS}, get)
     return Recipe({key: value for key, value in values.items() if value is not None})
 
 
@@ -77,7 +77,7 @@ def settings_recipe(get: Callable[[str], Any], is_given: Callable[[str], bool]) 
 
     Raises InputError where a setting that is given has no effect.
     """
-    values = values_of(PROPERTIES, get)
+    values = read_values(PROPERTIES, get)
     given = [s.key for name, s in PROPERTIES.items() if is_given(name) and values[s.key] != s.default]
     if file := get("method_file"):
         kept = {*given, *(PROPERTIES[name].key for name in _OF_FILES)} - {"reconstruction.method"}
@@ -96,7 +96,7 @@ def fit_method(settings: ReconstructionProperties, of_counts: bool) -> None:
 def drawn(settings: ReconstructionProperties) -> Iterator[tuple[str, bool]]:
     """The properties that the chosen method and prior have, each with whether it has an effect."""
     shown = {name: PROPERTIES[name] for name in _OF_FILES} if settings.method_file else PROPERTIES
-    yield from drawn_of(shown, settings, lambda need: True)
+    yield from properties_to_draw(shown, settings, lambda need: True)
     yield "method_file", True
 
 
@@ -123,6 +123,6 @@ class ReconstructionProperties(ReconstructionSettings, bpy.types.PropertyGroup):
         return json.loads(self.record) if self.record else {}
 
 
-ReconstructionProperties.__annotations__.update(unset_of(PROPERTIES), how=_PUT_TOGETHER)
+ReconstructionProperties.__annotations__.update(make_check_marks(PROPERTIES), how=_PUT_TOGETHER)
 
 CLASSES = (ReconstructionProperties,)

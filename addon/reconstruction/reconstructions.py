@@ -67,7 +67,7 @@ class _Last:
 def resumable(context: bpy.types.Context) -> Path | None:
     """The file from which Continue goes on: of the panel's reconstruction, if it was made by iterations."""
     item = context.scene.mphdrr_reconstruction.volume
-    path = None if item is None else storage.resumable(volumes.file_of(item))
+    path = None if item is None else storage.resume_file(volumes.file_of(item))
     return path if path is not None and path.is_file() else None
 
 
@@ -138,19 +138,19 @@ def _reconstructing(
             if time.monotonic() - before > _BETWEEN and is_watched:
                 shelf.latest = shown_of(np.array(values), objective)
                 before = time.monotonic()
-            return shelf.enough.is_set()
+            return shelf.finish_now.is_set()
 
         mu = _mu(run, recipe, readers, own_mu)
         found = reconstruct_run(run, recipe, mu, last.found if last else None, watch, stages, method)
         scores = _scores(run, found.volume, stages("scoring"))
         shown = shown_of(found.volume.array, found.objective.tolist(), scores, found.settings["flatters"])
         if found.iterations:
-            shelf.files.append(storage.resumable(shown.stored.path))
+            shelf.files.append(storage.resume_file(shown.stored.path))
             write_reconstruction(found, shelf.files[-1])
         return shown, found
 
     def finish(result: tuple[_Shown, Reconstruction]) -> str:
-        jobs.scene_again(uid, "the reconstruction is")  # or an error
+        jobs.require_scene(uid, "the reconstruction is")  # or an error
         shown, found = result
         item = shelf.show(shown)
         volumes.make_active(bpy.context, item)
@@ -160,14 +160,14 @@ def _reconstructing(
         seconds = time.perf_counter() - start
         return f"Reconstructed {item.name!r}: {shown.record['title']}, {shown.record['voxels']}, in {seconds:.1f} s"
 
-    return jobs.Job("Reconstructing", work, finish, shelf.clear, shelf.look, shelf.enough)
+    return jobs.Job("Reconstructing", work, finish, shelf.clear, shelf.refresh, shelf.finish_now)
 
 
 class _Shelf:
     """What a running reconstruction has put into the scene and on the disk, to be replaced, or taken back."""
 
     def __init__(self, context: bpy.types.Context, name: str, last: _Last | None) -> None:
-        self.name, self.enough, self._last = name, threading.Event(), last
+        self.name, self.finish_now, self._last = name, threading.Event(), last
         self.files: list[Path] = []
         self.latest: _Shown | None = None  # made by the thread
         self.room = images.room(context) if windows.has_window() else None  # that the picture fills
@@ -180,7 +180,7 @@ class _Shelf:
         packed = None if image is None else image.packed_file
         self._picture = None if packed is None else bytes(packed.data)
 
-    def look(self) -> None:
+    def refresh(self) -> None:
         """Show what the thread has made since."""
         self.room = images.room(bpy.context)
         latest, self.latest = self.latest, None
@@ -192,8 +192,8 @@ class _Shelf:
 
     def show(self, shown: _Shown) -> bpy.types.Object:
         """Put a state of the reconstruction into the scene, in place of the one before."""
-        scene = jobs.found_again(bpy.data.scenes, self._scene)
-        item = jobs.found_again(bpy.data.objects, self._item)
+        scene = jobs.find_by_uid(bpy.data.scenes, self._scene)
+        item = jobs.find_by_uid(bpy.data.objects, self._item)
         if not self._is_shown:
             self._is_shown = True
             self._hide(runs.projected(scene), scene.mphdrr_reconstruction.volume if item is None else None)
@@ -227,8 +227,8 @@ class _Shelf:
 
     def clear(self) -> None:
         """Take everything back."""
-        item = jobs.found_again(bpy.data.objects, self._item)
-        for hidden in filter(None, (jobs.found_again(bpy.data.objects, uid) for uid in self._hidden)):
+        item = jobs.find_by_uid(bpy.data.objects, self._item)
+        for hidden in filter(None, (jobs.find_by_uid(bpy.data.objects, uid) for uid in self._hidden)):
             hidden.hide_set(False)
         if item is not None and self._last is not None:
             volumes.replace_stored(item, self._last.stored)
@@ -236,7 +236,7 @@ class _Shelf:
             materials = list(item.data.materials)
             objects.remove_objects([item, *item.children])
             objects.remove_unused(materials)
-        scene = jobs.found_again(bpy.data.scenes, self._scene)
+        scene = jobs.find_by_uid(bpy.data.scenes, self._scene)
         if scene is not None and self._is_shown:
             settings = scene.mphdrr_reconstruction
             with suppress(ReferenceError):

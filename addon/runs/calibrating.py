@@ -35,7 +35,7 @@ def calibrating(context: bpy.types.Context, path: Path, apply: bool = True, exag
 
     def finish(result: tuple[Calibration, bytes]) -> str:
         found, picture = result
-        collection = jobs.found_again(bpy.data.collections, uid)
+        collection = jobs.find_by_uid(bpy.data.collections, uid)
         if collection is None:
             raise InputError("the scanner that was calibrated is gone")
         _require_same(collection, found)

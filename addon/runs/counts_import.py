@@ -53,8 +53,8 @@ def importing(context: bpy.types.Context, paths: list[Path], given: Mapping[str,
 
     def finish(result: tuple[ProjectionRun, images.Pictures]) -> jobs.Finishing:
         run, made = result
-        scene = jobs.scene_again(scene_uid, "the projections are")
-        owner = jobs.found_again(bpy.data.collections, scanner_uid)
+        scene = jobs.require_scene(scene_uid, "the projections are")
+        owner = jobs.find_by_uid(bpy.data.collections, scanner_uid)
         state = runs.state_of(system, run.recipe, None, None) | {"measured": caption(run)}
         images.show_below((yield from rendering.storing(scene, run, path, state, owner, made)), bpy.context)
         return (

@@ -231,7 +231,7 @@ class Session:
         error = worker.error
         if error is None:
             self.shown, self.problem = worker.result, ""
-            self.cautions = tuple(map(reports.in_window, worker.caught[:_MOST_CAUTIONS]))
+            self.cautions = tuple(map(reports.in_window, worker.warnings[:_MOST_CAUTIONS]))
         elif isinstance(error, InputError):
             self._fail(str(error))
         elif isinstance(error, MemoryError):
@@ -283,7 +283,7 @@ def start() -> None:
 def stop(*_: Any) -> None:
     """Switch the preview off: also before a file is loaded, or the extension is disabled."""
     global _session, _drawing
-    timers.forget(_look)
+    timers.cancel(_look)
     if _drawing is not None:
         _drawing()
         windows.redraw("VIEW_3D")
@@ -295,7 +295,7 @@ def after_update(scene: bpy.types.Scene | None = None, depsgraph: bpy.types.Deps
     if _session is None or (depsgraph is not None and depsgraph.mode != "VIEWPORT"):
         return
     _session.has_changed = True
-    timers.soon(_look)
+    timers.schedule(_look)
 
 
 def _look() -> float | None:

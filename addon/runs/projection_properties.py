@@ -15,7 +15,14 @@ from ...core.runs.recipe import Recipe, fitting_recipe
 from ...core.runs.settings import SETTINGS
 from ..blender import setting_properties
 from ..blender.file_properties import path_property
-from ..blender.setting_properties import drawn_of, identifier, material_of, of_modules, properties_of, set_property
+from ..blender.setting_properties import (
+    identifier,
+    make_properties,
+    material_property,
+    modules_property,
+    properties_to_draw,
+    set_property,
+)
 from ..blender.updates import on_edit
 from ..scanner import scanner
 from ..volumes import volumes
@@ -47,12 +54,12 @@ class ProjectionSettings:
     last: IntProperty(name="Last Module", description="Its number; 0: to the last", default=0, min=0)
 
 
-ProjectionSettings.__annotations__.update(properties_of(PROPERTIES))
+ProjectionSettings.__annotations__.update(make_properties(PROPERTIES))
 
 
 def recipe_values(get: Callable[[str], Any]) -> dict[str, Any]:
     """The values of the settings by their keys in a recipe, None for none; `get` gives a property's."""
-    values = setting_properties.values_of(PROPERTIES, get)
+    values = setting_properties.read_values(PROPERTIES, get)
     values["noise.seed"] = get("seed") if get("noise") else None
     return values
 
@@ -78,7 +85,7 @@ def settings_recipe(
     given = [
         setting.key
         for name, setting in PROPERTIES.items()
-        if any(map(is_given, filter(None, (name, material_of(name, setting), of_modules(name, setting)))))
+        if any(map(is_given, filter(None, (name, material_property(name, setting), modules_property(name, setting)))))
         and values[setting.key] != setting.default
     ]
     return fitting_recipe(values, given)
@@ -131,7 +138,7 @@ def set_time(settings: ProjectionProperties) -> None:
 
 def drawn(settings: ProjectionProperties, table: str) -> Iterator[tuple[str, bool]]:
     """The properties of a table that the chosen model and hole have, each with whether it has an effect."""
-    of_others = drawn_of(
+    of_others = properties_to_draw(
         PROPERTIES, settings, lambda need: need.startswith("model.kind=") or "model.hole=rays" in need, table
     )
     for name, is_active in of_others:
@@ -216,6 +223,6 @@ class ProjectionProperties(ProjectionSettings, bpy.types.PropertyGroup):
     run_summary: StringProperty(name="Shown Run", description="What the shown run is", options={"HIDDEN"})
 
 
-ProjectionProperties.__annotations__.update(setting_properties.unset_of(PROPERTIES))
+ProjectionProperties.__annotations__.update(setting_properties.make_check_marks(PROPERTIES))
 
 CLASSES = (RunProperties, ProjectionProperties)

@@ -65,8 +65,8 @@ def render_job(context: bpy.types.Context, recipe: Recipe, volume: str = "", mu:
         return [(run, kept(run, path, display, stages)) for run, path in zip(made, paths, strict=True)]
 
     def finish(result: list[tuple[ProjectionRun, images.Pictures]]) -> jobs.Finishing:
-        scene = jobs.scene_again(scene_uid, "the projections are")
-        owner = jobs.found_again(bpy.data.collections, scanner_uid)  # which need not be the panel's any more
+        scene = jobs.require_scene(scene_uid, "the projections are")
+        owner = jobs.find_by_uid(bpy.data.collections, scanner_uid)  # which need not be the panel's any more
         for number, (path, (run, made)) in enumerate(zip(paths, result, strict=True)):
             mosaic = yield from storing(scene, run, path, state, owner, made)
             scene.mphdrr_projections.runs[-1].keep = number < len(paths) - 1  # each frame is a run
@@ -253,7 +253,7 @@ def showing_job(scene: bpy.types.Scene, index: int) -> jobs.Job:
 
     def finish(result: tuple[ProjectionRun, images.Pictures]) -> jobs.Finishing:
         run, made = result
-        scene = jobs.scene_again(uid, "the projections are")
+        scene = jobs.require_scene(uid, "the projections are")
         files = [item.file for item in scene.mphdrr_projections.runs]
         if file not in files:  # it was removed meanwhile
             raise InputError(f"the run {name!r} is gone")
@@ -272,7 +272,7 @@ def active_run_changed(scene: bpy.types.Scene) -> None:
     if bpy.app.background:
         _show_chosen()
     else:
-        timers.soon(_show_chosen, _REST)
+        timers.schedule(_show_chosen, _REST)
 
 
 def _show_chosen() -> float | None:

@@ -191,7 +191,7 @@ def measured_text(scene: bpy.types.Scene) -> str:
 
 def size_text(items: Any) -> str:
     """How much of the disk the files of runs need."""
-    sizes = [storage.size_of(storage.absolute(item.file)) for item in items]
+    sizes = [storage.file_size(storage.absolute(item.file)) for item in items]
     missing = "file missing" if None in sizes else ""
     return ", ".join(filter(None, [readable_size(sum(filter(None, sizes))) if any(sizes) else "", missing]))
 
@@ -200,7 +200,7 @@ def remove_file(item: bpy.types.PropertyGroup) -> bool:
     """Remove a run's file if it is this .blend's own and no other run needs it; returns whether it is gone."""
     path = storage.absolute(item.file)
     needed = [run.file for scene in bpy.data.scenes for run in scene.mphdrr_projections.runs].count(item.file)
-    if not storage.is_own(path) or needed > 1:
+    if not storage.is_in_folder(path) or needed > 1:
         return not path.exists()
     with refusing(path, "cannot be removed"):
         path.unlink(missing_ok=True)
@@ -222,7 +222,7 @@ def after_load(*_: Any) -> None:
 def after_update(*_: Any) -> None:
     """Something has changed: compare the runs with the scene once it rests. Costs next to nothing itself."""
     if not bpy.app.background:
-        timers.soon(_look, _REST)
+        timers.schedule(_look, _REST)
 
 
 def _look() -> None:

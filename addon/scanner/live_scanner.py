@@ -123,7 +123,7 @@ def _look_for_copies(collection: bpy.types.Collection) -> None:
 
 def _settle_later() -> None:
     if not bpy.app.background:
-        timers.soon(_settle, _INTERVAL)
+        timers.schedule(_settle, _INTERVAL)
 
 
 def _settle() -> float | None:

@@ -35,7 +35,7 @@ def optimizing(scene: bpy.types.Scene, path: Path) -> jobs.Job:
         try:
             return optimize(recipe, stages_of(progress)("designing"), callback=shown.note)
         except Cancelled as stop:
-            if not shown.enough.is_set():
+            if not shown.finish_now.is_set():
                 raise
             return stop.design  # type: ignore[no-any-return]
 
@@ -46,17 +46,17 @@ def optimizing(scene: bpy.types.Scene, path: Path) -> jobs.Job:
         collection.mphdrr_scanner.design = json.dumps([*lines[many * len(found.parameters) :], *found.faults[:_MOST]])
         for fault in found.faults:
             warn(fault)
-        stopped = f", stopped after {len(found.objective)} steps" * shown.enough.is_set()
+        stopped = f", stopped after {len(found.objective)} steps" * shown.finish_now.is_set()
         return f"Optimised '{collection.name}'{stopped}: {'; '.join(lines[len(found.parameters) :])}"
 
-    return jobs.Job("Optimising", work, finish, shown.take_back, shown.look, shown.enough)
+    return jobs.Job("Optimising", work, finish, shown.take_back, shown.refresh, shown.finish_now)
 
 
 class _Shown:
     """The scanner in the scene that a search moves, to be taken back where the user cancels."""
 
     def __init__(self, scene: bpy.types.Scene, name: str) -> None:
-        self.enough = threading.Event()
+        self.finish_now = threading.Event()
         active = scanner.active_scanner(scene)
         self._scene, self._name = scene.session_uid, name
         self._uid = 0 if active is None else active.session_uid
@@ -67,10 +67,10 @@ class _Shown:
     def note(self, system: PinholeSystem, objective: float) -> None:
         """Take the best until now, in the thread; raises Cancelled where that is enough."""
         self._latest = system
-        if self.enough.is_set():
+        if self.finish_now.is_set():
             raise Cancelled
 
-    def look(self) -> None:
+    def refresh(self) -> None:
         """Show what the thread has found since."""
         latest, self._latest = self._latest, None
         if latest is not None:
@@ -78,8 +78,8 @@ class _Shown:
 
     def show(self, system: PinholeSystem) -> bpy.types.Collection:
         """Make the scanner the one found; the first call decides whether it is the one that was active."""
-        scene = jobs.scene_again(self._scene, "the design is")
-        collection = jobs.found_again(bpy.data.collections, self._uid)
+        scene = jobs.require_scene(self._scene, "the design is")
+        collection = jobs.find_by_uid(bpy.data.collections, self._uid)
         if not self._kept:
             self._is_new = collection is None or not module_edits.can_become(collection, system)
             collection = None if self._is_new else collection
@@ -93,8 +93,8 @@ class _Shown:
 
     def take_back(self) -> None:
         """Leave the scene as it was."""
-        scene = jobs.found_again(bpy.data.scenes, self._scene)
-        collection = jobs.found_again(bpy.data.collections, self._uid)
+        scene = jobs.find_by_uid(bpy.data.scenes, self._scene)
+        collection = jobs.find_by_uid(bpy.data.collections, self._uid)
         if not self._kept or scene is None or collection is None:
             return
         if self._is_new:

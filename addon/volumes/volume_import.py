@@ -117,7 +117,7 @@ def _made_of(
 ) -> jobs.Job:
     """The job that adds `what` is made of a volume, state by state, in its place."""
     volumes.require_volume(item)
-    readers = [volumes.reader(item, path) for path in storage.files_of_states(item.data)]
+    readers = [volumes.reader(item, path) for path in storage.state_files(item.data)]
     count = len(readers)
     n_x, n_y, n_z = item.mphdrr_volume.shape
     memory.require(8.0 * count * n_x * n_y * n_z, f"the {what} of {count * n_x * n_y * n_z} voxels")

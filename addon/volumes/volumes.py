@@ -72,7 +72,7 @@ def adding(
         return store_volume(made, folder, pose, provenance)
 
     def finished(stored: StoredVolume) -> str:
-        item = add_stored(stored, name, jobs.found_again(bpy.data.collections, home_uid))
+        item = add_stored(stored, name, jobs.find_by_uid(bpy.data.collections, home_uid))
         make_active(bpy.context, item)
         return finish(item, stored)
 
@@ -123,7 +123,7 @@ def volume_from_object(item: bpy.types.Object) -> Volume:
 def reader(item: bpy.types.Object, path: Path | None = None) -> Callable[[], Volume]:
     """A function that does what `volume_from_object` does but leaves bpy alone, to be called in a thread.
 
-    `path` is the file of a state (`storage.files_of_states`); default: of the one at the current frame.
+    `path` is the file of a state (`storage.state_files`); default: of the one at the current frame.
     """
     path, pose = source(item, path)
     return lambda: moved(vdb.read_vdb(path), pose)
@@ -149,8 +149,8 @@ def require_volume(item: bpy.types.Object | None) -> None:
 
 def file_of(item: bpy.types.Object) -> Path:
     """The .vdb with every voxel of a Volume object; of a sequence, that of the current frame."""
-    path = storage.full_resolution(storage.absolute(item.data.filepath))
-    return storage.of_frame(path, _state(item.data) or 1) if item.data.is_sequence else path
+    path = storage.full_resolution_file(storage.absolute(item.data.filepath))
+    return storage.frame_file(path, _state(item.data) or 1) if item.data.is_sequence else path
 
 
 def content_of(item: bpy.types.Object) -> str:
@@ -166,7 +166,7 @@ def state_text(item: bpy.types.Object) -> str:
 
 def file_state(item: bpy.types.Object) -> str:
     """What there is to say about a Volume object's file: its size, or that it is missing."""
-    size = storage.size_of(file_of(item))
+    size = storage.file_size(file_of(item))
     if size is None:
         return "missing"
     shown = ", coarser copy shown" if ids.PREVIEW in item.data.filepath else ""
@@ -240,7 +240,7 @@ def after_load(*_: Any) -> None:
         if settings.center_shift != compat.VDB_CENTER_SHIFT and item.data not in missing:
             settings.content = content_of(item)
             try:
-                states = [vdb.read_vdb(path) for path in storage.files_of_states(item.data)]
+                states = [vdb.read_vdb(path) for path in storage.state_files(item.data)]
                 item.data.filepath = storage.stored_path(write_states(states, storage.folder()))
                 settings.center_shift = compat.VDB_CENTER_SHIFT
                 settings.display_high = settings.display_high  # which draws it: its surface was elsewhere, too

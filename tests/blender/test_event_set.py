@@ -179,7 +179,7 @@ def test_a_set_is_that_of_the_library_and_goes_on_after_cancel(recipe, scene, tm
 
     with pytest.raises(Cancelled):
         jobs.run(job, progress)
-    assert job.left() == "1 event made now and kept; Make Event Set goes on from there"
+    assert job.leftovers() == "1 event made now and kept; Make Event Set goes on from there"
     first = Path(folder, "events", "000000.h5")
     assert [path.name for path in first.parent.iterdir()] == [first.name]
     written = first.stat().st_mtime_ns

@@ -230,7 +230,7 @@ def test_render_says_which_volumes_of_the_view_it_lacks(small_render, capfd, mon
     bpy.context.view_layer.update()
     assert rendered(small_render, capfd) == ""
     volumes.file_of(item).unlink()
-    storage._size_at.cache_clear()
+    storage._cached_size.cache_clear()
     assert rendered(small_render, capfd).endswith(f"nothing of {item.name!r}: its files are missing")
 
 

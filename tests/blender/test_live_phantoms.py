@@ -130,14 +130,14 @@ def test_a_setting_that_changes_while_an_update_is_made(item, window, monkeypatc
 
 
 def test_panels_look_at_the_disk_now_and_then(item, monkeypatch):
-    monkeypatch.setattr(storage, "_LOOK", 1e9)
+    monkeypatch.setattr(storage, "_SIZE_LIFETIME", 1e9)
     path = volumes.file_of(item)
     assert "KiB" in volumes.file_state(item) and storage.missing_volumes() == []
     content = path.read_bytes()
     path.unlink()
     assert "KiB" in volumes.file_state(item) and storage.missing_volumes() == []
-    storage._size_at.cache_clear()
+    storage._cached_size.cache_clear()
     assert volumes.file_state(item) == "missing" and storage.missing_volumes() == [item.data]
     path.write_bytes(content)
-    storage._size_at.cache_clear()
+    storage._cached_size.cache_clear()
     assert "KiB" in volumes.file_state(item)

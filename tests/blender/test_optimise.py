@@ -121,7 +121,7 @@ def moved(scene, recipe, looks: int) -> tuple[jobs.Job, list[mph.PinholeSystem]]
     job, seen = optimising.optimizing(scene, recipe), []
 
     def work(done, total):
-        job.look()
+        job.refresh()
         collections = scanner.scanners(scene)
         seen.append(scanner.read_scanner(collections[-1]) if collections else None)
         if len(seen) == looks:
@@ -154,7 +154,7 @@ def test_finishing_early_keeps_the_best_so_far(scene, recipe):
     def progress(done, total):
         assert done < 4
         if done == 2:
-            job.enough.set()
+            job.finish_now.set()
 
     assert "stopped after 3 steps" in jobs.run(job, progress)
     half = json.loads(scanner.active_scanner(scene).mphdrr_scanner.design)

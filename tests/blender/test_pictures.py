@@ -95,10 +95,10 @@ def test_an_animation_that_is_ended_keeps_its_pictures(example, tmp_path, monkey
     job, steps = started()
     with pytest.raises(mph.Cancelled):
         steps.throw(mph.Cancelled())
-    assert job.left() == f"3 pictures are in {tmp_path / 'film-frames'}"
+    assert job.leftovers() == f"3 pictures are in {tmp_path / 'film-frames'}"
     assert len(list((tmp_path / "film-frames").iterdir())) == 3 and path.read_bytes() == b"older"
     job, steps = started()
-    job.enough.set()
+    job.finish_now.set()
     list(steps)
     assert bpy.data.movieclips.load(str(path)).frame_duration == 3
     assert sorted(found.name for found in tmp_path.iterdir()) == ["film-frames", "film.mp4"]

@@ -219,7 +219,7 @@ def test_it_is_shown_while_it_runs_and_cancelled_without_a_trace(render, scene, 
     job, seen = job_of(scene), []
 
     def progress(done: int, total: int) -> None:
-        job.look()  # the window does so from time to time
+        job.refresh()  # the window does so from time to time
         if reconstructed() is not None:
             seen.append(len(scene.mphdrr_reconstruction.known["objective"]))
             assert scene.mphdrr_reconstruction.known["scores"] == []
@@ -239,9 +239,9 @@ def test_finish_now_keeps_what_there_is(render, scene, monkeypatch):
     job = job_of(scene)
 
     def progress(done: int, total: int) -> None:
-        job.look()
+        job.refresh()
         if reconstructed() is not None:
-            job.enough.set()
+            job.finish_now.set()
 
     text = jobs.run(job, progress)
     assert "OSEM, 2 iterations" in text and len(scene.mphdrr_reconstruction.known["objective"]) == 2
@@ -260,7 +260,7 @@ def test_continue_goes_on_as_if_there_had_been_no_break(render, scene, monkeypat
     job = reconstructions.continuing(bpy.context)
 
     def cancel(done: int, total: int) -> None:
-        job.look()
+        job.refresh()
         if len(scene.mphdrr_reconstruction.known["objective"]) > 4:
             raise Cancelled
 

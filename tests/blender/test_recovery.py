@@ -31,7 +31,7 @@ def crashed(scene, small_workbook, tmp_path, capsys):
     volumes.add_volume(Volume(np.ones((4, 4, 4)), Grid.centered(4, 1.0), "hu"), "CT")
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "study.blend"))
     shutil.rmtree(tmp_path / "study_mphdrr")
-    storage._size_at.cache_clear()
+    storage._cached_size.cache_clear()
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "study.blend"))
     said = capsys.readouterr().out
     assert "Modules map, Tank are missing: press Make Again" in said
@@ -49,10 +49,10 @@ def test_one_update_gives_one_grid(crashed):
 
 
 def test_all_with_a_recipe_are_made_again_where_they_were(crashed, capsys):
-    storage._size_at.cache_clear()
+    storage._cached_size.cache_clear()
     assert bpy.ops.mphdrr.remake_volumes() == {"FINISHED"}
     assert "CT: find the voxel files" in capsys.readouterr().out
-    storage._size_at.cache_clear()
+    storage._cached_size.cache_clear()
     again, others = recovery.missing(bpy.context.scene)
     assert again == [] and [item.name for item in others] == ["CT"]
     assert set(crashed) == {"Tank", "Tank mu", "Modules map"}

@@ -37,7 +37,7 @@ def using_ct(context: bpy.types.Context) -> jobs.Job:
     The body that the X rays saw attenuates its photons; the CT is what the reconstruction knows of it.
     """
     uid = context.scene.session_uid
-    job = volume_import.ct_numbers(context.scene.mphdrr_reconstruction.volume)
+    job = volume_import.ct_numbers_job(context.scene.mphdrr_reconstruction.volume)
     add = job.finish
 
     def finish(result: Any) -> str:

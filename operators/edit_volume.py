@@ -57,7 +57,7 @@ class MPHDRR_OT_ct_to_attenuation(jobs.JobOperator, bpy.types.Operator):
     poll = needs((_is_ct, "No CT is active: select a volume of CT numbers (hu)"))
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        return volume_import.converting(context.object, decimals.typed(self.energy))
+        return volume_import.attenuation_job(context.object, decimals.typed(self.energy))
 
 
 class MPHDRR_OT_add_dose_map(jobs.JobOperator, bpy.types.Operator):
@@ -73,7 +73,7 @@ class MPHDRR_OT_add_dose_map(jobs.JobOperator, bpy.types.Operator):
     poll = needs((_is_activity, "No activity is active: select a volume of activity"))
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        return volume_import.dosing(context.object, self.isotope)
+        return volume_import.dose_job(context.object, self.isotope)
 
 
 class MPHDRR_OT_clean_volume_files(Reported, bpy.types.Operator):

@@ -27,7 +27,7 @@ class MPHDRR_PT_phantom(Folded, bpy.types.Panel):
         row.operator("mphdrr.import_volume", text="Import Volume", icon="IMPORT")
         if storage.missing_volumes():
             _draw_missing(adding.column(align=True), context.scene)
-        item = volumes.meant(context)
+        item = volumes.panel_volume(context)
         if item is not None:
             _draw_numbers(layout, item)
             row = layout.split(factor=0.32, align=True)
@@ -63,7 +63,7 @@ def _draw_numbers(layout: bpy.types.UILayout, item: bpy.types.Object) -> None:
         ("Size", " × ".join(f"{s:.3g}" for s in settings.spacing) + " mm"),
         ("Values", f"{settings.minimum:.4g} to {settings.maximum:.4g} {settings.unit}".removesuffix(" 1")),
         *([("State", volumes.state_text(item))] if item.data.is_sequence else []),
-        ("File", volumes.file_state(item)),
+        ("File", volumes.file_note(item)),
     )
     if settings.message:
         column = layout.column()
@@ -76,10 +76,10 @@ def _draw_numbers(layout: bpy.types.UILayout, item: bpy.types.Object) -> None:
 class _OfVolume(Popover):
     """Mix into panels of the volume that is meant; they draw by `draw_volume`."""
 
-    poll = layouts.shown_where(volumes.meant)
+    poll = layouts.shown_where(volumes.panel_volume)
 
     def draw(self, context: bpy.types.Context) -> None:
-        layout, item = layouts.invoking(layouts.labelled(self.layout)), volumes.meant(context)  # type: ignore[attr-defined]
+        layout, item = layouts.invoking(layouts.labelled(self.layout)), volumes.panel_volume(context)  # type: ignore[attr-defined]
         if item is not None:  # the scene may have changed since poll
             layout.context_pointer_set("object", item)  # which the buttons work on, active or not
             self.draw_volume(layout, context, item)
@@ -113,7 +113,7 @@ class MPHDRR_PT_look(_OfVolume, bpy.types.Panel):
             column.prop(item.data, "sequence_mode", text="Then")
         if slices.planes_of(item):
             column = layout.column(align=True)
-            for axis, name in enumerate(slices.names(item)):
+            for axis, name in enumerate(slices.plane_names(item)):
                 column.prop(settings, "slices", index=axis, text=name)
             column.operator("mphdrr.remove_slices", icon="X")
         else:
@@ -125,7 +125,7 @@ class MPHDRR_PT_phantom_settings(_OfVolume, bpy.types.Panel):
 
     bl_label = "Settings"
 
-    poll = layouts.shown_where(lambda context: phantoms.settings_of(volumes.meant(context)) is not None)
+    poll = layouts.shown_where(lambda context: phantoms.settings_of(volumes.panel_volume(context)) is not None)
 
     def draw_volume(self, layout: bpy.types.UILayout, context: bpy.types.Context, item: bpy.types.Object) -> None:
         phantoms.settings_of(item).draw_settings(layout)
@@ -149,7 +149,7 @@ def _draw_update(layout: bpy.types.UILayout, item: bpy.types.Object) -> None:
 class MPHDRR_PT_perspective(_OfVolume, bpy.types.Panel):
     """The volume in the coordinates of the active module: column, row and depth."""
 
-    poll = layouts.shown_where(lambda context: selection.active_module(context) and volumes.meant(context))
+    poll = layouts.shown_where(lambda context: selection.active_module(context) and volumes.panel_volume(context))
 
     def draw_volume(self, layout: bpy.types.UILayout, context: bpy.types.Context, item: bpy.types.Object) -> None:
         settings, camera = context.scene.mphdrr_perspective, selection.active_module(context)

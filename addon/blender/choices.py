@@ -21,10 +21,7 @@ KINDS = {
     "VOLUME": 0, "DERENZO": 1, "NEMA": 2, "JASZCZAK": 3, "DEFRISE": 4, "SHEPP_LOGAN": 5, "POINTS": 6, "TORSO": 7,
     "FILE": 1000,
 }  # fmt: skip
-PHANTOM_WORDS = {
-    "modified": 0,
-    "original": 1,
-}  # words that a phantom's settings offer (`core.phantoms.settings.choice`)
+PHANTOM_WORDS = {"modified": 0, "original": 1}  # words offered by `core.phantoms.settings.choice`
 ISOTOPES = {
     "NONE": 0, "F-18": 1, "Ga-67": 2, "Tc-99m": 3, "In-111": 4, "I-123": 5, "I-131": 6, "Xe-133": 7, "Lu-177": 8,
     "Tl-201": 9,
@@ -41,12 +38,12 @@ UNITS = {
 }  # fmt: skip
 
 
-_MAX_NUMBER = 0xFFFFFF
+_MASK = 0xFFFFFF
 """The largest checksum: Blender's buttons that show choices side by side keep numbers as float32, exact up to here."""
 
 
-def items(numbers: Mapping[str, int], entries: Iterable[tuple[str, str, str]]) -> Items:
+def items(numbers: Mapping[str, int], rows: Iterable[tuple[str, str, str]]) -> Items:
     """Return items (identifier, label, description, number); numbers come from a table above, else from a checksum."""
     return tuple(
-        (name, label, text, numbers.get(name, zlib.crc32(name.encode()) & _MAX_NUMBER)) for name, label, text in entries
+        (name, label, text, numbers.get(name, zlib.crc32(name.encode()) & _MASK)) for name, label, text in rows
     )

@@ -43,7 +43,7 @@ def identifier(name: str, word: str) -> str:
 
 def make_properties(settings: Settings) -> dict[str, Any]:
     """Return the Blender properties of settings, by name, as a class takes them in its annotations."""
-    properties: dict[str, Any] = {}
+    result: dict[str, Any] = {}
     for name, setting in settings.items():
         zero = "empty" if setting.kind is str else "0"
         absent = f"; {zero}: {setting.absent}" if setting.default is None and setting.absent else ""
@@ -56,35 +56,34 @@ def make_properties(settings: Settings) -> dict[str, Any]:
         material = material_property(name, setting)
         if material is not None:
             no_material = ("NUMBER", "By Coefficient", f"By its attenuation coefficient{absent}")
-            properties[material] = _enumeration(material, setting, no_material)
+            result[material] = _enumeration(material, setting, no_material)
             common["name"] = f"µ ({setting.unit})"  # below the material's menu
         if setting.kind is bool:
-            properties[name] = props.BoolProperty(**common, default=setting.default)
+            result[name] = props.BoolProperty(**common, default=setting.default)
         elif setting.kind is str and not setting.words:
-            properties[name] = props.StringProperty(**common)
+            result[name] = props.StringProperty(**common)
         elif setting.kind is str:
             absent_item = ("NONE", setting.unset, setting.absent.capitalize()) if setting.default is None else None
-            properties[name] = _enumeration(name, setting, absent_item)
+            result[name] = _enumeration(name, setting, absent_item)
         elif is_list(setting):
             text = f"{setting.text}; such as 10, 20, 30. Empty: {setting.absent}"
-            properties[name] = props.StringProperty(name=setting.label, description=text)
+            result[name] = props.StringProperty(name=setting.label, description=text)
         elif _is_vector(setting):
             vector = props.IntVectorProperty if setting.kind is int else props.FloatVectorProperty
-            zeros = (0,) * setting.sizes[0]  # type: ignore[index]
-            properties[name] = vector(size=len(zeros), default=zeros, **common)
+            result[name] = vector(size=setting.sizes[0], default=(0,) * setting.sizes[0], **common)  # type: ignore[index]
         else:
             make: Callable[..., Any] = props.IntProperty if setting.kind is int else props.FloatProperty
             default = setting.default[0] if isinstance(setting.default, tuple) else setting.default or 0
-            properties[name] = make(default=default, **common)
+            result[name] = make(default=default, **common)
         if modules_name := modules_property(name, setting):
             or_file = f", or a file with an image for each ({', '.join(setting.endings)})" if setting.endings else ""
             as_file = {"subtype": "FILE_PATH", "options": {"PATH_SUPPORTS_BLEND_RELATIVE"}} if setting.endings else {}
-            properties[modules_name] = props.StringProperty(
+            result[modules_name] = props.StringProperty(
                 **as_file,
                 name=f"Each {setting.label.partition(' (')[0]}",
                 description=f"A number for each module that is projected, such as 10, 20, 30{or_file}. Empty: one for all",
             )
-    return properties
+    return result
 
 
 def make_check_marks(settings: Settings) -> dict[str, Any]:
@@ -95,10 +94,10 @@ def make_check_marks(settings: Settings) -> dict[str, Any]:
     marks = {}
     for name, setting in settings.items():
         if setting.kind in (int, float) and setting.default is None and not is_list(setting):
-            first: Any = setting.kind((setting.slider or 10) / 10)
-            if _is_vector(setting):
-                first = tuple(first * (k + 1) for k in range(setting.sizes[0]))  # type: ignore[index]
-            marks[layouts.unset_name(name)] = check_mark(name, setting.unset, setting.absent, first)
+            first = setting.kind((setting.slider or 10) / 10)
+            size = setting.sizes[0] if _is_vector(setting) else 0  # type: ignore[index]
+            value = tuple(first * (k + 1) for k in range(size)) or first
+            marks[layouts.unset_name(name)] = check_mark(name, setting.unset, setting.absent, value)
     return marks
 
 

@@ -26,9 +26,7 @@ from . import ids
 _OUR_VOLUME = re.compile(r"[a-z]+-[0-9a-f]{16}(\.preview)?(_\d{4})?\.(vdb|h5)")
 """Names of the files that `stored_volumes` writes, made from their content."""
 _OUR_RUN = re.compile(r".*-projections-[0-9a-f]{8}\.h5")  # names of run files
-_ENDING = re.compile(
-    r"\.[A-Za-z]\w*$"
-)  # a file's ending; neither a folder's name nor a number typed for a file has one
+_ENDING = re.compile(r"\.[A-Za-z]\w*$")  # a file's ending; a folder, or a number typed in place of a file, has none
 _FRAME = re.compile(r"_\d{4}\.vdb$")  # the frame number at the end of the names of a sequence's files
 
 _SIZE_LIFETIME = 2.0  # s for which a file's size, once read, is shown
@@ -172,7 +170,7 @@ def remove_unused() -> str:
 
 def summarize_unused(files: list[Path]) -> str:
     """Return the number and size of unused files in words."""
-    return f"{_count_and_size({path: path.stat().st_size for path in files})} of voxels or runs that nothing needs"
+    return f"{_amount({path: path.stat().st_size for path in files})} of voxels or runs that nothing needs"
 
 
 def state_files(data: bpy.types.Volume) -> list[Path]:
@@ -228,20 +226,18 @@ class _GatheredFiles:
     @property
     def text(self) -> str:
         """The copied, shared and missing files in a line; "" for none."""
-        target, owners = (
-            ", ".join(sorted({path.parent.name for path in sizes})) for sizes in (self.copied, self.shared)
-        )
+        target, owners = (", ".join(sorted({path.parent.name for path in x})) for x in (self.copied, self.shared))
         amounts = {
-            f"copied {_count_and_size(self.copied)} into {target}": self.copied,
-            f"shares {_count_and_size(self.shared)} with {owners}": self.shared,
-            f"{_count_and_size(self.outside)} elsewhere: Collect Files copies them": self.outside,
+            f"copied {_amount(self.copied)} into {target}": self.copied,
+            f"shares {_amount(self.shared)} with {owners}": self.shared,
+            f"{_amount(self.outside)} elsewhere: Collect Files copies them": self.outside,
         }
         return "; ".join(
             filter(None, [*(text for text, files in amounts.items() if files), self.absent, *self.problems])
         )
 
 
-def _count_and_size(files: dict[Path, int]) -> str:
+def _amount(files: dict[Path, int]) -> str:
     """Return the number of files and their total size in words."""
     return f"{len(files)} file{'s' * (len(files) > 1)} ({readable_size(sum(files.values()))})"
 
@@ -295,8 +291,7 @@ def collect_files() -> str:
     for text in (*notes, *filter(None, [gathered.absent, *gathered.problems])):
         warn(text)
     names = several(sorted(path.name for path in gathered.copied), 6)
-    amount = _count_and_size(gathered.copied)
-    return f"Copied {amount} into {_folder()}: {names}. Save the .blend" if names else "All are there"
+    return f"Copied {_amount(gathered.copied)} into {_folder()}: {names}. Save the .blend" if names else "All are there"
 
 
 def before_save(filepath: str, _: Any = None) -> None:

@@ -68,7 +68,7 @@ class _Ramp(Display):
     ramp: volume_materials.Ramp = ()
 
     def colored(self, values: ArrayLike, window: tuple[float, float] | None = None) -> NDArray[np.uint8]:
-        table = np.rint(255 * slices.colors("", self.ramp)[:, :3]).astype(np.uint8)
+        table = np.rint(255 * slices.color_table("", self.ramp)[:, :3]).astype(np.uint8)
         return table[np.rint(255 * self.shares(values, window or self.window(values))).astype(int)]
 
 
@@ -200,9 +200,9 @@ def _prepared(stage: Stage, how: How) -> Generator[None, None, None]:
     if volume is None:
         warn(f"the picture shows nothing of {item.name!r}{_UNSEEN}")
         return
-    settings, factor = item.mphdrr_volume, volume_materials.shown_unit(item.mphdrr_volume.quantity)[1]
+    settings, factor = item.mphdrr_volume, volume_materials.display_unit(item.mphdrr_volume.quantity)[1]
     level = min((settings.display_low + settings.display_high) / factor, float(volume.array.max())) / 2
-    stage.draw_surface(volume_to_mesh(volume, level), volume_materials.ramp_of(item, smoke=True))
+    stage.draw_surface(volume_to_mesh(volume, level), volume_materials.item_ramp(item, smoke=True))
     warn(f"the picture shows {item.name!r} as the surface at {level * factor:.3g} {settings.unit}: {_UNDRAWN}")
 
 
@@ -231,7 +231,7 @@ def _label(stage: Stage, page: Page) -> None:
     if stage.item is not None and [part.type for part in stage.drawn] == ["VOLUME"]:
         settings = stage.item.mphdrr_volume
         window = settings.display_low, settings.display_high
-        ramp = _Ramp(ramp=volume_materials.ramp_of(stage.item, smoke=True))
+        ramp = _Ramp(ramp=volume_materials.item_ramp(stage.item, smoke=True))
         left, tall = page.width - round(em) - bar_width(page, ramp, window, settings.unit), round(11 * em)
         page.area(box(left - em, page.height - tall - 4.2 * em, page.width, tall + 4.2 * em), page.paper, _VEIL)
         color_bar(page, ramp, window, settings.unit, left, page.height - tall - round(1.4 * em), tall)

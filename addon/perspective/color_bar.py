@@ -31,7 +31,7 @@ def marks(item: bpy.types.Object) -> tuple[str, list[str]]:
 
 def _shown(context: bpy.types.Context) -> bpy.types.Object | None:
     """The volume whose bar is drawn: the active one, or another with slices that are seen, or of a frustum that is."""
-    for item in (slices.sliced(context), *volumes.volume_objects(context.scene)):
+    for item in (slices.active_sliced_volume(context), *volumes.volume_objects(context.scene)):
         if item is not None and any(plane.visible_get() for plane in slices.planes_of(item)):
             return item
     return next(iter(frustums.seen_volumes(context.scene)), None)
@@ -44,7 +44,7 @@ def draw() -> None:
     if item is None:
         return
     left, bottom, width, height = place()
-    colors = slices.colors(item.mphdrr_volume.quantity, volume_materials.ramp_of(item))
+    colors = slices.color_table(item.mphdrr_volume.quantity, volume_materials.item_ramp(item))
     colors[:, 3] = 1.0
     up = bottom + height * np.linspace(0.0, 1.0, len(colors))
     corners = np.stack([np.column_stack([np.full(len(up), x), up]) for x in (left, left + width)], axis=1)

@@ -108,7 +108,7 @@ def resampling(context: bpy.types.Context, cells: int, uniform: str) -> jobs.Job
         return f"Added {item.name!r}: {volumes.values_text(stored)}"
 
     name, pose = f"{asked.name} through {asked.module}", volumes.pose_of_object(context.object)
-    return volumes.adding(name, make, name, finish, pose, provenance, context.object.users_collection[0])
+    return volumes.add_volume_job(name, make, name, finish, pose, provenance, context.object.users_collection[0])
 
 
 def _followed(
@@ -139,7 +139,7 @@ def on_voxels(array: NDArray[np.float32], g: PerspectiveGrid, like: Volume, prog
 def colored(values: NDArray[np.float32], quantity: str, low: float, high: float) -> NDArray[np.uint8]:
     """Colours (…, 4) of values, those of slices; the lower a value in the display range, the more transparent."""
     relative = np.clip((values - low) / max(high - low, 1e-30), 0.0, 1.0)
-    colors = np.rint(255 * slices.colors(quantity)[:, :3]).astype(np.uint8)
+    colors = np.rint(255 * slices.color_table(quantity)[:, :3]).astype(np.uint8)
     shown = np.empty((*values.shape, 4), np.uint8)
     shown[..., :3] = colors[np.rint(relative * (len(colors) - 1)).astype(np.intp)]
     shown[..., 3] = np.rint(255 * relative**_OPACITY_POWER)
@@ -233,7 +233,7 @@ def _views(scene: bpy.types.Scene, camera: bpy.types.Object) -> Views:
 
 def _state(scene: bpy.types.Scene, item: bpy.types.Object, camera: bpy.types.Object) -> dict[str, Any]:
     """What a frustum shows, as JSON holds it."""
-    path, pose = volumes.source(item)
+    path, pose = volumes.file_and_pose(item)
     views = _views(scene, camera)
     arrays = views.sources, views.detector_centers, views.u_steps, views.v_steps
     return {
@@ -249,7 +249,7 @@ def _shown_range(item: bpy.types.Object) -> tuple[float, float]:
 
 def _display_range(item: bpy.types.Object) -> tuple[float, float]:
     """The values, in the voxels' own unit, that have the first and the last colour."""
-    factor = volume_materials.shown_unit(volumes.quantity_of(item))[1]
+    factor = volume_materials.display_unit(volumes.quantity_of(item))[1]
     low, high = _shown_range(item)
     return low / factor, high / factor
 

@@ -23,7 +23,7 @@ from ...core.progress import Progress, part_of, stages_of
 from ..blender import jobs, objects, storage
 from ..blender.reports import Need
 from ..volumes import meshes, vdb, volumes
-from ..volumes.stored_volumes import StoredVolume, moved, store_volume
+from ..volumes.stored_volumes import StoredVolume, move_grid, store_volume
 from .phantom_properties import FILE, PhantomSettings
 
 _OUTLINE = "mphdrr_outline"  # custom property of an outline's object
@@ -78,7 +78,7 @@ class Recipe:
             else:
                 place, settings = pose, self.settings
                 own = [phantom.voxelize(self.grid, None, next(reports), quantity) for phantom in self.states]
-                made = [moved(volume, pose) for volume in own]
+                made = [move_grid(volume, pose) for volume in own]
             stages("writing the voxels")
             stored.append(store_volume(made, folder, place, settings))
         return stored
@@ -220,7 +220,7 @@ def mu_energy(item: bpy.types.Object) -> float | None:
     if (root := root_of(item)) is not None:
         return recipe_of(settings_of(root)).phantom.mu_energy
     path = volumes.file_of(item)
-    energy = vdb.provenance_of(path).get("energy_keV") if path.is_file() else None
+    energy = vdb.read_provenance(path).get("energy_keV") if path.is_file() else None
     return None if energy is None else float(energy)
 
 

@@ -202,7 +202,7 @@ class _Shelf:
             self._item = item.session_uid
         else:
             volumes.replace_stored(item, shown.stored)
-        factor = volume_materials.shown_unit(item.mphdrr_volume.quantity)[1]
+        factor = volume_materials.display_unit(item.mphdrr_volume.quantity)[1]
         bright = factor * bright_value(shown.stored.volume.array)
         if bright > 0:  # the hottest voxel does not say how bright the others are
             item.mphdrr_volume.display_high = bright

@@ -102,9 +102,15 @@ def request(context: bpy.types.Context) -> Request:
     shown = scene.mphdrr_display
     distance = float(recipe_views(recipe, system).fields(system.poses())[0, 2])
     share = None if shown.planes == "NONE" else planes.share_of_way(shown, module, distance)
-    mu = None if mu_item is None else volumes.source(mu_item)
+    mu = None if mu_item is None else volumes.file_and_pose(mu_item)
     return Request(
-        rendering.with_energy(recipe, item), system, volumes.source(item), mu, shown.display(), share, tuple(lines)
+        rendering.with_energy(recipe, item),
+        system,
+        volumes.file_and_pose(item),
+        mu,
+        shown.display(),
+        share,
+        tuple(lines),
     )
 
 
@@ -120,7 +126,7 @@ def make(asked: Request, quick: bool, voxels: dict[Path, Volume]) -> Preview:
     for path, _ in sources:
         if path not in voxels:
             voxels[path] = vdb.read_vdb(path)
-    volume, *mu = (stored_volumes.moved(voxels[path], pose) for path, pose in sources)
+    volume, *mu = (stored_volumes.move_grid(voxels[path], pose) for path, pose in sources)
     run, *_ = run_recipe(quick_recipe(recipe) if quick else recipe, system, volume, mu[0] if mu else None)
     shown = run.projections
     if run.unit == "counts" and quick:  # shown per pixel of the panel's size, as the full picture and the runs are

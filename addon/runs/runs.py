@@ -242,7 +242,7 @@ def _look() -> None:
 def _volume_state(item: bpy.types.Object) -> dict[str, Any]:
     state = volumes.state_text(item) if item.data.is_sequence else ""
     pose = volumes.pose_of_object(item).tolist()
-    return {"name": item.name, "content": volumes.content_of(item), "state": state, "pose": pose}
+    return {"name": item.name, "content": volumes.content_key(item), "state": state, "pose": pose}
 
 
 def panel_recipe(scene: bpy.types.Scene, collection: bpy.types.Collection | None = None) -> Recipe:
@@ -356,7 +356,7 @@ def _found(scene: bpy.types.Scene, old: Mapping[str, Any] | None) -> bpy.types.O
         return None
     known = volumes.volume_objects(scene)
     by_name = [item for item in known if item.name == old["name"]]
-    return next(iter(by_name or [item for item in known if volumes.content_of(item) == old["content"]]), None)
+    return next(iter(by_name or [item for item in known if volumes.content_key(item) == old["content"]]), None)
 
 
 def _of_volume(

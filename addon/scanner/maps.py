@@ -57,7 +57,7 @@ def mapping(
             item = volumes.add_stored(stored, name, scene.collection)
             volume_materials.show_in_eevee(scene)
         item.mphdrr_volume.recipe, item.mphdrr_volume.scanner = recipe, collection
-        unit, factor = volume_materials.shown_unit(quantity)
+        unit, factor = volume_materials.display_unit(quantity)
         values, high = stored.volume.array, stored.high
         low, high = factor * float(values[values > 0].min(initial=high)), factor * high
         item.mphdrr_volume.display_low, item.mphdrr_volume.display_high = low if low < high else 0.0, high

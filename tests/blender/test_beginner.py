@@ -312,7 +312,7 @@ def test_the_numbers_of_the_only_volume_are_shown_whatever_is_selected(scene, ri
     bpy.ops.mphdrr.add_points(voxels=8)
     item = bpy.context.object
     bpy.context.view_layer.objects.active = camera
-    assert volumes.meant(bpy.context) == item
+    assert volumes.panel_volume(bpy.context) == item
     assert {"MPHDRR_PT_look", "MPHDRR_PT_phantom_settings"} <= drawn(is_open=True).keys()
     with bpy.context.temp_override(object=item):  # as the panel's buttons have it
         bpy.ops.mphdrr.add_slices()

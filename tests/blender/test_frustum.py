@@ -114,7 +114,7 @@ def test_what_is_low_is_transparent_and_colours_are_those_of_slices():
     values = np.array([-1.0, 0.0, 0.5, 1.0, 3.0], np.float32)
     found = frustums.colored(values, "activity", 0.0, 1.0)
     assert found[:, 3].tolist() == [0, 0, 180, 255, 255]
-    np.testing.assert_array_equal(found[3, :3], np.rint(255 * slices.colors("activity")[-1, :3]))
+    np.testing.assert_array_equal(found[3, :3], np.rint(255 * slices.color_table("activity")[-1, :3]))
 
 
 def test_ct_numbers_are_air_outside_their_grid(ring_system):

@@ -84,7 +84,7 @@ def updating(tmp_path):
 
 def importing(tmp_path):
     write_volume(Volume(np.ones((3, 4, 5)), Grid.centered((3, 4, 5), 2.0), "hu"), tmp_path / "ct.nii")
-    return volume_import.importing([tmp_path / "ct.nii"])
+    return volume_import.import_job([tmp_path / "ct.nii"])
 
 
 def mapping(tmp_path):

@@ -132,12 +132,12 @@ def test_a_setting_that_changes_while_an_update_is_made(item, window, monkeypatc
 def test_panels_look_at_the_disk_now_and_then(item, monkeypatch):
     monkeypatch.setattr(storage, "_SIZE_LIFETIME", 1e9)
     path = volumes.file_of(item)
-    assert "KiB" in volumes.file_state(item) and storage.missing_volumes() == []
+    assert "KiB" in volumes.file_note(item) and storage.missing_volumes() == []
     content = path.read_bytes()
     path.unlink()
-    assert "KiB" in volumes.file_state(item) and storage.missing_volumes() == []
+    assert "KiB" in volumes.file_note(item) and storage.missing_volumes() == []
     storage._cached_size.cache_clear()
-    assert volumes.file_state(item) == "missing" and storage.missing_volumes() == [item.data]
+    assert volumes.file_note(item) == "missing" and storage.missing_volumes() == [item.data]
     path.write_bytes(content)
     storage._cached_size.cache_clear()
-    assert "KiB" in volumes.file_state(item)
+    assert "KiB" in volumes.file_note(item)

@@ -45,7 +45,7 @@ def example_job(context: bpy.types.Context, of_xrays: bool = False, replace: boo
     # Of activity beside the modules' field of view, which few of them see, the voxels at its edge would shine.
     without = dict.fromkeys(("liver", "lung", "body"), 0.0) if of_xrays else {}
     settings = phantom_properties.plain_settings(kind, voxels=_VOXELS, **without)
-    adding = phantoms.adding(settings, name, pose, attenuation=of_xrays)
+    adding = phantoms.add_phantom_job(settings, name, pose, attenuation=of_xrays)
     given: dict[str, Any] = {"system.file": str(EXAMPLE), "detector.rows": _PIXELS, "detector.columns": _PIXELS}
     if of_xrays:
         given = {"model.kind": "spectral", "volume.energy": settings.phantom().mu_energy, "noise.seed": 1}

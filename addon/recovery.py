@@ -17,7 +17,7 @@ def missing(scene: bpy.types.Scene) -> tuple[list[bpy.types.Object], list[bpy.ty
     """A scene's volumes whose files are missing: phantoms and maps, which can be made again, and the others."""
     gone = set(storage.missing_volumes())
     found = [item for item in volumes.volume_objects(scene) if item.data in gone]
-    phantom = {item: phantoms.root_of(item) for item in found}
+    phantom = {item: phantoms.owning_phantom(item) for item in found}
     known = [item for item in found if phantom[item] is not None or maps.can_be_made_again(scene, item)]
     again = dict.fromkeys(phantom[item] or item for item in known)
     return list(again), [item for item in found if item not in known]
@@ -29,7 +29,9 @@ def remaking(scene: bpy.types.Scene) -> jobs.Job:
     made: list[tuple[str, jobs.Job]] = []
     for item in again:
         try:
-            job = phantoms.updating(item) if phantoms.settings_of(item) is not None else maps.again(scene, item)
+            job = (
+                phantoms.update_phantom_job(item) if phantoms.settings_of(item) is not None else maps.again(scene, item)
+            )
             made.append((item.name, job))
         except InputError as error:
             warn(f"{item.name}: {error}")

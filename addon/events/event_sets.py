@@ -233,7 +233,7 @@ def _phantom_of(planned: events.PlannedEvent, target: _Target, files: Path, prog
     voxels = target.voxels or min(_VOXELS, *recipe.grid.shape)
     settings = phantom_properties.plain_settings(entry.kind.name, **values, quantity=recipe.quantity, voxels=voxels)
     quantities = [recipe.quantity, *target.others]
-    made = phantoms.recipe_of(settings).voxelize(quantities, [placement] * len(quantities), files, progress)
+    made = phantoms.copy_settings(settings).voxelize(quantities, [placement] * len(quantities), files, progress)
     return _Phantom(made, settings, placement)
 
 
@@ -253,9 +253,9 @@ def _put(scene: bpy.types.Scene, phantom: _Phantom, target: _Target) -> bpy.type
         phantoms.remove_outline(item)
         item.mphdrr_volume.kind = "VOLUME"
         return item
-    phantoms.take_settings(item, phantom.settings.identifier, phantom.settings.values())
+    phantoms.store_settings(item, phantom.settings.identifier, phantom.settings.values())
     item.matrix_world = Matrix(phantom.placement)
-    phantoms.replace(item, phantom.stored[: len(phantoms.with_children(item))])
+    phantoms.replace_voxels(item, phantom.stored[: len(phantoms.with_children(item))])
     return item
 
 

@@ -95,7 +95,7 @@ def request(context: bpy.types.Context) -> Request:
     if isinstance(system, PinholeSystem):
         lines.append(f"At the isocentre {module.sensitivity:.2f} cps/MBq, {module.resolution:.2f} mm FWHM")
     for one in chosen:
-        if (phantom := phantoms.outdated(one)) is not None:
+        if (phantom := phantoms.outdated_phantom(one)) is not None:
             lines.append(f"{phantom.name} as it was last built: Update Phantom shows the new one")
     if not module.aimed:
         lines.append("Not aimed at the isocentre")

@@ -325,7 +325,7 @@ def _with_volume(recipe: Recipe, item: bpy.types.Object) -> Recipe:
 
 def of_phantom(recipe: Recipe, settings: phantoms.PhantomSettings, pose: NDArray[np.float64], state: int = 0) -> Recipe:
     """The recipe with the phantom of these settings, at a world-from-phantom pose (4, 4), mm, in a state, from 0."""
-    made = phantoms.recipe_of(settings)
+    made = phantoms.copy_settings(settings)
     values: dict[str, Any] = {
         "phantom.voxels": made.grid.shape, "phantom.spacing": made.grid.spacing.tolist(), "phantom.turn_grid": True,
     }  # fmt: skip

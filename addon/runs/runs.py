@@ -377,7 +377,7 @@ def _of_volume(
     if now["name"] != old["name"] and not same_voxels:
         yield f"{what or 'volume '}{old['name']}, now {now['name']}"
         return
-    phantom = phantoms.root_of(item)
+    phantom = phantoms.owning_phantom(item)
     kind = what + ("volume" if phantom is None else "phantom")
     if not same_voxels or (phantom is not None and phantom.mphdrr_volume.outdated):
         yield f"{kind} {item.name} changed"

@@ -81,6 +81,9 @@ def import_job(
     return volumes.add_volume_job(label, make, name, finish, provenance=provenance, collection=collection)
 
 
+importing = import_job  # the name in version 0.2.0, for scripts
+
+
 def name_without_ending(path: Path) -> str:
     """Return a file's name without the ending by which it is read."""
     endings = sorted(READ_ENDINGS, key=len, reverse=True)

@@ -96,7 +96,7 @@ def test_the_phantom_in_the_scene_becomes_that_of_the_event(recipe, scene, mirro
     planned = first_of(recipe, "derenzo", mirrored)
     assert bpy.ops.mphdrr.try_event(number=planned.number) == {"FINISHED"}
     item = only_phantom()
-    made = phantoms.recipe_of(phantoms.settings_of(item)).phantom
+    made = phantoms.copy_settings(phantoms.settings_of(item)).phantom
     assert made.altered == planned.phantom.altered == -2
     assert made.radius == pytest.approx(planned.phantom.radius, rel=1e-6)
     np.testing.assert_allclose(made.rod_diameters, planned.phantom.rod_diameters, rtol=1e-6)

@@ -157,7 +157,7 @@ def test_a_phantom_that_has_changed_is_previewed_as_it_was_built(scanned, scene)
     phantom = bpy.data.objects["Derenzo"]
     before = shown()
     phantom.mphdrr_volume.outdated = True
-    assert phantoms.outdated(phantom) == phantom
+    assert phantoms.outdated_phantom(phantom) == phantom
     after = shown()
     np.testing.assert_array_equal(before.run.projections, after.run.projections)
     assert "Derenzo as it was last built" in " ".join(after.lines) and "last built" not in " ".join(before.lines)

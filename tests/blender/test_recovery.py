@@ -22,7 +22,7 @@ TANK = {"rod_diameters": (0,) * 6, "sphere_diameters": (30, 0, 0, 0, 0, 0)}  # l
 def crashed(scene, small_workbook, tmp_path, capsys):
     """A scene with volumes of every origin, opened again after their files have gone; returns their voxels by name."""
     bpy.ops.mphdrr.import_geometry(filepath=str(small_workbook))
-    job = phantoms.adding(phantom_properties.plain_settings("jaszczak", voxels=24, **TANK), "Tank", None, True)
+    job = phantoms.add_phantom_job(phantom_properties.plain_settings("jaszczak", voxels=24, **TANK), "Tank", None, True)
     jobs.run(job)
     bpy.data.objects["Tank"].location = (3.0, 4.0, 5.0)
     bpy.ops.mphdrr.add_map(quantity="modules", voxels=6, side=90, within_roi=False)

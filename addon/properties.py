@@ -212,12 +212,12 @@ _OWN = {cls: dict(cls.__annotations__) for cls in (ModuleProperties, ScannerProp
 
 def add_columns() -> None:
     """Give modules and scanners the properties of the typed columns that there are now, before they are registered."""
-    known = columns.known_columns()
+    known = columns.all_columns()
     for cls, edited, suffix in (
         (ModuleProperties, lambda name: on_edit("length" if callable(known[name].blank) else "module"), ""),
         (ScannerProperties, lambda name: on_edit("all_modules", name), ". Changing it sets all modules"),
     ):
-        cls.__annotations__ = columns.declared(edited, suffix) | _OWN[cls]
+        cls.__annotations__ = columns.make_properties(edited, suffix) | _OWN[cls]
 
 
 # Every property group; a group comes after those that it points to.

@@ -30,7 +30,9 @@ def remaking(scene: bpy.types.Scene) -> jobs.Job:
     for item in again:
         try:
             job = (
-                phantoms.update_phantom_job(item) if phantoms.settings_of(item) is not None else maps.again(scene, item)
+                phantoms.update_phantom_job(item)
+                if phantoms.settings_of(item) is not None
+                else maps.remake_map_job(scene, item)
             )
             made.append((item.name, job))
         except InputError as error:

@@ -156,7 +156,7 @@ def _modules_removed(scene: bpy.types.Scene, modules: list[bpy.types.Object]) ->
 # What edited properties and rooms below call (`addon/blender/updates.py`).
 UPDATES: dict[str, Callable[..., None]] = {
     "module": following.refresh_module,
-    "length": following.length_typed,
+    "length": following.keep_typed_length,
     "visible": scanner.set_visible,
     "scanner": following.refresh,
     "all_modules": following.set_for_all,

@@ -26,7 +26,7 @@ class MPHDRR_PT_design(ScannerPanel, bpy.types.Panel):
             box = layout.box().column(align=True)
             box.label(text=properties.untidy.capitalize(), icon="ERROR")
             box.operator("mphdrr.tidy_modules", icon="BRUSH_DATA")
-        edited = sum(not following.shows_its_field(camera) for camera in scanner.modules(collection))
+        edited = sum(not following.has_field_of_view(camera) for camera in scanner.modules(collection))
         if edited:
             box = layout.box().column(align=True)
             draw_text(
@@ -104,7 +104,7 @@ def _draw_pinholes(layout: bpy.types.UILayout, column: bpy.types.UILayout, prope
     )
 
 
-def _draw_module(layout: bpy.types.UILayout, camera: bpy.types.Object, kind: module_values.Kind) -> None:
+def _draw_module(layout: bpy.types.UILayout, camera: bpy.types.Object, kind: module_values.ScannerType) -> None:
     module = camera.mphdrr_module
     _draw_values(layout, module, kind, mixed=())
     for text in (module.problem, module.finding):
@@ -124,10 +124,10 @@ def _draw_module(layout: bpy.types.UILayout, camera: bpy.types.Object, kind: mod
 
 
 def _draw_values(
-    layout: bpy.types.UILayout, values: bpy.types.PropertyGroup, kind: module_values.Kind, mixed: Sequence[str]
+    layout: bpy.types.UILayout, values: bpy.types.PropertyGroup, kind: module_values.ScannerType, mixed: Sequence[str]
 ) -> bpy.types.UILayout:
     """Draw the values of a module's columns, those by formula last; "mixed" stands beside those that differ."""
-    column, last = layouts.labelled(layout.column(align=True)), module_values.designed(kind)
+    column, last = layouts.labelled(layout.column(align=True)), module_values.formula_columns(kind)
     for one in kind.columns.scalars.values():
         if one not in last:
             column.prop(values, one.field, text=_label(one, mixed))

@@ -32,7 +32,7 @@ class MPHDRR_PT_projections(Folded, bpy.types.Panel):
         column.prop(settings, "volume", placeholder="Active volume")
         layouts.draw_settings(column, settings, (each for each in drawn(settings, "model") if each[0] in _MAIN))
         collection = scanner.active_scanner(context.scene)
-        own = collection and scanner.own_pixels(collection)
+        own = collection and scanner.fixed_pixels(collection)
         split = column.split(factor=0.4)
         name = split.row()
         name.alignment = "RIGHT"  # as the settings' names

@@ -101,7 +101,7 @@ def _place(plane: bpy.types.Object, settings: bpy.types.PropertyGroup, part: tup
     # A picture's longer side is as long as the empty; pixels that are not square are stretched.
     columns, rows = plane.data.size
     plane.empty_display_size = max(columns, rows)
-    grabbing.place(plane, Matrix.LocRotScale((x, y, -depth), None, (width / columns, height / rows, 1.0)))
+    grabbing.set_home(plane, Matrix.LocRotScale((x, y, -depth), None, (width / columns, height / rows, 1.0)))
     _place_background(plane, part[0])
 
 

@@ -40,7 +40,7 @@ def calibrating(context: bpy.types.Context, path: Path, apply: bool = True, exag
             raise InputError("the scanner that was calibrated is gone")
         _require_same(collection, found)
         if apply:
-            module_edits.move_to(collection, found.system)
+            module_edits.move_modules(collection, found.system)
         factor = arrows.show(collection, found.nominal.centers, found.system.centers, exaggeration)
         lines = [*found.summary(), *([f"arrows: {factor:g} times the shift"] if factor else [])]
         collection.mphdrr_scanner.calibration = json.dumps(lines)

@@ -78,7 +78,7 @@ def settings_recipe(
     first, last = get("first"), get("last")
     modules = f"{first or ''}-{last or ''}" if first or last else None
     values = {**recipe_values(get), **more, "system.modules": modules}
-    if own := collection and scanner.own_pixels(collection):
+    if own := collection and scanner.fixed_pixels(collection):
         pixels = {"height": own[0], "width": own[1]}
         of_images = [name for name, setting in PROPERTIES.items() if setting.key.startswith("detector.")]
         values |= {PROPERTIES[name].key: pixels.get(name) for name in of_images if not is_given(name)}

@@ -288,14 +288,14 @@ def _of_modules(
     kind, found = module_values.kind_of(collection), scanner.modules(collection)
     count, modes = len(found), {str(o.mphdrr_module.number): o.mphdrr_module.length_mode for o in found}
     now: dict[str, dict[str, Any]] = {}
-    places = module_values.placed(kind, found, objects.world_matrices(found))
-    for _, system in module_values.readings(kind, found, places):
+    places = module_values.read_placement(kind, found, objects.world_matrices(found))
+    for _, system in module_values.read_in_groups(kind, found, places):
         if isinstance(system, InputError):
             yield str(system), None
         else:
             now |= _values_of(system)
     changed: dict[str, dict[int, tuple[Any, Any]]] = {}  # by column, then by module
-    follow = {column.name for column in module_values.designed(kind)}
+    follow = {column.name for column in module_values.formula_columns(kind)}
     for number in old["modules"].keys() & now.keys():
         pairs = _changed(old["modules"][number], now[number])
         if modes[number] == module_values.FROM_ROI and len(pairs) > 1:

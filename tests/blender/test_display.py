@@ -198,7 +198,7 @@ def test_planes_of_the_active_module_its_ring_or_all_that_are_visible(projected,
 def test_planes_go_with_their_modules(projected, scene):
     projected()
     collection = scanner.active_scanner(scene)
-    module_edits.remove(collection, [scanner.module(collection, 1)])
+    module_edits.remove_modules(collection, [scanner.module(collection, 1)])
     assert [plane.mphdrr_module.number for plane in planes.planes(scene)] == [2, 3, 4, 5, 6, 7, 8]
     assert ids.picture_name(images.projection_name(1, range(8))) in bpy.data.images, "the run's pictures stay"
     bpy.data.objects.remove(scanner.module(collection, 5))  # as X does

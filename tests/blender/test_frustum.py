@@ -210,7 +210,7 @@ def test_it_is_hidden_and_removed_with_its_module(shown, scene):
     bpy.context.view_layer.update()
     assert not frustum.hide_viewport and not any(layer.hide_viewport for layer in frustum.children)
     camera = frustum.parent
-    module_edits.remove(scanner.active_scanner(scene), [camera])
+    module_edits.remove_modules(scanner.active_scanner(scene), [camera])
     assert frustums.frustums(scene) == [] and names()[2] == before[2]
     choose(4)
     bpy.ops.mphdrr.show_in_perspective(planes=2)

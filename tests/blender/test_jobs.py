@@ -90,11 +90,11 @@ def importing(tmp_path):
 
 
 def mapping(tmp_path):
-    return maps.mapping(bpy.context.scene, "modules", 8)
+    return maps.map_job(bpy.context.scene, "modules", 8)
 
 
 def exporting(tmp_path):
-    return scanner_files.exporting_scanner(scanner.active_scanner(bpy.context.scene), tmp_path / "own.xlsx")
+    return scanner_files.export_workbook_job(scanner.active_scanner(bpy.context.scene), tmp_path / "own.xlsx")
 
 
 def loading(tmp_path):

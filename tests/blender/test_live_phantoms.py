@@ -121,7 +121,7 @@ def test_a_setting_that_changes_while_an_update_is_made(item, window, monkeypatc
 
         return working
 
-    monkeypatch.setattr(phantoms, "remaking", edited_meanwhile)
+    monkeypatch.setattr(phantoms, "make_voxelizer", edited_meanwhile)
     assert bpy.ops.mphdrr.update_phantom() == {"FINISHED"}
     assert item.mphdrr_volume.outdated and is_waiting()
     monkeypatch.undo()

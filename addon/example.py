@@ -64,7 +64,7 @@ def example_job(context: bpy.types.Context, of_xrays: bool = False, replace: boo
         scene = jobs.require_scene(scene_uid, "the projections are")
         if of_xrays:
             scene.mphdrr_display.colors, scene.mphdrr_display.scale = "GREY", "LOG"
-        mosaic = yield from images.storing(run, made)
+        mosaic = yield from images.store_images(run, made)
         collection = scanner.build_scanner(scene, pinholes, replace=replace)
         yield None
         if of_xrays:

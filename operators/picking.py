@@ -53,7 +53,7 @@ class MPHDRR_OT_pick_pixel(eyedropper.Eyedropper, reports.Reported, bpy.types.Op
         area, region, place = found
         if area.type == "IMAGE_EDITOR":
             at = tiles.picture_at(area.spaces.active.image, *region.view2d.region_to_view(*place))
-            return None if at is None else (at[0].number, *at[0].pixel(at[1], run.views.shape))
+            return None if at is None else (at[0].number, *at[0].pixel_at(at[1], run.views.shape))
         if area.type != "VIEW_3D":
             return None
         origin, direction = (
@@ -149,7 +149,7 @@ class MPHDRR_OT_pick_module(bpy.types.Operator):
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         try:
-            picked = tiles.pick(context, event.mouse_region_x, event.mouse_region_y)
+            picked = tiles.pick_module(context, event.mouse_region_x, event.mouse_region_y)
         except InputError as error:
             self.report({"WARNING"}, reports.in_window(error))
             return {"CANCELLED"}

@@ -166,7 +166,7 @@ def opening(context: bpy.types.Context, folder: str, number: int, model: str = "
     def finish(opened: _Opened) -> jobs.Finishing:
         run, mosaic = opened.run, None
         if run is not None and opened.pictures is not None:
-            mosaic = yield from images.storing(run, opened.pictures)
+            mosaic = yield from images.store_images(run, opened.pictures)
         scene = jobs.require_scene(uid, "the event is")
         settings = scene.mphdrr_events
         collection = scanner.active_scanner(scene)

@@ -86,12 +86,12 @@ def run_views(scene: bpy.types.Scene) -> RunViews | None:
     """Those of the run that is shown; None where the scene has none, or its file kept no views."""
     mosaic = bpy.data.images.get(ids.MOSAIC)
     shown = images.tiles(mosaic)
-    if mosaic is None or shown is None or not images.is_of(scene):
+    if mosaic is None or shown is None or not images.belong_to(scene):
         return None
     uid = mosaic.session_uid
     if uid not in _runs:
         _runs.clear()
-        found = images.views_of(mosaic)
+        found = images.mosaic_views(mosaic)
         if found is None:
             return None
         views, roi_radius = found
@@ -106,7 +106,7 @@ def required_views(scene: bpy.types.Scene) -> RunViews:
     run = run_views(scene)
     if run is not None:
         return run
-    if not images.is_of(scene):
+    if not images.belong_to(scene):
         raise InputError("the projections are of another scene: render this one's first")
     raise InputError(
         "the shown run was kept by an earlier version, without its views: show it anew, or render it again"

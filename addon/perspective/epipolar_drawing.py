@@ -33,7 +33,9 @@ def draw_over_pictures() -> None:
     """Draw what the pictures' modules see; Blender calls this for every Image Editor."""
     context = bpy.context
     image, (found, _) = context.space_data.image, epipolar.shown(context.scene)
-    shown = [each for each in tiles.pictures(image) if each.number in found.run.numbers] if found is not None else []
+    shown = (
+        [each for each in tiles.shown_pictures(image) if each.number in found.run.numbers] if found is not None else []
+    )
     if found is None or not shown:
         return
     index = np.array([found.run.index(picture.number) for picture in shown])
@@ -45,7 +47,7 @@ def draw_over_pictures() -> None:
 
     def placed(pixels: Floats) -> Floats:
         """Places (P, …, 2) in the region of pixels (M, …, 2) of the modules whose pictures these are."""
-        within = shown[0].places(pixels[index], found.run.views.shape) - shown[0].corner
+        within = shown[0].image_positions(pixels[index], found.run.views.shape) - shown[0].corner
         at = within + corners.reshape(len(corners), *(1,) * (within.ndim - 2), 2)
         seen = np.stack([at[..., 1] / width, 1.0 - at[..., 0] / height], axis=-1)
         return np.asarray((seen - first) / (last - first) * [region.width, region.height])
@@ -108,7 +110,7 @@ def plane_pixel(
         distance = -start[2] / way[2] if way[2] > 0 else -1.0  # seen from behind, it is not there
         right, up = (start + distance * way)[:2] + np.array([columns, rows]) / 2
         if distance > 0 and 0 <= right < columns and 0 < up <= rows:
-            met.append((distance, run.numbers[i], *picture.pixel((rows - up, right), run.views.shape)))
+            met.append((distance, run.numbers[i], *picture.pixel_at((rows - up, right), run.views.shape)))
     return min(met)[1:] if met else None
 
 
@@ -120,7 +122,7 @@ def _planes(
     places = {name: i for i, name in enumerate(names)}
     kept = [o for o in planes.planes(context.scene) if o.parent and o.data and o.data.name in places]
     shown = [plane for plane in kept if plane.visible_get()]
-    picture = next(iter(tiles.pictures(shown[0].data)), None) if shown else None
+    picture = next(iter(tiles.shown_pictures(shown[0].data)), None) if shown else None
     return shown, np.array([places[plane.data.name] for plane in shown], np.intp), picture
 
 
@@ -141,7 +143,7 @@ def _on_planes(context: bpy.types.Context, found: epipolar.Picked) -> _Drawn:
 
     def local(pixels: Floats) -> Floats:
         """Places (P, …, 2) on the planes of pixels (M, …, 2) of their modules."""
-        down, right = np.moveaxis(picture.places(pixels[index], run.views.shape), -1, 0)
+        down, right = np.moveaxis(picture.image_positions(pixels[index], run.views.shape), -1, 0)
         return np.stack([right - columns / 2, rows / 2 - down], axis=-1)
 
     def world(chosen: NDArray[np.bool_], ends: Floats) -> Floats:

@@ -296,7 +296,7 @@ def _build(
     digits = len(str(len(files)))
     for n, (file, (origin, along_u, _, along_v)) in enumerate(zip(files, corners, strict=True), start=1):
         text = f"{name} layer {n:0{digits}d}"
-        picture = images.filled(bpy.data.images.new(text, 1, 1, alpha=True), file)
+        picture = images.fill(bpy.data.images.new(text, 1, 1, alpha=True), file)
         layer = objects.picture_empty(text, frustum, picture, "DOUBLE_SIDED")
         layer.empty_display_size = max(n_u, n_v)
         across, up = origin - along_u, along_v - origin  # a picture's columns go against u, as the pinhole sees it

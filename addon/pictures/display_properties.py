@@ -1,4 +1,4 @@
-"""How projections are shown: `Scene.mphdrr_display`."""
+"""Settings for showing projections: `Scene.mphdrr_display`."""
 
 import bpy
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, FloatVectorProperty
@@ -21,7 +21,7 @@ _PLANES = (
 
 
 class DisplayProperties(bpy.types.PropertyGroup):
-    """How the last run's projections are shown; the exact numbers stay."""
+    """Colours, window and planes with which the last run's projections are shown; the exact numbers stay."""
 
     colors: EnumProperty(
         name="Colors", description="Colours of the numbers; all but grey are perceptually uniform",
@@ -74,7 +74,7 @@ class DisplayProperties(bpy.types.PropertyGroup):
 
     @property
     def problem(self) -> str:
-        """What is wrong with the window; "" where it is good."""
+        """Problem of the window in words; "" for a valid window."""
         try:
             self.display()
         except InputError as error:
@@ -82,7 +82,7 @@ class DisplayProperties(bpy.types.PropertyGroup):
         return ""
 
     def display(self) -> Display:
-        """The colours, scale and window; raises `InputError` where the window is none."""
+        """Return the colours, scale and window; raise `InputError` for an invalid window."""
         low, high = (None, None) if self.automatic else (self.low, self.high)
         return Display(self.colors.lower(), self.scale.lower(), low, high, self.half)
 

@@ -170,7 +170,7 @@ class _Shelf:
         self.name, self.finish_now, self._last = name, threading.Event(), last
         self.files: list[Path] = []
         self.latest: _Shown | None = None  # made by the thread
-        self.room = images.room(context) if windows.has_window() else None  # that the picture fills
+        self.room = images.editor_size(context) if windows.has_window() else None  # that the picture fills
         scene = context.scene
         settings = scene.mphdrr_reconstruction
         self._scene, self._item, self._is_shown = scene.session_uid, last.item if last else 0, False
@@ -182,7 +182,7 @@ class _Shelf:
 
     def refresh(self) -> None:
         """Show what the thread has made since."""
-        self.room = images.room(bpy.context)
+        self.room = images.editor_size(bpy.context)
         latest, self.latest = self.latest, None
         if latest is not None:
             is_first = not self._is_shown
@@ -206,7 +206,7 @@ class _Shelf:
         bright = factor * bright_value(shown.stored.volume.array)
         if bright > 0:  # the hottest voxel does not say how bright the others are
             item.mphdrr_volume.display_high = bright
-        images.store_drawn(ids.RECONSTRUCTION, shown.picture)
+        images.store_png(ids.RECONSTRUCTION, shown.picture)
         settings = scene.mphdrr_reconstruction
         settings.volume, settings.record = item, json.dumps(shown.record)
         return item
@@ -243,7 +243,7 @@ class _Shelf:
                 settings.volume, settings.record = self._before
             image = bpy.data.images.get(ids.RECONSTRUCTION)
             if self._picture is not None:
-                images.store_drawn(ids.RECONSTRUCTION, self._picture)
+                images.store_png(ids.RECONSTRUCTION, self._picture)
             elif image is not None:
                 bpy.data.images.remove(image)
         self.tidy()

@@ -45,7 +45,7 @@ def calibrating(context: bpy.types.Context, path: Path, apply: bool = True, exag
         lines = [*found.summary(), *([f"arrows: {factor:g} times the shift"] if factor else [])]
         collection.mphdrr_scanner.calibration = json.dumps(lines)
         _mark_misfits(collection, found)
-        images.show_below(images.store_drawn(ids.RESIDUALS, picture), bpy.context)
+        images.show_below(images.store_png(ids.RESIDUALS, picture), bpy.context)
         return f"{'Calibrated' if apply else 'Not applied'}: {'; '.join(lines[:3])}"
 
     return jobs.Job("Calibrating", work, finish)

@@ -101,7 +101,7 @@ def request(context: bpy.types.Context) -> Request:
         lines.append("Not aimed at the isocentre")
     shown = scene.mphdrr_display
     distance = float(recipe_views(recipe, system).fields(system.poses())[0, 2])
-    share = None if shown.planes == "NONE" else planes.share_of_way(shown, module, distance)
+    share = None if shown.planes == "NONE" else planes.relative_distance(shown, module, distance)
     mu = None if mu_item is None else volumes.file_and_pose(mu_item)
     return Request(
         rendering.with_energy(recipe, item),

@@ -86,7 +86,7 @@ def kept(run: ProjectionRun, path: Path, display: Display, stages: Stages) -> im
     """Write a run's file, in a job's thread, and make what its images hold."""
     stages("writing the run file")
     write_run(run, path)
-    return images.pictures(run, display, stages("packing"))
+    return images.make_pictures(run, display, stages("packing"))
 
 
 def sources(
@@ -214,7 +214,7 @@ def storing(
 ) -> Generator[tuple[str, int, int] | None, None, bpy.types.Image]:
     """Show `run` of the scanner `collection` and put it into the list; returns the mosaic.
 
-    It is kept in the file `path` and was made in that `state` of the scene; `made` is what `images.pictures` made of it.
+    It is kept in the file `path` and was made in that `state` of the scene; `made` is what `images.make_pictures` made of it.
     """
     mosaic = yield from showing(scene, run, collection, made)
     runs.add(scene, run, path, state, collection)
@@ -228,7 +228,7 @@ def showing(
     made: images.Pictures | None = None,
 ) -> Generator[tuple[str, int, int] | None, None, bpy.types.Image]:
     """Make images and planes of a run of the scanner `collection`, in place of another's; returns the mosaic."""
-    mosaic = yield from images.storing(run, made or images.pictures(run, scene.mphdrr_display.display()))
+    mosaic = yield from images.store_images(run, made or images.make_pictures(run, scene.mphdrr_display.display()))
     yield None
     place(scene, run, collection)
     return mosaic
@@ -237,7 +237,7 @@ def showing(
 def place(scene: bpy.types.Scene, run: ProjectionRun, collection: bpy.types.Collection | None) -> None:
     """Make the planes of a run of the scanner `collection`, of which there are images."""
     images.set_scanner(bpy.data.images[ids.MOSAIC], collection)
-    planes.make(scene, run, collection)
+    planes.show(scene, run, collection)
     recoloring.check()  # the display may have been edited meanwhile
 
 
@@ -249,7 +249,7 @@ def showing_job(scene: bpy.types.Scene, index: int) -> jobs.Job:
 
     def work(progress: Progress) -> tuple[ProjectionRun, images.Pictures]:
         run = read_run(path)
-        return run, images.pictures(run, display, stages_of(progress)("packing"))
+        return run, images.make_pictures(run, display, stages_of(progress)("packing"))
 
     def finish(result: tuple[ProjectionRun, images.Pictures]) -> jobs.Finishing:
         run, made = result
@@ -302,7 +302,7 @@ def remove_run(scene: bpy.types.Scene, index: int) -> str:
     if not is_shown:
         runs.mark_shown(scene, next((i for i, item in enumerate(settings.runs) if item.file == shown), -1))
     elif not settings.runs:
-        if images.is_of(scene):
+        if images.belong_to(scene):
             images.clear()
         planes.remove(scene)
         runs.mark_shown(scene, -1)

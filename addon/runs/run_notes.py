@@ -22,7 +22,7 @@ def draw() -> None:
     if not images.is_ours(image):
         return
     lines, stale = runs.change_lines(context.scene), runs.stale_modules(context.scene)
-    if not images.is_of(context.scene):
+    if not images.belong_to(context.scene):
         lines, stale = ["the projections of another scene"], None
     texts = (
         [(f"Not of the scene as it is now: {', '.join(lines)}", _COLOR)] if lines and lines != [runs.UNKNOWN] else []
@@ -38,7 +38,7 @@ def draw() -> None:
         placed.append((text, left, 0.3 * bar, color))
         left += windows.text_width(text, scale * _SIZE) + 2 * scale * _LEFT
     windows.draw_texts(placed, scale * _SIZE)
-    for picture in tiles.pictures(image):
+    for picture in tiles.shown_pictures(image):
         if stale is None or picture.number in stale:
             _draw_corner(tiles.frame(context, picture, image.size), scale)
 

@@ -33,8 +33,8 @@ def place_of(number: int, pixel: tuple[float, float]) -> tuple[int, int]:
     """Where on the screen a module's tile has a pixel."""
     _, area, region = editor("IMAGE_EDITOR")
     image = area.spaces.active.image
-    (tile,) = (each for each in tiles.pictures(image) if each.number == number)
-    row, column = tile.places(pixel, epipolar.run_views(bpy.context.scene).views.shape)
+    (tile,) = (each for each in tiles.shown_pictures(image) if each.number == number)
+    row, column = tile.image_positions(pixel, epipolar.run_views(bpy.context.scene).views.shape)
     return on_screen(*region.view2d.view_to_region(column / image.size[0], 1 - row / image.size[1]), "IMAGE_EDITOR")
 
 

@@ -180,17 +180,17 @@ def test_pixels_and_places_in_pictures_are_one_to_one(projected, scene, half, de
     shape = run.views.shape
     rng = np.random.default_rng(5)
     for image in (bpy.data.images[name] for name in (ids.MOSAIC, "mphDRR 07", "mphDRR 07 picture")):
-        shown = tiles.pictures(image)
+        shown = tiles.shown_pictures(image)
         assert [picture.number for picture in shown] == (run.numbers if image.name == ids.MOSAIC else [7])
         for picture in shown:
             share = 0.25 if picture.half else 0.0
             within = rng.uniform(share + 0.02, 0.98 - share, (5, 2)) * [pixels[0], pixels[1]] - 0.5
-            places = picture.places(within, shape)
-            np.testing.assert_allclose(picture.pixels(places, shape), within, atol=1e-9)
+            places = picture.image_positions(within, shape)
+            np.testing.assert_allclose(picture.projection_pixels(places, shape), within, atol=1e-9)
             width, height = image.size
             for (down, right), (column, row) in zip(places, within, strict=True):
                 found, place = tiles.picture_at(image, right / width, 1 - down / height)
-                assert found == picture and picture.pixel(place, shape) == (round(column), round(row))
+                assert found == picture and picture.pixel_at(place, shape) == (round(column), round(row))
 
 
 @pytest.mark.parametrize(("half", "detector"), [(False, "VIRTUAL"), (True, "REAL")])

@@ -49,15 +49,15 @@ def example_job(context: bpy.types.Context, of_xrays: bool = False, replace: boo
     given: dict[str, Any] = {"system.file": str(EXAMPLE), "detector.rows": _PIXELS, "detector.columns": _PIXELS}
     if of_xrays:
         given = {"model.kind": "spectral", "volume.energy": settings.phantom().mu_energy, "noise.seed": 1}
-    recipe = rendering.of_phantom(Recipe(given), settings, pose)
-    scene_uid, path = scene.session_uid, rendering.run_path(scene)
+    recipe = rendering.with_settings(Recipe(given), settings, pose)
+    scene_uid, path = scene.session_uid, rendering.new_run_path(scene)
     display = Display("grey", "log") if of_xrays else scene.mphdrr_display.display()
 
     def work(progress: Progress) -> Any:
         stages = stages_of(progress)
         stored = adding.work(progress)
         (run,) = run_recipe(recipe, system, stored[-1].volume, stages=stages)
-        return stored, run, rendering.kept(run, path, display, stages)
+        return stored, run, rendering.write_and_draw(run, path, display, stages)
 
     def finish(result: Any) -> jobs.Finishing:
         stored, run, made = result
@@ -72,9 +72,9 @@ def example_job(context: bpy.types.Context, of_xrays: bool = False, replace: boo
             yield None
         adding.finish(stored)
         yield None
-        rendering.place(scene, run, collection)
+        rendering.show_planes(scene, run, collection)
         projected = phantoms.with_children(bpy.context.object)[-1]
-        runs.add(scene, run, path, rendering.taken_over(scene, run, projected), collection)
+        runs.add_run(scene, run, path, rendering.adopt_settings(scene, run, projected), collection)
         if of_xrays:
             _ask_for_spect(scene)
         _hide_startup(scene, collection)

@@ -73,7 +73,7 @@ def next_step(context: bpy.types.Context) -> Step:
     if spect_ct.chain(scene):
         return Step("mphdrr.use_ct", "Use CT for SPECT", "MOD_FLUIDSIM")
     if _is_without_dose(scene):
-        isotope = {"isotope": runs.settings_of(scene)["model.isotope"]}
+        isotope = {"isotope": runs.run_settings(scene)["model.isotope"]}
         item = scene.mphdrr_reconstruction.volume
         return Step("mphdrr.add_dose_map", "Dose Map", "OUTLINER_DATA_VOLUME", isotope, item)
     if scene.mphdrr_events.recipe:
@@ -98,7 +98,7 @@ def _phantoms(scene: bpy.types.Scene) -> list[bpy.types.Object]:
 
 def _run(scene: bpy.types.Scene) -> bpy.types.PropertyGroup | None:
     """The shown run, unless it is of another scanner than the panels work on."""
-    run = runs.shown(scene)
+    run = runs.shown_run(scene)
     is_other = run is not None and run.scanner not in (None, scanner.active_scanner(scene))
     return None if is_other else run
 
@@ -107,7 +107,7 @@ def _is_without_dose(scene: bpy.types.Scene) -> bool:
     """Whether SPECT beside X-ray tubes has been reconstructed, of an isotope whose dose is known, and no dose made yet."""
     has_tubes = not all(map(scanner.sees_activity, scanner.scanners(scene)))
     has_dose = any(volumes.quantity_of(each) == "dose_rate" for each in volumes.volume_objects(scene))
-    return has_tubes and not has_dose and runs.settings_of(scene).get("model.isotope") in decays()
+    return has_tubes and not has_dose and runs.run_settings(scene).get("model.isotope") in decays()
 
 
 def _stale(scene: bpy.types.Scene) -> list[str]:

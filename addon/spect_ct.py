@@ -13,7 +13,7 @@ from .volumes import volume_import, volumes
 
 def shown_reconstruction(scene: bpy.types.Scene) -> Mapping[str, Any]:
     """What is known of the reconstruction of the shown run; empty where there is none."""
-    settings, run = scene.mphdrr_reconstruction, runs.shown(scene)
+    settings, run = scene.mphdrr_reconstruction, runs.shown_run(scene)
     if run is None or settings.volume not in volumes.volume_objects(scene):
         return {}
     known: Mapping[str, Any] = settings.known
@@ -22,9 +22,9 @@ def shown_reconstruction(scene: bpy.types.Scene) -> Mapping[str, Any]:
 
 def chain(scene: bpy.types.Scene) -> tuple[bpy.types.Collection, bpy.types.Object] | None:
     """The pinholes and the activity that SPECT would be of, where a CT has been reconstructed; else None."""
-    if runs.settings_of(scene).get("model.kind") != "spectral" or not shown_reconstruction(scene):
+    if runs.run_settings(scene).get("model.kind") != "spectral" or not shown_reconstruction(scene):
         return None
-    body = runs.projected(scene)
+    body = runs.projected_volume(scene)
     pinholes = list(filter(scanner.sees_activity, scanner.scanners(scene)))
     found = [each for each in volumes.volume_objects(scene) if volumes.quantity_of(each) == "activity"]
     found.sort(key=lambda each: body is None or each != body.parent)
@@ -42,7 +42,7 @@ def using_ct(context: bpy.types.Context) -> jobs.Job:
 
     def finish(result: Any) -> str:
         scene = jobs.require_scene(uid, "the CT is")
-        found, body = chain(scene), runs.projected(scene)
+        found, body = chain(scene), runs.projected_volume(scene)
         text = str(add(result))
         if found is not None:
             settings, reconstruction = scene.mphdrr_projections, scene.mphdrr_reconstruction

@@ -28,4 +28,4 @@ class MPHDRR_OT_calibrate(jobs.JobOperator, bpy.types.Operator):
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
         path = self.required_file("set filepath to a calibration recipe (.toml)")
-        return calibrating.calibrating(context, path, self.apply, self.exaggeration)
+        return calibrating.calibrate_job(context, path, self.apply, self.exaggeration)

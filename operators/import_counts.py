@@ -62,7 +62,7 @@ class MPHDRR_OT_import_counts(jobs.JobOperator, bpy.types.Operator):
         names = sorted({item.name for item in self.files if item.name})
         folder = storage.absolute(self.directory)
         paths = [folder / name for name in names] if len(names) > 1 else [storage.absolute(self.filepath)]
-        return counts_import.importing(context, paths if self.filepath or names else [], self._given())
+        return counts_import.import_counts_job(context, paths if self.filepath or names else [], self._given())
 
     def _given(self) -> dict[str, Any]:
         """The entries of a recipe that are given; None for the others."""

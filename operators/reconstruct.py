@@ -10,7 +10,7 @@ from .render_projections import ShowPicture
 
 _DONE: Need = (lambda _: ids.RECONSTRUCTION in bpy.data.images, "No reconstruction yet: reconstruct a run first")
 _NOTHING = "Nothing to go on from: its method has no iterations, or the file of the last one is not beside its voxels"
-_RUN: Need = (lambda context: runs.shown(context.scene) is not None, "No run yet: render the projections first")
+_RUN: Need = (lambda context: runs.shown_run(context.scene) is not None, "No run yet: render the projections first")
 
 
 class MPHDRR_OT_reconstruct(reconstruction_properties.ReconstructionSettings, jobs.JobOperator, bpy.types.Operator):

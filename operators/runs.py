@@ -37,7 +37,7 @@ class MPHDRR_OT_show_run(jobs.JobOperator, bpy.types.Operator):
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
         _required_run(context.scene, self.index)
-        return rendering.showing_job(context.scene, self.index)
+        return rendering.show_run_job(context.scene, self.index)
 
 
 class MPHDRR_OT_remove_run(Reported, bpy.types.Operator):
@@ -50,7 +50,7 @@ class MPHDRR_OT_remove_run(Reported, bpy.types.Operator):
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         item = _required_run(context.scene, self.index)
         message = "Neither Undo nor the .blend as it was saved will find its file again."
-        return ask_to_remove(self, context, event, f"Remove {item.name!r} ({runs.size_text([item])})?", message)
+        return ask_to_remove(self, context, event, f"Remove {item.name!r} ({runs.file_size_text([item])})?", message)
 
     def act(self, context: bpy.types.Context) -> str:
         _required_run(context.scene, self.index)
@@ -60,7 +60,7 @@ class MPHDRR_OT_remove_run(Reported, bpy.types.Operator):
 def _other_runs(self: Any, context: bpy.types.Context | None) -> list[tuple[str, str, str]]:
     """The runs that are not shown, by their places in the list."""
     found = context.scene.mphdrr_projections.runs if context is not None else ()
-    shown = runs.shown(context.scene) if context is not None else None
+    shown = runs.shown_run(context.scene) if context is not None else None
     _others[:] = [(str(i), item.name, item.summary) for i, item in enumerate(found) if item != shown]
     return _others
 
@@ -83,7 +83,7 @@ class MPHDRR_OT_flood_efficiency(jobs.ExportJob, bpy.types.Operator):
     )  # fmt: skip
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        flood = storage.absolute(runs.required(context.scene, "take efficiencies from").file)
+        flood = storage.absolute(runs.required_run(context.scene, "take efficiencies from").file)
         path = self.required_file("expected a name ending in .npy")
         order, scene_uid = self.order, context.scene.session_uid
 
@@ -105,11 +105,11 @@ class MPHDRR_OT_compare_runs(jobs.JobOperator, bpy.types.Operator):
     other: EnumProperty(name="Other", description="What is subtracted", items=_other_runs, options={"SKIP_SAVE"})
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        shown = runs.shown(context.scene)
+        shown = runs.shown_run(context.scene)
         if shown is None or not self.other:
             raise InputError("there is no other run to compare with: keep the shown one and render again")
         other = _required_run(context.scene, int(self.other))
-        paths = [rendering.file_of(item.file) for item in (shown, other)]
+        paths = [rendering.run_file_path(item.file) for item in (shown, other)]
         names = f"{shown.name!r} minus {other.name!r}"
 
         def work(progress: Progress) -> Any:

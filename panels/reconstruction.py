@@ -18,12 +18,12 @@ _PLOT = 3.0  # of a button's heights
 class MPHDRR_PT_reconstruction(Folded, bpy.types.Panel):
     bl_order = ids.ORDER_RECONSTRUCTION
 
-    poll = layouts.shown_where(lambda context: runs.shown(context.scene) is not None)
+    poll = layouts.shown_where(lambda context: runs.shown_run(context.scene) is not None)
 
     def draw(self, context: bpy.types.Context) -> None:
         layout = layouts.labelled(self.layout)
         settings = context.scene.mphdrr_reconstruction
-        run = runs.shown(context.scene)
+        run = runs.shown_run(context.scene)
         if run is not None:  # the scene may have changed since poll
             layout.label(text=iface("Of {run}").format(run=run.name), translate=False, icon="RENDER_STILL")
         main = layout.column(align=True)

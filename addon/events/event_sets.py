@@ -146,7 +146,7 @@ def opening(context: bpy.types.Context, folder: str, number: int, model: str = "
         raise InputError("no folder given: choose that of an event set")
     scene, path, files = context.scene, storage.absolute(folder), storage.folder()
     target, truth_uid = _target_of(_own(scene, "phantom")), getattr(_own(scene, "truth"), "session_uid", 0)
-    run_file, display, uid = rendering.run_path(scene), scene.mphdrr_display.display(), scene.session_uid
+    run_file, display, uid = rendering.new_run_path(scene), scene.mphdrr_display.display(), scene.session_uid
 
     def work(progress: Progress) -> _Opened:
         stages = stages_of(progress)
@@ -161,7 +161,9 @@ def opening(context: bpy.types.Context, folder: str, number: int, model: str = "
             return _Opened(name, _text(planned), truth, phantom, None, None)
         run = event.run(model or next(iter(models)))
         run = replace(run, settings={**run.settings, "volume": name})
-        return _Opened(name, _text(planned), truth, phantom, run, rendering.kept(run, run_file, display, stages))
+        return _Opened(
+            name, _text(planned), truth, phantom, run, rendering.write_and_draw(run, run_file, display, stages)
+        )
 
     def finish(opened: _Opened) -> jobs.Finishing:
         run, mosaic = opened.run, None
@@ -187,8 +189,8 @@ def opening(context: bpy.types.Context, folder: str, number: int, model: str = "
         _show(item, settings.phantom)
         yield None
         if run is not None:
-            rendering.place(scene, run, collection)
-            runs.add(scene, run, run_file, rendering.taken_over(scene, run, item), collection)
+            rendering.show_planes(scene, run, collection)
+            runs.add_run(scene, run, run_file, rendering.adopt_settings(scene, run, item), collection)
             images.show_below(mosaic, bpy.context)
         return f"Opened {opened.text}" + ("" if run is not None else "; it has no projections of a model")
 

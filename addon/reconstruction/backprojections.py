@@ -19,8 +19,8 @@ def backprojecting(context: bpy.types.Context, recipe: Recipe, how: str) -> jobs
 
     `how` is one of those of `core.perspective.backprojection`. Raises InputError where no run is shown.
     """
-    scene, shown = context.scene, runs.required(context.scene, "back-project")
-    path, name, folder, uid = rendering.file_of(shown.file), shown.name, storage.folder(), scene.session_uid
+    scene, shown = context.scene, runs.required_run(context.scene, "back-project")
+    path, name, folder, uid = rendering.run_file_path(shown.file), shown.name, storage.folder(), scene.session_uid
     label, start = HOW_LABELS[how], time.perf_counter()
 
     def work(progress: Progress) -> stored_volumes.StoredVolume:

@@ -76,8 +76,8 @@ def reconstructing(context: bpy.types.Context, recipe: Recipe) -> jobs.Job:
 
     The volume comes into the scene with the first iteration that is shown. The object of an earlier reconstruction stays.
     """
-    run = runs.required(context.scene, "reconstruct")
-    return _reconstructing(context, recipe, rendering.file_of(run.file), run.name)
+    run = runs.required_run(context.scene, "reconstruct")
+    return _reconstructing(context, recipe, rendering.run_file_path(run.file), run.name)
 
 
 def continuing(context: bpy.types.Context) -> jobs.Job:
@@ -96,7 +96,7 @@ def continuing(context: bpy.types.Context) -> jobs.Job:
     )  # fmt: skip
     recipe = recipe_of_tables(found.settings["recipe"]).updated({"reconstruction.iterations": MORE})
     last = _Last(item.session_uid, found, before)
-    return _reconstructing(context, recipe, rendering.file_of(run.file), run.name, last)
+    return _reconstructing(context, recipe, rendering.run_file_path(run.file), run.name, last)
 
 
 def _reconstructing(
@@ -196,7 +196,7 @@ class _Shelf:
         item = jobs.find_by_uid(bpy.data.objects, self._item)
         if not self._is_shown:
             self._is_shown = True
-            self._hide(runs.projected(scene), scene.mphdrr_reconstruction.volume if item is None else None)
+            self._hide(runs.projected_volume(scene), scene.mphdrr_reconstruction.volume if item is None else None)
         if item is None:  # or the user has deleted it
             item = volumes.add_stored(shown.stored, self.name, scene.collection)
             self._item = item.session_uid

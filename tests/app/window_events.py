@@ -121,7 +121,7 @@ def steps():
     settings.opened = 3
     yield from job(mph.open_event)
     scene = bpy.context.scene
-    seen["opened"], seen["run"] = scene.mphdrr_events.truth.name, runs.shown(scene).name
+    seen["opened"], seen["run"] = scene.mphdrr_events.truth.name, runs.shown_run(scene).name
     seen["image"] = editor("IMAGE_EDITOR")[1].spaces.active.image.name
     seen["changes"] = runs.changes(scene)
     yield 3.0  # until the note of the set is read

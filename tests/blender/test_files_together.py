@@ -65,7 +65,7 @@ def is_whole(top: Path, expected: dict[str, np.ndarray]) -> None:
     assert [path for path in outside if path.suffix != ".xlsx"] == []
     now = held()
     assert now.keys() == expected.keys() and all(np.array_equal(now[name], expected[name]) for name in now)
-    assert runs.shown(bpy.context.scene) is not None
+    assert runs.shown_run(bpy.context.scene) is not None
 
 
 def test_save_as_makes_a_pair_of_its_own_that_opens_elsewhere(study, tmp_path, capfd):

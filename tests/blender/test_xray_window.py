@@ -61,7 +61,7 @@ def test_what_the_panel_shows_is_what_is_rendered(scene):
     grid = mph.Grid.centered(12, 12.0)
     values = np.random.default_rng(3).uniform(0.0, 0.02, grid.shape).astype(np.float32)
     volumes.add_volume(mph.Volume(values, grid, "mu"), "Body")
-    assert preview.request(bpy.context).recipe["detector.rows"] == 20
+    assert preview.read_request(bpy.context).recipe["detector.rows"] == 20
     assert bpy.ops.mphdrr.render_projections() == {"FINISHED"}
     run = mph.read_run(storage.absolute(panel.run_file))
     assert run.projections.shape == (24, 20, 20)

@@ -41,7 +41,7 @@ class MPHDRR_OT_pick_pixel(eyedropper.Eyedropper, reports.Reported, bpy.types.Op
 
     def act(self, context: bpy.types.Context) -> str:
         pixel = (decimals.typed(each) for each in (self.column, self.row, self.k))
-        found = epipolar.pick(context.scene, self.module, *pixel)
+        found = epipolar.pick_pixel(context.scene, self.module, *pixel)
         column, row = found.pixel
         return f"Module {self.module}, column {column:g}, row {row:g}: {found.seen_by} modules see the marker"
 

@@ -29,7 +29,7 @@ class _Epipolar:
         row = layout.row(align=True)
         row.use_property_split = False
         layouts.draw_all(row, settings, "column", "row")
-        found, problem = epipolar.shown(context.scene)
+        found, problem = epipolar.picked_or_problem(context.scene)
         if problem:
             draw_text(layout, problem)
         if found is None:

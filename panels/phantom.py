@@ -170,7 +170,7 @@ class MPHDRR_PT_perspective(_OfVolume, bpy.types.Panel):
 def _draw_frustum(column: bpy.types.UILayout, scene: bpy.types.Scene, frustum: bpy.types.Object) -> None:
     """What is shown, and what has changed since."""
     module = "?" if frustum.parent is None else frustum.parent.name
-    text = iface("Shown: {volume}, by {module}").format(volume=frustums.volume_of(frustum), module=module)
+    text = iface("Shown: {volume}, by {module}").format(volume=frustums.volume_name(frustum), module=module)
     column.label(text=text, translate=False)
     if changed := frustums.changes(scene, frustum):
         column.alert = True

@@ -1,4 +1,4 @@
-"""The settings of the Perspective panel, `Scene.mphdrr_perspective`, and of Epipolar Lines, `Scene.mphdrr_epipolar`."""
+"""Settings of the Perspective panel, `Scene.mphdrr_perspective`, and of Epipolar Lines, `Scene.mphdrr_epipolar`."""
 
 import bpy
 from bpy.props import EnumProperty, FloatProperty, IntProperty, StringProperty
@@ -14,7 +14,7 @@ _UNIFORM = (
 
 
 class PerspectiveSettings:
-    """How volumes are put into a module's own coordinates; mixed into the scene's properties and into the operators."""
+    """Properties of a module's own coordinates, shared by the scene's settings (the panel) and the operators."""
 
     planes: IntProperty(
         name="Planes", description="Of the frustum: each shows the volume's mean along the rays in its layer", default=12,
@@ -35,24 +35,26 @@ class PerspectiveProperties(PerspectiveSettings, bpy.types.PropertyGroup):
 
 
 def _range(settings: bpy.types.PropertyGroup) -> tuple[float, float]:
-    """k at the front and at the back of the ROI; (0, 0) where no pixel is picked."""
-    found, _ = epipolar.shown(settings.id_data)
-    return (0.0, 0.0) if found is None else found.k_range
+    """Return k at the front and at the back of the ROI; (0, 0) where no pixel is picked."""
+    picked, _ = epipolar.picked_or_problem(settings.id_data)
+    return (0.0, 0.0) if picked is None else picked.k_range
 
 
 def _along(settings: bpy.types.PropertyGroup) -> float:
+    """Return the marker's position between the front (0) and the back (1) of the ROI, evenly in k."""
     front, back = _range(settings)
     return min(max((settings.k - front) / (back - front), 0.0), 1.0) if front != back else 0.0
 
 
 def _set_along(settings: bpy.types.PropertyGroup, value: float) -> None:
+    """Set the marker's position between the front (0) and the back (1) of the ROI, evenly in k."""
     front, back = _range(settings)
     if front != back:
         settings.k = front + value * (back - front)
 
 
 class EpipolarProperties(bpy.types.PropertyGroup):
-    """A pixel of the shown run, and a marker on its ray."""
+    """Pixel of the shown run, and a marker on its ray."""
 
     views: StringProperty(
         name="Views", description="Which views the pixel was picked in; empty: none is picked", options={"HIDDEN"}

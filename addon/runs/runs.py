@@ -79,7 +79,7 @@ def add_run(
     unique = name
     while unique in names_in_list:
         unique, number = f"{name} {number}", number + 1
-    item = settings.runs.add_run()
+    item = settings.runs.add()
     item.name = item.usual_name = unique
     item.file, item.summary = storage.stored_path(path.absolute()), run_summary(run)
     item.state, item.scanner = json.dumps(state) if state else "", collection
@@ -214,7 +214,7 @@ def after_load(*_: Any) -> None:
     for scene in bpy.data.scenes:
         settings = scene.mphdrr_projections
         if settings.run_file and not settings.runs:
-            item = settings.runs.add_run()
+            item = settings.runs.add()
             item.name = item.usual_name = (settings.run_summary.split(", ")[1:] or ["Run"])[0]
             item.file, item.summary, item.is_saved = settings.run_file, settings.run_summary, True
     after_update()

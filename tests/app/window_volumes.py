@@ -104,7 +104,7 @@ def steps():
     yield from drawn()
     picture("map")
     seen["map"] = [place((0.0, 0.0, 0.0)), place((60.0, -60.0, 60.0))]
-    left, bottom, width, height = color_bar.place()
+    left, bottom, width, height = color_bar.rectangle()
     seen["bar"] = [*on_screen(left, bottom + height - 1), width, height]
     space.show_region_ui = True
     bpy.context.view_layer.objects.active = bpy.data.objects["Sensitivity map"]

@@ -43,7 +43,7 @@ def test_the_volume_is_that_of_the_command_line(rendered, scene, how):
     np.testing.assert_allclose(found.array, expected.array, rtol=1e-6)
     np.testing.assert_allclose(found.grid.affine, expected.grid.affine, atol=1e-6)
     assert len(slices.planes_of(item)) == 3 and item.mphdrr_volume.display_high == pytest.approx(expected.array.max())
-    assert color_bar.marks(item)[0].startswith("backprojection")
+    assert color_bar.labels(item)[0].startswith("backprojection")
 
 
 def test_it_has_the_panels_voxels_and_stands_beside_the_last_one(rendered, scene):

@@ -170,7 +170,7 @@ def test_a_map_has_a_bar_in_the_unit_of_the_panels(scene, small_workbook):
     item = bpy.data.objects["Sensitivity map"]
     middle = 1e6 * volumes.volume_from_object(item).array[4, 4, 4]
     assert middle == pytest.approx(scene.mphdrr_geometry.scanner.mphdrr_scanner.sensitivity, rel=1e-5)
-    title, texts = color_bar.marks(item)
+    title, texts = color_bar.labels(item)
     settings = item.mphdrr_volume
     assert title == "sensitivity, cps/MBq" and float(texts[0]) <= middle <= float(texts[-1])
     assert (

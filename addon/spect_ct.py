@@ -16,7 +16,7 @@ def shown_reconstruction(scene: bpy.types.Scene) -> Mapping[str, Any]:
     settings, run = scene.mphdrr_reconstruction, runs.shown_run(scene)
     if run is None or settings.volume not in volumes.volume_objects(scene):
         return {}
-    known: Mapping[str, Any] = settings.known
+    known: Mapping[str, Any] = settings.details
     return known if run.file.endswith(known.get("run", "")) else {}
 
 

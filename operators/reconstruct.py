@@ -31,7 +31,7 @@ class MPHDRR_OT_reconstruct(reconstruction_properties.ReconstructionSettings, jo
         return super().ask(context)
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        return reconstructions.reconstructing(
+        return reconstructions.reconstruct_job(
             context,
             reconstruction_properties.settings_recipe(
                 self.setting_getter(context.scene.mphdrr_reconstruction), self.properties.is_property_set
@@ -42,10 +42,10 @@ class MPHDRR_OT_reconstruct(reconstruction_properties.ReconstructionSettings, jo
 class MPHDRR_OT_continue_reconstruction(jobs.JobOperator, bpy.types.Operator):
     """Do ten more iterations of the last reconstruction, of the same run with the same settings, in the same volume"""
 
-    poll = needs(_DONE, (reconstructions.resumable, _NOTHING))
+    poll = needs(_DONE, (reconstructions.resume_path, _NOTHING))
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        return reconstructions.continuing(context)
+        return reconstructions.continue_job(context)
 
 
 class MPHDRR_OT_backproject(reconstruction_properties.BackprojectionSettings, jobs.JobOperator, bpy.types.Operator):
@@ -60,7 +60,9 @@ class MPHDRR_OT_backproject(reconstruction_properties.BackprojectionSettings, jo
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
         get = self.setting_getter(context.scene.mphdrr_reconstruction)
-        return backprojections.backprojecting(context, reconstruction_properties.voxels_recipe(get), get("how").lower())
+        return backprojections.backproject_job(
+            context, reconstruction_properties.voxels_recipe(get), get("how").lower()
+        )
 
 
 class MPHDRR_OT_show_reconstruction(ShowPicture, bpy.types.Operator):

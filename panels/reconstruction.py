@@ -4,7 +4,7 @@ import bpy
 from bpy.app.translations import pgettext_iface as iface
 
 from ..addon.blender import ids, layouts, plots
-from ..addon.reconstruction.reconstruction_properties import drawn
+from ..addon.reconstruction.reconstruction_properties import panel_properties
 from ..addon.runs import runs
 from .sidebar import Folded, Popover, draw_text
 
@@ -27,14 +27,14 @@ class MPHDRR_PT_reconstruction(Folded, bpy.types.Panel):
         if run is not None:  # the scene may have changed since poll
             layout.label(text=iface("Of {run}").format(run=run.name), translate=False, icon="RENDER_STILL")
         main = layout.column(align=True)
-        layouts.draw_settings(main, settings, (each for each in drawn(settings) if each[0] in _MAIN))
+        layouts.draw_settings(main, settings, (each for each in panel_properties(settings) if each[0] in _MAIN))
         row = layouts.invoking(layout.row())
         row.scale_y = 1.4
         row.operator("mphdrr.reconstruct", text="Reconstruct", icon="OUTLINER_OB_VOLUME")
         row = layout.row(align=True)
         row.popover("MPHDRR_PT_backprojection")
         row.popover("MPHDRR_PT_reconstruction_model", icon="PREFERENCES")
-        known = settings.known
+        known = settings.details
         if known and settings.volume is not None:
             _draw_result(layout, settings, known)
 
@@ -80,7 +80,7 @@ class MPHDRR_PT_reconstruction_model(Popover, bpy.types.Panel):
 
     def draw(self, context: bpy.types.Context) -> None:
         settings = context.scene.mphdrr_reconstruction
-        others = (each for each in drawn(settings) if each[0] not in _MAIN)
+        others = (each for each in panel_properties(settings) if each[0] not in _MAIN)
         column = layouts.labelled(self.layout).column()
         if runs.holds_counts(context.scene):
             column.prop(settings, "mu", placeholder="The run's")

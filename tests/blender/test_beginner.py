@@ -247,7 +247,7 @@ def test_what_is_proposed_leads_to_a_score(scene, small_workbook):
     settings.width = settings.height = reconstruction.voxels = 12
     reconstruction.method = "SIRT"  # without a window, what is chosen by the run is the default
     assert [press(), press(), press()] == ["Add Phantom", "Render Projections", "Reconstruct"]
-    assert "NRMSE" in {name for name, _ in reconstruction.known["scores"]}
+    assert "NRMSE" in {name for name, _ in reconstruction.details["scores"]}
     assert next_step.next_step(bpy.context).text == "Export Dataset"
     scanner.module(scanner.active_scanner(scene), 3).location.x += 1.0
     bpy.context.view_layer.update()

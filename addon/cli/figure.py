@@ -134,7 +134,7 @@ def _render(kind: FigureKind, page: Page, subject: Subject, paths: list[Path], h
     if kind.studio.volume and subject.volume is not None:
         item = volumes.add_volume(subject.volume, subject.name or "Volume")
     with quiet():
-        _follow(figures.drawing(page, subject, kind, item, paths, how, figures.Reel()))
+        _follow(figures.draw_figure(page, subject, kind, item, paths, how, figures.Reel()))
 
 
 def _follow(steps: Any) -> None:

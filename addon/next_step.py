@@ -49,7 +49,7 @@ def stages(context: bpy.types.Context) -> list[Stage]:
     collection, run, known = scanner.active_scanner(scene), _run(scene), _phantoms(scene)
     stale, found = (_stale(scene), spect_ct.shown_reconstruction(scene)) if run else ([], {})
     scores = found.get("scores", ())
-    made = event_notes.of_set(scene.mphdrr_events.folder)
+    made = event_notes.set_note(scene.mphdrr_events.folder)
     return [
         Stage("Scanner", collection.name if collection else ""),
         Stage("Phantom", known[0].name if len(known) == 1 else f"{len(known)} volumes" if known else ""),

@@ -75,9 +75,9 @@ def steps():
     bpy.data.objects.remove(bpy.data.objects["Cube"])
     (folder / "events.toml").write_text(RECIPE)
     settings.recipe, settings.folder, settings.count = str(folder / "events.toml"), str(folder / "set"), 12
-    while event_notes.of_recipe(settings.recipe).text == "Reading …":
+    while event_notes.recipe_note(settings.recipe).text == "Reading …":
         yield 0.1
-    note = event_notes.of_recipe(settings.recipe)
+    note = event_notes.recipe_note(settings.recipe)
     seen["note"] = [note.text, note.is_wrong]
     for _ in range(3):
         yield from job(mph.try_event)

@@ -171,7 +171,7 @@ def test_a_file_of_the_recipe_is_tried_too(recipe, scene, tmp_path):
 def test_a_set_is_that_of_the_library_and_goes_on_after_cancel(recipe, scene, tmp_path):
     events.make(recipe, tmp_path / "expected", 2)
     folder = scene.mphdrr_events.folder
-    job = event_sets.making(str(tmp_path / "small.toml"), folder, 2)
+    job = event_sets.make_set_job(str(tmp_path / "small.toml"), folder, 2)
 
     def progress(done: int, total: int) -> None:
         if done == 1:
@@ -186,7 +186,7 @@ def test_a_set_is_that_of_the_library_and_goes_on_after_cancel(recipe, scene, tm
     assert bpy.ops.mphdrr.make_event_set() == {"FINISHED"}
     assert first.stat().st_mtime_ns == written
     assert files(Path(folder)) == files(tmp_path / "expected")
-    assert jobs.run(event_sets.making("", folder, 2)).startswith("All events asked for are there already: 2 in ")
+    assert jobs.run(event_sets.make_set_job("", folder, 2)).startswith("All events asked for are there already: 2 in ")
 
 
 def test_an_event_is_opened_with_truth_phantom_and_projections(recipe, scene, tmp_path):
@@ -299,18 +299,18 @@ def test_what_is_wrong_is_said_in_a_line(recipe, scene, tmp_path):
 
 def test_notes_say_what_a_recipe_and_a_set_are(recipe, scene, tmp_path):
     settings = scene.mphdrr_events
-    note = event_notes.of_recipe(settings.recipe)
+    note = event_notes.recipe_note(settings.recipe)
     assert (note.text, note.is_wrong) == ("derenzo, defrise; lines, counts; 16³ voxels of 6 mm", False)
-    assert event_notes.of_recipe("") is None and event_notes.of_set(settings.folder) is None
+    assert event_notes.recipe_note("") is None and event_notes.set_note(settings.folder) is None
     events.make(recipe, tmp_path / "set", 2)
     (tmp_path / "set/events/000001.h5").unlink()
-    note = event_notes.of_set(settings.folder)
+    note = event_notes.set_note(settings.folder)
     assert note.text.startswith("1 of 2 events, ") and note.models == ("lines", "counts")
     Path(settings.recipe).write_text(TEXT.replace("radius =", "radios ="))
-    note = event_notes.of_recipe(settings.recipe)
+    note = event_notes.recipe_note(settings.recipe)
     assert note.is_wrong and note.text.startswith("phantoms: derenzo: radios: no such setting")
     Path(settings.recipe).write_text(TEXT.replace(str(WORKBOOK), "gone.xlsx"))
-    assert "gone.xlsx: no such file" in event_notes.of_recipe(settings.recipe).text
+    assert "gone.xlsx: no such file" in event_notes.recipe_note(settings.recipe).text
 
 
 @pytest.mark.parametrize("like", TEMPLATES)

@@ -1,4 +1,4 @@
-"""``mphdrr demo``: the main job on the example workbook, from the geometry to a file to train on."""
+"""``mphdrr demo``: the main job on the example workbook, from the geometry to a dataset for training."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from . import COMMANDS
 from .scene import INSTALL_BLENDER, new_scene, quiet, save_scene
 
 _FIGURES = {"phantom": "picture", "cut-away": "cut-away", "sums": "sums"}
-"""Name and kind of those besides the modules' ranges."""
+"""Kinds of the figures by name, besides those of the modules' ranges."""
 _SIZE = dict.fromkeys(("scanner", "picture", "cut-away"), (880, 510))
-"""Smaller than usual: they take most of the demo's time."""
+"""Sizes of figures, pixels; smaller than usual, since figures take most of the demo's time."""
 
 
 def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
@@ -37,9 +37,10 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
 
 
 def _run(arguments: argparse.Namespace) -> None:
+    """Run the demo."""
     out = files.ensure_folder(arguments.output)
     has_blender = importlib.util.find_spec("bpy") is not None
-    scene = new_scene() if has_blender else None  # before the long work: what is wrong with Blender shows at once
+    scene = new_scene() if has_blender else None  # before the long work, so that problems with Blender show at once
     with _step("geometry"):
         system = read_workbook(arguments)
     with _step("projections"):
@@ -82,14 +83,15 @@ def _make_scene(scene: Any, run: mph.ProjectionRun, out: Path) -> None:
         save_scene(out / "scanner.blend")
     with _step("pictures"), quiet():
         ranges = (f"{first}-{last}" for first, last in scanner.quick_ranges(run.system))
-        wanted = [(f"modules-{modules}", "scanner", modules) for modules in ranges]
-        for name, figure, modules in (*wanted, *((name, kind, None) for name, kind in _FIGURES.items())):
+        range_figures = [(f"modules-{modules}", "scanner", modules) for modules in ranges]
+        for name, figure, modules in (*range_figures, *((name, kind, None) for name, kind in _FIGURES.items())):
             path = out / f"{name}.png"
             jobs.run(figures.figure_job(bpy.context, figure, [path], _SIZE.get(figure), modules, samples=8))
 
 
 @contextlib.contextmanager
 def _step(name: str) -> Iterator[None]:
+    """Print the name and the duration, s, of a step."""
     started = time.monotonic()
     yield
     print(f"{name:12s} {time.monotonic() - started:5.1f} s", flush=True)

@@ -1,4 +1,4 @@
-"""The extension's property groups: what the panels show and what is stored in the .blend file.
+"""Property groups of the extension: the settings in the panels, and the values stored in the .blend file.
 
 Blender's FloatProperty is a float32: 100 mm is kept to 8e-6 mm only. `ModuleProperties.exact` therefore holds the
 float64 numbers beside it (`module_values.py`). Names and enumeration numbers must stay as they are: old files have them.
@@ -33,12 +33,14 @@ from .scanner import column_maps, columns
 from .scanner.collimators import PARTS
 
 
-# Functions, not lambdas: Blender evaluates annotations where a lambda does not find this module's names.
+# Functions, not lambdas: Blender evaluates annotations in a place where a lambda does not find this module's names.
 def _is_visible(self: ModuleProperties) -> bool:
+    """Return whether a module is shown in the viewport."""
     return not self.id_data.hide_viewport
 
 
 def _set_visible(self: ModuleProperties, value: bool) -> None:
+    """Show or hide a module."""
     FUNCTIONS["visible"](self.id_data, value)
 
 
@@ -46,13 +48,13 @@ _LENGTH_MODES = [
     ("FROM_ROI", "From ROI", "l follows b, d, Ld and R: the field of view is tangent to the ROI sphere", 0),
     ("TYPED", "Typed", "l stays as it was typed", 1),
 ]
-_SEES_ROI = 1 - 1e-6  # of R: an `l` from the ROI sees R up to rounding
+_SEES_ROI = 1 - 1e-6  # radius seen, relative to R, from which on the ROI counts as seen: allows for rounding of `l`
 
 
 class ModuleProperties(bpy.types.PropertyGroup):
-    """`Object.mphdrr_module`: one module, on its camera object; other parts carry `part` and `number` only.
+    """Properties of a module, `Object.mphdrr_module`, on its camera object; other parts have `part` and `number` only.
 
-    It also has a property for each typed column of any kind of scanner that is no coordinate (`add_columns`).
+    There is also a property for each typed column of any kind of scanner that is no coordinate (`add_columns`).
     """
 
     is_module: BoolProperty(name="Is Module", options={"HIDDEN"})
@@ -78,7 +80,7 @@ class ModuleProperties(bpy.types.PropertyGroup):
     )
     placed: FloatVectorProperty(name="Placed", description="Where it was last built, mm", size=3, options={"HIDDEN"})
     built: StringProperty(name="Built", description="The numbers that the readouts belong to", options={"HIDDEN"})
-    # Readouts: what the panels show, written by following.py.
+    # Readouts, which `following.py` writes and the panels show.
     pinhole_distance: FloatProperty(name="Pinhole Distance", description="b: from the pinhole to the isocentre, in mm")
     sensitivity: FloatProperty(name="Sensitivity", description="Of an ideal pinhole at the isocentre, cps/MBq")
     resolution: FloatProperty(
@@ -97,7 +99,7 @@ class ModuleProperties(bpy.types.PropertyGroup):
 
 
 class ScannerProperties(bpy.types.PropertyGroup):
-    """One scanner; lives on its collection as `Collection.mphdrr_scanner`. It has the modules' properties, too."""
+    """Properties of a scanner, `Collection.mphdrr_scanner`; it has the modules' properties, too."""
 
     is_scanner: BoolProperty(name="Is Scanner", options={"HIDDEN"})
     is_ring: BoolProperty(name="Is Ring", description="The collection is a ring of a scanner", options={"HIDDEN"})
@@ -145,13 +147,13 @@ class ScannerProperties(bpy.types.PropertyGroup):
         "stays turned: it is tilted",
         default=True, update=on_edit("scanner"),
     )  # fmt: skip
-    # With the modules' properties: the first module's values. `mixed` names those that differ between modules.
+    # The modules' properties have the first module's values here. `mixed` names those that differ between modules.
     length_mode: EnumProperty(
         name="Length", description="Where the collimators' lengths come from. Changing it sets all modules",
         items=_LENGTH_MODES, default="TYPED", update=on_edit("all_modules", "length_mode"),
     )  # fmt: skip
     mixed: StringProperty(name="Mixed", description="Names of the numbers that differ between modules")
-    # Readouts of all modules together, written by following.py.
+    # Readouts of all modules together, which `following.py` writes.
     count: IntProperty(name="Modules", description="Number of modules now", min=0)
     sensitivity: FloatProperty(name="Sensitivity", description="Of all modules together, at the isocentre, cps/MBq")
     resolution: FloatProperty(name="Resolution", description="Mean FWHM in mm of the modules at the isocentre")
@@ -166,6 +168,7 @@ class ScannerProperties(bpy.types.PropertyGroup):
 
 
 def _is_scanner(self: GeometryProperties, collection: bpy.types.Collection) -> bool:
+    """Return whether a collection can be chosen as the scanner."""
     return collection.mphdrr_scanner.is_scanner
 
 
@@ -184,7 +187,7 @@ class GeometryProperties(bpy.types.PropertyGroup):
     )
     first: IntProperty(name="First", description="First module number of the range", default=1)
     last: IntProperty(name="Last", description="Last module number of the range", default=40)
-    # What `sight_lines.py` draws in the 3D views.
+    # Lines that `sight_lines.py` draws in the 3D views.
     show_rays: BoolProperty(
         name="Ray", description="Draw the principal ray, through the isocentre to the virtual detector",
         update=on_edit("sight_lines"),
@@ -207,20 +210,20 @@ _ROOMS = (
     phantom_properties, projection_properties, reconstruction_properties, display_properties,
     perspective_properties, event_properties, column_maps,
 )  # fmt: skip
-_OWN = {cls: dict(cls.__annotations__) for cls in (ModuleProperties, ScannerProperties)}
+_OWN_ANNOTATIONS = {cls: dict(cls.__annotations__) for cls in (ModuleProperties, ScannerProperties)}
 
 
 def add_columns() -> None:
-    """Give modules and scanners the properties of the typed columns that there are now, before they are registered."""
-    known = columns.all_columns()
-    for cls, edited, suffix in (
-        (ModuleProperties, lambda name: on_edit("length" if callable(known[name].blank) else "module"), ""),
+    """Give modules and scanners the properties of all typed columns of the present kinds, before they are registered."""
+    all_columns = columns.all_columns()
+    for cls, make_update, suffix in (
+        (ModuleProperties, lambda name: on_edit("length" if callable(all_columns[name].blank) else "module"), ""),
         (ScannerProperties, lambda name: on_edit("all_modules", name), ". Changing it sets all modules"),
     ):
-        cls.__annotations__ = columns.make_properties(edited, suffix) | _OWN[cls]
+        cls.__annotations__ = columns.make_properties(make_update, suffix) | _OWN_ANNOTATIONS[cls]
 
 
-# Every property group; a group comes after those that it points to.
+# All property groups; a group comes after those that it refers to.
 CLASSES = (ModuleProperties, ScannerProperties, GeometryProperties, *(cls for room in _ROOMS for cls in room.CLASSES))
 
 # (Blender type, attribute name, group): `registration.py` attaches a `PointerProperty` of the group to the type.

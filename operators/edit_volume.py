@@ -133,10 +133,12 @@ class MPHDRR_OT_remake_volumes(jobs.JobOperator, bpy.types.Operator):
 
     bl_label = "Make Missing Volumes Again"
 
-    poll = needs((lambda context: recovery.missing(context.scene)[0], "No phantom or map misses its file of voxels"))
+    poll = needs(
+        (lambda context: recovery.missing_volumes(context.scene)[0], "No phantom or map misses its file of voxels")
+    )
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        return recovery.remaking(context.scene)
+        return recovery.remake_job(context.scene)
 
 
 class MPHDRR_OT_find_volume_files(Reported, bpy.types.Operator):

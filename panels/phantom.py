@@ -41,7 +41,7 @@ class MPHDRR_PT_phantom(Folded, bpy.types.Panel):
 
 def _draw_missing(column: bpy.types.UILayout, scene: bpy.types.Scene) -> None:
     """The volumes whose files are gone: what can be made again, and what else to do."""
-    again, others = recovery.missing(scene)
+    again, others = recovery.missing_volumes(scene)
     column.alert = True
     column.label(text="Files of voxels are missing", icon="ERROR")
     if again:
@@ -50,7 +50,7 @@ def _draw_missing(column: bpy.types.UILayout, scene: bpy.types.Scene) -> None:
             "mphdrr.remake_volumes", text=iface("Make Again: {names}").format(names=names), icon="FILE_REFRESH"
         )
     if others:
-        draw_text(column, recovery.what_to_do(others), "BLANK1")
+        draw_text(column, recovery.advice(others), "BLANK1")
     column.operator("mphdrr.find_volume_files", icon="VIEWZOOM")
 
 

@@ -145,8 +145,7 @@ def open_event_job(context: bpy.types.Context, folder: str, number: int, model: 
     if not folder:
         raise InputError("no folder given: choose that of an event set")
     scene, path, files = context.scene, storage.absolute(folder), storage.folder()
-    target = _make_target(_panel_item(scene, "phantom"))
-    truth_uid = getattr(_panel_item(scene, "truth"), "session_uid", 0)
+    target, truth_uid = _make_target(_item(scene, "phantom")), getattr(_item(scene, "truth"), "session_uid", 0)
     run_file, display, uid = rendering.new_run_path(scene), scene.mphdrr_display.display(), scene.session_uid
 
     def work(progress: Progress) -> _StoredEvent:
@@ -270,13 +269,13 @@ def _place_phantom(scene: bpy.types.Scene, phantom: _Phantom, target: _Target) -
 def _phantom_to_try(context: bpy.types.Context) -> bpy.types.Object | None:
     """Return the scene's phantom to try an event on; None where a new one is to be made."""
     scene_phantoms = [item for item in volumes.volume_objects(context.scene) if phantoms.settings_of(item) is not None]
-    panel_phantom = _panel_item(context.scene, "phantom")
+    panel_phantom = _item(context.scene, "phantom")
     if context.object in scene_phantoms:
         return context.object
     return panel_phantom or (scene_phantoms[0] if len(scene_phantoms) == 1 else None)
 
 
-def _panel_item(scene: bpy.types.Scene, name: str) -> bpy.types.Object | None:
+def _item(scene: bpy.types.Scene, name: str) -> bpy.types.Object | None:
     """Return an object that the panel's settings refer to; None if the user has deleted it."""
     item = getattr(scene.mphdrr_events, name)
     return item if item in volumes.volume_objects(scene) else None

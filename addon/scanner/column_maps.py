@@ -81,19 +81,13 @@ class ColumnMapTable(bpy.types.PropertyGroup):
         update=_edited,
     )
     rows: EnumProperty(
-        name="Rows",
-        description="Which modules of table 1 the rows belong to",
-        items=choices.items(
-            choices.JOINED,
-            (
-                ("BY_NUMBER", "By Number", "A row belongs to the module with its number or name"),
-                ("IN_ORDER", "In Order", "The first row belongs to the first module, and so on"),
-                ("ONE_FOR_ALL", "One for All", "The first row holds what all modules share"),
-            ),
-        ),
-        default="BY_NUMBER",
-        update=_edited,
-    )
+        name="Rows", description="Which modules of table 1 the rows belong to", default="BY_NUMBER", update=_edited,
+        items=choices.items(choices.JOINED, (
+            ("BY_NUMBER", "By Number", "A row belongs to the module with its number or name"),
+            ("IN_ORDER", "In Order", "The first row belongs to the first module, and so on"),
+            ("ONE_FOR_ALL", "One for All", "The first row holds what all modules share"),
+        )),
+    )  # fmt: skip
 
 
 class ColumnMapQuantity(bpy.types.PropertyGroup):

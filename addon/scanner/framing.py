@@ -94,6 +94,5 @@ def _covered_widths(area: bpy.types.Area) -> tuple[int, int]:
     """Return the widths, pixels, that toolbar and sidebar cover at the left and the right of an area."""
     widths = {region.alignment: region.width for region in area.regions if region.type in ("UI", "TOOLS")}
     left_width, right_width = widths.get("LEFT", 0), widths.get("RIGHT", 0)
-    return (left_width if left_width > 1 else 0), (
-        right_width if right_width > 1 else 0
-    )  # hidden regions are 1 pixel wide
+    # Hidden regions are 1 pixel wide.
+    return (left_width if left_width > 1 else 0), (right_width if right_width > 1 else 0)

@@ -251,8 +251,8 @@ def test_what_is_proposed_leads_to_a_score(scene, small_workbook):
     assert next_step.next_step(bpy.context).text == "Export Dataset"
     scanner.module(scanner.active_scanner(scene), 3).location.x += 1.0
     bpy.context.view_layer.update()
-    run = next(stage for stage in next_step.stages(bpy.context) if stage.name == "Run")
-    assert run.is_stale and run.found == "Module 03 moved"
+    run = next(stage for stage in next_step.work_stages(bpy.context) if stage.name == "Run")
+    assert run.is_stale and run.note == "Module 03 moved"
     check(drawn())
     assert [press(), press()] == ["Render Again", "Reconstruct"]
     scene.mphdrr_events.recipe = "//heart.toml"

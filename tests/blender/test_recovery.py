@@ -53,7 +53,7 @@ def test_all_with_a_recipe_are_made_again_where_they_were(crashed, capsys):
     assert bpy.ops.mphdrr.remake_volumes() == {"FINISHED"}
     assert "CT: find the voxel files" in capsys.readouterr().out
     storage._cached_size.cache_clear()
-    again, others = recovery.missing(bpy.context.scene)
+    again, others = recovery.missing_volumes(bpy.context.scene)
     assert again == [] and [item.name for item in others] == ["CT"]
     assert set(crashed) == {"Tank", "Tank mu", "Modules map"}
     for name, volume in crashed.items():

@@ -34,7 +34,7 @@ class MPHDRR_Preferences(bpy.types.AddonPreferences):
     bl_idname = PACKAGE
 
     threads: IntProperty(
-        name="Threads", description="Processor threads that projections use where the panel does not say; 0: all",
+        name="Threads", description="Processor threads for projections unless the panel sets them; 0: all",
         default=0, min=0, soft_max=64, update=_apply,
     )  # fmt: skip
     copies: BoolProperty(

@@ -59,7 +59,7 @@ class ModuleProperties(bpy.types.PropertyGroup):
 
     is_module: BoolProperty(name="Is Module", options={"HIDDEN"})
     part: EnumProperty(
-        name="Part", description="What the object is in a scanner", options={"HIDDEN"},
+        name="Part", description="Kind of part of a scanner", options={"HIDDEN"},
         default="NONE",
         items=choices.items(choices.PARTS, ((part, part.capitalize(), "") for part in dict.fromkeys((*ids.PARTS, *PARTS)))),
     )  # fmt: skip
@@ -68,29 +68,27 @@ class ModuleProperties(bpy.types.PropertyGroup):
         get=_is_visible, set=_set_visible,
     )  # fmt: skip
     number: IntProperty(name="Number", description="Module number, as in the workbook")
-    index: IntProperty(name="Index", description="Place of the module in its system, from 0", min=0, options={"HIDDEN"})
+    index: IntProperty(name="Index", description="Index of the module in its system, from 0", min=0, options={"HIDDEN"})
     ring: IntProperty(name="Ring", description="Ring of the module, counted from 0", min=0)
     added: BoolProperty(name="Added", description="The module is not in the workbook", options={"HIDDEN"})
     length_mode: EnumProperty(
-        name="Length", description="Where the collimator's length l comes from", items=_LENGTH_MODES, default="TYPED",
+        name="Length", description="Origin of the collimator's length l", items=_LENGTH_MODES, default="TYPED",
         update=on_edit("module"),
     )  # fmt: skip
     exact: StringProperty(
-        name="Exact Values", description="Numbers and place as imported, float64 JSON", options={"HIDDEN"}
+        name="Exact Values", description="Numbers and pose as imported, float64 JSON", options={"HIDDEN"}
     )
-    placed: FloatVectorProperty(name="Placed", description="Where it was last built, mm", size=3, options={"HIDDEN"})
-    built: StringProperty(name="Built", description="The numbers that the readouts belong to", options={"HIDDEN"})
+    placed: FloatVectorProperty(name="Placed", description="Position when last built, mm", size=3, options={"HIDDEN"})
+    built: StringProperty(name="Built", description="Values behind the readouts", options={"HIDDEN"})
     # Readouts, which `following.py` writes and the panels show.
-    pinhole_distance: FloatProperty(name="Pinhole Distance", description="b: from the pinhole to the isocentre, in mm")
-    sensitivity: FloatProperty(name="Sensitivity", description="Of an ideal pinhole at the isocentre, cps/MBq")
-    resolution: FloatProperty(
-        name="Resolution", description="FWHM in mm at the isocentre, of the hole and the detector"
-    )
-    magnification: FloatProperty(name="Magnification l / b", description="Of the image on the crystal")
-    roi_seen: FloatProperty(name="Radius Seen", description="Radius in mm of the largest sphere that it sees whole")
+    pinhole_distance: FloatProperty(name="Pinhole Distance", description="Distance b to the isocentre, in mm")
+    sensitivity: FloatProperty(name="Sensitivity", description="Ideal pinhole's sensitivity at the isocentre, cps/MBq")
+    resolution: FloatProperty(name="Resolution", description="FWHM of hole and detector at the isocentre, in mm")
+    magnification: FloatProperty(name="Magnification l / b", description="Magnification of the image on the crystal")
+    roi_seen: FloatProperty(name="Radius Seen", description="Radius in mm of the largest sphere that is seen whole")
     aimed: BoolProperty(name="Aimed", description="The camera looks at the isocentre", default=True)
-    problem: StringProperty(name="Problem", description="Why the module's numbers are impossible")
-    finding: StringProperty(name="Finding", description="What the last check of the geometry found at this module")
+    problem: StringProperty(name="Problem", description="Reason why the module's numbers are impossible")
+    finding: StringProperty(name="Finding", description="Findings of the last geometry check at this module")
 
     @property
     def sees_roi(self) -> bool:
@@ -103,17 +101,15 @@ class ScannerProperties(bpy.types.PropertyGroup):
 
     is_scanner: BoolProperty(name="Is Scanner", options={"HIDDEN"})
     is_ring: BoolProperty(name="Is Ring", description="The collection is a ring of a scanner", options={"HIDDEN"})
-    kind: StringProperty(
-        name="Kind", description="What kind of scanner it is", default=PinholeSystem.kind, options={"HIDDEN"}
-    )
-    scanner_name: StringProperty(name="Scanner Name", description="Its name in the import: the same name replaces it")
-    workbook: path_property("Workbook", "File last read from or written to")
+    kind: StringProperty(name="Kind", description="Kind of the scanner", default=PinholeSystem.kind, options={"HIDDEN"})
+    scanner_name: StringProperty(name="Scanner Name", description="Name in the import; the same name replaces it")
+    workbook: path_property("Workbook", "Workbook that was last read or written")
     sha256: StringProperty(name="SHA-256", description="Checksum of the workbook when it was read")
-    n_modules: IntProperty(name="Modules", description="Number of modules when it was imported", min=0)
+    n_modules: IntProperty(name="Modules", description="Number of modules when the scanner was imported", min=0)
     quick_ranges: StringProperty(
         name="Quick Ranges", description="Module ranges with a button, JSON", options={"HIDDEN"}
     )
-    source: StringProperty(name="Source", description="Where the numbers come from, JSON", options={"HIDDEN"})
+    source: StringProperty(name="Source", description="Workbook that the numbers come from, JSON", options={"HIDDEN"})
     plate_thickness: FloatProperty(
         name="Plate", description="Thickness of the aperture plates in mm", min=0.0, update=on_edit("scanner")
     )
@@ -121,11 +117,11 @@ class ScannerProperties(bpy.types.PropertyGroup):
         name="Wall", description="Thickness of the collimators' walls in mm", min=0.0, update=on_edit("scanner")
     )
     opening_angle: FloatProperty(
-        name="Opening Angle", description="Full angle of the double cone in which the holes open from their knife edge",
+        name="Opening Angle", description="Full angle of the double cone in which holes open from the knife edge",
         subtype="ANGLE", default=math.pi / 2, min=0.01, max=3.1, update=on_edit("scanner"),
     )  # fmt: skip
     edge_at: EnumProperty(
-        name="Knife Edge", description="Where in the aperture plates the knife edge is; it stays at the pinhole's centre",
+        name="Knife Edge", description="Depth of the knife edge in the plate; it stays at the pinhole's centre",
         items=[
             ("MIDDLE", "Middle", "In the middle of the plate", 0),
             ("FRONT", "Front", "On the plate's face towards the ROI", 1),
@@ -134,11 +130,11 @@ class ScannerProperties(bpy.types.PropertyGroup):
         default="MIDDLE", update=on_edit("scanner"),
     )  # fmt: skip
     intrinsic_fwhm: FloatProperty(
-        name="Intrinsic FWHM", description="Resolution of the detectors in mm on the crystal, for the readouts. 0: ideal",
+        name="Intrinsic FWHM", description="Resolution of the detectors on the crystal in mm, for the readouts; 0: ideal",
         min=0.0, soft_max=10.0, step=10, update=on_edit("scanner"),
     )  # fmt: skip
     bore: FloatProperty(
-        name="Bore", description="Radius in mm about the z axis that the patient needs, for Check Geometry. 0: not checked",
+        name="Bore", description="Radius in mm around the z axis that the patient needs, for Check Geometry; 0: unchecked",
         min=0.0, soft_max=500.0,
     )  # fmt: skip
     keep_aimed: BoolProperty(
@@ -149,22 +145,22 @@ class ScannerProperties(bpy.types.PropertyGroup):
     )  # fmt: skip
     # The modules' properties have the first module's values here. `mixed` names those that differ between modules.
     length_mode: EnumProperty(
-        name="Length", description="Where the collimators' lengths come from. Changing it sets all modules",
+        name="Length", description="Origin of the collimators' lengths l. Changing it sets all modules",
         items=_LENGTH_MODES, default="TYPED", update=on_edit("all_modules", "length_mode"),
     )  # fmt: skip
     mixed: StringProperty(name="Mixed", description="Names of the numbers that differ between modules")
     # Readouts of all modules together, which `following.py` writes.
-    count: IntProperty(name="Modules", description="Number of modules now", min=0)
-    sensitivity: FloatProperty(name="Sensitivity", description="Of all modules together, at the isocentre, cps/MBq")
+    count: IntProperty(name="Modules", description="Present number of modules", min=0)
+    sensitivity: FloatProperty(name="Sensitivity", description="Sensitivity of all modules at the isocentre, cps/MBq")
     resolution: FloatProperty(name="Resolution", description="Mean FWHM in mm of the modules at the isocentre")
     n_covering: IntProperty(name="Covering", description="Number of modules that see their whole ROI sphere")
     parts_free: BoolProperty(
         name="Parts Free", description="Parts may be grabbed; version 0.1.0 locked them", options={"HIDDEN"}
     )
     untidy: StringProperty(name="Untidy", description="Copied cameras and parts without a camera, in words")
-    findings: StringProperty(name="Findings", description="What the last check of the geometry found, JSON")
-    design: StringProperty(name="Design", description="What the last design found, lines as JSON")
-    calibration: StringProperty(name="Calibration", description="What the last calibration found, lines as JSON")
+    findings: StringProperty(name="Findings", description="Findings of the last geometry check, JSON")
+    design: StringProperty(name="Design", description="Result of the last design, lines as JSON")
+    calibration: StringProperty(name="Calibration", description="Result of the last calibration, lines as JSON")
 
 
 def _is_scanner(self: GeometryProperties, collection: bpy.types.Collection) -> bool:
@@ -176,11 +172,11 @@ class GeometryProperties(bpy.types.PropertyGroup):
     """State of the Geometry panel; `Scene.mphdrr_geometry`."""
 
     scanner: PointerProperty(
-        name="Scanner", description="The scanner that the panels work on: the one of the active object",
+        name="Scanner", description="Scanner that the panels work on: the active object's",
         type=bpy.types.Collection, poll=_is_scanner, update=on_edit("scanner_chosen"),
     )  # fmt: skip
     active_index: IntProperty(
-        name="Active Module", description="Its index among the scanner's objects", update=on_edit("active_module")
+        name="Active Module", description="Index among the scanner's objects", update=on_edit("active_module")
     )
     all_at_once: BoolProperty(
         name="All Modules", description="Show and change all modules at once, not the active one alone"
@@ -197,11 +193,11 @@ class GeometryProperties(bpy.types.PropertyGroup):
         update=on_edit("sight_lines"),
     )  # fmt: skip
     show_detectors: BoolProperty(
-        name="Detector", description="Draw the virtual detector where it truly is, at the magnification times l",
+        name="Detector", description="Draw the virtual detector at its distance, the magnification times l",
         update=on_edit("sight_lines"),
     )  # fmt: skip
     sight_all: BoolProperty(
-        name="All Modules", description="Draw it for all visible modules, not for the active one only",
+        name="All Modules", description="Draw the lines of all visible modules, not of the active one only",
         update=on_edit("sight_lines"),
     )  # fmt: skip
 

@@ -23,7 +23,7 @@ def path_property(name: str, description: str, *options: str, subtype: str = "FI
     return StringProperty(name=name, description=description, subtype=subtype, options=all_options, **keywords)
 
 
-DIRECTORY = StringProperty(description="Where the files are", subtype="DIR_PATH", options={"SKIP_SAVE"})
+DIRECTORY = StringProperty(description="Folder of the files", subtype="DIR_PATH", options={"SKIP_SAVE"})
 
 
 def shown_files(endings: Iterable[str]) -> Any:

@@ -425,7 +425,7 @@ class MPHDRR_OT_cancel_job(reports.Reported, bpy.types.Operator):
     bl_label = "Cancel"
     bl_options = {"INTERNAL"}
 
-    number: IntProperty(name="Job", description="Its number; 0: the running one", options={"HIDDEN", "SKIP_SAVE"})
+    number: IntProperty(name="Job", description="Number; 0: the running job", options={"HIDDEN", "SKIP_SAVE"})
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         """Ask whether to keep or to discard the running job's results so far, if they can be kept."""

@@ -17,7 +17,7 @@ def _models(self: bpy.types.PropertyGroup, context: bpy.types.Context, typed: st
 
 def recipe_property(update: Any = None) -> Any:
     """Return a property for a recipe's file."""
-    text = "Text (.toml) that says from which phantoms, poses and models events are drawn"
+    text = "Text (.toml) with the phantoms, poses and models from which events are drawn"
     return path_property("Recipe", text, "SKIP_SAVE", update=update)
 
 
@@ -29,14 +29,14 @@ def _propose_folder(self: Any, context: bpy.types.Context) -> None:
 
 RECIPE = recipe_property()
 FOLDER = path_property(
-    "Folder", "Of the event set: its recipe, its index and a file for each event", "SKIP_SAVE", subtype="DIR_PATH"
+    "Folder", "Folder of the event set: its recipe, index and a file for each event", "SKIP_SAVE", subtype="DIR_PATH"
 )
 COUNT = IntProperty(
-    name="Events", description="Of the whole set, numbered from 0; those that are there stay as they are", default=10,
+    name="Events", description="Number of events of the whole set; existing ones stay as they are", default=10,
     min=1, soft_max=10000, options={"SKIP_SAVE"},
 )  # fmt: skip
 MODEL = StringProperty(
-    name="Model", description="Whose projections are shown; empty: the recipe's first", search=_models,
+    name="Model", description="Model whose projections are shown; empty: the recipe's first", search=_models,
     search_options={"SUGGESTION"}, options={"SKIP_SAVE"},
 )  # fmt: skip
 
@@ -46,7 +46,7 @@ def number_property(description: str) -> Any:
     return IntProperty(name="Event", description=description, min=0, soft_max=10000, options={"SKIP_SAVE"})
 
 
-NEXT = number_property("Number of the event that is tried next: its draws depend on it and on the recipe alone")
+NEXT = number_property("Number of the event to try next: its draws depend on it and on the recipe alone")
 OPENED = number_property("Number of the event to open, from 0")
 
 
@@ -60,15 +60,15 @@ class EventProperties(bpy.types.PropertyGroup):
     opened: OPENED
     model: MODEL
     phantom: PointerProperty(
-        name="Phantom", description="That events are tried on", type=bpy.types.Object,
+        name="Phantom", description="Phantom on which events are tried", type=bpy.types.Object,
         poll=lambda self, item: volumes.is_volume(item), options={"HIDDEN"},
     )  # fmt: skip
     truth: PointerProperty(
-        name="Truth", description="Of the event that was opened last", type=bpy.types.Object,
+        name="Truth", description="Truth of the event that was opened last", type=bpy.types.Object,
         poll=lambda self, item: volumes.is_volume(item), options={"HIDDEN"},
     )  # fmt: skip
-    proposed: path_property("Proposed Folder", "That the recipe has proposed", "HIDDEN", subtype="DIR_PATH")
-    tried: StringProperty(name="Tried", description="What the phantom in the scene is", options={"HIDDEN"})
+    proposed: path_property("Proposed Folder", "Folder proposed for the recipe", "HIDDEN", subtype="DIR_PATH")
+    tried: StringProperty(name="Tried", description="Event that the phantom in the scene shows", options={"HIDDEN"})
 
 
 CLASSES = (EventProperties,)

@@ -121,11 +121,11 @@ def sampling(update: Any = None) -> dict[str, Any]:
     quantities = (("activity", "Activity", "In kBq/mL"), ("mu", "Attenuation", "Linear attenuation in 1/mm"))
     return {
         "quantity": EnumProperty(
-            name="Quantity", description="What the voxels hold", default="activity", update=update,
+            name="Quantity", description="Quantity of the voxels", default="activity", update=update,
             items=choices.items(choices.QUANTITIES, quantities),
         ),
         "voxels": IntProperty(
-            name="Voxels per Side", description="How many the grid has along each of its sides", default=128, min=4,
+            name="Voxels per Side", description="Number of voxels along each side of the grid", default=128, min=4,
             soft_max=512, max=4096, update=update,
         ),
         "voxel_size": FloatProperty(
@@ -144,7 +144,7 @@ def settings_class(kind: Kind, name: str, bases: tuple[type, ...], update: Any =
     fields = {field.name: _make_property(field, kind, update) for field in _setting_fields(kind)}
     if _has_states(kind):
         fields["frames"] = IntProperty(
-            name="Frames", description="States of the heart's cycle; 1: it stands still at its phase", default=1, min=1,
+            name="Frames", description="Number of states of the heart's cycle; 1: its phase alone", default=1, min=1,
             soft_max=48, max=1000, update=update, options={"SKIP_SAVE"},
         )  # fmt: skip
     members["__annotations__"] = members.get("__annotations__", {}) | fields | sampling(update) | AUTO_SIZE
@@ -236,7 +236,7 @@ class PhantomTextProperties(PhantomSettings, bpy.types.PropertyGroup):
 
     __annotations__ = {
         "text": PointerProperty(
-            name="Text", description="Describes the phantom in TOML", type=bpy.types.Text, update=on_edit("phantom")
+            name="Text", description="The phantom in TOML", type=bpy.types.Text, update=on_edit("phantom")
         ),
         **sampling(on_edit("phantom")),
         **AUTO_SIZE,
@@ -267,14 +267,14 @@ _GROUPS = {
 _KINDS = (
     ("VOLUME", "Volume", "Voxels from elsewhere"),
     *((identifier(kind).upper(), kind.label, kind.summary) for kind in KINDS),
-    (FILE.upper(), "Text", "Shapes that a text describes"),
+    (FILE.upper(), "Text", "Shapes described by a text"),
 )
 
 
 LOOKS = (
     ("DENSITY", "Density", "Smoke that is the denser, the higher the value"),
     ("BRIGHTEST", "Brightest", "The highest values shine through, as in a maximum intensity projection"),
-    ("SHELL", "Shell", "The surface at a value: spheres, rods, the heart"),
+    ("SHELL", "Shell", "The isosurface of a value: spheres, rods, the heart"),
     ("CUT", "Cut-Away", "The outer surface, cut open at the slices"),
     ("BONE", "Bone", "Of a CT or mu: the bones' surface, and their window"),
     ("SOFT", "Soft Tissue", "Of a CT or mu: the skin, and the window of soft tissue"),
@@ -287,7 +287,7 @@ class VolumeProperties(bpy.types.PropertyGroup):
 
     is_volume: BoolProperty(options={"HIDDEN"})
     kind: EnumProperty(
-        name="Kind", description="The kind whose settings count", default="VOLUME",
+        name="Kind", description="Kind of the phantom whose settings are used", default="VOLUME",
         items=choices.items(choices.KINDS, _KINDS),
     )  # fmt: skip
     with_parent: BoolProperty(options={"HIDDEN"})  # another quantity of the phantom that is the parent
@@ -296,11 +296,11 @@ class VolumeProperties(bpy.types.PropertyGroup):
     scanner: PointerProperty(type=bpy.types.Collection, options={"HIDDEN"})  # scanner of a map
     message: StringProperty(options={"HIDDEN"})  # problem of the phantom's settings
     quantity: EnumProperty(
-        name="Quantity", description="What the voxels hold", default="activity",
+        name="Quantity", description="Quantity of the voxels", default="activity",
         items=choices.items(choices.QUANTITIES, ((name, name.capitalize(), f"In {unit}") for name, unit in UNITS.items())),
     )  # fmt: skip
     unit: StringProperty(name="Unit", description="Unit of the voxels' values")
-    shape: IntVectorProperty(name="Shape", description="Voxels along the grid's axes", size=3)
+    shape: IntVectorProperty(name="Shape", description="Numbers of voxels along the grid's axes", size=3)
     spacing: FloatVectorProperty(name="Spacing", description="Voxel size in mm along the grid's axes", size=3)
     minimum: FloatProperty(name="Minimum", description="Smallest voxel value")
     maximum: FloatProperty(name="Maximum", description="Largest voxel value")
@@ -310,7 +310,7 @@ class VolumeProperties(bpy.types.PropertyGroup):
         name="Low", description="Value at and below which nothing is shown", update=on_edit("display_range")
     )
     display_high: FloatProperty(
-        name="High", description="Value that is shown brightest", default=1.0, update=on_edit("display_range")
+        name="High", description="Value with the brightest colour", default=1.0, update=on_edit("display_range")
     )
     look: EnumProperty(
         name="Look", description="How the volume is drawn", items=choices.items({}, LOOKS), default="DENSITY",
@@ -319,7 +319,7 @@ class VolumeProperties(bpy.types.PropertyGroup):
     surface: FloatProperty(
         name="Surface", description="Value at which the surface is drawn", update=on_edit("display_range")
     )
-    slices: IntVectorProperty(name="Slices", description="Voxel from 0", size=3, min=0, update=on_edit("slices"))
+    slices: IntVectorProperty(name="Slices", description="Index, from 0", size=3, min=0, update=on_edit("slices"))
     # Name of the file that the voxels were first stored in: it identifies them in every version of Blender.
     content: StringProperty(options={"HIDDEN"})
     exact_pose: StringProperty(options={"HIDDEN"})  # world-from-object matrix in double precision, JSON

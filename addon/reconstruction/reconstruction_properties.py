@@ -33,7 +33,7 @@ _VOXEL_NAMES = ("voxels", "spacing", "center")
 _WAYS = {
     "sum": ("Sum", "Add up the views: large wherever many rays cross something"),
     "product": ("Geometric Mean", "Multiply the views: nothing where one view sees nothing"),
-    "minimum": ("Minimum", "The least that a view sees there"),
+    "minimum": ("Minimum", "The smallest value that a view has there"),
 }
 HOW_LABELS = {how: _WAYS.get(how, (how.capitalize(), ""))[0] for how in HOW}
 """Labels of the ways to combine views."""
@@ -53,7 +53,7 @@ _METHOD_FILE_NAMES = ("ignore_attenuation", "ignore_blur", "hole", "aperture_poi
 
 
 _COMBINE_BY = EnumProperty(
-    name="Combine By", description="How the views that see a voxel are put together",
+    name="Combine By", description="How the views of a voxel are combined",
     items=choices.items({}, ((how.upper(), HOW_LABELS[how], _WAYS.get(how, ("", ""))[1]) for how in HOW)), default="SUM",
 )  # fmt: skip
 
@@ -112,10 +112,8 @@ class ReconstructionProperties(ReconstructionSettings, bpy.types.PropertyGroup):
         "that which the run was made with; empty: the run's", type=bpy.types.Object,
         poll=lambda self, item: volumes.is_volume(item) and volumes.quantity_of(item) in ("mu", "hu"),
     )  # fmt: skip
-    fitted: StringProperty(
-        name="Fitted Method", description="The method that what a run holds has chosen", options={"HIDDEN"}
-    )
-    record: StringProperty(name="Record", description="What is known of it, JSON", options={"HIDDEN"})
+    fitted: StringProperty(name="Fitted Method", description="Method chosen for the run's content", options={"HIDDEN"})
+    record: StringProperty(name="Record", description="Details of the last reconstruction, JSON", options={"HIDDEN"})
 
     @property
     def details(self) -> Mapping[str, Any]:

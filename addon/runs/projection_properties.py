@@ -41,10 +41,10 @@ PROPERTIES = {
 class ProjectionSettings:
     """Properties for projecting, shared by the scene's settings (the panel) and the operator (scripts)."""
 
-    noise: BoolProperty(name="Poisson Noise", description="Draw counts instead of their expected means")
-    seed: IntProperty(name="Seed", description="Of the noise: the same seed draws the same counts", default=1, min=0)
-    first: IntProperty(name="First Module", description="Its number; 0: from the first", default=0, min=0)
-    last: IntProperty(name="Last Module", description="Its number; 0: to the last", default=0, min=0)
+    noise: BoolProperty(name="Poisson Noise", description="Draw Poisson counts instead of expected counts")
+    seed: IntProperty(name="Seed", description="Seed of the noise: it determines the drawn counts", default=1, min=0)
+    first: IntProperty(name="First Module", description="Number of the first module; 0: the lowest", default=0, min=0)
+    last: IntProperty(name="Last Module", description="Number of the last module; 0: the highest", default=0, min=0)
 
 
 ProjectionSettings.__annotations__.update(setting_properties.make_properties(PROPERTIES))
@@ -157,17 +157,17 @@ def _attenuates(self: ProjectionProperties, item: bpy.types.Object) -> bool:
 class RunProperties(bpy.types.PropertyGroup):
     """Properties of a run in the scene's list `ProjectionProperties.runs`, written by `addon/runs/runs.py`."""
 
-    name: StringProperty(name="Name", description="Of the run; one that is given another name is kept")
-    usual_name: StringProperty(name="Usual Name", description="That it got when it was made", options={"HIDDEN"})
-    file: path_property("File", "With its exact arrays", "HIDDEN")
-    scanner: PointerProperty(name="Scanner", description="That it is of", type=bpy.types.Collection)
-    summary: StringProperty(name="Summary", description="What it is", options={"HIDDEN"})
-    state: StringProperty(name="State", description="Of the scene when it was made, float64 JSON", options={"HIDDEN"})
+    name: StringProperty(name="Name", description="Name of the run; a renamed run is kept")
+    usual_name: StringProperty(name="Usual Name", description="Original name of the run", options={"HIDDEN"})
+    file: path_property("File", "File with the run's exact arrays", "HIDDEN")
+    scanner: PointerProperty(name="Scanner", description="Scanner of the run", type=bpy.types.Collection)
+    summary: StringProperty(name="Summary", description="Contents of the run", options={"HIDDEN"})
+    state: StringProperty(name="State", description="The scene's state when made, float64 JSON", options={"HIDDEN"})
     keep: BoolProperty(
         name="Keep",
-        description="Keep this run. Of the others the last two stay, and the next render replaces the older",
+        description="Keep this run. Of all others the last two stay, and the next render replaces the older",
     )
-    is_saved: BoolProperty(name="Saved", description="A saved .blend may need its file", options={"HIDDEN"})
+    is_saved: BoolProperty(name="Saved", description="A saved .blend may need the run's file", options={"HIDDEN"})
 
     @property
     def is_kept(self) -> bool:
@@ -198,7 +198,7 @@ class ProjectionProperties(ProjectionSettings, bpy.types.PropertyGroup):
     """State of the Projections panel; `Scene.mphdrr_projections`."""
 
     volume: PointerProperty(
-        name="Volume", description="What to project; empty: the active volume, or the only one", type=bpy.types.Object,
+        name="Volume", description="Volume to project; empty: the active volume, or the only one", type=bpy.types.Object,
         poll=_is_ours, update=_volume_chosen,
     )  # fmt: skip
     all_modules: BoolProperty(
@@ -206,7 +206,7 @@ class ProjectionProperties(ProjectionSettings, bpy.types.PropertyGroup):
         get=_projects_all, set=_project_all,
     )  # fmt: skip
     fitted: StringProperty(
-        name="Fitted Model", description="The model that the volume's quantity has chosen", options={"HIDDEN"}
+        name="Fitted Model", description="Model chosen for the volume's quantity", options={"HIDDEN"}
     )
     mu: PointerProperty(
         name="Attenuation", description="Volume of attenuation coefficients (1/mm) before the pinhole, or of CT numbers, "
@@ -215,10 +215,10 @@ class ProjectionProperties(ProjectionSettings, bpy.types.PropertyGroup):
     )  # fmt: skip
     runs: CollectionProperty(type=RunProperties, name="Runs", options={"HIDDEN"})
     active_run: IntProperty(
-        name="Run", description="The run in the list whose images are shown", update=on_edit("active_run")
+        name="Run", description="Run in the list whose images are shown", update=on_edit("active_run")
     )
     run_file: path_property("Run", "File with the shown run's exact arrays", "HIDDEN")
-    run_summary: StringProperty(name="Shown Run", description="What the shown run is", options={"HIDDEN"})
+    run_summary: StringProperty(name="Shown Run", description="Contents of the shown run", options={"HIDDEN"})
 
 
 ProjectionProperties.__annotations__.update(setting_properties.make_check_marks(PROPERTIES))

@@ -67,21 +67,21 @@ class ColumnMapTable(bpy.types.PropertyGroup):
 
     sheet: StringProperty(name="Sheet", description="Name of the sheet", search=_sheets, update=_edited)
     header_row: IntProperty(
-        name="Header Row", description="Row of the headings shown below; they are not read. 0: none", min=0,
+        name="Header Row", description="Row of the headings shown below, which are not read; 0: none", min=0,
         update=_edited,
     )  # fmt: skip
     first_row: IntProperty(name="First Row", description="Row of the first module", default=2, min=1, update=_edited)
     last_row: IntProperty(name="Last Row", description="Row of the last module", default=2, min=1, update=_edited)
     skip_rows: StringProperty(
-        name="Skip Rows", description="Rows in between that hold no module, such as 43, 50-52", update=_edited
+        name="Skip Rows", description="Rows in between without a module, such as 43, 50-52", update=_edited
     )
     number: StringProperty(
         name="Number Column",
-        description="Letters of the column of module numbers or names. Empty: the rows are modules 1, 2, ...",
+        description="Letters of the column with module numbers or names. Empty: the rows are modules 1, 2, ...",
         update=_edited,
     )
     rows: EnumProperty(
-        name="Rows", description="Which modules of table 1 the rows belong to", default="BY_NUMBER", update=_edited,
+        name="Rows", description="How rows are assigned to the modules of table 1", default="BY_NUMBER", update=_edited,
         items=choices.items(choices.JOINED, (
             ("BY_NUMBER", "By Number", "A row belongs to the module with its number or name"),
             ("IN_ORDER", "In Order", "The first row belongs to the first module, and so on"),
@@ -93,12 +93,12 @@ class ColumnMapTable(bpy.types.PropertyGroup):
 class ColumnMapQuantity(bpy.types.PropertyGroup):
     """Column of a quantity (`MappedColumn`)."""
 
-    name: StringProperty(name="Quantity", description="Its symbol")
-    table: IntProperty(name="Table", description="Which table its column is in", default=1, min=1, max=MAX_TABLES,
+    name: StringProperty(name="Quantity", description="Symbol of the quantity")
+    table: IntProperty(name="Table", description="Table with the quantity's column", default=1, min=1, max=MAX_TABLES,
                        update=_edited)  # fmt: skip
     column: StringProperty(name="Column", description="The column's letters. Empty: none", update=_edited)
     unit: EnumProperty(
-        name="Unit", description="Of the numbers in the column",
+        name="Unit", description="Unit of the numbers in the column",
         items=_units(LENGTH_UNITS, ANGLE_UNITS), default="NONE", update=_edited,
     )  # fmt: skip
     seen: StringProperty(name="Seen", description="The column's heading and first number in the workbook")
@@ -108,15 +108,15 @@ class ColumnMapProperties(bpy.types.PropertyGroup):
     """Settings of the dialog and what they yield; `WindowManager.mphdrr_columns`."""
 
     filled: BoolProperty(name="Filled", description="A changed setting updates the preview", options={"HIDDEN"})
-    workbook: StringProperty(name="Workbook", description="File that the settings are for", subtype="FILE_PATH")
-    sheets: StringProperty(name="Sheets", description="Names of its sheets, JSON", options={"HIDDEN"})
+    workbook: StringProperty(name="Workbook", description="Workbook that the settings belong to", subtype="FILE_PATH")
+    sheets: StringProperty(name="Sheets", description="Names of the workbook's sheets, JSON", options={"HIDDEN"})
     doubts: StringProperty(name="Doubts", description="What the reader did not understand, JSON", options={"HIDDEN"})
     n_tables: IntProperty(
         name="Tables", description="Ranges of rows: the first holds x1, y1 and z1, the others dimensions",
         default=2, min=1, max=MAX_TABLES, update=_number_of_tables_changed,
     )  # fmt: skip
     unit: EnumProperty(
-        name="All Lengths In", description="Changing it sets the unit of every length below",
+        name="All Lengths In", description="Unit for every length below",
         items=_units(LENGTH_UNITS), default="NONE", update=_unit_of_all_changed,
     )  # fmt: skip
     tables: CollectionProperty(type=ColumnMapTable, name="Tables")
@@ -125,9 +125,9 @@ class ColumnMapProperties(bpy.types.PropertyGroup):
         name="Save Map As",
         description="Also write the column map to this new .toml file, beside the workbook unless a folder is given",
     )
-    refusal: StringProperty(name="Refusal", description="Why the workbook cannot be read with these settings")
+    refusal: StringProperty(name="Refusal", description="Reason why the workbook cannot be read with these settings")
     remarks: StringProperty(name="Remarks", description="The reader's warnings, JSON", options={"HIDDEN"})
-    n_modules: IntProperty(name="Modules", description="How many are read", min=0)
+    n_modules: IntProperty(name="Modules", description="Number of modules that are read", min=0)
     preview: StringProperty(
         name="Preview", description="Headings, then rows of numbers as they are read, JSON", options={"HIDDEN"}
     )

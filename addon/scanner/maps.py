@@ -13,10 +13,10 @@ from ..volumes.stored_volumes import StoredVolume, store_volume
 from . import scanner
 
 _DESCRIPTIONS = {
-    "sensitivity": "Of all modules together, cps/MBq",
+    "sensitivity": "Sensitivity of all modules together, cps/MBq",
     "modules": "Number of modules that see a voxel",
-    "resolution": "FWHM in mm that the projections hold, all modules together",
-    "completeness": "Of the angular sampling (Tuy): 1 where every plane through the voxel meets a pinhole. Slow",
+    "resolution": "FWHM in mm of the projections of all modules together",
+    "completeness": "Angular completeness (Tuy): 1 where every plane through the voxel meets a pinhole. Slow",
 }
 QUANTITIES = choices.items(choices.MAPS, ((name, name.capitalize(), _DESCRIPTIONS.get(name, "")) for name in MAPS))
 _BYTES_PER_VOXEL = 40.0  # memory needed while the map is made and put into the scene

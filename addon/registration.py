@@ -196,8 +196,8 @@ def register(command: Callable[..., int] | None = None) -> None:
             handlers.append(function)
             _registered.callback(_remove_handler, handlers, function)
         if not bpy.app.background:
-            for space, draw, when in DRAWINGS:
-                drawing = space.draw_handler_add(draw, (), "WINDOW", when)
+            for space, draw, draw_type in DRAWINGS:
+                drawing = space.draw_handler_add(draw, (), "WINDOW", draw_type)
                 _registered.callback(space.draw_handler_remove, drawing, "WINDOW")
             keymaps = bpy.context.window_manager.keyconfigs.addon.keymaps
             for name in ("Image", "Image Editor Tool: Sample"):  # the latter takes clicks before "Image" does

@@ -201,7 +201,7 @@ class JobOperator:
     dialog: dict[str, Any] | None = None
     """Arguments of a dialog of the operator's properties: `confirm_text` on its button, `width`; None for no dialog."""
 
-    _asked = False
+    _has_asked = False
     _job: Job | None = None
     _run: Worker | None = None
     _timer: bpy.types.Timer | None = None
@@ -245,7 +245,7 @@ class JobOperator:
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Do the job at once and return when it is done."""
-        if self._asked:
+        if self._has_asked:
             return self._start_after_asking()
         try:
             if is_running():
@@ -265,7 +265,7 @@ class JobOperator:
         try:
             result = None if self.confirmed else self.ask(context)
             if result is not None:
-                self._asked = True
+                self._has_asked = True
                 return result
             with reports.warnings_reported(self):
                 job = self.job(context)

@@ -34,7 +34,7 @@ class _Target:
     """Phantom in the scene that will become an event's phantom, described for a worker thread."""
 
     uid: int = 0  # `session_uid` of its object; 0: there is none yet
-    others: tuple[str, ...] = ()  # quantities of its other volumes
+    other_quantities: tuple[str, ...] = ()  # quantities of its other volumes
     voxels: int = 0  # number along each side; 0: the recipe's
 
 
@@ -238,7 +238,7 @@ def _store_phantom(planned: events.PlannedEvent, target: _Target, files: Path, p
         values["frames"] = entry["gates"]
     voxels = target.voxels or min(_MAX_VOXELS, *recipe.grid.shape)
     settings = phantom_properties.plain_settings(entry.kind.name, **values, quantity=recipe.quantity, voxels=voxels)
-    quantities = [recipe.quantity, *target.others]
+    quantities = [recipe.quantity, *target.other_quantities]
     stored = phantoms.copy_settings(settings).voxelize(quantities, [placement] * len(quantities), files, progress)
     return _Phantom(stored, settings, placement)
 
@@ -286,8 +286,8 @@ def _make_target(item: bpy.types.Object | None) -> _Target:
     if item is None:
         return _Target()
     settings = phantoms.settings_of(item)
-    others = tuple(volumes.quantity_of(child) for child in phantoms.with_children(item)[1:])
-    return _Target(item.session_uid, others, 0 if settings is None else settings.voxels)
+    other_quantities = tuple(volumes.quantity_of(child) for child in phantoms.with_children(item)[1:])
+    return _Target(item.session_uid, other_quantities, 0 if settings is None else settings.voxels)
 
 
 def _select(item: bpy.types.Object, hidden_item: bpy.types.Object | None) -> None:

@@ -55,12 +55,12 @@ class FigureScene:
         self.subject, self.item, self.page, self.top = subject, item, page, top
         self.studio, self._motion = view, motion = kind.studio, kind.motion
         self.full_system = subject.scanner
-        chosen = subject.chosen(self.full_system)
+        chosen_system = subject.chosen(self.full_system)
         if view.lit and subject.modules is None and motion != "light":  # all rays together could not be told apart
-            chosen = chosen[chosen.rings() == chosen.rings().max() // 2]
-        self.numbers: list[int] = chosen.numbers.tolist()
+            chosen_system = chosen_system[chosen_system.rings() == chosen_system.rings().max() // 2]
+        self.numbers: list[int] = chosen_system.numbers.tolist()
         """Numbers of the chosen modules."""
-        self.system = self.full_system if view.lit else chosen
+        self.system = self.full_system if view.lit else chosen_system
         self.scene = scene = bpy.data.scenes.new(ids.STUDIO)
         self.radius = self.full_system.region_radius()
         self.volume_objects: list[bpy.types.Object] = []
@@ -142,16 +142,16 @@ class FigureScene:
         numbered = dict(zip(self.system.numbers.tolist(), range(len(self.system)), strict=True))
         parts = self.system.parts(self.subject.construction)
         for kind in dict.fromkeys(part.kind for part in parts):
-            chosen = [part for part in parts if part.kind == kind]
-            firsts = np.cumsum([0, *(len(part.vertices) for part in chosen)])
-            faces = [part.solid[1] + first for part, first in zip(chosen, firsts[:-1], strict=True)]
+            kind_parts = [part for part in parts if part.kind == kind]
+            firsts = np.cumsum([0, *(len(part.vertices) for part in kind_parts)])
+            faces = [part.solid[1] + first for part, first in zip(kind_parts, firsts[:-1], strict=True)]
             mesh = bpy.data.meshes.new(ids.STUDIO)
-            vertices = np.concatenate([part.vertices for part in chosen])
+            vertices = np.concatenate([part.vertices for part in kind_parts])
             collimators.reshape_mesh(mesh, (vertices, np.concatenate(faces)))
             mesh.materials.append(_figure_material(kind.upper()))
             for name in ("lit", "there"):
                 mesh.attributes.new(name, "FLOAT", "FACE")
-            module = np.repeat([numbered[part.number] for part in chosen], [len(f) for f in faces])
+            module = np.repeat([numbered[part.number] for part in kind_parts], [len(f) for f in faces])
             self._modules.append((mesh, module))
             self.add_object(mesh)
 
@@ -202,9 +202,9 @@ def aim_camera(camera: bpy.types.Object, direction: Points, page: Page, points: 
     distance = max((x_high + x_low) / (2 * half_width), (y_high + y_low) / (top_edge + bottom_edge))
     cx, cy = (x_high - x_low) / 2, (y_high - top_edge * distance + bottom_edge * distance - y_low) / 2
     for _ in range(10):  # centre the points where one direction leaves room
-        seen_x, seen_y = (x - cx) / (depth + distance), (y - cy) / (depth + distance)
-        cx += distance * (seen_x.max() + seen_x.min()) / 2
-        cy += distance * (seen_y.max() - top_edge + seen_y.min() + bottom_edge) / 2
+        view_x, view_y = (x - cx) / (depth + distance), (y - cy) / (depth + distance)
+        cx += distance * (view_x.max() + view_x.min()) / 2
+        cy += distance * (view_y.max() - top_edge + view_y.min() + bottom_edge) / 2
     camera.location = cx * right + cy * up + distance * back
     camera.rotation_mode, camera.rotation_quaternion = "QUATERNION", turn
     camera.data.clip_start, camera.data.clip_end = 0.01 * distance, 10.0 * distance

@@ -319,7 +319,7 @@ class VolumeProperties(bpy.types.PropertyGroup):
     surface: FloatProperty(
         name="Surface", description="Value at which the surface is drawn", update=on_edit("display_range")
     )
-    slices: IntVectorProperty(name="Slices", description="Index, from 0", size=3, min=0, update=on_edit("slices"))
+    slices: IntVectorProperty(name="Slices", description="Voxel of each slice", size=3, min=0, update=on_edit("slices"))
     # Name of the file that the voxels were first stored in: it identifies them in every version of Blender.
     content: StringProperty(options={"HIDDEN"})
     exact_pose: StringProperty(options={"HIDDEN"})  # world-from-object matrix in double precision, JSON

@@ -47,7 +47,7 @@ class Pictures:
     exact: list[bytes]  # OpenEXR files of float32 numbers, one per module
     colored: list[bytes]  # PNG files, one per module
     mosaic: bytes  # PNG file
-    drawn: Sheet  # layout of the mosaic's tiles
+    layout: Sheet  # layout of the mosaic's tiles
 
 
 def make_pictures(run: ProjectionRun, display: Display, progress: Progress | None = None) -> Pictures:
@@ -82,7 +82,7 @@ def store_images(run: ProjectionRun, files: Pictures) -> Generator[tuple[str, in
         raise
     _replace_images(new_images)
     mosaic = new_images[ids.MOSAIC]
-    _store_tiles(mosaic, files.drawn, numbers, run.system.rings().tolist(), run.unit, files.display)
+    _store_tiles(mosaic, files.layout, numbers, run.system.rings().tolist(), run.unit, files.display)
     mosaic[_LABELS] = "\n".join(labels(run))
     arrays = {name: getattr(run.views, name).ravel().tolist() for name in _ARRAYS}
     system = run.system
@@ -115,16 +115,16 @@ def recolor_images(display: Display, arrays: dict[int, NDArray[np.float32]]) -> 
         arrays[uid] = np.stack(exact_arrays)
         del exact_arrays
     projections = arrays[uid]
-    file, drawn = yield from _run_in_worker(lambda _: _draw_mosaic(projections, texts, rings, unit, display), False)
+    file, layout = yield from _run_in_worker(lambda _: _draw_mosaic(projections, texts, rings, unit, display), False)
     mosaic = fill(bpy.data.images[ids.MOSAIC], file)
-    _store_tiles(_load_pixels(mosaic), drawn, numbers, rings, unit, None)
+    _store_tiles(_load_pixels(mosaic), layout, numbers, rings, unit, None)
     files = yield from _run_in_worker(lambda progress: _color(projections, display, progress), True)
     for name, file in zip(names, files, strict=True):
         picture = bpy.data.images.get(ids.picture_name(name))
         if picture is not None:
             _load_pixels(fill(picture, file))
             yield True
-    _store_tiles(bpy.data.images[ids.MOSAIC], drawn, numbers, rings, unit, display)
+    _store_tiles(bpy.data.images[ids.MOSAIC], layout, numbers, rings, unit, display)
 
 
 def _run_in_worker(make: Callable[[Progress], Any], is_mosaic_made: bool) -> Generator[bool, None, Any]:
@@ -209,8 +209,8 @@ def _draw_mosaic(
     projections: NDArray[np.float32], texts: list[str], rings: list[int], unit: str, display: Display
 ) -> tuple[bytes, Sheet]:
     """Return the mosaic of projections (M, n_v, n_u), with a text in each tile, as a PNG file, and its layout."""
-    drawn = sheet(projections, texts, rings, unit, display)
-    return png(drawn.picture, _PNG_LEVEL), drawn
+    layout = sheet(projections, texts, rings, unit, display)
+    return png(layout.picture, _PNG_LEVEL), layout
 
 
 def _make_all(make: Callable[[Any], bytes], pictures: NDArray[np.float32], progress: Progress | None) -> list[bytes]:
@@ -224,21 +224,21 @@ def _make_all(make: Callable[[Any], bytes], pictures: NDArray[np.float32], progr
 
 
 def _store_tiles(
-    image: bpy.types.Image, drawn: Sheet, numbers: list[int], rings: list[int], unit: str, display: Display | None
+    image: bpy.types.Image, layout: Sheet, numbers: list[int], rings: list[int], unit: str, display: Display | None
 ) -> None:
     """Store the mosaic's layout on its image, and the display of all pictures; None if they have different ones."""
     image[_TILES] = {
-        "numbers": numbers, "rings": rings, "unit": unit, "corners": drawn.corners.ravel().tolist(), "tile": drawn.tile,
-        "window": drawn.window, "summed": drawn.summed, "totals": drawn.totals.tolist(), "maxima": drawn.maxima.tolist(),
-        "half": drawn.half, "share": drawn.share,
+        "numbers": numbers, "rings": rings, "unit": unit, "corners": layout.corners.ravel().tolist(), "tile": layout.tile,
+        "window": layout.window, "summed": layout.summed, "totals": layout.totals.tolist(), "maxima": layout.maxima.tolist(),
+        "half": layout.half, "share": layout.share,
         "display": repr(display),
     }  # fmt: skip
 
 
-def store_difference(drawn: Sheet, numbers: list[int], unit: str, text: str) -> bpy.types.Image:
+def store_difference(layout: Sheet, numbers: list[int], unit: str, text: str) -> bpy.types.Image:
     """Store the image of the difference of two runs until other projections are shown; `text` has its numbers."""
-    image = _store_image(ids.DIFFERENCE, png(drawn.picture, _PNG_LEVEL))
-    _store_tiles(image, drawn, numbers, [], unit, None)
+    image = _store_image(ids.DIFFERENCE, png(layout.picture, _PNG_LEVEL))
+    _store_tiles(image, layout, numbers, [], unit, None)
     image[_TEXT] = text
     return image
 

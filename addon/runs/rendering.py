@@ -93,9 +93,9 @@ def source_objects(
     context: bpy.types.Context, recipe: Recipe, model: Model, volume: str = "", mu: str = ""
 ) -> tuple[bpy.types.Object, bpy.types.Object | None]:
     """Return the objects to project and, if any, to attenuate; arguments and errors are those of `render_job`."""
-    taken = ("mu",) if recipe["model.photons"] else model.takes
+    usable = ("mu",) if recipe["model.photons"] else model.takes
     kind = scanner.kind_of(scanner.required_scanner(context.scene))
-    item = _chosen_volume(context, volume, tuple(q for q in kind.takes if q in taken), model.name)
+    item = _chosen_volume(context, volume, tuple(q for q in kind.takes if q in usable), model.name)
     return item, attenuating_object(context, recipe, mu)
 
 
@@ -116,10 +116,10 @@ def attenuating_object(context: bpy.types.Context, recipe: Recipe, mu: str = "")
 
 def integrates_activity(context: bpy.types.Context) -> bool:
     """Return whether the panel asks for a radiograph of activity, whichever volume it would take: few users want one."""
-    settings, known = context.scene.mphdrr_projections, volumes.volume_objects(context.scene)
+    settings, in_scene = context.scene.mphdrr_projections, volumes.volume_objects(context.scene)
     if not scanner.sees_activity(scanner.active_scanner(context.scene)):
         return False
-    candidates = [settings.volume] if settings.volume else [context.object] if context.object in known else known
+    candidates = [settings.volume] if settings.volume else [context.object] if context.object in in_scene else in_scene
     is_radiograph = settings.model == "TRANSMISSION" and not settings.photons
     return is_radiograph and bool(candidates) and all(volumes.quantity_of(item) == "activity" for item in candidates)
 

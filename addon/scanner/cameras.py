@@ -52,11 +52,11 @@ def has_field_of_view(camera: bpy.types.Camera) -> bool:
     if _KEY not in camera:
         return True
     x, y, distance, width, _ = field_of(camera)
-    now = camera.sensor_width / camera.lens * distance / abs(width) - 1.0, camera.shift_x, camera.shift_y
+    errors = camera.sensor_width / camera.lens * distance / abs(width) - 1.0, camera.shift_x, camera.shift_y
     return (
         camera.type == "PERSP"
         and camera.sensor_fit == "HORIZONTAL"
-        and all(abs(a - b) < _ROUNDING for a, b in zip(now, (0.0, x / abs(width), y / abs(width)), strict=True))
+        and all(abs(a - b) < _ROUNDING for a, b in zip(errors, (0.0, x / abs(width), y / abs(width)), strict=True))
     )
 
 

@@ -247,10 +247,10 @@ def _write_formula_values(kind: ScannerType, rows: _Rows, cameras_: Cameras, exa
                 rows[column.field][m] = values[column.field]
         else:
             stale.append(m)
-    known = SimpleNamespace(**{name: np.array([rows[name][m] for m in stale]) for name in inputs})
+    arguments = SimpleNamespace(**{name: np.array([rows[name][m] for m in stale]) for name in inputs})
     for column in formula_columns(kind) if stale else ():
         with suppress(InputError):  # constructing the system refuses the same values
-            for m, value in zip(stale, column.default(kind.columns.needed_values(known)).tolist(), strict=True):
+            for m, value in zip(stale, column.default(kind.columns.needed_values(arguments)).tolist(), strict=True):
                 rows[column.field][m] = value
 
 

@@ -279,10 +279,10 @@ def check_geometry(collection: bpy.types.Collection) -> tuple[list[str], list[bp
     if isinstance(system, PinholeSystem):
         findings: Sequence[Finding] = pinholes.find_problems(collection.mphdrr_scanner, system)
     else:
-        others = [c for c in scanners(bpy.context.scene) if c.mphdrr_scanner.kind != system.kind]
-        constructions = [pinholes.construction(c.mphdrr_scanner) for c in others if pinholes.has_pinholes(kind_of(c))]
+        other_scanners = [c for c in scanners(bpy.context.scene) if c.mphdrr_scanner.kind != system.kind]
+        designs = [pinholes.construction(c.mphdrr_scanner) for c in other_scanners if pinholes.has_pinholes(kind_of(c))]
         bore = typed(collection.mphdrr_scanner.bore) or None
-        findings = system.findings([read_scanner(c) for c in others], next(iter(constructions), None), bore)
+        findings = system.findings([read_scanner(c) for c in other_scanners], next(iter(designs), None), bore)
     with following.writing():
         collection.mphdrr_scanner.findings = json.dumps([str(finding) for finding in findings])
         for camera in cameras_:

@@ -69,10 +69,10 @@ def write_states(states: Sequence[Volume], folder: Path, provenance: dict[str, A
         content = (grid.shape, grid.affine.tolist(), state.quantity, compat.VDB_CENTER_SHIFT, provenance or {})
         digest.update(json.dumps(content).encode())
     stem = f"{states[0].quantity}-{digest.hexdigest()[:16]}"
-    shown = list(states)
-    while max(np.count_nonzero(state.array != _empty_value(state)) for state in shown) > MAX_SHOWN_VOXELS:
-        shown = [coarsen(state) for state in shown]
-    low = min(float(state.array.min()) for state in shown)
+    shown_states = list(states)
+    while max(np.count_nonzero(state.array != _empty_value(state)) for state in shown_states) > MAX_SHOWN_VOXELS:
+        shown_states = [coarsen(state) for state in shown_states]
+    low = min(float(state.array.min()) for state in shown_states)
     smoke_above = volume_materials.default_range(states[0].quantity, low, 1.0)[0] if low < 0 else None
 
     def write(stem: str, states: Sequence[Volume], provenance: Any, smoke_above: float | None) -> Path:
@@ -82,10 +82,10 @@ def write_states(states: Sequence[Volume], folder: Path, provenance: dict[str, A
                 vdb.write_vdb(state, path, provenance, smoke_above=smoke_above, center_shift=compat.VDB_CENTER_SHIFT)
         return paths[0]
 
-    if shown[0] is states[0]:
+    if shown_states[0] is states[0]:
         return write(stem, states, provenance, smoke_above)
     write(stem, states, provenance, None)
-    return write(stem + ids.PREVIEW, shown, {"coarser_copy_of": stem}, smoke_above)
+    return write(stem + ids.PREVIEW, shown_states, {"coarser_copy_of": stem}, smoke_above)
 
 
 def move_grid(volume: Volume, matrix: NDArray[np.float64]) -> Volume:

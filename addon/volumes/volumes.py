@@ -312,19 +312,20 @@ def _set_properties(item: bpy.types.Object, stored: StoredVolume) -> None:
     volume = stored.volume
     item.matrix_world = Matrix(stored.pose)
     settings = item.mphdrr_volume
-    low, high = shown = settings.display_low, settings.display_high
+    low, high = display_range = settings.display_low, settings.display_high
     surface_share = (settings.surface - low) / ((high - low) or 1.0)  # share of the display range
     usual_range = volume_materials.default_range(settings.quantity, settings.minimum, settings.maximum)
     unit, factor = volume_materials.display_unit(volume.quantity)
-    is_range_typed = settings.is_volume and settings.quantity == volume.quantity and not np.allclose(shown, usual_range)
+    is_same_kind = settings.is_volume and settings.quantity == volume.quantity
+    is_typed = is_same_kind and not np.allclose(display_range, usual_range)
     settings.is_volume, settings.quantity, settings.unit = True, volume.quantity, unit
     settings.shape, settings.spacing = volume.grid.shape, volume.grid.spacing
     settings.minimum, settings.maximum = factor * stored.low, factor * stored.high
     settings.extent = stored.extent
     settings.exact_pose, settings.content = json.dumps(stored.pose.tolist()), stored.path.name
     settings.center_shift = compat.VDB_CENTER_SHIFT
-    if not is_range_typed:
-        shown = volume_materials.default_range(volume.quantity, factor * stored.low, factor * stored.high)
-    if shown != (low, high):
-        settings.surface = shown[0] + surface_share * (shown[1] - shown[0])
-    settings.display_low, settings.display_high = shown
+    if not is_typed:
+        display_range = volume_materials.default_range(volume.quantity, factor * stored.low, factor * stored.high)
+    if display_range != (low, high):
+        settings.surface = display_range[0] + surface_share * (display_range[1] - display_range[0])
+    settings.display_low, settings.display_high = display_range

@@ -29,7 +29,7 @@ _SIZE = dict.fromkeys(("scanner", "picture", "cut-away"), (880, 510))
 def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     """Add the command."""
     parser = add_command(subparsers, "demo", COMMANDS[__name__], "mphdrr demo --output out")
-    parser.add_argument("--output", default="out", metavar="FOLDER", help="where the results go")
+    parser.add_argument("--output", default="out", metavar="FOLDER", help="folder for the results")
     add_workbook(parser, "--workbook", str(EXAMPLE))
     parser.add_argument("--voxels", type=int, default=256, metavar="N", help="voxels along each side of the volume")
     parser.add_argument("--size", type=int, default=256, metavar="N", help="pixels along each side of an image")

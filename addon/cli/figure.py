@@ -11,9 +11,9 @@ import numpy as np
 
 from ... import core as mph
 from ...core.cli.options import add_command, output_path, progress_bar, refuse
-from ...core.figures.kinds import FILMS, KINDS, PAPERS, SAMPLES, FigureKind, How, figure_kind
+from ...core.figures.kinds import FILMS, KINDS, PAPERS, SAMPLES, FigureKind, Rendering, figure_kind
 from ...core.figures.page import SUFFIXES, Page
-from ...core.figures.subject import NEEDS, Subject, require
+from ...core.figures.subject import NEEDS, FigureSubject, require
 from ...core.phantoms.kinds import KINDS as PHANTOMS
 from ...core.runs.formats import FORMATS
 from ...core.toml import read_toml
@@ -59,8 +59,8 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     add("--no-labels", action="store_true", help="without title and axes, where the figure is rendered")
     add("--samples", type=int, default=SAMPLES, metavar="N", help="rays per pixel, where the figure is rendered")
     add("--style", choices=list(PAPERS), default="dark", help="of figures that are rendered")
-    add("--seconds", type=float, default=How().seconds, metavar="S", help="how long an animation is")
-    add("--fps", type=int, default=How().fps, metavar="N", help="pictures of an animation per second")
+    add("--seconds", type=float, default=Rendering().seconds, metavar="S", help="how long an animation is")
+    add("--fps", type=int, default=Rendering().fps, metavar="N", help="pictures of an animation per second")
     parser.set_defaults(run=_run)
 
 
@@ -87,7 +87,7 @@ def _run(arguments: argparse.Namespace) -> None:
     if not arguments.output:
         raise mph.InputError("nothing to write: give --output FILE")
     paths = [output_path(name, kind.suffixes) for name in arguments.output]
-    how = How(*(not arguments.no_labels, *(getattr(arguments, name) for name in How._fields[1:])))
+    how = Rendering(*(not arguments.no_labels, *(getattr(arguments, name) for name in Rendering._fields[1:])))
     page = kind.page(arguments.size, how)
     blends = [file for file in arguments.files if file.lower().endswith(".blend")]
     if blends:
@@ -109,7 +109,9 @@ def _run(arguments: argparse.Namespace) -> None:
         print(path)
 
 
-def _draw_scene(arguments: argparse.Namespace, kind: FigureKind, blend: Path, paths: list[Path], how: How) -> None:
+def _draw_scene(
+    arguments: argparse.Namespace, kind: FigureKind, blend: Path, paths: list[Path], how: Rendering
+) -> None:
     """Draw a figure of the scene in a .blend, as the window draws it."""
     new_scene()
     import bpy
@@ -125,7 +127,7 @@ def _draw_scene(arguments: argparse.Namespace, kind: FigureKind, blend: Path, pa
         _run_steps(job.finish(job.work(lambda done, total: None)))
 
 
-def _render_figure(kind: FigureKind, page: Page, subject: Subject, paths: list[Path], how: How) -> None:
+def _render_figure(kind: FigureKind, page: Page, subject: FigureSubject, paths: list[Path], how: Rendering) -> None:
     """Draw a figure that Blender renders."""
     new_scene()
     from ..figures import figures
@@ -146,8 +148,8 @@ def _run_steps(steps: Any) -> None:
         report(*step[1:])
 
 
-def _read_subject(arguments: argparse.Namespace) -> Subject:
-    """Read all files of the command line into one `Subject`; later files override earlier ones."""
+def _read_subject(arguments: argparse.Namespace) -> FigureSubject:
+    """Read all files of the command line into one `FigureSubject`; later files override earlier ones."""
     values: dict[str, Any] = {"modules": arguments.modules}
     is_posed = False
     for file in arguments.files:
@@ -156,11 +158,11 @@ def _read_subject(arguments: argparse.Namespace) -> Subject:
         values |= file_values
     if not is_posed:
         refuse(arguments, _POSED, "is for a phantom: name its kind, or its .toml")
-    return Subject(**values)
+    return FigureSubject(**values)
 
 
 def _read_file(arguments: argparse.Namespace, file: str, scanner: Any) -> dict[str, Any]:
-    """Return the values of `Subject`'s fields that a file, or a kind of phantom, holds."""
+    """Return the values of `FigureSubject`'s fields that a file, or a kind of phantom, holds."""
     suffix = Path(file).suffix.lower()
     if suffix in _WORKBOOKS:
         return {"scanner": mph.read_scanner(file, next(iter(mph.kinds_in(file)), "pinhole"))}
@@ -187,7 +189,7 @@ def _read_file(arguments: argparse.Namespace, file: str, scanner: Any) -> dict[s
 
 
 def _run_values(run: mph.ProjectionRun) -> dict[str, Any]:
-    """Return the values of `Subject`'s fields that a run holds."""
+    """Return the values of `FigureSubject`'s fields that a run holds."""
     values: dict[str, Any] = {
         "scanner": run.system,
         "volume": run.volume,

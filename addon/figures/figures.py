@@ -21,10 +21,10 @@ from numpy.typing import ArrayLike, NDArray
 from ...core import PinholeSystem, Progress, files, read_run, recording, volume_to_mesh
 from ...core.cli.options import output_path
 from ...core.errors import InputError, warn
-from ...core.figures.kinds import KINDS, SAMPLES, FigureKind, How, figure_kind
+from ...core.figures.kinds import KINDS, SAMPLES, FigureKind, Rendering, figure_kind
 from ...core.figures.page import DARK, Page, box
 from ...core.figures.parts import bar_width, color_bar, heading, heading_height
-from ...core.figures.subject import Subject, require
+from ...core.figures.subject import FigureSubject, require
 from ...core.runs.display import Display
 from ...core.runs.resizing import resized
 from ..blender import ids, jobs, storage, timers, windows
@@ -90,10 +90,10 @@ def figure_job(
     """Return the job that writes a figure of the context's scene to files (.png, .svg; .mp4), `size` pixels wide and high.
 
     `modules` are all by default; for a figure of one module, the active one; for a picture the selected ones, if there are
-    several. `how` are the fields of `core.figures.kinds.How`. Raises InputError where the scene lacks what the figure
+    several. `how` are the fields of `core.figures.kinds.Rendering`. Raises InputError where the scene lacks what the figure
     needs.
     """
-    options = How(**how)
+    options = Rendering(**how)
     kind, scene = figure_kind(name), context.scene
     page = kind.page(size, options)
     paths = [output_path(str(path), kind.suffixes) for path in paths]
@@ -120,16 +120,16 @@ def figure_job(
         readers["run"] = partial(read_run, storage.absolute(run_file))
     require(kind.needs, {*subject_values, *readers}, kind.name, _MISSING)
 
-    def work(progress: Progress) -> Subject:
+    def work(progress: Progress) -> FigureSubject:
         progress(0, 1)
         read_values = {key: read() for key, read in readers.items()}
         if "run" in read_values:
             subject_values["name"] = read_values["run"].settings.get("volume", "")
-        return Subject(**subject_values, **read_values)
+        return FigureSubject(**subject_values, **read_values)
 
     reel = Reel()
 
-    def finish(subject: Subject) -> Generator[Step, None, str]:
+    def finish(subject: FigureSubject) -> Generator[Step, None, str]:
         yield from draw_figure(page, subject, kind, item, paths, options, reel)
         if windows.has_window() and paths[0].suffix == ".png":
             images.show_file(paths[0], bpy.context)
@@ -144,11 +144,11 @@ def figure_job(
 
 def draw_figure(
     page: Page,
-    subject: Subject,
+    subject: FigureSubject,
     kind: FigureKind,
     item: bpy.types.Object | None,
     paths: Sequence[Path],
-    how: How,
+    how: Rendering,
     reel: Reel,
 ) -> Generator[Step, None, None]:
     """Draw a figure on its page and write it to `paths`; yield while Blender's own job renders, and after each picture.
@@ -172,7 +172,7 @@ def draw_figure(
         page.write(path)
 
 
-def _render_film(stage: FigureScene, how: How, path: Path, reel: Reel) -> Generator[Step, None, None]:
+def _render_film(stage: FigureScene, how: Rendering, path: Path, reel: Reel) -> Generator[Step, None, None]:
     """Render an animation's pictures, and join them to an MP4."""
     pictures = reel.pictures = []
     folder = files.ensure_folder(path.with_name(f"{path.stem}-frames"))
@@ -193,7 +193,7 @@ def _render_film(stage: FigureScene, how: How, path: Path, reel: Reel) -> Genera
     yield from engine.write_film(pictures, path, how.fps, page)
 
 
-def _set_up(stage: FigureScene, how: How) -> Generator[None, None, None]:
+def _set_up(stage: FigureScene, how: Rendering) -> Generator[None, None, None]:
     """Set up Cycles for a figure's scene; a volume that Cycles does not draw becomes a surface, with a warning."""
     engine.set_up(stage.scene, stage.page, how.samples)
     item, volume = stage.item, stage.subject.volume
@@ -208,7 +208,7 @@ def _set_up(stage: FigureScene, how: How) -> Generator[None, None, None]:
     warn(f"the picture shows {item.name!r} as the surface at {level * factor:.3g} {settings.unit}: {_UNDRAWN}")
 
 
-def _render_picture(stage: FigureScene, how: How, page: Page) -> Generator[None, None, None]:
+def _render_picture(stage: FigureScene, how: Rendering, page: Page) -> Generator[None, None, None]:
     """Render a figure's scene, as it is now, onto a page."""
     page.image((yield from _render_pixels(stage.scene)), 0, 0, page.width, page.height)
     if how.labels:
@@ -303,8 +303,8 @@ def _report_unseen() -> float | None:
             reach = max((item.matrix_world @ Vector(corner)).length for corner in item.bound_box) + 1.0
             sizes = reach / np.array([50, 10, 10, 50, 1])  # of a small module behind the volume
             with recording.recorded_warnings() as warnings:
-                subject = Subject(PinholeSystem(-2 * reach * DIRECTION[None], *sizes))
-                page, options = Page(_SMALL_SIZE, _SMALL_SIZE), How(labels=False, samples=1)
+                subject = FigureSubject(PinholeSystem(-2 * reach * DIRECTION[None], *sizes))
+                page, options = Page(_SMALL_SIZE, _SMALL_SIZE), Rendering(labels=False, samples=1)
                 list(draw_figure(page, subject, figure_kind("inside"), item, [], options, Reel()))
             reason = _UNSEEN if any(_UNSEEN in text for text in warnings) else ""
             _known_visible.update([] if reason else [key])

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ...core.figures.kinds import FigureKind
 from ...core.figures.page import Page
-from ...core.figures.subject import Subject
+from ...core.figures.subject import FigureSubject
 from ...core.volumes.meshes.mesh import Mesh
 from ..blender import compat, ids
 from ..scanner import collimators
@@ -50,12 +50,14 @@ _SPHERE = np.stack(  # points (N, 3) of a sphere of radius 1
 class FigureScene:
     """Scanner of a subject and volume of an object in a scene of their own, with a camera that frames them on a page."""
 
-    def __init__(self, subject: Subject, kind: FigureKind, item: bpy.types.Object | None, page: Page, top: int) -> None:
+    def __init__(
+        self, subject: FigureSubject, kind: FigureKind, item: bpy.types.Object | None, page: Page, top: int
+    ) -> None:
         assert subject.scanner is not None and kind.studio is not None
         self.subject, self.item, self.page, self.top = subject, item, page, top
         self.studio, self._motion = view, motion = kind.studio, kind.motion
         self.full_system = subject.scanner
-        chosen_system = subject.chosen(self.full_system)
+        chosen_system = subject.select_modules(self.full_system)
         if view.lit and subject.modules is None and motion != "light":  # all rays together could not be told apart
             chosen_system = chosen_system[chosen_system.rings() == chosen_system.rings().max() // 2]
         self.numbers: list[int] = chosen_system.numbers.tolist()

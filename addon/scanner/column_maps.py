@@ -227,7 +227,7 @@ def _preview_modules(workbook: Path, columns: ColumnMap) -> tuple[int, list[list
     """Return the number of modules, and headings with the numbers, mm, of the first modules and the last."""
     system = read_system(workbook, columns)
     shown_columns = [c for c in system.columns.values() if c.name == "b" or not (c.derived or c.is_unused(system))]
-    values = zip(*(c.of(system).tolist() for c in shown_columns), strict=True)
+    values = zip(*(c.values(system).tolist() for c in shown_columns), strict=True)
     rows = [
         [str(module), *(value if isinstance(value, str) else f"{value:.3f}" for value in row)]
         for module, row in zip(system.numbers.tolist(), values, strict=True)

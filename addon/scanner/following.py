@@ -160,7 +160,7 @@ def _update_modules(
         module.problem = str(system) if isinstance(system, InputError) else ""
         if isinstance(system, Scanner):
             for column in formula_columns(type(system)):
-                setattr(module, column.field, float(column.of(system)[m]))
+                setattr(module, column.field, float(column.values(system)[m]))
     if changed:
         pinholes.write_readouts(system, [cameras_[m].mphdrr_module for m in changed], changed, scanner)
     if isinstance(system, Scanner):

@@ -12,7 +12,7 @@ import numpy as np
 from ...core import recording, workbook
 from ...core.errors import InputError, warn
 from ...core.exchange import FORMATS, write_geometry
-from ...core.geometry.scanner import Detector, Scanner, first
+from ...core.geometry.scanner import Detector, Scanner, first_true
 from ...core.progress import Progress, stages_of
 from ..blender import decimals, jobs, storage
 from . import module_values, pinholes, scanner
@@ -104,7 +104,7 @@ def _difference(system: Scanner, written: Scanner) -> str:
     """Return in words the first difference between two systems; "" for none."""
     if not np.array_equal(system.numbers, written.numbers):
         return "the modules' numbers"
-    for column in system.columns.values():
-        for i in first(~column.same(column.of(written), column.of(system))) if column.role != "derived" else ():
+    for column in (system.columns[name] for name in system.columns.typed):
+        for i in first_true(~column.agree(column.values(written), column.values(system))):
             return f"{column.title} of module {system.numbers[i]}"
     return ""

@@ -50,7 +50,7 @@ def draft_column_map(path: AnyPath, kind: str = "pinhole") -> ColumnMapDraft:
     tables = [mapped for table in dict.fromkeys(chosen.values()) for mapped in _mapped(table, chosen, certain)]
     for name in declared.optional:
         if name in partial and found.tables[name].is_filled(name):
-            used = declared[name].blank_is.removesuffix("'s")
+            used = declared[name].fallback.removesuffix("'s")
             questions.append(f"{name} stands in some rows only and is left out here: {used} is then used for all")
     missing = [name for name in declared.typed if name not in found.tables and not declared[name].is_text]
     if not certain:

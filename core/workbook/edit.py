@@ -212,14 +212,14 @@ class Edit:
         if declared.formula or right > MAX_COLUMN:
             i = int(np.argmin(self.is_default[name]))
             lacks = f"sheet {title} has no column headed {name} for the {declared.title} of module {numbers[i]}"
-            value = declared.text_of(declared.of(self.system)[i])
-            raise InputError(f"{self.workbook.name}: {lacks}, {value}, which is not {declared.blank_is}")
+            value = declared.text_of(declared.values(self.system)[i])
+            raise InputError(f"{self.workbook.name}: {lacks}, {value}, which is not {declared.fallback}")
         of_coordinates, usual = self.columns[self.system.columns.leading].unit, next(iter(declared.units))
         unit = of_coordinates if declared.kind == "length" else usual
         table.columns[name] = right, unit
         self.layout.add(table, name, table.rows)
         self.given[name] = np.array(["" if declared.is_text else math.nan] * len(self.old))
-        symbol, description = declared.headed(unit)
+        symbol, description = declared.heading(unit)
         heads = (symbol, description) if len(table.heading_rows) == 2 else (description or symbol,)
         for row, text in zip(table.heading_rows, heads, strict=False):
             sheet.type((row, right), text)
@@ -237,7 +237,7 @@ class Edit:
 
     def _is_spread(self, column: ColumnCells) -> bool:
         """Whether the modules need different values in place of one cell of a table with one row for all."""
-        new = column.declared.of(self.system)
+        new = column.declared.values(self.system)
         return column.table not in self.layout.rows_of and bool(np.any(new != new[0]))
 
     def _number_modules(self) -> None:
@@ -277,7 +277,7 @@ class Edit:
     def _require(self, column: ColumnCells) -> None:
         """Demand the values of a column of the scanner, in the cells' unit."""
         name, sheet, read_by = column.name, self.workbook.sheet(column.table.sheet.name), self.old.source
-        new, old = (column.in_cells(column.declared.of(system)).tolist() for system in (self.system, self.old))
+        new, old = (column.in_cells(column.declared.values(system)).tolist() for system in (self.system, self.old))
         given, blank = self.given[name].tolist(), absent(self.given[name])
         # By a column map, each cell of numbers must be filled.
         is_default = self.is_default.get(name)
@@ -321,7 +321,7 @@ class Edit:
         The formulas of these four may refer to one cell for all modules where each has its own now, and know of no tilt.
         """
         declared, sheet = column.declared, self.workbook.sheet(column.table.sheet.name)
-        new, old = (column.in_cells(declared.of(system)).tolist() for system in (self.system, self.old))
+        new, old = (column.in_cells(declared.values(system)).tolist() for system in (self.system, self.old))
         rows = self.rows[column.table]
         for i, (row, j) in enumerate(zip(rows.new, self.old_of, strict=True)):
             source = rows.source(i)

@@ -107,13 +107,13 @@ class ColumnCells:
         """What a cell with this value holds, None if it is nothing for this column."""
         if self.declared.is_text:
             text = text_of(value)
-            return None if text is None or self.declared.word(text) is None else text
+            return None if text is None or self.declared.parse(text) is None else text
         number = value if type(value) is float and math.isfinite(value) else None
         return None if number is None or (self.declared.kind == "whole" and number % 1) else number
 
     def in_code(self, given: Array) -> Array:
         """Numbers in the cells' unit as mm or rad, texts as the scanner has them."""
-        return np.array([self.declared.word(text) for text in given]) if self.declared.is_text else given * self.factor
+        return np.array([self.declared.parse(text) for text in given]) if self.declared.is_text else given * self.factor
 
     def in_cells(self, values: Array) -> Array:
         """Numbers in mm or rad in the cells' unit; texts as they are."""

@@ -12,7 +12,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..geometry.columns import Column
-from ..geometry.scanner import Scanner, first
+from ..geometry.scanner import Scanner, first_true
 from .layout import MAX_MODULES
 from .sheet_xml import CellError, cell_name
 
@@ -69,7 +69,7 @@ def new_sheets(system: Scanner, styled: bool = True) -> tuple[dict[str, dict[int
             continue
         (title, at), content = places[column.name], _content(column, system, places)
         style = _FOUR_DECIMALS if styled and title == main and not column.is_text else _NORMAL
-        cells[title][at] = _column(at, column.headed(), content, (heading, style))
+        cells[title][at] = _column(at, column.heading(), content, (heading, style))
         rows = enumerate(content, start=_FIRST_ROW)
         stored |= {f"{title}!{cell_name((row, at))}": value for row, (value, formula) in rows if formula}
     return {title: _rows(its) for title, its in cells.items()}, stored
@@ -90,7 +90,7 @@ def _places(system: Scanner) -> dict[str, tuple[str, int]]:
 
 def _content(column: Column, system: Scanner, places: dict[str, tuple[str, int]]) -> list[tuple[Any, str]]:
     """The value and the formula, "" where that does not give the value, of each module's cell of a column."""
-    title, held = places[column.name][0], column.of(system)
+    title, held = places[column.name][0], column.values(system)
     values = (held if column.is_text else held / next(iter(column.units.values()))).tolist()
     if not column.formula:
         return [(value, "") for value in values]
@@ -112,10 +112,10 @@ def refuse_unreadable(system: Scanner) -> None:
     if len(numbers) > MAX_MODULES:
         raise InputError(f"{cannot}: it has {len(numbers)} modules, expected at most {MAX_MODULES}")
     with np.errstate(over="ignore", invalid="ignore"):
-        held = {"number": numbers.astype(np.float64), **{name: column.of(system) for name, column in declared.items()}}
+        held = {"number": numbers.astype(np.float64), **{name: c.values(system) for name, c in declared.items()}}
     for name, values in held.items():
         most = _LARGEST_NUMBER if name == "number" else np.finfo(np.float64).max
-        for i in first(~(np.abs(values) <= most)) if values.dtype.kind == "f" else ():
+        for i in first_true(~(np.abs(values) <= most)) if values.dtype.kind == "f" else ():
             raise InputError(f"{cannot}: {name} of module {numbers[i]} is {values[i]:g}, expected at most {most:g}")
     places = _places(system)
 

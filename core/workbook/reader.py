@@ -11,7 +11,7 @@ from ..arrays import Array, Floats
 from ..errors import InputError, naming, warn
 from ..files import AnyPath
 from ..geometry.columns import Values
-from ..geometry.scanner import Scanner, first
+from ..geometry.scanner import Scanner, first_true
 from ..geometry.system import AnyScanner, PinholeSystem
 from ..scanner_kinds import SCANNERS, scanner_kind
 from ..system_source import QuantityCells, SystemSource
@@ -125,8 +125,8 @@ def _doubtful(
     for name in declared.derived:
         if name in given:
             rounded = declared[name].rounded_with
-            slack = _rounding(cells[rounded], declared[rounded].of(system)) if rounded in cells else 0.0
-            yield from _differences(cells[name], given[name], declared[name].of(system), "formula", slack)
+            slack = _rounding(cells[rounded], declared[rounded].values(system)) if rounded in cells else 0.0
+            yield from _differences(cells[name], given[name], declared[name].values(system), "formula", slack)
     for place, why in list(book.unverified.items())[:1]:
         though = "the file asks to be calculated when it is opened and the formula cannot be computed here"
         yield f"{book.path.name}: {book.workbook.text(place)}: the stored value is used, though {though} ({why})"
@@ -157,7 +157,7 @@ def _source(book: Book, layout: Layout, columns: ColumnMap | None) -> SystemSour
 def _refuse_not_positive(column: ColumnCells, values: Floats) -> None:
     """Raise `InputError` if a number (M,), mm or rad, is not positive but plausible ones are."""
     declared = column.declared
-    for i in first(values <= 0) if declared.plausible[0] > 0 else ():
+    for i in first_true(values <= 0) if declared.plausible[0] > 0 else ():
         raise InputError(f"{column.where(i)} has {declared.name} = {declared.text_of(values[i])}, expected more than 0")
 
 
@@ -167,7 +167,7 @@ def _implausible(system: Scanner, cells: dict[str, ColumnCells]) -> Iterator[str
         if declared.is_text:
             continue
         low, high = declared.plausible
-        values = declared.of(system)
+        values = declared.values(system)
         column = cells[name if name in cells and not declared.derived else system.columns.leading]
         odd = np.flatnonzero((values < low) | (values > high))
         if len(odd):

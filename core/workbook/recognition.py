@@ -147,7 +147,7 @@ def _notes(layout: Layout, found: Recognized) -> Iterator[str]:
     modules = found.tables[declared.leading]
     unknown = {table.sheet.place(*at): text for table in tables for at, text in table.unknown()}
     absent = [declared[name] for name in declared.optional if name not in found.tables and declared[name].formula]
-    without = [f"no column is headed {c.name}, so the {c.title} is {c.blank_is}; " for c in absent if modules.unknown()]
+    without = [f"no column is headed {c.name}, so the {c.title} is {c.fallback}; " for c in absent if modules.unknown()]
     if without or any(map(modules.words.may_mean, unknown.values())):
         places = ", ".join(f"{place} {quoted(text)}" for place, text in unknown.items())
         yield f"{''.join(without)}{places}: not understood and not read"

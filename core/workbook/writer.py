@@ -10,7 +10,7 @@ import numpy as np
 
 from ..errors import InputError, several, warn
 from ..files import AnyPath, replacing, write_bytes
-from ..geometry.scanner import Scanner, first
+from ..geometry.scanner import Scanner, first_true
 from ..recording import recorded_warnings
 from ..validation import instance
 from .book import SAVING, Book, shortened
@@ -104,7 +104,7 @@ def write_system(
 def _refuse_texts(system: Scanner) -> None:
     """Refuse texts that no cell gives back: spreadsheets cut them off, and XML has no control characters."""
     for column in (column for column in system.columns.values() if column.is_text):
-        for number, text in zip(system.numbers, column.of(system).tolist(), strict=True):
+        for number, text in zip(system.numbers, column.values(system).tolist(), strict=True):
             if text != text.strip() or _NOT_IN_CELLS.search(text) or len(text) > _LONGEST:
                 expected = f"at most {_LONGEST} characters without blanks at the ends and control characters"
                 found = f"module {number}: {column.title} {shortened(repr(text))}"
@@ -161,8 +161,8 @@ def _refuse_other_system(path: Path, name: str, columns: ColumnMap | None, syste
         read_as = f"would be read as {several(back.system.numbers)}"
         raise InputError(f"{cannot}: its modules {several(system.numbers)} {read_as}")
     for declared in [system.columns[typed] for typed in system.columns.typed]:
-        wanted, got = declared.of(system), declared.of(back.system)
-        for i in first(~declared.same(got, wanted, _WITHIN)):
+        wanted, got = declared.values(system), declared.values(back.system)
+        for i in first_true(~declared.agree(got, wanted, _WITHIN)):
             column = back.layout.columns.get(declared.name)
             why = f": {column.place(i)} is read for all modules" if column is not None and column.shared else ""
             number = f"{declared.name} = {declared.text_of(wanted[i], 9)} of module {system.numbers[i]}"
@@ -174,9 +174,9 @@ def _warn_of_formulas(workbook: WorkbookXml, recalculated: Recalculation) -> Non
     for place in sorted(recalculated.replaced):
         replaced[place[0], place[2]].append(place)
     for places in replaced.values():
-        cells, why = several(map(workbook.text, places), shown=1), recalculated.replaced[places[0]]
+        cells, why = several(map(workbook.text, places), limit=1), recalculated.replaced[places[0]]
         warn(f"{workbook.name}: {cells}: the formula was replaced by the system's number ({why})")
     if recalculated.cleared:
         cleared, first = recalculated.cleared, next(iter(recalculated.cleared.values()))
-        where = f"{workbook.name}: {several(map(workbook.text, cleared), shown=1)}"
+        where = f"{workbook.name}: {several(map(workbook.text, cleared), limit=1)}"
         warn(f"{where}: the formula's new value could not be calculated ({first}); {SAVING} stores the value")

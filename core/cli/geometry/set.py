@@ -48,7 +48,7 @@ def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
         letters = tuple(c.name.rpartition("_")[2].upper() for c in its)
         more: dict[str, Any] = {"type": _TYPES.get(column.kind, float)} | ({"nargs": len(its)} if many else {})
         if column.kind == "choice":
-            more |= {"choices": column.choices, "type": lambda text, column=column: column.word(text) or text}
+            more |= {"choices": column.choices, "type": lambda text, column=column: column.parse(text) or text}
         else:
             more["metavar"] = letters if many else _METAVARS.get(column.kind, "N")
         what = ", ".join(dict.fromkeys(c.help for c in its)) + "; degrees" * (column.kind == "angle")

@@ -61,7 +61,7 @@ def _show_columns(arguments: argparse.Namespace, system: Scanner) -> None:
     chosen = chosen_modules(system, arguments.modules)
     rings = system.rings()[np.isin(system.numbers, chosen.numbers)] + 1  # those of the whole scanner
     own = {name: column for name, column in chosen.columns.items() if not column.is_unused(chosen)}
-    columns = {"number": chosen.numbers, "ring": rings, **{name: column.of(chosen) for name, column in own.items()}}
+    columns = {"number": chosen.numbers, "ring": rings, **{name: column.values(chosen) for name, column in own.items()}}
     texts = {name: list(map(own[name].number_of if name in own else str, columns[name].tolist())) for name in columns}
     width = {name: max(map(len, (name, *its))) for name, its in texts.items()}
     rows = [tuple(texts), *zip(*texts.values(), strict=True)]
@@ -87,11 +87,11 @@ def _rows(system: mph.PinholeSystem) -> list[dict[str, Any]]:
     columns = {"number": system.numbers, "ring": system.rings() + 1, **positions}
     declared = system.columns
     names = dict.fromkeys(("b", "l", "azimuth", "elevation", *declared.dimensions, *declared.optional))
-    return table_rows({**columns, **{name: declared[name].of(system) for name in names}})
+    return table_rows({**columns, **{name: declared[name].values(system) for name in names}})
 
 
 def _shown(system: mph.PinholeSystem) -> dict[str, list[str]]:
     """The texts of the columns that modules may have, and that some have: column -> a text for each module."""
     declared = system.columns
     more = [declared[name] for name in declared.optional if name != "l" and not declared[name].is_unused(system)]
-    return {c.name: [c.number_of(value) for value in c.of(system).tolist()] for c in more}
+    return {c.name: [c.number_of(value) for value in c.values(system).tolist()] for c in more}

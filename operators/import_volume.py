@@ -117,4 +117,4 @@ class MPHDRR_OT_import_volume_sequence(ReadVolumes, bpy.types.Operator):
                 endings = ", ".join(_SEQUENCE_ENDINGS)
                 raise InputError(f"{path}: expected a name ending in {endings}; a DICOM series is one volume")
         common = re.sub(r"[\d _.-]*$", "", os.path.commonprefix([name_without_ending(path) for path in paths]))  # noqa: RUF071
-        return self.importing(paths, self.name or common, self.frame_start)
+        return self.import_job(paths, self.name or common, self.frame_start)

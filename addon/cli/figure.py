@@ -87,20 +87,20 @@ def _run(arguments: argparse.Namespace) -> None:
     if not arguments.output:
         raise mph.InputError("nothing to write: give --output FILE")
     paths = [output_path(name, kind.suffixes) for name in arguments.output]
-    how = Rendering(*(not arguments.no_labels, *(getattr(arguments, name) for name in Rendering._fields[1:])))
-    page = kind.page(arguments.size, how)
+    style = Rendering(*(not arguments.no_labels, *(getattr(arguments, name) for name in Rendering._fields[1:])))
+    page = kind.page(arguments.size, style)
     blends = [file for file in arguments.files if file.lower().endswith(".blend")]
     if blends:
         if len(arguments.files) > 1:
             raise mph.InputError(f"{blends[0]}: a .blend holds all that is shown; give no other file")
         refuse(arguments, _POSED, "is for phantoms that are named on the command line, not for a .blend")
-        _draw_scene(arguments, kind, Path(blends[0]), paths, how)
+        _draw_scene(arguments, kind, Path(blends[0]), paths, style)
     else:
         subject = _read_subject(arguments)
         available = [need for need in NEEDS if getattr(subject, need) is not None]
         require(kind.needs, available, kind.name, _MISSING)
         if kind.draw is None:
-            _render_figure(kind, page, subject, paths, how)
+            _render_figure(kind, page, subject, paths, style)
         else:
             kind.draw(page, subject)
             for path in paths:
@@ -110,7 +110,7 @@ def _run(arguments: argparse.Namespace) -> None:
 
 
 def _draw_scene(
-    arguments: argparse.Namespace, kind: FigureKind, blend: Path, paths: list[Path], how: Rendering
+    arguments: argparse.Namespace, kind: FigureKind, blend: Path, paths: list[Path], style: Rendering
 ) -> None:
     """Draw a figure of the scene in a .blend, as the window draws it."""
     new_scene()
@@ -123,11 +123,11 @@ def _draw_scene(
             bpy.ops.wm.open_mainfile(filepath=str(blend.absolute()))
         except RuntimeError as error:
             raise mph.InputError(f"{blend}: cannot be opened ({str(error).strip().splitlines()[0]})") from None
-        job = figures.figure_job(bpy.context, kind.name, paths, arguments.size, arguments.modules, **how._asdict())
+        job = figures.figure_job(bpy.context, kind.name, paths, arguments.size, arguments.modules, **style._asdict())
         _run_steps(job.finish(job.work(lambda done, total: None)))
 
 
-def _render_figure(kind: FigureKind, page: Page, subject: FigureSubject, paths: list[Path], how: Rendering) -> None:
+def _render_figure(kind: FigureKind, page: Page, subject: FigureSubject, paths: list[Path], style: Rendering) -> None:
     """Draw a figure that Blender renders."""
     new_scene()
     from ..figures import figures
@@ -138,7 +138,7 @@ def _render_figure(kind: FigureKind, page: Page, subject: FigureSubject, paths: 
     if kind.studio.volume and subject.volume is not None:
         item = volumes.add_volume(subject.volume, subject.name or "Volume")
     with quiet():
-        _run_steps(figures.draw_figure(page, subject, kind, item, paths, how, figures.Reel()))
+        _run_steps(figures.draw_figure(page, subject, kind, item, paths, style, figures.Reel()))
 
 
 def _run_steps(steps: Any) -> None:

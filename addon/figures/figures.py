@@ -85,15 +85,15 @@ def figure_job(
     paths: Sequence[Path],
     size: tuple[int, int] | None = None,
     modules: str | None = None,
-    **how: Any,
+    **style: Any,
 ) -> jobs.Job:
     """Return the job that writes a figure of the context's scene to files (.png, .svg; .mp4), `size` pixels wide and high.
 
     `modules` are all by default; for a figure of one module, the active one; for a picture the selected ones, if there are
-    several. `how` are the fields of `core.figures.kinds.Rendering`. Raises InputError where the scene lacks what the figure
+    several. `style` are the fields of `core.figures.kinds.Rendering`. Raises InputError where the scene lacks what the figure
     needs.
     """
-    options = Rendering(**how)
+    options = Rendering(**style)
     kind, scene = figure_kind(name), context.scene
     page = kind.page(size, options)
     paths = [output_path(str(path), kind.suffixes) for path in paths]
@@ -148,7 +148,7 @@ def draw_figure(
     kind: FigureKind,
     item: bpy.types.Object | None,
     paths: Sequence[Path],
-    how: Rendering,
+    style: Rendering,
     reel: Reel,
 ) -> Generator[Step, None, None]:
     """Draw a figure on its page and write it to `paths`; yield while Blender's own job renders, and after each picture.
@@ -159,43 +159,43 @@ def draw_figure(
     if kind.draw is not None:
         kind.draw(page, subject)
     if kind.studio is not None:
-        stage = FigureScene(subject, kind, item, page, heading_height(page, 1) if how.labels else 0)
+        stage = FigureScene(subject, kind, item, page, heading_height(page, 1) if style.labels else 0)
         try:
-            yield from _set_up(stage, how)
+            yield from _set_up(stage, style)
             for path in paths if kind.motion else ():
-                yield from _render_film(stage, how, path, reel)
+                yield from _render_film(stage, style, path, reel)
             if not kind.motion:
-                yield from _render_picture(stage, how, page)
+                yield from _render_picture(stage, style, page)
         finally:
             stage.remove()
     for path in () if kind.motion else paths:
         page.write(path)
 
 
-def _render_film(stage: FigureScene, how: Rendering, path: Path, reel: Reel) -> Generator[Step, None, None]:
+def _render_film(stage: FigureScene, style: Rendering, path: Path, reel: Reel) -> Generator[Step, None, None]:
     """Render an animation's pictures, and join them to an MP4."""
     pictures = reel.pictures = []
     folder = files.ensure_folder(path.with_name(f"{path.stem}-frames"))
     for old_picture in folder.glob(f"{glob.escape(path.stem)}-[0-9][0-9][0-9][0-9].png"):
         old_picture.unlink()  # an older animation may have been longer
     shown_moment, page = None, stage.page
-    for k in range(how.frames):
-        moment = stage.moment(k / how.frames)
+    for k in range(style.frames):
+        moment = stage.moment(k / style.frames)
         if moment != shown_moment:
             stage.show(*moment)
             shown_moment, page = moment, Page(page.width, page.height, page.paper)
-            yield from _render_picture(stage, how, page)
+            yield from _render_picture(stage, style, page)
         pictures.append(folder / f"{path.stem}-{k + 1:04d}.png")
         page.write(pictures[-1])
-        yield "rendering pictures", k + 1, how.frames
+        yield "rendering pictures", k + 1, style.frames
         if reel.is_set():
             break
-    yield from engine.write_film(pictures, path, how.fps, page)
+    yield from engine.write_film(pictures, path, style.fps, page)
 
 
-def _set_up(stage: FigureScene, how: Rendering) -> Generator[None, None, None]:
+def _set_up(stage: FigureScene, style: Rendering) -> Generator[None, None, None]:
     """Set up Cycles for a figure's scene; a volume that Cycles does not draw becomes a surface, with a warning."""
-    engine.set_up(stage.scene, stage.page, how.samples)
+    engine.set_up(stage.scene, stage.page, style.samples)
     item, volume = stage.item, stage.subject.volume
     if item is None or not stage.volume_objects or (yield from _are_visible(stage.scene, stage.volume_objects)):
         return
@@ -208,10 +208,10 @@ def _set_up(stage: FigureScene, how: Rendering) -> Generator[None, None, None]:
     warn(f"the picture shows {item.name!r} as the surface at {level * factor:.3g} {settings.unit}: {_UNDRAWN}")
 
 
-def _render_picture(stage: FigureScene, how: Rendering, page: Page) -> Generator[None, None, None]:
+def _render_picture(stage: FigureScene, style: Rendering, page: Page) -> Generator[None, None, None]:
     """Render a figure's scene, as it is now, onto a page."""
     page.image((yield from _render_pixels(stage.scene)), 0, 0, page.width, page.height)
-    if how.labels:
+    if style.labels:
         _label(stage, page)
 
 

@@ -6,8 +6,7 @@ from ..geometry.columns import AGREEING, LENGTH_UNITS
 
 EXACT = 1e-6
 """Largest difference of two numbers of one column that agree: relative, and absolute in mm or rad."""
-_COARSEST_ROUNDING = {"rad": 5e-4, "deg": 5e-3, "": 5e-3}
-_COARSEST_ROUNDING |= {unit: 0.005 / factor for unit, factor in LENGTH_UNITS.items()}
+_COARSEST_ROUNDING = {"rad": 5e-4, "deg": 5e-3, "": 5e-3} | {unit: 0.005 / mm for unit, mm in LENGTH_UNITS.items()}
 """Unit -> largest rounding error, in that unit, that is assumed of a typed number."""
 
 

@@ -4,7 +4,7 @@ import math
 import re
 from collections import defaultdict
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
@@ -23,23 +23,18 @@ class UncomputedValue(str):
     """Stand-in for the value of a formula that cannot be computed here and stores no reliable value; its text says why."""
 
 
+@dataclass
 class Calculation:
-    """Values of a workbook's formulas, each calculated after the formulas that it needs, without recursion.
+    """Values of a workbook's formulas, each calculated after the formulas that it needs, without recursion."""
 
-    `cell_at` returns the content of a cell. `is_calculated` returns whether the value of a cell, by its address and content,
-    is calculated; the values of all other cells are taken as stored. `settle` is called with a formula's address and its
-    computed value, or the `UncomputedValue`, and returns the value that other formulas see.
-    """
-
-    def __init__(
-        self,
-        workbook: WorkbookXml,
-        cell_at: Callable[[Address], Cell],
-        is_calculated: Callable[[Address, Cell], bool],
-        settle: Callable[[Address, Any], Any],
-    ) -> None:
-        self._workbook, self._cell_at, self._is_calculated, self._settle = workbook, cell_at, is_calculated, settle
-        self._values: dict[Address, Any] = {}
+    workbook: WorkbookXml
+    cell_at: Callable[[Address], Cell]
+    """Function that returns the content of a cell."""
+    is_calculated: Callable[[Address, Cell], bool]
+    """Function of a cell's address and content: whether its value is calculated, or else taken as stored."""
+    settle: Callable[[Address, Any], Any]
+    """Function of a formula's address and computed value, or `UncomputedValue`, that returns the value others see."""
+    _values: dict[Address, Any] = field(default_factory=dict)
 
     def value(self, address: Address) -> Any:
         """Return the settled value of the formula at `address`."""
@@ -54,12 +49,12 @@ class Calculation:
             value = self._calculate(current, missing)
             loop = next((needed for needed in missing if needed in begun), None)
             if loop is not None:
-                detour = f"to {self._workbook.address_text(loop)}, which refers back to it"
+                detour = f"to {self.workbook.address_text(loop)}, which refers back to it"
                 value = UncomputedValue(f"it refers {'back to itself' if loop == current else detour}")
             elif missing:
                 pending += missing
                 continue
-            self._values[current] = self._settle(current, value)
+            self._values[current] = self.settle(current, value)
         return self._values[address]
 
     def _calculate(self, address: Address, missing: list[Address]) -> Any:
@@ -67,18 +62,17 @@ class Calculation:
 
         The value is meaningless if any are appended.
         """
-        workbook, sheet = self._workbook, address[0]
+        workbook, sheet = self.workbook, address[0]
 
         def title(name: str | None) -> str:
-            known_title = sheet if name is None else workbook.find_title(name)
-            if known_title is None:
+            if (known_title := sheet if name is None else workbook.find_title(name)) is None:
                 raise NotComputable(f"there is no sheet {name}")
             return known_title
 
         def lookup(name: str | None, row: int, column: int) -> Any:
             needed = (title(name), row, column)
-            cell = self._cell_at(needed)
-            if not self._is_calculated(needed, cell):
+            cell = self.cell_at(needed)
+            if not self.is_calculated(needed, cell):
                 if isinstance(cell.value, UnreadableValue):
                     raise NotComputable(f"{workbook.address_text(needed)} holds {cell.value!r}")
                 return cell.value
@@ -90,7 +84,7 @@ class Calculation:
                 raise NotComputable(f"it needs {workbook.address_text(needed)}, and there: {value}")
             return value
 
-        cell = self._cell_at(address)
+        cell = self.cell_at(address)
         if cell.array is not None or cell.formula is None:
             return UncomputedValue("it is an array formula or a data table")
         context = FormulaContext(

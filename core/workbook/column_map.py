@@ -90,8 +90,7 @@ class ColumnMap:
         for i, table in enumerate(self.tables):
             for c in table.columns:
                 if c.quantity in table_of:
-                    twice = f"{_key(i, c.quantity)} is in {table_of[c.quantity]} too"
-                    faults.append(f"{twice}, expected each quantity once")
+                    faults.append(f"{_key(i, c.quantity)} is in {table_of[c.quantity]} too, expected it in one table")
                 table_of.setdefault(c.quantity, _key(i))
         for name in leading:
             if table_of.get(name) != _key(0):

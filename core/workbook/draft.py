@@ -131,7 +131,7 @@ def _guess_columns(sheet: Sheet, definitions: ColumnTable, name: str) -> Iterato
     """Yield a table of one column for each column of numbers under a heading that may mean the scanner's column `name`."""
     vocabulary = get_vocabulary(definitions)
     headings = {position: text for position, text in sheet.texts.items() if position[0] <= HEADING_ROWS}
-    number_columns = {column for (_, column), text in headings.items() if is_number_heading(text)}
+    numbered = {column for (_, column), text in headings.items() if is_number_heading(text)}
     for (row, column), text in headings.items():
         below = [r for r in sheet.rows if r > row and type(sheet.value(r, column)) is float]
         if below and name in vocabulary.suggest_columns(text) and vocabulary.parse_heading(text) is None:
@@ -139,8 +139,7 @@ def _guess_columns(sheet: Sheet, definitions: ColumnTable, name: str) -> Iterato
             if len(rows) == 1 and name not in definitions.position:
                 yield _mapped_table(sheet, rows, columns, row, matching="one for all")
             else:
-                number_column = next(iter(number_columns)) if len(number_columns) == 1 else None
-                yield _mapped_table(sheet, rows, columns, row, number_column)
+                yield _mapped_table(sheet, rows, columns, row, next(iter(numbered)) if len(numbered) == 1 else None)
 
 
 def preview_workbook(path: AnyPath, rows: int = 20, columns: int = 26) -> dict[str, tuple[tuple[str, ...], ...]]:

@@ -271,8 +271,7 @@ class WorkbookEdit:
                 for i, number in numbers:
                     j = self.old_index[i]
                     old_number = None if j is None else float(self.old.numbers[j])
-                    address = (table.sheet.name, rows.new[i], table.number_column)
-                    self._require_value(address, float(number), old_number)
+                    self._require_value((table.sheet.name, rows.new[i], table.number_column), float(number), old_number)
 
     def _spread_rows(self, column: ColumnCells) -> tuple[int, ...]:
         """Return a row for each module in a table that had one row for all, after copying that row to them.

@@ -42,14 +42,13 @@ def new_workbook(system: Scanner) -> tuple[bytes, dict[str, Any]]:
     for i, (file, rows) in enumerate(zip(files, sheets.values(), strict=True)):
         selected = "" if i else ' tabSelected="1"'
         parts[path.format(file=file)] = sheet.format(selected=selected, rows="".join(rows.values()))
-    sheet_list = (f'<sheet name="{escape(t)}" sheetId="{i}" r:id="rId{i}"/>' for i, t in enumerate(sheets, start=1))
+    entries = "".join(f'<sheet name="{escape(t)}" sheetId="{i}" r:id="rId{i}"/>' for i, t in enumerate(sheets, start=1))
     relations = "\n".join(_RELATION.format(i, file) for i, file in enumerate(files, start=1))
-    values = {"{sheets}": "".join(sheet_list), "{relations}": relations, "{styles}": str(len(files) + 1)}
     memory = io.BytesIO()
     with zipfile.ZipFile(memory, "w") as archive:
         for part, xml in parts.items():
-            for placeholder, text in values.items():
-                xml = xml.replace(placeholder, text)
+            for slot, text in (("{sheets}", entries), ("{relations}", relations), ("{styles}", str(len(files) + 1))):
+                xml = xml.replace(slot, text)
             # ZipInfo dates the member 1980, so that a system always gives the same file.
             archive.writestr(zipfile.ZipInfo(part), xml, zipfile.ZIP_DEFLATED)
     return memory.getvalue(), stored

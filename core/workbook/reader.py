@@ -65,12 +65,13 @@ def kinds_in(path: AnyPath) -> tuple[str, ...]:
     A kind with a sheet of its own is there if the workbook has that sheet, any other kind if its headings are in a sheet.
     """
     book = Book(path)
-    with_sheet = {name: kind for name, kind in SCANNERS.items() if kind.sheet}
-    kinds = [name for name, kind in with_sheet.items() if book.workbook.find_title(kind.sheet)]
-    for name in SCANNERS.keys() - with_sheet.keys():
-        tables = find_headed_tables(book, SCANNERS[name])[1]
-        kinds += [name] if any(SCANNERS[name].columns.leading in table.columns for table in tables) else []
-    return tuple(name for name in SCANNERS if name in kinds)
+
+    def is_in_book(kind: type[Scanner]) -> bool:
+        if kind.sheet:
+            return book.workbook.find_title(kind.sheet) is not None
+        return any(kind.columns.leading in table.columns for table in find_headed_tables(book, kind)[1])
+
+    return tuple(name for name, kind in SCANNERS.items() if is_in_book(kind))
 
 
 def _read(path: AnyPath, scanner: type[AnyScanner], columns: ColumnMap | AnyPath | None) -> AnyScanner:

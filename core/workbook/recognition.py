@@ -136,10 +136,9 @@ def _match_rows(modules: HeadedTable, table: HeadedTable) -> tuple[int, ...]:
         if table.numbers is not None and list(table.numbers) != sorted(table.numbers):
             unsorted = f"the modules' numbers in {table_sheet} are in no order, {sheet} has none"
             raise _unclear_error(book, f"{unsorted}, expected numbers in both")
-        expected = "expected a column in both that says which rows belong together"
         for heading in (heading for heading in table_headings if heading not in headings):
             heads = f"{table.sheet.address(*table_headings[heading])} heads names of modules"
-            raise _unclear_error(book, f"{heads}, which {sheet} does not have, {expected}")
+            raise _unclear_error(book, f"{heads}, which {sheet} lacks, expected a column in both that matches the rows")
     for heading in headings.keys() & table_headings.keys():
         for row, table_row in zip(modules.rows, rows, strict=True):
             position, table_position = (row, headings[heading][1]), (table_row, table_headings[heading][1])

@@ -14,8 +14,7 @@ from .package import Element, escape_xml, parse_elements, set_attribute, splice
 MAIN = "http://schemas.openxmlformats.org/spreadsheetml/2006/main"
 STRICT = "http://purl.oclc.org/ooxml/spreadsheetml/main"
 
-MAX_ROW = 1_048_576
-MAX_COLUMN = 16_384
+MAX_ROW, MAX_COLUMN = 1_048_576, 16_384
 Position = tuple[int, int]
 """Row and column of a cell, counted from 1."""
 

@@ -191,13 +191,11 @@ class WorkbookXml:
             self._extents[key] = max(rows, default=0), max(columns, default=0)
         return self._extents[key]
 
-    def describe_ranges_ending_at(self, sheet: str, last: int) -> list[str]:
-        """Return what refers to several rows of `sheet` up to row `last`: names, charts, tables and formulas, as texts."""
+    def describe_ranges_ending_at(self, sheet: str, row: int) -> list[str]:
+        """Return what refers to several rows of `sheet` of which `row` is the last: names, charts, tables, formulas."""
 
-        def ends_there(area: Reference | None, formula_sheet: str = "") -> bool:
-            if area is None or not area.top < area.bottom == last:
-                return False
-            return sheet == (self.find_title(area.sheet) or formula_sheet)
+        def ends_there(area: Reference | None, host: str = "") -> bool:
+            return area is not None and area.top < area.bottom == row and sheet == (self.find_title(area.sheet) or host)
 
         texts = [
             f"the name {name}"

@@ -94,7 +94,7 @@ def write_system(
         if system.sheet and book.workbook.find_title(system.sheet) is None:
             written = _write_with_new_sheet(system, book.workbook, target, temporary)
         else:
-            written = _write_edit(system, book, column_map, target, temporary)
+            written = _write_edited(system, book, column_map, target, temporary)
     return written
 
 
@@ -128,7 +128,7 @@ def _write_with_new_sheet(system: Scanner, workbook: WorkbookXml, target: Path, 
     return WrittenWorkbook(target.absolute(), cells, stored, ())
 
 
-def _write_edit(
+def _write_edited(
     system: Scanner, book: Book, columns: ColumnMap | None, target: Path, temporary: Path
 ) -> WrittenWorkbook:
     """Write the workbook into the file `temporary`, with its cells changed such that they hold a scanner."""

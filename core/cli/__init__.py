@@ -33,6 +33,7 @@ class CommandParser(argparse.ArgumentParser):
             self.register("action", name, NotingStore)
 
     def _print_message(self, message: str, file: Any = None) -> None:
+        """Write a help or version text, for argparse, without its silence about output that cannot be written."""
         (file or sys.stderr).write(message)  # argparse itself would ignore that this cannot be written
 
     def error(self, message: str) -> NoReturn:

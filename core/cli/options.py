@@ -42,6 +42,7 @@ class _HelpFormatter(argparse.HelpFormatter):
     """Help formatter that shows informative defaults, lists as they are typed, and keeps the lines of descriptions."""
 
     def _fill_text(self, text: str, width: int, indent: str) -> str:
+        """Return a description with its lines kept and wrapped to `width`; list items, which begin with a blank, hang."""
         paragraphs = []
         for line in text.splitlines():
             hanging = indent + _HANGING * line.startswith(" ")
@@ -49,6 +50,7 @@ class _HelpFormatter(argparse.HelpFormatter):
         return "\n".join(paragraphs)
 
     def _get_help_string(self, action: argparse.Action) -> str | None:
+        """Return an option's help text with its default, unless that is None, False, empty or suppressed."""
         if action.help is None or action.default in (None, [], False, argparse.SUPPRESS):
             return action.help
         default = action.default if isinstance(action.default, list) else [action.default]
@@ -186,6 +188,7 @@ def progress_bar(label: str, status_text: Callable[[], str] | None = None) -> Pr
     start_time, width = time.monotonic(), 30
 
     def show(n_done: int, total: int) -> None:
+        """Draw the bar; a finished one ends its line."""
         if not sys.stderr.isatty():
             return
         filled = width * n_done // max(total, 1)

@@ -37,6 +37,7 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     kinds = add_actions(subparsers, "phantom", "mphdrr phantom derenzo -o derenzo.nii.gz", "KIND")
 
     def finish(parser: argparse.ArgumentParser, make: Make, beats: bool) -> None:
+        """Add the options of the output, and --frames for a phantom that beats."""
         if beats:
             states = "number of states of the heart's cycle, as FILE-1, FILE-2 …, instead of one --phase"
             parser.add_argument("--frames", type=int, default=argparse.SUPPRESS, metavar="N", help=states)
@@ -56,6 +57,7 @@ def add_kinds(
     """
 
     def add(name: str, summary: str, options: str) -> argparse.ArgumentParser:
+        """Add a subcommand whose example has these options."""
         return add_command(kinds, name, summary, example.format(f"{name} {options}", name))
 
     for kind in KINDS:

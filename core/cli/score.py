@@ -28,6 +28,7 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     kinds = score.add_subparsers(metavar="KIND", title="kinds of phantoms, instead of --truth", required=False)
 
     def finish(parser: argparse.ArgumentParser, make: Make, beats: bool) -> None:
+        """Add the options of the score to the parser of a kind of phantom."""
         parser.argument_default = argparse.SUPPRESS  # options typed before the kind keep their values
         add_pose(parser, argparse.SUPPRESS)
         _add_options(parser)

@@ -72,6 +72,7 @@ class Book:
         return stored
 
     def _cell(self, address: Address) -> Cell:
+        """Return the content of a cell as it is in the file."""
         return self.sheets[address[0]].cells.get(address[1:], Cell())
 
 

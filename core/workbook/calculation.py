@@ -65,11 +65,13 @@ class Calculation:
         workbook, sheet = self.workbook, address[0]
 
         def title(name: str | None) -> str:
+            """Return a sheet's name as the workbook writes it, the formula's own sheet for None."""
             if (known_title := sheet if name is None else workbook.find_title(name)) is None:
                 raise NotComputable(f"there is no sheet {name}")
             return known_title
 
         def lookup(name: str | None, row: int, column: int) -> Any:
+            """Return the value of a cell that the formula refers to, or enter it in `missing`."""
             needed = (title(name), row, column)
             cell = self.cell_at(needed)
             if not self.is_calculated(needed, cell):

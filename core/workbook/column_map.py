@@ -37,7 +37,8 @@ class MappedColumn:
     """mm, cm, m, in, µm, dm, ft, mil or 0.1 mm; rad or deg. Empty for texts and plain numbers, and in a draft if unknown."""
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "unit", parse_unit(self.unit) or self.unit)  # "um" and "inches" are units, too
+        """Replace a word for a unit, such as "um" or "inches", by the unit."""
+        object.__setattr__(self, "unit", parse_unit(self.unit) or self.unit)
 
 
 @dataclass(frozen=True)

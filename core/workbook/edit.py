@@ -106,6 +106,7 @@ class ModuleRows:
                 sheet.set_value(position, None)
 
     def _positions(self, row: int) -> list[Position]:
+        """Return the positions of a row's cells that move."""
         return [(row, column) for column in self.columns]
 
     def _refuse_occupied(self, sheet: SheetXml) -> None:
@@ -274,9 +275,9 @@ class WorkbookEdit:
                     self._require_value((table.sheet.name, rows.new[i], table.number_column), float(number), old_number)
 
     def _spread_rows(self, column: ColumnCells) -> tuple[int, ...]:
-        """Return a row for each module in a table that had one row for all, after copying that row to them.
+        """Copy the single row of a table to a row for each module, and return these rows.
 
-        Without numbers, the rows are as far apart as those of the coordinates.
+        Without the modules' numbers, the rows are as far apart as those of the coordinates.
         """
         sheet, table, first = self.workbook.sheet(column.table.sheet.name), column.table, column.table.rows[0]
         coordinates = self.rows[self.modules].new

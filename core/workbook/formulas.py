@@ -93,7 +93,7 @@ _Term = Callable[[], Any]
 """A part of a formula, computed when called: the branch of an IF that is not taken must not be computed."""
 
 
-def _raise_error_value(value: Any) -> Any:
+def _refuse_error(value: Any) -> Any:
     """Return `value`; raise `_ErrorValue` if it is a `CellError`."""
     if isinstance(value, CellError):
         raise _ErrorValue(value)
@@ -106,7 +106,7 @@ def _to_scalar(value: Any) -> Any:
         if len(value) != 1:
             raise NotComputable("it uses a range where one cell belongs")
         value = value[0]
-    return _raise_error_value(value)
+    return _refuse_error(value)
 
 
 def _to_number(value: Any) -> float:
@@ -156,7 +156,7 @@ def _evaluate_numbers(terms: list[_Term]) -> list[float]:
     numbers = []
     for value in [term() for term in terms]:
         if isinstance(value, _AreaValues):
-            numbers += [cell for cell in map(_raise_error_value, value) if type(cell) is float]
+            numbers += [cell for cell in map(_refuse_error, value) if type(cell) is float]
         else:
             numbers.append(_to_number(value))
     return numbers
@@ -174,11 +174,13 @@ def _comparison(compare: Callable[[Any, Any], bool]) -> Callable[[Any, Any], boo
     """
 
     def rank(value: Any) -> tuple[int, Any]:
+        """Return a key that orders values of all types."""
         if isinstance(value, bool):
             return 2, value
         return (1, value.casefold()) if isinstance(value, str) else (0, value)
 
     def result(a: Any, b: Any) -> bool:
+        """Compare two values as a spreadsheet does."""
         a, b = _to_scalar(a), _to_scalar(b)
         zero = {str: "", bool: False}
         a = zero.get(type(b), 0.0) if a is None else a
@@ -230,6 +232,7 @@ def _rounding_function(rounding: str) -> Callable[[float, float], float]:
     """Return ROUND or a relative of it for a rounding mode of `decimal`."""
 
     def function(value: float, digits: float) -> float:
+        """Round a value to a number of decimals, which may be negative."""
         # Spreadsheets round the decimals that they show, not the binary digits: ROUND(2.675,2) is 2.68.
         step = decimal.Decimal(1).scaleb(-int(digits))
         with decimal.localcontext(prec=400):

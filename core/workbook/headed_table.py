@@ -77,7 +77,7 @@ class HeadedTable(ModuleTable):
 
     @cached_property
     def unrelated_heads(self) -> dict[int, dict[Position, str]]:
-        """Column that is not the scanner's -> texts at its head."""
+        """Column of the sheet that is no column of the scanner -> position and text of each cell at its head."""
         columns = {column for _, column in self.head_texts} - self.headings.keys()
         return {c: {p: text for p, text in self.head_texts.items() if p[1] == c} for c in sorted(columns)}
 
@@ -146,7 +146,7 @@ class HeadedTable(ModuleTable):
 
     @cached_property
     def _filled_rows(self) -> list[int]:
-        """Rows with anything but a note in the key columns, or with typed dimensions."""
+        """Rows with anything but a lone note in the key columns, or with typed dimensions; summary rows are left out."""
         names = (name for name in self.definitions.typed if name not in self.definitions.position)
         dimension_columns = [self.columns[name][0] for name in names if name in self.columns]
         filled_rows: list[int] = []

@@ -128,6 +128,7 @@ def refuse_unwritable(system: Scanner) -> None:
     places = _sheets_and_columns(system)
 
     def address_text(name: str, i: int) -> str:
+        """Return the address of the cell of a column and a module's index."""
         title, column = places[name]
         return f"{title}!{cell_name((_FIRST_ROW + i, column))}"
 

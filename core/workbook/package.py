@@ -165,6 +165,7 @@ def parse_elements(data: bytes, name: str) -> list[Element]:
     open_elements: list[Element] = []
 
     def start(tag: str, attributes: dict[str, str]) -> None:
+        """Add an element at its start tag."""
         offset = parser.CurrentByteIndex
         match = _START_TAG.match(data, offset)
         assert match is not None, "the parser has seen a whole tag at this offset"
@@ -176,15 +177,18 @@ def parse_elements(data: bytes, name: str) -> list[Element]:
             parent.children.append(parsed[-1])
 
     def end(_tag: str) -> None:
+        """Set the end of the innermost open element at its end tag."""
         element = open_elements.pop()
         if not data.endswith(b"/>", element.start, element.inner):
             element.close = parser.CurrentByteIndex
             element.end = data.index(b">", element.close) + 1
 
     def text(characters: str) -> None:
+        """Add text to the innermost open element."""
         open_elements[-1].text += characters
 
     def doctype(*_: Any) -> None:
+        """Refuse a document type, whose entities could expand without bound."""
         raise InputError(f"{name}: has a document type, expected none in a workbook")
 
     parser.StartElementHandler, parser.EndElementHandler = start, end

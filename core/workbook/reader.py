@@ -67,6 +67,7 @@ def kinds_in(path: AnyPath) -> tuple[str, ...]:
     book = Book(path)
 
     def is_in_book(kind: type[Scanner]) -> bool:
+        """Return whether the workbook has the kind's sheet, or the heading of its leading column."""
         if kind.sheet:
             return book.workbook.find_title(kind.sheet) is not None
         return any(kind.columns.leading in table.columns for table in find_headed_tables(book, kind)[1])
@@ -75,6 +76,7 @@ def kinds_in(path: AnyPath) -> tuple[str, ...]:
 
 
 def _read(path: AnyPath, scanner: type[AnyScanner], columns: ColumnMap | AnyPath | None) -> AnyScanner:
+    """Return the scanner of a class from the workbook file at `path`, by its headings or a column map."""
     columns = load_column_map(columns, path, scanner)  # before the workbook, which may be large
     return read_book(Book(path), scanner, columns).system
 

@@ -115,6 +115,7 @@ def headed_layout(book: Book, scanner: type[Scanner]) -> WorkbookLayout:
 
 
 def _unclear_error(book: Book, doubt: str) -> InputError:
+    """Return the error for a doubt, with the advice to write a column map."""
     return InputError(f"{book.path.name}: {doubt}; {_HELP}")
 
 

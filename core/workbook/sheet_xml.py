@@ -251,6 +251,7 @@ class SheetXml:
         return any((formula is None) != (original is None) for formula, original in pairs)
 
     def _original(self, position: Position) -> Cell:
+        """Return the content of a cell in the file, a blank one if the file has none there."""
         return self.original.get(position, _BLANK)
 
     def to_bytes(self) -> bytes:

@@ -72,6 +72,7 @@ class WorkbookXml:
 
     @cached_property
     def _strings(self) -> list[str]:
+        """Shared strings, to which the cells of all sheets refer by index."""
         part = self._related.get("sharedStrings")
         return [] if part is None else shared_strings(self.package.elements(part))
 
@@ -195,6 +196,7 @@ class WorkbookXml:
         """Return what refers to several rows of `sheet` of which `row` is the last: names, charts, tables, formulas."""
 
         def ends_there(area: Reference | None, host: str = "") -> bool:
+            """Return whether an area ends at the row; `host` is the sheet of the formula, for an area without a sheet."""
             return area is not None and area.top < area.bottom == row and sheet == (self.find_title(area.sheet) or host)
 
         texts = [

@@ -137,9 +137,9 @@ def _change_modules(system: Scanner, arguments: argparse.Namespace, chosen: Bool
 def _change_pinholes(
     system: mph.PinholeSystem, arguments: argparse.Namespace, chosen: Bools, changes: dict[str, Any]
 ) -> mph.PinholeSystem:
-    """Return pinhole modules with these changes of fields, the chosen ones (M,) shifted, with their collimator lengths.
+    """Return pinhole modules with these changes of fields, the chosen ones (M,) shifted, and with their collimator lengths.
 
-    A length is the one typed, or the design formula's if it was that so far.
+    A module's length is the one typed; else it stays, or is the design formula's if it was that before.
     """
     if arguments.move is not None:
         changes["centers"] = np.where(chosen[:, None], system.centers + arguments.move, system.centers)

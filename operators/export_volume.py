@@ -1,4 +1,4 @@
-"""File > Export > Volume: the active volume, where it stands in the world, for other programs."""
+"""File > Export > Volume: write the active volume, at its place in the world, for other programs."""
 
 import bpy
 

@@ -1,4 +1,4 @@
-"""Sidebar, at the top: how far the scene is, the job that runs, and the one button that comes next."""
+"""Sidebar, Next Step: the stages that the scene has reached, the running job, and the button of the next step."""
 
 import bpy
 from bpy.app.translations import pgettext_iface as iface
@@ -38,6 +38,7 @@ class MPHDRR_PT_next_step(Sidebar, bpy.types.Panel):
 
 
 def _draw_stage(layout: bpy.types.UILayout, stage: next_step.Stage) -> None:
+    """Draw a stage's name with a mark: reached, out of date, or still open."""
     column = layout.column(align=True)
     column.active, column.alert = bool(stage.found), stage.is_stale
     icon = "ERROR" if stage.is_stale else "CHECKMARK" if stage.found else "RADIOBUT_OFF"

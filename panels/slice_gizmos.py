@@ -1,4 +1,4 @@
-"""Arrows in the 3D view that move the active volume's slices along with the mouse."""
+"""Gizmos in the 3D view by which the mouse moves the active volume's slices."""
 
 import bpy
 from mathutils import Matrix, Vector
@@ -6,11 +6,11 @@ from mathutils import Matrix, Vector
 from ..addon.blender.layouts import shown_where
 from ..addon.volumes import slices
 
-_COLORS = ((1.0, 0.2, 0.32), (0.55, 0.86, 0.0), (0.16, 0.56, 1.0))  # of Blender's axes
+_COLORS = ((1.0, 0.2, 0.32), (0.55, 0.86, 0.0), (0.16, 0.56, 1.0))  # the colours of Blender's axes
 
 
 class MPHDRR_GGT_slices(bpy.types.GizmoGroup):
-    """An arrow at a corner of each slice."""
+    """Gizmo group with an arrow at a corner of each slice."""
 
     bl_idname = "MPHDRR_GGT_slices"
     bl_space_type = "VIEW_3D"

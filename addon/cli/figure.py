@@ -11,9 +11,9 @@ import numpy as np
 
 from ... import core as mph
 from ...core.cli.options import add_command, output_path, progress_bar, refuse
-from ...core.figures.kinds import FILMS, KINDS, PAPERS, SAMPLES, FigureKind, How, figure_kind
+from ...core.figures.kinds import FILMS, KINDS, PAPERS, SAMPLES, FigureKind, Rendering, figure_kind
 from ...core.figures.page import SUFFIXES, Page
-from ...core.figures.subject import NEEDS, Subject, require
+from ...core.figures.subject import NEEDS, FigureSubject, require
 from ...core.phantoms.kinds import KINDS as PHANTOMS
 from ...core.runs.formats import FORMATS
 from ...core.toml import read_toml
@@ -59,8 +59,8 @@ def add_parser(subparsers) -> None:  # type: ignore[no-untyped-def]
     add("--no-labels", action="store_true", help="without title and axes, where the figure is rendered")
     add("--samples", type=int, default=SAMPLES, metavar="N", help="rays per pixel, where the figure is rendered")
     add("--style", choices=list(PAPERS), default="dark", help="of figures that are rendered")
-    add("--seconds", type=float, default=How().seconds, metavar="S", help="how long an animation is")
-    add("--fps", type=int, default=How().fps, metavar="N", help="pictures of an animation per second")
+    add("--seconds", type=float, default=Rendering().seconds, metavar="S", help="how long an animation is")
+    add("--fps", type=int, default=Rendering().fps, metavar="N", help="pictures of an animation per second")
     parser.set_defaults(run=_run)
 
 
@@ -85,7 +85,7 @@ def _run(arguments: argparse.Namespace) -> None:
     if not arguments.output:
         raise mph.InputError("nothing to write: give --output FILE")
     paths = [output_path(name, kind.suffixes) for name in arguments.output]
-    how = How(*(not arguments.no_labels, *(getattr(arguments, name) for name in How._fields[1:])))
+    how = Rendering(*(not arguments.no_labels, *(getattr(arguments, name) for name in Rendering._fields[1:])))
     page = kind.page(arguments.size, how)
     blends = [file for file in arguments.files if file.lower().endswith(".blend")]
     if blends:
@@ -107,7 +107,7 @@ def _run(arguments: argparse.Namespace) -> None:
         print(path)
 
 
-def _of_scene(arguments: argparse.Namespace, kind: FigureKind, blend: Path, paths: list[Path], how: How) -> None:
+def _of_scene(arguments: argparse.Namespace, kind: FigureKind, blend: Path, paths: list[Path], how: Rendering) -> None:
     """A figure of the scene in a .blend, as the window makes it."""
     new_scene()
     import bpy
@@ -123,7 +123,7 @@ def _of_scene(arguments: argparse.Namespace, kind: FigureKind, blend: Path, path
         _follow(job.finish(job.work(lambda done, total: None)))
 
 
-def _render(kind: FigureKind, page: Page, subject: Subject, paths: list[Path], how: How) -> None:
+def _render(kind: FigureKind, page: Page, subject: FigureSubject, paths: list[Path], how: Rendering) -> None:
     """A figure that Blender renders."""
     new_scene()
     from ..figures import figures
@@ -144,7 +144,7 @@ def _follow(steps: Any) -> None:
         show(*step[1:])
 
 
-def _subject(arguments: argparse.Namespace) -> Subject:
+def _subject(arguments: argparse.Namespace) -> FigureSubject:
     """What the files and names on the command line hold; of two that hold the same, the later counts."""
     found: dict[str, Any] = {"modules": arguments.modules}
     posed = False
@@ -154,11 +154,11 @@ def _subject(arguments: argparse.Namespace) -> Subject:
         found |= made
     if not posed:
         refuse(arguments, _POSED, "is for a phantom: name its kind, or its .toml")
-    return Subject(**found)
+    return FigureSubject(**found)
 
 
 def _read(arguments: argparse.Namespace, file: str, scanner: Any) -> dict[str, Any]:
-    """What one of the files holds, by the names of `Subject`'s fields."""
+    """What one of the files holds, by the names of `FigureSubject`'s fields."""
     suffix = Path(file).suffix.lower()
     if suffix in _WORKBOOKS:
         return {"scanner": mph.read_scanner(file, next(iter(mph.kinds_in(file)), "pinhole"))}

@@ -21,10 +21,10 @@ from numpy.typing import ArrayLike, NDArray
 from ...core import PinholeSystem, Progress, files, read_run, recording, volume_to_mesh
 from ...core.cli.options import output_path
 from ...core.errors import InputError, warn
-from ...core.figures.kinds import KINDS, SAMPLES, FigureKind, How, figure_kind
+from ...core.figures.kinds import KINDS, SAMPLES, FigureKind, Rendering, figure_kind
 from ...core.figures.page import DARK, Page, box
 from ...core.figures.parts import bar_width, color_bar, heading, heading_height
-from ...core.figures.subject import Subject, require
+from ...core.figures.subject import FigureSubject, require
 from ...core.runs.display import Display
 from ...core.runs.resizing import resized
 from ..blender import ids, jobs, storage, timers, windows
@@ -88,10 +88,11 @@ def figure_job(
 ) -> jobs.Job:
     """The job that writes a figure of the context's scene to files (.png, .svg; .mp4), `size` pixels wide and high.
 
-    `modules` are all by default; of figures of one module, the active one; of a picture those selected, if more than one
-    is. `how` are the fields of `core.figures.kinds.How`. Raises InputError where the scene has not what the figure needs.
+    `modules` are all by default; of figures of one module, the active one; of a picture those selected, if more than one is.
+    `how` are the fields of `core.figures.kinds.Rendering`. Raises InputError where the scene has not what the figure
+    needs.
     """
-    given = How(**how)
+    given = Rendering(**how)
     kind, scene = figure_kind(name), context.scene
     page = kind.page(size, given)
     paths = [output_path(str(path), kind.suffixes) for path in paths]
@@ -118,16 +119,16 @@ def figure_job(
         later["run"] = partial(read_run, storage.absolute(run_file))
     require(kind.needs, {*known, *later}, kind.name, _MISSING)
 
-    def work(progress: Progress) -> Subject:
+    def work(progress: Progress) -> FigureSubject:
         progress(0, 1)
         found = {key: read() for key, read in later.items()}
         if "run" in found:
             known["name"] = found["run"].settings.get("volume", "")
-        return Subject(**known, **found)
+        return FigureSubject(**known, **found)
 
     reel = Reel()
 
-    def finish(subject: Subject) -> Generator[Step, None, str]:
+    def finish(subject: FigureSubject) -> Generator[Step, None, str]:
         yield from drawing(page, subject, kind, item, paths, given, reel)
         if windows.has_window() and paths[0].suffix == ".png":
             images.show_file(paths[0], bpy.context)
@@ -142,11 +143,11 @@ def figure_job(
 
 def drawing(
     page: Page,
-    subject: Subject,
+    subject: FigureSubject,
     kind: FigureKind,
     item: bpy.types.Object | None,
     paths: Sequence[Path],
-    how: How,
+    how: Rendering,
     reel: Reel,
 ) -> Generator[Step, None, None]:
     """Draw a figure on its page and write it to `paths`; yields while Blender's own job renders, and pictures of a film.
@@ -170,7 +171,7 @@ def drawing(
         page.write(path)
 
 
-def _filmed(stage: Stage, how: How, path: Path, reel: Reel) -> Generator[Step, None, None]:
+def _filmed(stage: Stage, how: Rendering, path: Path, reel: Reel) -> Generator[Step, None, None]:
     """Render an animation's pictures, and put them together to an MP4."""
     made = reel.pictures = []
     folder = files.ensure_folder(path.with_name(f"{path.stem}-frames"))
@@ -191,7 +192,7 @@ def _filmed(stage: Stage, how: How, path: Path, reel: Reel) -> Generator[Step, N
     yield from engine.write_film(made, path, how.fps, page)
 
 
-def _prepared(stage: Stage, how: How) -> Generator[None, None, None]:
+def _prepared(stage: Stage, how: Rendering) -> Generator[None, None, None]:
     """Set up Cycles for a stage; a volume that it does not draw becomes a surface, which is said."""
     engine.set_up(stage.scene, stage.page, how.samples)
     item, volume = stage.item, stage.subject.volume
@@ -206,7 +207,7 @@ def _prepared(stage: Stage, how: How) -> Generator[None, None, None]:
     warn(f"the picture shows {item.name!r} as the surface at {level * factor:.3g} {settings.unit}: {_UNDRAWN}")
 
 
-def _picture(stage: Stage, how: How, page: Page) -> Generator[None, None, None]:
+def _picture(stage: Stage, how: Rendering, page: Page) -> Generator[None, None, None]:
     """Render a stage, as it is now, onto a page."""
     page.image((yield from _render(stage.scene)), 0, 0, page.width, page.height)
     if how.labels:
@@ -300,8 +301,8 @@ def _say_what_is_unseen() -> float | None:
             reach = max((item.matrix_world @ Vector(corner)).length for corner in item.bound_box) + 1.0
             sizes = reach / np.array([50, 10, 10, 50, 1])  # of a small module behind it, as seen
             with recording.recorded_warnings() as caught:
-                subject = Subject(PinholeSystem(-2 * reach * DIRECTION[None], *sizes))
-                page, how = Page(_SMALL, _SMALL), How(labels=False, samples=1)
+                subject = FigureSubject(PinholeSystem(-2 * reach * DIRECTION[None], *sizes))
+                page, how = Page(_SMALL, _SMALL), Rendering(labels=False, samples=1)
                 list(drawing(page, subject, figure_kind("inside"), item, [], how, Reel()))
             why = _UNSEEN if any(_UNSEEN in text for text in caught) else ""
             _drawn.update([] if why else [known])

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ...core.figures.kinds import FigureKind
 from ...core.figures.page import Page
-from ...core.figures.subject import Subject
+from ...core.figures.subject import FigureSubject
 from ...core.volumes.meshes.mesh import Mesh
 from ..blender import compat, ids
 from ..scanner import collimators
@@ -49,12 +49,14 @@ _BALL = np.stack(  # points (N, 3) of a sphere of radius 1
 class Stage:
     """A subject's scanner and the volume of an object, in a scene of their own, with a camera that sees them on a page."""
 
-    def __init__(self, subject: Subject, kind: FigureKind, item: bpy.types.Object | None, page: Page, top: int) -> None:
+    def __init__(
+        self, subject: FigureSubject, kind: FigureKind, item: bpy.types.Object | None, page: Page, top: int
+    ) -> None:
         assert subject.scanner is not None and kind.studio is not None
         self.subject, self.item, self.page, self.top = subject, item, page, top
         self.shown, self._motion = shown, motion = kind.studio, kind.motion
         self.whole = subject.scanner
-        chosen = subject.chosen(self.whole)
+        chosen = subject.select_modules(self.whole)
         if shown.lit and subject.modules is None and motion != "light":  # of all rays none could be told apart
             chosen = chosen[chosen.rings() == chosen.rings().max() // 2]
         self.numbers: list[int] = chosen.numbers.tolist()

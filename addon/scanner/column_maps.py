@@ -228,7 +228,7 @@ def _preview(workbook: Path, columns: ColumnMap) -> tuple[int, list[list[str]]]:
     """How many modules the workbook has; headings, then the numbers of the first modules and the last, mm."""
     system = read_system(workbook, columns)
     columns_of = [c for c in system.columns.values() if c.name == "b" or not (c.derived or c.is_unused(system))]
-    values = zip(*(c.of(system).tolist() for c in columns_of), strict=True)
+    values = zip(*(c.values(system).tolist() for c in columns_of), strict=True)
     rows = [
         [str(module), *(value if isinstance(value, str) else f"{value:.3f}" for value in row)]
         for module, row in zip(system.numbers.tolist(), values, strict=True)

@@ -159,7 +159,7 @@ def _follow(
         module.problem = str(found) if isinstance(found, InputError) else ""
         if isinstance(found, Scanner):
             for column in designed(type(found)):
-                setattr(module, column.field, float(column.of(found)[m]))
+                setattr(module, column.field, float(column.values(found)[m]))
     if changed:
         pinholes.write_readouts(found, [cameras_[m].mphdrr_module for m in changed], changed, scanner)
     if isinstance(found, Scanner):

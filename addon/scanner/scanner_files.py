@@ -12,7 +12,7 @@ import numpy as np
 from ...core import recording, workbook
 from ...core.errors import InputError, warn
 from ...core.exchange import FORMATS, write_geometry
-from ...core.geometry.scanner import Detector, Scanner, first
+from ...core.geometry.scanner import Detector, Scanner, first_true
 from ...core.progress import Progress, stages_of
 from ..blender import decimals, jobs, storage
 from . import module_values, pinholes, scanner
@@ -102,7 +102,7 @@ def _difference(one: Scanner, other: Scanner) -> str:
     """Where two systems differ, in words."""
     if not np.array_equal(one.numbers, other.numbers):
         return "the modules' numbers"
-    for column in one.columns.values():
-        for i in first(~column.same(column.of(other), column.of(one))) if column.role != "derived" else ():
+    for column in (one.columns[name] for name in one.columns.typed):
+        for i in first_true(~column.agree(column.values(other), column.values(one))):
             return f"{column.title} of module {one.numbers[i]}"
     return ""

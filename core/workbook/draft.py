@@ -50,7 +50,7 @@ def draft_column_map(path: AnyPath, kind: str = "pinhole") -> ColumnMapDraft:
     tables = [m for table in dict.fromkeys(table_of.values()) for m in _map_table(table, table_of, is_certain)]
     for name in definitions.optional:
         if name in incomplete and recognized.tables[name].is_filled(name):
-            used = definitions[name].blank_is.removesuffix("'s")
+            used = definitions[name].fallback.removesuffix("'s")
             questions.append(f"{name} stands in some rows only and is left out here: {used} is then used for all")
     missing = [name for name in definitions.typed if name not in recognized.tables and not definitions[name].is_text]
     if not is_certain:

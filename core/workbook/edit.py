@@ -230,14 +230,14 @@ class WorkbookEdit:
         if definition.formula or right > MAX_COLUMN:
             i = int(np.argmin(self.is_default[name]))
             lacks = f"sheet {title} has no column headed {name} for the {definition.title} of module {numbers[i]}"
-            value = definition.text_of(definition.of(self.system)[i])
-            raise InputError(f"{self.workbook.name}: {lacks}, {value}, which is not {definition.blank_is}")
+            value = definition.text_of(definition.values(self.system)[i])
+            raise InputError(f"{self.workbook.name}: {lacks}, {value}, which is not {definition.fallback}")
         coordinate_unit = self.columns[self.system.columns.leading].unit
         unit = coordinate_unit if definition.kind == "length" else next(iter(definition.units))
         table.columns[name] = right, unit
         self.layout.add_column(table, name, table.rows)
         self.cell_values[name] = np.array(["" if definition.is_text else math.nan] * len(self.old))
-        symbol, description = definition.headed(unit)
+        symbol, description = definition.heading(unit)
         heads = (symbol, description) if len(table.heading_rows) == 2 else (description or symbol,)
         for row, text in zip(table.heading_rows, heads, strict=False):
             sheet.set_value((row, right), text)
@@ -257,7 +257,7 @@ class WorkbookEdit:
 
     def _needs_spreading(self, column: ColumnCells) -> bool:
         """Return whether a column with one cell for all modules needs a cell for each, since the values differ."""
-        new = column.definition.of(self.system)
+        new = column.definition.values(self.system)
         return column.table not in self.layout.rows_of and bool(np.any(new != new[0]))
 
     def _number_modules(self) -> None:
@@ -301,7 +301,7 @@ class WorkbookEdit:
     def _require_values(self, column: ColumnCells) -> None:
         """Require the values of a typed column of the scanner in its cells, in the cells' unit."""
         name, sheet, source = column.name, self.workbook.sheet(column.table.sheet.name), self.old.source
-        new, old = (column.to_cell_units(column.definition.of(system)).tolist() for system in (self.system, self.old))
+        new, old = (column.to_cell_units(column.definition.values(s)).tolist() for s in (self.system, self.old))
         cell_values, is_blank = self.cell_values[name].tolist(), is_absent(self.cell_values[name])
         # With a column map, each cell of numbers must be filled.
         is_default = self.is_default.get(name)
@@ -349,7 +349,7 @@ class WorkbookEdit:
         The formulas of these four may refer to one cell for all modules where each has its own now, and know of no tilt.
         """
         definition, sheet = column.definition, self.workbook.sheet(column.table.sheet.name)
-        new, old = (column.to_cell_units(definition.of(system)).tolist() for system in (self.system, self.old))
+        new, old = (column.to_cell_units(definition.values(system)).tolist() for system in (self.system, self.old))
         rows = self.rows[column.table]
         for i, (row, j) in enumerate(zip(rows.new, self.old_index, strict=True)):
             source_row = rows.source_row(i)

@@ -113,14 +113,13 @@ class ColumnCells:
         """Return a cell's value as the number or text that the column takes, None if it cannot be one."""
         if self.definition.is_text:
             text = cell_text(value)
-            return None if text is None or self.definition.word(text) is None else text
+            return None if text is None or self.definition.parse(text) is None else text
         number = value if type(value) is float and math.isfinite(value) else None
         return None if number is None or (self.definition.kind == "whole" and number % 1) else number
 
-    def to_scanner_units(self, cell_values: Array) -> Array:
+    def to_scanner_units(self, values: Array) -> Array:
         """Return numbers in the cells' unit as mm or rad, and texts as the words of the scanner's column."""
-        word = self.definition.word
-        return np.array([word(text) for text in cell_values]) if self.definition.is_text else cell_values * self.factor
+        return np.array([*map(self.definition.parse, values)]) if self.definition.is_text else values * self.factor
 
     def to_cell_units(self, values: Array) -> Array:
         """Return numbers in mm or rad in the cells' unit; texts stay as they are."""

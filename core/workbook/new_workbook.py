@@ -12,7 +12,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..geometry.columns import Column
-from ..geometry.scanner import Scanner, first
+from ..geometry.scanner import Scanner, first_true
 from .layout import MAX_MODULES
 from .sheet_xml import CellError, cell_name
 
@@ -73,7 +73,7 @@ def new_sheets(system: Scanner, styled: bool = True) -> tuple[dict[str, dict[int
             continue
         (title, column), content = places[definition.name], _column_content(definition, system, places)
         style = _FOUR_DECIMALS if styled and title == main and not definition.is_text else _NORMAL
-        cells[title][column] = _column_xml(column, definition.headed(), content, (heading, style))
+        cells[title][column] = _column_xml(column, definition.heading(), content, (heading, style))
         rows = enumerate(content, start=_FIRST_ROW)
         stored |= {f"{title}!{cell_name((row, column))}": value for row, (value, formula) in rows if formula}
     return {title: _rows_xml(columns) for title, columns in cells.items()}, stored
@@ -97,7 +97,7 @@ def _sheets_and_columns(system: Scanner) -> dict[str, tuple[str, int]]:
 
 def _column_content(definition: Column, system: Scanner, places: dict[str, tuple[str, int]]) -> _Content:
     """Return (value, formula) of each module's cell in a column; the formula is "" where it does not give the value."""
-    title, values = places[definition.name][0], definition.of(system)
+    title, values = places[definition.name][0], definition.values(system)
     numbers = (values if definition.is_text else values / next(iter(definition.units.values()))).tolist()
     if not definition.formula:
         return [(number, "") for number in numbers]
@@ -120,10 +120,10 @@ def refuse_unwritable(system: Scanner) -> None:
     if len(numbers) > MAX_MODULES:
         raise InputError(f"{cannot}: it has {len(numbers)} modules, expected at most {MAX_MODULES}")
     with np.errstate(over="ignore", invalid="ignore"):
-        values_of = {"number": numbers.astype(np.float64), **{name: c.of(system) for name, c in definitions.items()}}
-    for name, values in values_of.items():
+        arrays = {"number": numbers.astype(np.float64), **{name: c.values(system) for name, c in definitions.items()}}
+    for name, values in arrays.items():
         limit = _LARGEST_NUMBER if name == "number" else np.finfo(np.float64).max
-        for i in first(~(np.abs(values) <= limit)) if values.dtype.kind == "f" else ():
+        for i in first_true(~(np.abs(values) <= limit)) if values.dtype.kind == "f" else ():
             raise InputError(f"{cannot}: {name} of module {numbers[i]} is {values[i]:g}, expected at most {limit:g}")
     places = _sheets_and_columns(system)
 

@@ -11,7 +11,7 @@ from ..arrays import Array, Floats
 from ..errors import InputError, naming, warn
 from ..files import AnyPath
 from ..geometry.columns import Values
-from ..geometry.scanner import Scanner, first
+from ..geometry.scanner import Scanner, first_true
 from ..geometry.system import AnyScanner, PinholeSystem
 from ..scanner_kinds import SCANNERS, scanner_kind
 from ..system_source import QuantityCells, SystemSource
@@ -135,8 +135,9 @@ def _find_doubtful_values(
     for name in definitions.derived:
         if name in cell_values:
             rounded = definitions[name].rounded_with
-            slack = _rounding_errors(cells[rounded], definitions[rounded].of(system)) if rounded in cells else 0.0
-            yield from _find_differences(cells[name], cell_values[name], definitions[name].of(system), "formula", slack)
+            slack = _rounding_errors(cells[rounded], definitions[rounded].values(system)) if rounded in cells else 0.0
+            expected = definitions[name].values(system)
+            yield from _find_differences(cells[name], cell_values[name], expected, "formula", slack)
     for address, reason in list(book.unverified.items())[:1]:
         though = "the file asks to be calculated when it is opened and the formula cannot be computed here"
         cell = f"{book.path.name}: {book.workbook.address_text(address)}"
@@ -168,7 +169,7 @@ def _system_source(book: Book, layout: WorkbookLayout, column_map: ColumnMap | N
 
 def _refuse_not_positive(column: ColumnCells, values: Floats) -> None:
     """Raise `InputError` if a number (M,), mm or rad, is not positive in a column whose plausible values all are."""
-    for i in first(values <= 0) if column.definition.plausible[0] > 0 else ():
+    for i in first_true(values <= 0) if column.definition.plausible[0] > 0 else ():
         has = f"has {column.name} = {column.definition.text_of(values[i])}"
         raise InputError(f"{column.location(i)} {has}, expected more than 0")
 
@@ -179,7 +180,7 @@ def _find_implausible_values(system: Scanner, cells: dict[str, ColumnCells]) -> 
         if definition.is_text:
             continue
         low, high = definition.plausible
-        values = definition.of(system)
+        values = definition.values(system)
         column = cells[name if name in cells and not definition.derived else system.columns.leading]
         implausible = np.flatnonzero((values < low) | (values > high)).tolist()
         for i in implausible[:1]:

@@ -157,7 +157,7 @@ def _find_notes(layout: WorkbookLayout, recognized: RecognizedTables) -> Iterato
     unknown = {t.sheet.address(*position): text for t in tables for position, text in t.unknown_headings()}
     absent = [definitions[name] for name in definitions.optional if name not in recognized.tables]
     computed = [column for column in absent if column.formula and modules.unknown_headings()]
-    defaults = [f"no column is headed {c.name}, so the {c.title} is {c.blank_is}; " for c in computed]
+    defaults = [f"no column is headed {c.name}, so the {c.title} is {c.fallback}; " for c in computed]
     if defaults or any(map(modules.vocabulary.suggest_columns, unknown.values())):
         cells = ", ".join(f"{cell} {quote_text(text)}" for cell, text in unknown.items())
         yield f"{''.join(defaults)}{cells}: not understood and not read"

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..errors import InputError, several, warn
 from ..files import AnyPath, replacing, write_bytes
-from ..geometry.scanner import Scanner, first
+from ..geometry.scanner import Scanner, first_true
 from ..recording import recorded_warnings
 from ..validation import instance
 from .book import SAVING, Book, shorten
@@ -101,7 +101,7 @@ def write_system(
 def _refuse_unstorable_texts(system: Scanner) -> None:
     """Raise `InputError` for texts that no cell gives back: spreadsheets cut them off, XML has no control characters."""
     for column in (column for column in system.columns.values() if column.is_text):
-        for number, text in zip(system.numbers, column.of(system).tolist(), strict=True):
+        for number, text in zip(system.numbers, column.values(system).tolist(), strict=True):
             if text != text.strip() or _NOT_IN_CELLS.search(text) or len(text) > _MAX_TEXT_LENGTH:
                 expected = f"at most {_MAX_TEXT_LENGTH} characters without blanks at the ends and control characters"
                 value = f"module {number}: {column.title} {shorten(repr(text))}"
@@ -166,8 +166,8 @@ def _refuse_other_reading(path: Path, name: str, columns: ColumnMap | None, syst
         read_as = f"would be read as {several(read_back.numbers)}"
         raise InputError(f"{cannot}: its modules {several(system.numbers)} {read_as}")
     for definition in [system.columns[name] for name in system.columns.typed]:
-        expected, values = definition.of(system), definition.of(read_back)
-        for i in first(~definition.same(values, expected, _WRITING_ERROR)):
+        expected, values = definition.values(system), definition.values(read_back)
+        for i in first_true(~definition.agree(values, expected, _WRITING_ERROR)):
             column = reading.layout.columns.get(definition.name)
             reason = f": {column.address(i)} is read for all modules" if column is not None and column.shared else ""
             number = f"{definition.name} = {definition.text_of(expected[i], 9)} of module {system.numbers[i]}"
@@ -180,9 +180,9 @@ def _warn_of_formulas(workbook: WorkbookXml, recalculated: Recalculation) -> Non
     for address in sorted(recalculated.replaced):
         replaced[address[0], address[2]].append(address)
     for addresses in replaced.values():
-        cells, reason = several(map(workbook.address_text, addresses), shown=1), recalculated.replaced[addresses[0]]
+        cells, reason = several(map(workbook.address_text, addresses), limit=1), recalculated.replaced[addresses[0]]
         warn(f"{workbook.name}: {cells}: the formula was replaced by the system's number ({reason})")
     if recalculated.cleared:
         cleared, reason = recalculated.cleared, next(iter(recalculated.cleared.values()))
-        cells = f"{workbook.name}: {several(map(workbook.address_text, cleared), shown=1)}"
+        cells = f"{workbook.name}: {several(map(workbook.address_text, cleared), limit=1)}"
         warn(f"{cells}: the formula's new value could not be calculated ({reason}); {SAVING} stores the value")

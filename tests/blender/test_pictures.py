@@ -125,8 +125,8 @@ def test_animations_refuse_what_cannot_be(tmp_path, capsys):
     common = ["figure", "light-up", "scene.blend", "-o"]
     for words, said in (
         (["a.png"], "expected a name ending in .mp4"),
-        (["a.mp4", "--size", "321x200"], "size 321x200: of an animation both must be even"),
-        (["a.mp4", "--seconds", "0"], "0 s of 24 pictures each: expected more than 0 of both"),
+        (["a.mp4", "--size", "321x200"], "size 321x200: both must be even for an animation"),
+        (["a.mp4", "--seconds", "0"], "0 s of 24 pictures each: expected more than 0 for both"),
     ):
         assert main([*common, str(tmp_path / words[0]), *words[1:]]) == 1
         assert said in capsys.readouterr().err

@@ -53,7 +53,7 @@ def add_parser(actions) -> None:  # type: ignore[no-untyped-def]
             {"nargs": len(columns)} if is_vector else {}
         )
         if column.kind == "choice":
-            extra |= {"choices": column.choices, "type": lambda text, column=column: column.word(text) or text}
+            extra |= {"choices": column.choices, "type": lambda text, column=column: column.parse(text) or text}
         else:
             extra["metavar"] = letters if is_vector else _METAVARS.get(column.kind, "N")
         help_text = ", ".join(dict.fromkeys(c.help for c in columns)) + "; degrees" * (column.kind == "angle")

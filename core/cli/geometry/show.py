@@ -60,7 +60,7 @@ def _show_columns(arguments: argparse.Namespace, system: Scanner) -> None:
     chosen = chosen_modules(system, arguments.modules)
     rings = system.rings()[np.isin(system.numbers, chosen.numbers)] + 1  # those of the whole scanner
     used = {name: column for name, column in chosen.columns.items() if not column.is_unused(chosen)}
-    columns = {"number": chosen.numbers, "ring": rings, **{name: column.of(chosen) for name, column in used.items()}}
+    columns = {"number": chosen.numbers, "ring": rings, **{name: c.values(chosen) for name, c in used.items()}}
     texts = {name: list(map(used[name].number_of if name in used else str, columns[name].tolist())) for name in columns}
     widths = {name: max(map(len, (name, *values))) for name, values in texts.items()}
     rows = [tuple(texts), *zip(*texts.values(), strict=True)]
@@ -88,11 +88,11 @@ def _rows(system: mph.PinholeSystem) -> list[dict[str, Any]]:
     columns = {"number": system.numbers, "ring": system.rings() + 1, **positions}
     definitions = system.columns
     names = dict.fromkeys(("b", "l", "azimuth", "elevation", *definitions.dimensions, *definitions.optional))
-    return table_rows({**columns, **{name: definitions[name].of(system) for name in names}})
+    return table_rows({**columns, **{name: definitions[name].values(system) for name in names}})
 
 
 def _optional_texts(system: mph.PinholeSystem) -> dict[str, list[str]]:
     """Return name -> texts (M,) of the optional columns, without l, in which a module's value is not a blank cell's."""
     table = system.columns
     used = [table[name] for name in table.optional if name != "l" and not table[name].is_unused(system)]
-    return {c.name: [c.number_of(value) for value in c.of(system).tolist()] for c in used}
+    return {c.name: [c.number_of(value) for value in c.values(system).tolist()] for c in used}

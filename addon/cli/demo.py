@@ -13,7 +13,7 @@ from typing import Any
 from ... import core as mph
 from ...core import files
 from ...core.cli.options import add_command, progress_bar
-from ...core.cli.scanners import add_workbook, read_workbook
+from ...core.cli.scanners import add_workbook, read_pinhole_system
 from ...core.errors import warn
 from ...core.example import EULER_DEGREES, EXAMPLE
 from ...core.runs.mosaic import write_sheet
@@ -42,7 +42,7 @@ def _run(arguments: argparse.Namespace) -> None:
     has_blender = importlib.util.find_spec("bpy") is not None
     scene = new_scene() if has_blender else None  # before the long work, so that problems with Blender show at once
     with _step("geometry"):
-        system = read_workbook(arguments)
+        system = read_pinhole_system(arguments)
     with _step("projections"):
         recipe = mph.Recipe({
             "system.file": arguments.workbook,

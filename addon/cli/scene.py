@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from ... import core as mph
 from ...core.cli.options import add_command, output_path
-from ...core.cli.scanners import add_workbook, chosen_modules, read_any
+from ...core.cli.scanners import add_workbook, chosen_modules, read_any_scanner
 from . import COMMANDS
 
 if TYPE_CHECKING:
@@ -42,7 +42,7 @@ def _run(arguments: argparse.Namespace) -> None:
     from ...core.volumes.volume_files import read_volume_of
 
     path = output_path(arguments.output, (".blend",))
-    system = chosen_modules(read_any(arguments), arguments.modules)
+    system = chosen_modules(read_any_scanner(arguments), arguments.modules)
     volume = mph.read_volume(arguments.volume) if arguments.volume else None
     mu = read_volume_of(arguments.mu, "mu") if arguments.mu else None
     run = mph.read_run(arguments.run_file) if arguments.run_file else None

@@ -90,8 +90,8 @@ def figure_job(
     """Return the job that writes a figure of the context's scene to files (.png, .svg; .mp4), `size` pixels wide and high.
 
     `modules` are all by default; for a figure of one module, the active one; for a picture the selected ones, if there are
-    several. `style` are the fields of `core.figures.kinds.Rendering`. Raises InputError where the scene lacks what the figure
-    needs.
+    several. `style` are the fields of `core.figures.kinds.Rendering`. Raises InputError where the scene lacks what the
+    figure needs.
     """
     options = Rendering(**style)
     kind, scene = figure_kind(name), context.scene

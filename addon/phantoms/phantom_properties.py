@@ -19,7 +19,7 @@ from bpy.props import (
 )
 
 from ...core import Grid, InputError, Phantom
-from ...core.phantoms.kinds import KINDS, Kind
+from ...core.phantoms.kinds import KINDS, PhantomKind
 from ...core.phantoms.language import parse_phantom
 from ...core.volumes.volume import UNITS
 from ..blender import choices, decimals, layouts
@@ -137,7 +137,7 @@ def sampling(update: Any = None) -> dict[str, Any]:
 FITTED = {layouts.unset_name("voxel_size"): check_mark("voxel_size", "Auto", "fits the grid to the phantom", 1.0)}
 
 
-def settings_class(kind: Kind, name: str, bases: tuple[type, ...], update: Any = None, **members: Any) -> Any:
+def settings_class(kind: PhantomKind, name: str, bases: tuple[type, ...], update: Any = None, **members: Any) -> Any:
     """A class for Blender, of `KindSettings` and other bases, with the settings of one kind as properties."""
     own = {field.name: _property(field, kind, update) for field in _fields(kind)}
     if _beats(kind):
@@ -166,7 +166,7 @@ def plain_settings(name: str, **values: Any) -> KindSettings:
     return settings
 
 
-def identifier(kind: Kind) -> str:
+def identifier(kind: PhantomKind) -> str:
     """A kind's name in Python."""
     return kind.name.replace("-", "_")
 
@@ -176,12 +176,12 @@ def menu_entries() -> list[tuple[str, str, bool]]:
     return [(identifier(kind), kind.label, _beats(kind)) for kind in KINDS]
 
 
-def _beats(kind: Kind) -> bool:
+def _beats(kind: PhantomKind) -> bool:
     """Whether a kind of phantom has states, one for each frame."""
     return hasattr(kind.phantom, "beating")
 
 
-def _fields(kind: Kind) -> list[Any]:
+def _fields(kind: PhantomKind) -> list[Any]:
     """The fields of a kind's class that can be set: those made by `setting`, `count` and `choice`."""
     return [field for field in dataclasses.fields(kind.phantom) if field.metadata]
 
@@ -194,7 +194,7 @@ def _key_ending(field: Any) -> str:
     return "_" + unit.replace("1/", "per_").replace("/", "_per_")
 
 
-def _property(field: Any, kind: Kind, update: Any) -> Any:
+def _property(field: Any, kind: PhantomKind, update: Any) -> Any:
     """A field of a phantom's dataclass as a property."""
     known = field.metadata
     unit = known.get("unit", "")

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..errors import InputError, refusing
-from ..files import AnyPath, ensure_folder, is_leftover, written_name
+from ..files import AnyPath, ensure_folder, final_name, is_leftover
 from ..memory import cores
 from ..progress import Progress, tell
 from .event_files import Place, header, verify
@@ -216,7 +216,7 @@ def _foreign(target: SetFolder) -> Iterator[Fault]:
                 continue
             if is_leftover(path):
                 yield Fault("leftover", path, f"{path}: left by a work that was interrupted")
-            elif written_name(name) is None:  # else it is under way
+            elif final_name(name) is None:  # else it is under way
                 yield Fault("foreign", path, f"{path}: not of this set")
 
 

@@ -234,7 +234,7 @@ def read_truth(file: Any, grid: Grid, which: tuple[slice, ...] = (), out: Floats
     if "truth" in file:
         return read_array(file, "truth", which, out)
     values = np.zeros(grid.n_voxels, np.float32)
-    values[hdf5.numbers(file["truth_index"])] = hdf5.numbers(file["truth_values"])
+    values[hdf5.read_numbers(file["truth_index"])] = hdf5.read_numbers(file["truth_values"])
     found = values.reshape(grid.shape)[which]
     if out is None:
         return found

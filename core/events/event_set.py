@@ -43,7 +43,7 @@ def _numbers(name: str, text: str) -> Any:
 
     def read(event: Event) -> Floats:
         with event.opened() as file:
-            return np.asarray(hdf5.numbers(event._dataset(file, name)), np.float64)
+            return np.asarray(hdf5.read_numbers(event._dataset(file, name)), np.float64)
 
     return property(read, doc=text)
 

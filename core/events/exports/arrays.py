@@ -19,7 +19,7 @@ def npy(array: Array) -> bytes:
 
 def pt(array: Array) -> bytes:
     """An array as a .pt file: one tensor, which ``torch.load(path, weights_only=True)`` gives."""
-    with needing(of="files of tensors (.pt)"):
+    with needing(feature="files of tensors (.pt)"):
         import torch
     buffer = io.BytesIO()  # torch writes a file's own name into it, and that of a temporary one is random
     torch.save(torch.from_numpy(np.array(array, order="C")), buffer)

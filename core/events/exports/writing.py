@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from ...errors import InputError
-from ...files import ensure_folder, is_leftover, write_bytes, written_name
+from ...files import ensure_folder, final_name, is_leftover, write_bytes
 from ...memory import readable_size
 from ...progress import Progress, tell
 from ..cells import csv_line, csv_lines, escaped, unescaped
@@ -81,7 +81,7 @@ class Plan:
         """Remove what a killed export was writing: readers of whole folders would find it."""
         known = {self.folder / file for part in self.parts for file in part.files}
         for path in (*self.folder.glob(".*"), *self.folder.glob("*/.*")):
-            name = written_name(path.name)
+            name = final_name(path.name)
             if name and is_leftover(path) and (path.with_name(name) in known or path.parent == self.folder):
                 path.unlink(missing_ok=True)
 
@@ -126,7 +126,7 @@ def plan_export(layout: Layout, chosen: Chosen, folder: Path, program: str, opti
 
 def _require_same(folder: Path, request: dict[str, Any], rows: list[Row]) -> int:
     """How many events the same export had in the folder before; `InputError` if something else is in it."""
-    if all(written_name(path.name) for path in folder.iterdir()):
+    if all(final_name(path.name) for path in folder.iterdir()):
         return 0
     try:
         asked = json.loads((folder / REQUEST).read_text(encoding="utf-8"))

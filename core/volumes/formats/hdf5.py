@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from ...errors import InputError
-from ...hdf5 import numbers, opened, pack
+from ...hdf5 import opened, pack, read_numbers
 from ..volume import Volume
 from .contents import VolumeFileContents, require_voxels
 
@@ -26,7 +26,7 @@ def read(path: Path) -> VolumeFileContents:
         length_unit, unit = (_attribute_text(dataset.attrs.get("unit")) for dataset in (affine, array))
         if length_unit not in (None, "mm"):
             raise InputError(f"its affine is in {length_unit}: expected mm")
-        return VolumeFileContents(numbers(array), numbers(affine), quantity, unit)
+        return VolumeFileContents(read_numbers(array), read_numbers(affine), quantity, unit)
 
 
 def _attribute_text(attribute: Any) -> str | None:

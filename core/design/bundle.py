@@ -124,6 +124,7 @@ class BundleAdjustment:
 
     def jacobian(self, x: Floats) -> Any:
         """Return the derivatives of `residuals` by x, a sparse matrix (residuals, unknowns)."""
+        # n_m modules with n_p parameters each, n unknowns.
         trial, n_m, n_p, n = self.geometry(x), len(self.system), len(self.sd), len(x)
         k, m = np.nonzero(self.used)
         nominal = self.system.frames()

@@ -72,7 +72,7 @@ class Constraint:
 
 
 class FieldOfView(Constraint):
-    """Every module sees its whole ROI, on all four sides, see `PinholeSystem.roi_radius_seen`."""
+    """Constraint that every module sees its whole ROI, on all four sides, see `PinholeSystem.roi_radius_seen`."""
 
     def _violation(self, rows: Floats, members: Indexes, system: PinholeSystem) -> Floats:
         """Return R minus the radius of the sphere that is seen on each of four sides (N, 4), mm."""
@@ -83,7 +83,7 @@ class FieldOfView(Constraint):
 
 
 class ModuleSeparation(Constraint):
-    """Modules do not overlap: a plane parallel to some face of two modules' hulls separates them.
+    """Constraint that modules do not overlap: a plane parallel to a face of one of two hulls separates them.
 
     A module's hull is the convex hull of its collimator and its crystal, which is slightly larger than both.
     """
@@ -109,7 +109,7 @@ class ModuleSeparation(Constraint):
 
 
 class LineOfSight(Constraint):
-    """No module blocks another module's view: none is in the cone between that pinhole and its ROI, or in the ROI."""
+    """Constraint that no module is in another module's view: in the cone from its pinhole around its ROI, or in the ROI."""
 
     def _members(self, system: PinholeSystem) -> Indexes:
         """Return the pairs (N, 2) of a viewing module and a module that is at most margin + 1 mm beside its cone."""
@@ -135,7 +135,7 @@ class LineOfSight(Constraint):
 
 
 class Clearance(Constraint):
-    """No module enters the bore or the body: an elliptic cylinder along z.
+    """Constraint that no module enters the bore or the body, an elliptic cylinder along z.
 
     The limit, mm, contains its semi-axes, and x and y of its centre if that is not the isocentre.
     """
@@ -150,7 +150,7 @@ class Clearance(Constraint):
 
 
 class SmallestHole(Constraint):
-    """No hole is narrower than the limit, the smallest diameter that can be made, mm."""
+    """Constraint that no hole is narrower than the limit, the smallest diameter that can be made, mm."""
 
     words = "its hole is {:.3g} mm too narrow"
 
@@ -160,7 +160,7 @@ class SmallestHole(Constraint):
 
 
 class CrystalArea(Constraint):
-    """The area of all crystals does not exceed that of a square whose side is the limit, mm."""
+    """Constraint on the area of all crystals: at most that of a square whose side is the limit, mm."""
 
     words = "the side of a square as large as their crystals is {:.3g} mm too long"
 

@@ -17,7 +17,7 @@ from .solvers import scipy_module
 _MARGIN = 3  # pixels around the expected shadow
 _MIN_COUNTS, _SIGNIFICANCE = 20, 6.0  # of a spot; standard deviations of its counts above the background
 _STEPS, _CONVERGED = 25, 0.01  # largest number of Fisher's scoring steps; size of the last one in standard deviations
-# Smallest background of a pixel, as a fraction of the counts of a pixel in the shadow: stray counts are never impossible.
+# Smallest background of a pixel, as a fraction of the counts of a pixel in the shadow: stray counts are always possible.
 _MIN_BACKGROUND = 1e-5
 
 

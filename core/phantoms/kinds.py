@@ -18,7 +18,7 @@ from .torso import CardiacTorso
 
 
 class PhantomKind(NamedTuple):
-    """One kind of phantom: its class, and its names and texts for users."""
+    """Kind of phantom: its class, and its names and texts for users."""
 
     name: str
     """Name on the command line and in recipes."""

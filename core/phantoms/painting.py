@@ -44,7 +44,7 @@ _RAYS, _PARTS = 1 << 14, 256
 
 @dataclass(frozen=True, eq=False)
 class Layer:
-    """One shape of a painting, its pose world-from-shape (4, 4), mm, and its value (activity or mu)."""
+    """Shape of a painting with its pose world-from-shape (4, 4), mm, and its value, an activity or a mu."""
 
     shape: Shape
     pose: Points

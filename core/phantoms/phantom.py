@@ -29,7 +29,7 @@ _FRACTION_IN_GRID = 0.98  # a warning is given if a smaller fraction of the phan
 
 
 class PhantomMesh(NamedTuple):
-    """One shape of a phantom as a closed mesh."""
+    """Closed mesh of one shape of a phantom."""
 
     name: str
     """Name of the shape, or its kind and number."""

@@ -239,10 +239,11 @@ def _drop_vertical(pieces: Floats) -> Floats:
 
 
 def _clip(pieces: Floats, axis: int, plane: ArrayLike, side: int) -> Floats:
-    """Return the parts (N, W, 3) of convex `pieces` (N, V, 3) above (`side` 1) or below (-1) each piece's `plane`.
+    """Return the parts (N, W, 3) of convex `pieces` (N, V, 3) above (`side` 1) or below (-1) the `plane`.
 
-    I. Sutherland, G. Hodgman, "Reentrant polygon clipping", CACM 17 (1974). Spare corners repeat the last one; a piece that
-    lies completely on the other side becomes a point.
+    `plane` is its position along `axis`, one for all pieces or one for each (N,). I. Sutherland, G. Hodgman, "Reentrant
+    polygon clipping", CACM 17 (1974). Spare corners repeat the last one; a piece that lies completely on the other side
+    becomes a point.
     """
     n, n_corners = pieces.shape[:2]
     plane = np.broadcast_to(plane, n)

@@ -19,7 +19,7 @@ from bpy.props import (
 )
 
 from ...core import Grid, InputError, Phantom
-from ...core.phantoms.kinds import KINDS, Kind
+from ...core.phantoms.kinds import KINDS, PhantomKind
 from ...core.phantoms.language import parse_phantom
 from ...core.volumes.volume import UNITS
 from ..blender import choices, decimals, layouts
@@ -139,7 +139,7 @@ AUTO_SIZE = {layouts.unset_name("voxel_size"): check_mark("voxel_size", "Auto", 
 """Check mark that fits the voxel size to the phantom."""
 
 
-def settings_class(kind: Kind, name: str, bases: tuple[type, ...], update: Any = None, **members: Any) -> Any:
+def settings_class(kind: PhantomKind, name: str, bases: tuple[type, ...], update: Any = None, **members: Any) -> Any:
     """Return a class for Blender, of `KindSettings` and other bases, with the settings of one kind as properties."""
     fields = {field.name: _make_property(field, kind, update) for field in _setting_fields(kind)}
     if _has_states(kind):
@@ -168,7 +168,7 @@ def plain_settings(name: str, **values: Any) -> KindSettings:
     return settings
 
 
-def identifier(kind: Kind) -> str:
+def identifier(kind: PhantomKind) -> str:
     """Return a kind's name in Python."""
     return kind.name.replace("-", "_")
 
@@ -178,12 +178,12 @@ def menu_entries() -> list[tuple[str, str, bool]]:
     return [(identifier(kind), kind.label, _has_states(kind)) for kind in KINDS]
 
 
-def _has_states(kind: Kind) -> bool:
+def _has_states(kind: PhantomKind) -> bool:
     """Return whether a kind of phantom beats, with one state for each frame."""
     return hasattr(kind.phantom, "beating")
 
 
-def _setting_fields(kind: Kind) -> list[Any]:
+def _setting_fields(kind: PhantomKind) -> list[Any]:
     """Return the fields of a kind's class that are settings: those made by `setting`, `count` and `choice`."""
     return [field for field in dataclasses.fields(kind.phantom) if field.metadata]
 
@@ -199,7 +199,7 @@ def _key_ending(field: Any) -> str:
     return "_" + unit.replace("1/", "per_").replace("/", "_per_")
 
 
-def _make_property(field: Any, kind: Kind, update: Any) -> Any:
+def _make_property(field: Any, kind: PhantomKind, update: Any) -> Any:
     """Return the Blender property of a field of a phantom's dataclass."""
     metadata = field.metadata
     unit = metadata.get("unit", "")

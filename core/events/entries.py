@@ -10,7 +10,7 @@ import numpy as np
 
 from ..errors import InputError, naming
 from ..geometry.grid import Grid
-from ..phantoms.kinds import KINDS, Kind
+from ..phantoms.kinds import KINDS, PhantomKind
 from ..phantoms.settings import setting_names
 from ..phantoms.torso import CardiacTorso
 from ..runs.settings import SETTINGS, Setting, own_settings
@@ -119,7 +119,7 @@ class PhantomEntry(DrawnValues):
         return _rows(str(self.given.get("kind")))
 
     @functools.cached_property
-    def kind(self) -> Kind | None:
+    def kind(self) -> PhantomKind | None:
         """None where the phantom is a file."""
         return next((kind for kind in KINDS if kind.name == self.given.get("kind")), None)
 
@@ -184,7 +184,7 @@ def is_text(file: Any) -> bool:
     return str(options(file)[0]).lower().endswith(".toml")
 
 
-def as_settings(phantom: Any, kind: Kind) -> dict[str, Any]:
+def as_settings(phantom: Any, kind: PhantomKind) -> dict[str, Any]:
     """All settings of a phantom by their names in recipes, as JSON holds them."""
     found = {key: getattr(phantom, name) for key, name in setting_names(kind.phantom).items()}
     return {key: np.asarray(value).tolist() if isinstance(value, tuple) else value for key, value in found.items()}

@@ -218,7 +218,7 @@ class Event:
         """The parallel projections (count, n_v, n_u) at so many angles, value x mm."""
         with self.opened() as file:
             shape = None if self.recipe.radon is None else (count, *self.recipe.radon.shape)
-            return Images.of(read_array(file, self._dataset(file, f"radon/{count}", shape).name), self.recipe.quantity)
+            return Images.tag(read_array(file, self._dataset(file, f"radon/{count}", shape).name), self.recipe.quantity)
 
     def radon_views(self, count: int) -> Views:
         """The views of the parallel projections."""

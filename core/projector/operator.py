@@ -152,7 +152,7 @@ class Projector(LinearOperator):
         if mu is None:
             images = super().__call__(x, progress)
             is_labelled = isinstance(x, Volume) and self.model.takes != ("activity",)
-            return Images.of(images, x.quantity) if is_labelled else images
+            return Images.tag(images, x.quantity) if is_labelled else images
         x = self._check(x)
         if self.model.mu is None:
             raise InputError("mu: the projector's model has none; give it one to say on which grid mu is")

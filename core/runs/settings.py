@@ -17,7 +17,7 @@ from types import MappingProxyType
 from typing import Any
 
 from ..errors import InputError
-from ..phantoms.kinds import KINDS, Kind
+from ..phantoms.kinds import KINDS, PhantomKind
 from ..phantoms.settings import setting_names
 from ..physics.isotopes import ISOTOPES
 from ..physics.materials import APERTURES, CRYSTALS
@@ -144,7 +144,7 @@ class OwnSetting(Setting):
         return tuple(value) if isinstance(value, list) else value
 
 
-def own_settings(kind: Kind, row: type[Setting] = OwnSetting, **common: Any) -> list[Setting]:
+def own_settings(kind: PhantomKind, row: type[Setting] = OwnSetting, **common: Any) -> list[Setting]:
     """The settings of a kind of phantoms, as rows of a class; `common` is what all of them have."""
     fields = {field.name: field for field in dataclasses.fields(kind.phantom)}
     found = []

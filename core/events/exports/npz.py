@@ -3,7 +3,7 @@
 import json
 from collections.abc import Iterator
 
-from ...volumes.formats.numpy_files import packed
+from ...volumes.formats.numpy_files import pack_npz
 from ..event_set import Event
 from .layout import Layout, Row
 from .record import record
@@ -22,4 +22,4 @@ class Npz(Layout):
         """All that there is of the event; `record` is text, as JSON."""
         affine, text = event.recipe.grid.affine, json.dumps(record(self.chosen, event))
         arrays = {**dict(self.chosen.arrays(event)), "truth_affine": affine, "pose": event.pose, "record": text}
-        yield self.files(row)[0], packed(arrays)
+        yield self.files(row)[0], pack_npz(arrays)

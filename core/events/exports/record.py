@@ -1,13 +1,13 @@
-"""What is known of an event besides its arrays, for programs that read JSON."""
+"""Record of an event besides its arrays, for programs that read JSON."""
 
 from typing import Any
 
 from ..event_set import Event
-from .layout import Chosen
+from .layout import ExportSelection
 
 
-def record(chosen: Chosen, event: Event) -> dict[str, Any]:
-    """The event's number, split, phantom, settings, pose, seeds, and the place of its truth: all that JSON can say."""
+def event_record(selection: ExportSelection, event: Event) -> dict[str, Any]:
+    """Return an event's number, split, phantom, settings, poses, truth's affine, units and noise, as JSON can hold them."""
     return {
         "number": event.number,
         "split": event.split or "",
@@ -19,7 +19,7 @@ def record(chosen: Chosen, event: Event) -> dict[str, Any]:
         "placement": event.placement.tolist(),
         "truth_affine": event.recipe.grid.affine.tolist(),
         "truth_quantity": event.recipe.quantity,
-        "units": {model: event.unit(model) for model in chosen.models},
-        "noise_seed": chosen.seed(event),
-        "level": chosen.level,
+        "units": {model: event.unit(model) for model in selection.models},
+        "noise_seed": selection.noise_seed(event),
+        "level": selection.level,
     }

@@ -112,7 +112,7 @@ def making(filepath: str, folder: str, count: int) -> jobs.Job:
         return time.perf_counter() - start
 
     def finish(seconds: float) -> str:
-        there = len(SetFolder(path).store.places())
+        there = len(SetFolder(path).store.locations())
         if not made:
             return f"All events asked for are there already: {there} in {path}"
         size = memory.readable_size(sum(event.size for event in made))

@@ -61,7 +61,7 @@ def _run(arguments: argparse.Namespace) -> None:
     options = {name: getattr(arguments, name) for name in ("count", "first", "workers", "shard", "dask", "pack")}
     work = events.making(recipe, arguments.folder, **options)
     done, folder = watched(work, arguments.quiet), work.folder
-    there, asked = len(folder.store.places()), sum(map(len, folder.asked))
+    there, asked = len(folder.store.locations()), sum(map(len, folder.requested))
     record = {"folder": arguments.folder, "asked": asked, "events": there, "made": done}
     print_answer(arguments, record, [f"{arguments.folder}: {there} of {asked} events, {done} made now"])
 
@@ -88,10 +88,10 @@ def watched(work: Making, quiet: bool) -> int:
 
 def _expected(work: Making) -> str:
     """How large the missing events become, by the first ones that are there."""
-    from ...events.store import size_of
+    from ...events.store import file_size
 
     missing = len(work.missing)
-    sizes = [size_of(place) for place in islice(work.folder.store.places().values(), 100)]
+    sizes = [file_size(location) for location in islice(work.folder.store.locations().values(), 100)]
     if sizes:
         each = sum(sizes) / len(sizes)
         return f"about {readable_size(each)} each, {readable_size(each * missing)} in all"

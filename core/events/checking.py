@@ -113,10 +113,10 @@ def check(folder: AnyPath, progress: Progress | None = None) -> list[Fault]:
 
     numbers = sorted({*requested, *locations})
     with ThreadPoolExecutor(cores()) as pool:
-        for done, fault in enumerate(pool.map(find_fault, numbers), 1):
+        for n_checked, fault in enumerate(pool.map(find_fault, numbers), 1):
             if fault is not None:
                 faults.append(fault)
-            tell(progress, done, len(numbers))
+            tell(progress, n_checked, len(numbers))
     return [*faults, *_foreign_files(target)]
 
 
@@ -192,8 +192,7 @@ def index_faults(folder: AnyPath) -> list[Fault]:
         stored = {}
     lines = {number: index.line(number) for number in (*stored, *locations) if number in requested}
     if index.path.read_bytes() != index.content(lines):
-        text = f"{index.path}: changed: its rows differ from those that recipe.toml gives"
-        return [Fault("index", index.path, text)]
+        return [Fault("index", index.path, f"{index.path}: changed: its rows differ from those that recipe.toml gives")]
     return []
 
 

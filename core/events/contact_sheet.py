@@ -94,9 +94,9 @@ def sheet_row(event: Event, model: str | None = None) -> SheetRow:
 def draw_sheet(rows: Sequence[SheetRow], title: str = "", lines: str = "") -> Page:
     """Draw a page of these rows, below `title` and `lines`; `InputError` for no rows, or more than a page holds."""
     row_height = _ABOVE + _SIDE + _BELOW
-    most = (LARGEST - _HEAD) // row_height
-    if not 1 <= len(rows) <= most:
-        raise InputError(f"contact sheet: expected 1 to {most} events, got {len(rows)}")
+    max_rows = (LARGEST - _HEAD) // row_height
+    if not 1 <= len(rows) <= max_rows:
+        raise InputError(f"contact sheet: expected 1 to {max_rows} events, got {len(rows)}")
     fraction = max((_central_fraction(row.images) for row in rows if row.images is not None), default=1.0)
     panels_by_row = [_row_panels(row, fraction) for row in rows]
     width = 2 * _MARGIN + max(sum(panel.width_with_gap for panel in panels) for panels in panels_by_row) - _GROUP
@@ -256,8 +256,7 @@ def _draw_panel(page: Page, panel: _Panel, left: int, top: int) -> None:
     x, y = left + (panel.frame - panel.width) // 2, top + (_SIDE - panel.height) // 2
     page.image(panel.picture, x, y, panel.width, panel.height)
     if panel.cross is not None:
-        across, down = panel.cross
-        tick = 12
+        (across, down), tick = panel.cross, 12
         if 0 <= down <= panel.height:
             for start in (x, x + panel.width - tick):
                 page.line([(start, y + down), (start + tick, y + down)], _CROSS, 1.2)

@@ -68,15 +68,15 @@ def required(value: Any, key: str, advice: str) -> Any:
     return value
 
 
-def check_entries(values: Mapping[str, Any], version: int, known: Collection[str]) -> None:
-    """Raise `InputError` where a recipe has another language version than `version`, or an entry not in `known`."""
+def check_entries(values: Mapping[str, Any], version: int, names: Collection[str]) -> None:
+    """Raise `InputError` where a recipe has another language version than `version`, or an entry not in `names`."""
     if "version" not in values:
         raise InputError(f"version: missing; this mphDRR reads version = {version}")
     if values["version"] != version or isinstance(values["version"], bool):
         raise InputError(f"version: expected {version}, got {values['version']!r}; a newer mphDRR may read it")
     for key in values:
-        if key not in known:
-            raise InputError(f"{key}: no such entry; expected {', '.join(known)}")
+        if key not in names:
+            raise InputError(f"{key}: no such entry; expected {', '.join(names)}")
 
 
 def grid_of(values: Any, name: str) -> Grid:
@@ -103,16 +103,16 @@ def _modern_value(row: Setting, value: Any) -> Any:
     return int(value) if row.kind is int and isinstance(value, float) and value.is_integer() else value
 
 
-def plain_name(name: Any, what: str) -> str:
+def plain_name(name: Any, label: str) -> str:
     """Return a name that is also usable as a file name (letters, digits, - and _), or raise `InputError`."""
     if not isinstance(name, str) or not name.replace("-", "").replace("_", "").isalnum():
-        raise InputError(f"{what}: expected a name of letters, digits, - and _, got {name!r}")
+        raise InputError(f"{label}: expected a name of letters, digits, - and _, got {name!r}")
     return name
 
 
 @dataclass(frozen=True)
 class PhantomEntry(DrawnValues):
-    """One of the phantoms from which events draw: values of its settings by key, some of which are draws."""
+    """Phantom that events may draw: values of its settings by key, some of which are draws."""
 
     settings: Mapping[str, Any] = field(default_factory=dict)
     """Values or draws of the settings of the phantom's kind, by their names in recipes."""

@@ -89,9 +89,7 @@ def verify(location: FileLocation) -> Header:
     return checked
 
 
-def pack_event(
-    event: EventArrays, recipe: EventRecipe, geometry: dict[str, Any], threads: int | None = None
-) -> memoryview:
+def pack(event: EventArrays, recipe: EventRecipe, geometry: dict[str, Any], threads: int | None = None) -> memoryview:
     """Return the bytes of an event's file, which are the same for the same event and the same versions of all packages.
 
     `geometry` holds small arrays with their units, by name, for the group ``geometry``. `threads` compress the arrays, by

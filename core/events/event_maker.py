@@ -92,14 +92,14 @@ class EventMaker:
         """Compute event `number`; `progress` is called as ``progress(steps done, steps)`` and may raise `Cancelled`."""
         planned, recipe = plan(self.recipe, number), self.recipe
         self.require_memory()
-        done, steps = 0, 1 + len(recipe.models) + (0 if recipe.radon is None else len(recipe.radon.counts))
+        n_done, n_steps = 0, 1 + len(recipe.models) + (0 if recipe.radon is None else len(recipe.radon.counts))
 
         def step() -> None:
-            nonlocal done
-            done += 1
-            tell(progress, done, steps)
+            nonlocal n_done
+            n_done += 1
+            tell(progress, n_done, n_steps)
 
-        tell(progress, 0, steps)
+        tell(progress, 0, n_steps)
         _ = self.system, choose("auto")  # their warnings come before the event, whose file must not hold them
         with naming(f"event {number}"), recorded_warnings() as warnings:
             truth = self.truth(planned)
@@ -119,11 +119,10 @@ class EventMaker:
     def truth(self, planned: PlannedEvent) -> Volume:
         """Return the event's truth: the drawn phantom on the recipe's grid, times the factor of activity."""
         planned.made_phantom.again()
-        factor = planned.activity_factor
         volume = self._voxelize(planned, self.recipe.quantity)
-        if factor == 1.0:
+        if planned.activity_factor == 1.0:
             return volume
-        return Volume(freeze(volume.array * np.float32(factor)), volume.grid, volume.quantity)
+        return Volume(freeze(volume.array * np.float32(planned.activity_factor)), volume.grid, volume.quantity)
 
     def _voxelize(self, planned: PlannedEvent, quantity: str) -> Volume:
         """Return the mean of the event's phantoms, or the volume of its file, on the grid of the truth."""

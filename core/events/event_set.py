@@ -49,7 +49,7 @@ def _stored_array(name: str, description: str) -> Any:
 
 
 class Event:
-    """One event of a set, of which each access opens the file, reads one item and closes the file."""
+    """Event of a set; each access opens the event's file, reads one item and closes the file."""
 
     def __init__(self, folder: SetFolder, number: int) -> None:
         self._folder, self.number = folder, number
@@ -249,7 +249,7 @@ class Event:
 
     def _run_recipe(self, model: Recipe) -> Recipe | None:
         """Return the recipe of a run with a model's images; None where no recipe can describe the attenuation."""
-        planned, recipe = self.planned, self._folder.recipe
+        planned, recipe, grid = self.planned, self.recipe, self.recipe.grid
         files = {key: model[key] for key in ("system.file", "system.columns")}
         changes: dict[str, Any] = {key: str(recipe.input(name).path) for key, name in files.items() if name is not None}
         if (mu_files := model["attenuation.file"]) is not None:
@@ -258,7 +258,6 @@ class Event:
                 changes |= {"attenuation.energy": None}  # the set's copy holds mu, not CT numbers
         record = recorded_recipe(recipe.placed(model.updated(changes)))
         if planned.phantom is not None and planned.entry["gates"] == 1 and planned.activity_factor == 1:
-            grid = recipe.grid
             values: dict[str, Any] = {"phantom.voxels": grid.shape, "phantom.spacing": grid.spacing.tolist()}
             if planned.file is not None:
                 values["phantom.file"] = str(recipe.input(planned.file).path)

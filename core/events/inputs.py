@@ -34,8 +34,7 @@ class Input:
 
     def copy_to(self, folder: Path) -> "Input":
         """Copy into a folder and return the copy: the same bytes of a plain file, an HDF5 file of a volume."""
-        path = self.path
-        stem, ending = (path.stem, path.suffix) if self.content == "copy" else (_volume_stem(path), ".h5")
+        stem, ending = (self.path.stem, self.path.suffix) if self.content == "copy" else (_stem(self.path), ".h5")
         target, number = folder / f"{stem}{ending}", 1
         while target.exists():
             if _sha256(target, self.content, True) == self.sha256:  # another process has copied it meanwhile
@@ -81,7 +80,7 @@ def _read_original(path: Path, content: str) -> Volume:
     return read_mu(path, energy or None) if quantity == "mu" else read_volume_of(path, quantity)
 
 
-def _volume_stem(path: Path) -> str:
+def _stem(path: Path) -> str:
     """Return the file name of a volume without its ending, .nii.gz included."""
     name = path.name
     return name[: -len(".nii.gz")] if name.lower().endswith(".nii.gz") else path.stem

@@ -55,10 +55,9 @@ class PlannedEvent:
         self.recipe, self.number = recipe, number
         dice = Dice(recipe.seed, number)
         entry = recipe.phantoms[dice.choice("phantom", [entry["odds"] for entry in recipe.phantoms])]
-        prefix, kinds = f"{entry.name}: ", {key: row.kind for key, row in entry.rows.items()}
+        prefix, is_int = f"{entry.name}: ", {key: row.kind is int for key, row in entry.rows.items()}
         self.entry, self.split = entry, entry["split"] or _draw_split(recipe, number)
-        settings = entry.settings.items()
-        self.settings = {key: dice.draw(value, prefix + key, kinds[key] is int) for key, value in settings}
+        self.settings = {key: dice.draw(value, prefix + key, is_int[key]) for key, value in entry.settings.items()}
         self.file, self.mu_file = dice.draw(entry["file"], f"{prefix}file"), None
         if entry["mu_file"] is not None:
             self.mu_file = possible_values(entry["mu_file"])[possible_values(entry["file"]).index(self.file)]

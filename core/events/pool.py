@@ -45,16 +45,15 @@ def make_in_processes(target: SetFolder, numbers: Sequence[int], workers: int) -
     waiting, n_breaks = deque(numbers), 0
     while waiting:
         under_way: dict[Future[Written], int] = {}
-        arguments = target.path, threads_per_worker(workers)
-        pool = ProcessPoolExecutor(workers, get_context("spawn"), _start_worker, arguments)
+        pool = ProcessPoolExecutor(workers, get_context("spawn"), _start, (target.path, threads_per_worker(workers)))
         try:
             while waiting or under_way:
                 while waiting and len(under_way) < workers + 1:  # one more than workers, so that none has to wait
                     with _hold_interrupts():
                         under_way[pool.submit(_write_event, waiting[0])] = waiting[0]
                     waiting.popleft()
-                done, _ = wait(under_way, return_when=FIRST_COMPLETED)
-                for future in sorted(done, key=under_way.__getitem__):
+                finished, _ = wait(under_way, return_when=FIRST_COMPLETED)
+                for future in sorted(finished, key=under_way.__getitem__):
                     written = future.result()
                     del under_way[future]
                     n_breaks = 0
@@ -95,7 +94,7 @@ def _hold_interrupts() -> Iterator[None]:
             signal.pthread_sigmask(signal.SIG_SETMASK, earlier_mask)
 
 
-def _start_worker(folder: Path, threads: int) -> None:
+def _start(folder: Path, threads: int) -> None:
     """Prepare a worker process for the events of a set."""
     global _writer
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Windows cannot hold it back

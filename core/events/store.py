@@ -68,12 +68,12 @@ class Store:
         with locked(self.shards / LOCK, f"{self.shards}: another process is packing this set; wait until it ends"):
             numbers, shards = self.single_events(), self.shard_paths()
             packed = dict(member for shard in shards for member in _members(shard))
-            last, done = int(shards[-1].stem) if shards else 0, 0
-            while done < len(numbers):
-                done += self._append(self.shards / f"{last:06d}.tar", numbers[done:], packed, shard_bytes)
+            last, n_packed = int(shards[-1].stem) if shards else 0, 0
+            while n_packed < len(numbers):
+                n_packed += self._append(self.shards / f"{last:06d}.tar", numbers[n_packed:], packed, shard_bytes)
                 last += 1
-                tell(progress, done, len(numbers))
-            return done
+                tell(progress, n_packed, len(numbers))
+            return n_packed
 
     def _append(self, shard: Path, numbers: Sequence[int], packed: Mapping[int, FileLocation], shard_bytes: int) -> int:
         """Move events to the end of a shard until it has `shard_bytes`, and return their number.
@@ -117,10 +117,10 @@ class Store:
             return 0
         with locked(self.shards / LOCK, f"{self.shards}: another process is packing this set; wait until it ends"):
             packed = [(n, location) for n, location in self.locations().items() if Path(location.path) in shards]
-            for done, (number, location) in enumerate(packed, 1):
+            for n_unpacked, (number, location) in enumerate(packed, 1):
                 if _is_intact(location):
                     write_bytes(self.event_path(number), read_bytes(location))
-                tell(progress, done, len(packed))
+                tell(progress, n_unpacked, len(packed))
             for shard in shards:
                 with refusing(shard, "cannot be removed"):
                     shard.unlink()

@@ -73,17 +73,17 @@ class Making(Iterator[Made]):
 
     def _report(self, written: Iterator[Written]) -> Iterator[Made]:
         """Yield a report on each event that was written; show each warning once, for the first event that gave it."""
-        shown: set[str] = set()
+        patterns: set[str] = set()
         store, unpacked_bytes = self.folder.store, 0
         try:
-            for done, event in enumerate(written, 1):
+            for n_made, event in enumerate(written, 1):
                 for text in event.warnings:
                     pattern = re.sub(r"[\d.]+", "", text)  # warnings that differ in numbers alone are shown once
-                    if pattern not in shown:
-                        shown.add(pattern)
+                    if pattern not in patterns:
+                        patterns.add(pattern)
                         warn(f"event {event.number}: {text}", 3)
                 path = store.event_path(event.number)
-                yield Made(event.number, path, event.size, event.seconds, done, len(self.missing))
+                yield Made(event.number, path, event.size, event.seconds, n_made, len(self.missing))
                 unpacked_bytes += event.size
                 if unpacked_bytes >= SHARD_BYTES:
                     _pack_if_sharded(store)
@@ -222,6 +222,6 @@ def make(
     (80, 256, 256)
     """
     count = whole_number(count, "count")
-    for made in making(recipe, folder, count, first, workers):
-        tell(progress, made.done, made.total)
+    for event in making(recipe, folder, count, first, workers):
+        tell(progress, event.done, event.total)
     return EventSet(folder)

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 from ..files import AnyPath, write_bytes
 from ..progress import Progress
 from ..recording import recorded_warnings
-from .event_files import FileLocation, pack_event
+from .event_files import FileLocation, pack
 from .event_maker import EventMaker
 from .folders import SetFolder
 
@@ -39,7 +39,7 @@ class EventWriter:
         if not folder.is_made(number, location):
             with recorded_warnings() as other_warnings:
                 event = self.maker.make(number, progress)
-            data = pack_event(event, folder.recipe, self._geometry_arrays(), self.maker.threads)
+            data = pack(event, folder.recipe, self._geometry_arrays(), self.maker.threads)
             write_bytes(location.path, data)
             warnings, size = [*event.warnings, *other_warnings], len(data)
         if number not in self._indexed:

@@ -129,5 +129,5 @@ def test_bytes_do_not_depend_on_threads_or_on_what_was_made_before(small):
     for threads in (1, 3):
         maker = events.EventMaker(recipe, threads)
         for number in (1, 0, 1):
-            packed = event_files.pack_event(maker.make(number), recipe, geometry, threads)
+            packed = event_files.pack(maker.make(number), recipe, geometry, threads)
             assert packed == small[number].path.read_bytes()

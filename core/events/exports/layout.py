@@ -52,6 +52,24 @@ class ExportSelection:
         """The shapes of an event's arrays, by name."""
         return field_shapes(self.events)
 
+    def record(self, event: Event) -> dict[str, Any]:
+        """Return the event's number, split, phantom, settings, poses, truth's affine, units and noise, for JSON."""
+        return {
+            "number": event.number,
+            "split": event.split or "",
+            "name": event.name,
+            "settings": event.settings,
+            "position_mm": event.position.tolist(),
+            "euler_degrees": event.euler_degrees.tolist(),
+            "pose": event.pose.tolist(),
+            "placement": event.placement.tolist(),
+            "truth_affine": event.recipe.grid.affine.tolist(),
+            "truth_quantity": event.recipe.quantity,
+            "units": {model: event.unit(model) for model in self.models},
+            "noise_seed": self.noise_seed(event),
+            "level": self.level,
+        }
+
     @property
     def radon_counts(self) -> tuple[int, ...]:
         """The numbers of angles of the set's Radon images."""

@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from ...volumes.formats.numpy_files import packed
 from ..event_set import Event
 from .layout import ExportLayout, Row
-from .record import event_record
 
 
 class Npz(ExportLayout):
@@ -20,6 +19,6 @@ class Npz(ExportLayout):
 
     def contents(self, row: Row, event: Event) -> Iterator[tuple[str, bytes | memoryview]]:
         """Yield the archive with all arrays of the event, and its record as a text of JSON."""
-        affine, text = event.recipe.grid.affine, json.dumps(event_record(self.selection, event))
+        affine, text = event.recipe.grid.affine, json.dumps(self.selection.record(event))
         arrays = {**dict(self.selection.arrays(event)), "truth_affine": affine, "pose": event.pose, "record": text}
         yield self.files(row)[0], packed(arrays)

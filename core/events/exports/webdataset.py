@@ -1,8 +1,8 @@
 """Shards of WebDataset: tar archives, whose members of one key, 000012.truth.npy.gz, 000012.radon96.npy.gz, are an event.
 
-The images of a model are 000012.NAME.npy.gz, and 000012.json is the record (`event_record`); names of uncompressed arrays
-end in .npy. A shard holds events of one split, ``train-000003.tar``, so that a brace pattern or a glob selects the events
-for training. The same set gives the same bytes.
+The images of a model are 000012.NAME.npy.gz, and 000012.json is the event's record (`ExportSelection.record`); names of
+uncompressed arrays end in .npy. A shard holds events of one split, ``train-000003.tar``, so that a brace pattern or a glob
+selects the events for training. The same set gives the same bytes.
 """
 
 import gzip
@@ -17,7 +17,6 @@ from ...validation import strict_whole
 from ..event_set import Event
 from .arrays import npy_bytes
 from .layout import ExportLayout, ExportPart, ExportSelection, Row
-from .record import event_record
 
 SHARD_BYTES = 10**9
 """Approximate size of a shard, bytes, where its number of events is not given."""
@@ -64,4 +63,4 @@ class WebDataset(ExportLayout):
                 yield f"{key}.{name}.npy.gz", gzip.compress(npy_bytes(array), 4, mtime=0)
             else:
                 yield f"{key}.{name}.npy", npy_bytes(array)
-        yield f"{key}.json", json.dumps(event_record(self.selection, event)).encode()
+        yield f"{key}.json", json.dumps(self.selection.record(event)).encode()

@@ -71,12 +71,12 @@ class ExportPlan:
         write_bytes(self.folder / REQUEST, json.dumps(self.request, indent=1).encode() + b"\n")
         for name, content in {TABLE: events_table(self.rows), **self.layout.tables(self.rows)}.items():
             write_bytes(self.folder / name, content)
-        done = len(self.rows) - self.events
+        n_written = len(self.rows) - self.events
 
         def report_event() -> None:
-            nonlocal done
-            done += 1
-            tell(progress, done, len(self.rows))
+            nonlocal n_written
+            n_written += 1
+            tell(progress, n_written, len(self.rows))
 
         for part in self.missing:
             self.layout.write(part, self.rows, self.folder, report_event)

@@ -1,4 +1,4 @@
-"""Numpy arrays and torch tensors: checked on the way in, of the caller's kind on the way out."""
+"""NumPy arrays and torch tensors: checks of arguments, and conversion of results to the caller's kind."""
 
 import functools
 import sys
@@ -17,41 +17,42 @@ Bools = NDArray[np.bool_]
 Indexes = NDArray[np.intp]
 Integers = NDArray[np.int64]
 Bytes = NDArray[np.uint8]
-Array = NDArray[Any]  # of any type
+Array = NDArray[Any]  # an array of any type
 ArrayOrTensor = Any  # a numpy array or a torch tensor; torch may not be installed
 
 
 def is_tensor(value: object) -> bool:
-    """Whether `value` is a torch tensor (torch is not imported to find out)."""
+    """Return whether `value` is a torch tensor, without importing torch."""
     torch = sys.modules.get("torch")
     return torch is not None and isinstance(value, torch.Tensor)
 
 
 def namespace(*values: ArrayOrTensor) -> Any:
-    """The library whose functions take `values`: torch if any is a tensor, else numpy."""
+    """Return the module whose functions take `values`: torch if any of them is a tensor, else numpy."""
     return sys.modules["torch"] if any(map(is_tensor, values)) else np
 
 
 def is_double(value: object) -> bool:
-    """Whether `value` is a torch tensor of float64."""
+    """Return whether `value` is a torch tensor of float64."""
     return is_tensor(value) and str(value.dtype) == "torch.float64"  # type: ignore[attr-defined]
 
 
 def checked(
     value: ArrayOrTensor, name: str, shape: tuple[int, ...], float64: bool, batch: bool = False, finite: bool = False
 ) -> ArrayOrTensor:
-    """`value` as float32 or float64 numbers, still an array or still a tensor on its device; not copied without need.
+    """Return `value` as real numbers of the expected `shape`, float64 if `float64` is true, else float32.
 
-    A float64 tensor stays float64. Of a `batch`, any axes may come before those of `shape`. If `finite`, the caller sees to
-    it that a tensor's numbers are.
+    An array stays an array and a tensor stays a tensor on its device; neither is copied without need. A float64 tensor stays
+    float64. With `batch`, any axes may precede those of `shape`. With `finite`, a tensor is not checked for infinities and
+    NaN, because the caller has done so. Raises `InputError`, whose message begins with `name`.
     """
     if is_tensor(value):
         import torch
 
         require_numbers(value, name)
-        wanted = batch_shape(shape, tuple(value.shape)) if batch else shape
-        if tuple(value.shape) != wanted:
-            raise InputError(f"{name}: expected shape {shape_text(wanted)}, got {shape_text(value.shape)}")
+        expected = batch_shape(shape, tuple(value.shape)) if batch else shape
+        if tuple(value.shape) != expected:
+            raise InputError(f"{name}: expected shape {shape_text(expected)}, got {shape_text(value.shape)}")
         if value.dtype != torch.float64:
             value = value.to(torch.float64 if float64 else torch.float32)
         if not finite and not bool(torch.isfinite(value.detach().sum())):
@@ -59,30 +60,29 @@ def checked(
         return value
     dtype = np.float64 if float64 else np.float32
     value = real_numbers(value, name)
-    if value.dtype == dtype and value.flags.c_contiguous:
-        wanted = batch_shape(shape, value.shape) if batch else shape
-        if value.shape == wanted:
-            require_finite(value, name)
-            return value
+    expected = batch_shape(shape, value.shape) if batch else shape
+    if value.dtype == dtype and value.flags.c_contiguous and value.shape == expected:
+        require_finite(value, name)
+        return value
     return real_array(value, name, shape, dtype, batch)
 
 
 def require_numbers(tensor: Any, name: str) -> None:
-    """Raise `InputError` unless a tensor holds real numbers, all of them."""
+    """Raise `InputError` unless `tensor` is a dense tensor of real numbers that is in memory."""
     if tensor.is_complex() or tensor.is_quantized or tensor.is_meta or str(tensor.layout) != "torch.strided":
         kind = f"{tensor.dtype}, {tensor.layout}, on {tensor.device}"
         raise InputError(f"{name}: expected a dense tensor of real numbers, got {kind}")
 
 
 def to_numpy(value: ArrayOrTensor, dtype: Any) -> np.ndarray[Any, Any]:
-    """`value` as a C-ordered, aligned array (compiled kernels take no other)."""
+    """Return `value` as a C-ordered, aligned array of `dtype`, as compiled kernels need it."""
     if is_tensor(value):
         value = value.numpy(force=True)
     return np.require(value, dtype, ["C", "A"])
 
 
 def to_tensor(value: ArrayOrTensor) -> Any:
-    """`value` as a contiguous tensor: a tensor on its own device, an array on torch's default device."""
+    """Return `value` as a contiguous tensor: a tensor stays on its device, an array goes to torch's default device."""
     import torch
 
     if is_tensor(value):
@@ -92,17 +92,17 @@ def to_tensor(value: ArrayOrTensor) -> Any:
     return torch.from_numpy(np.ascontiguousarray(value)).to(torch.get_default_device())
 
 
-def to_caller(result: ArrayOrTensor, given: ArrayOrTensor) -> ArrayOrTensor:
-    """`result` of the kind of `given`: a tensor on its device, or a numpy array."""
-    if is_tensor(given):
+def to_caller(result: ArrayOrTensor, argument: ArrayOrTensor) -> ArrayOrTensor:
+    """Return `result` as the kind of the caller's `argument`: a tensor on the argument's device, or a NumPy array."""
+    if is_tensor(argument):
         import torch
 
-        return torch.as_tensor(result, device=given.device)
+        return torch.as_tensor(result, device=argument.device)
     return result.cpu().numpy() if is_tensor(result) else result
 
 
 def zeros(shape: tuple[int, ...], like: ArrayOrTensor) -> ArrayOrTensor:
-    """Zeros of the kind, type and device of `like`."""
+    """Return zeros of `shape`, an array or tensor of the type and on the device of `like`."""
     if is_tensor(like):
         return like.new_zeros(shape)
     # Unlike np.zeros, np.empty gets large pages of memory: a backprojection takes half the time.
@@ -112,7 +112,7 @@ def zeros(shape: tuple[int, ...], like: ArrayOrTensor) -> ArrayOrTensor:
 
 
 def cast_like(values: ArrayOrTensor, like: ArrayOrTensor) -> ArrayOrTensor:
-    """`values` of the kind, type and device of `like`; not part of a graph."""
+    """Return `values` as an array or tensor of the type and on the device of `like`, detached from torch's graph."""
     if not is_tensor(like):
         return to_numpy(values, like.dtype) if is_tensor(values) else np.asarray(values, dtype=like.dtype)
     if is_tensor(values):
@@ -123,28 +123,34 @@ def cast_like(values: ArrayOrTensor, like: ArrayOrTensor) -> ArrayOrTensor:
 
 
 def promote(*values: ArrayOrTensor) -> tuple[ArrayOrTensor, ...]:
-    """All as tensors of one type and device if any is a tensor, still part of their graphs; else as they are."""
+    """Return `values` as tensors of one type on one device if any of them is a tensor, else unchanged.
+
+    Tensors stay part of torch's graph.
+    """
     device = next((value.device for value in values if is_tensor(value)), None)
     if device is None:
         return values
     import torch
 
     tensors = [value if is_tensor(value) else torch.tensor(value) for value in values]
-    kind = functools.reduce(torch.promote_types, (tensor.dtype for tensor in tensors))
-    return tuple(tensor.to(device, kind) for tensor in tensors)
+    dtype = functools.reduce(torch.promote_types, (tensor.dtype for tensor in tensors))
+    return tuple(tensor.to(device, dtype) for tensor in tensors)
 
 
 def cropped(*volumes: ArrayOrTensor) -> tuple[list[ArrayOrTensor], tuple[int, int, int]]:
-    """The smallest box that holds all nonzero voxels of `volumes` (of one shape), and the index of its first voxel."""
-    find = _filled_ranges_of_tensors if is_tensor(volumes[0]) else _filled_ranges
-    ranges = find(volumes)
+    """Crop `volumes`, all of one shape, to their common bounding box; return the cropped volumes and the box's first index.
+
+    The bounding box is the smallest box that holds all nonzero voxels of all volumes; of zeros alone it is one voxel.
+    """
+    find_ranges = _filled_ranges_of_tensors if is_tensor(volumes[0]) else _filled_ranges
+    ranges = find_ranges(volumes)
     boxes = [volume[tuple(slice(first, last) for first, last in ranges)] for volume in volumes]
     boxes = [box.contiguous() if is_tensor(box) else np.ascontiguousarray(box) for box in boxes]
     return boxes, (ranges[0][0], ranges[1][0], ranges[2][0])
 
 
 def _filled_ranges(volumes: tuple[Array, ...]) -> list[tuple[int, int]]:
-    """First and last + 1 index of nonzero voxels along each axis. Reads the empty margins, not whole volumes."""
+    """Return the range (first, last + 1) of the nonzero voxels' indices along each axis; reads the empty margins alone."""
     ranges: list[tuple[int, int]] = []
     for axis in (0, 1):
         slabs = [np.moveaxis(volume, axis, 0) for volume in volumes]
@@ -163,18 +169,18 @@ def _filled_ranges(volumes: tuple[Array, ...]) -> list[tuple[int, int]]:
 
 
 def _filled_ranges_of_tensors(volumes: tuple[Any, ...]) -> list[tuple[int, int]]:
-    """The same in few steps, since each waits for the GPU."""
+    """Return `_filled_ranges` of tensors, in few steps because each one waits for the GPU."""
     filled = [volume != 0 for volume in volumes]
-    # Whether anything is in a row along y, or along x: fast, as neighbours in memory (along z) are not joined.
+    # Rows along x and y are joined first: neighbours in memory, which lie along z, would be joined slowly.
     along_x, along_y = ([flags.any(axis) for flags in filled] for axis in (0, 1))
     ranges: list[tuple[int, int]] = []
-    for rows, across in ((along_y, 1), (along_x, 1), (along_x, 0)):
-        where = np.concatenate([np.flatnonzero(flags.any(across).cpu().numpy()) for flags in rows])
-        ranges.append((int(where.min()), int(where.max()) + 1) if len(where) else (0, 1))
+    for rows, axis in ((along_y, 1), (along_x, 1), (along_x, 0)):
+        indices = np.concatenate([np.flatnonzero(flags.any(axis).cpu().numpy()) for flags in rows])
+        ranges.append((int(indices.min()), int(indices.max()) + 1) if len(indices) else (0, 1))
     return ranges
 
 
 def table_rows(columns: dict[str, Array]) -> list[dict[str, Any]]:
-    """The rows of a table given by its columns, in Python's numbers."""
+    """Return the rows of a table that is given by its columns; the values are Python's own numbers and texts."""
     values = (column.tolist() for column in columns.values())
     return [dict(zip(columns, row, strict=True)) for row in zip(*values, strict=True)]

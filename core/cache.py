@@ -1,4 +1,4 @@
-"""Where what can be made again is kept, such as kernels compiled for a GPU."""
+"""The folder of mphDRR's cache, for files that can be made again, such as kernels compiled for a GPU."""
 
 import os
 import sys
@@ -8,13 +8,13 @@ _chosen: Path | None = None
 
 
 def keep_in(folder: Path | None) -> None:
-    """Keep it in `folder` from now on; None: where this user's programs do."""
+    """Set the cache's folder; None restores the default, the folder where this user's programs keep their caches."""
     global _chosen
     _chosen = folder
 
 
 def folder() -> Path:
-    """The folder, which may not exist yet."""
+    """Return the cache's folder, which may not exist yet."""
     if _chosen is not None:
         return _chosen
     if sys.platform == "win32":

@@ -1,4 +1,8 @@
-"""Errors and warnings about the user's input, and the exception of cancelled work."""
+"""Errors and warnings about the user's input, and the exception that cancels work.
+
+The context managers turn the exceptions of libraries and of the operating system into an `InputError` with one line that
+names the place.
+"""
 
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
@@ -8,43 +12,52 @@ from typing import Any
 
 
 class InputError(ValueError):
-    """The user's input cannot be used: one line that names the place, what was found and what was expected.
+    """Refusal of the user's input, in one line that names the place, what was expected and what was found.
 
-    Every public function raises it where an argument is of another kind or shape, not finite or out of its range.
-    Docstrings have a section "Raises" only for what is particular to a function.
+    Every public function raises it for an argument of another kind or shape, not finite, or out of its range. A docstring
+    has a section "Raises" only for refusals that are particular to its function.
     """
 
 
 class Cancelled(Exception):
-    """Raised by a progress callback to stop the work. Nothing half-done is left behind."""
+    """Exception by which a progress callback stops the work. Nothing half-done is left behind."""
 
     reconstruction: Any = None
-    """Of an iterative reconstruction: the `Reconstruction` after its last whole iteration, which can be resumed."""
+    """The `Reconstruction` after the last whole iteration of a cancelled reconstruction, which can be resumed; else None."""
     design: Any = None
-    """Of a search for a design: the best `Design` until then."""
+    """The best `Design` that a cancelled search had found; else None."""
 
 
 class InputWarning(UserWarning):
-    """The user's input was used, but something about it should be checked."""
+    """Warning about input that was used, but that the user should check."""
 
 
 def warn(text: str, stacklevel: int = 3) -> None:
-    """Give an `InputWarning`; where a function of users gives it itself, not by a helper, the `stacklevel` is 2."""
+    """Issue an `InputWarning` that names the line `stacklevel` calls up.
+
+    The `stacklevel` is 2 in a public function that warns itself, and 3 in a helper that a public function calls.
+    """
     warnings.warn(text, InputWarning, stacklevel=stacklevel + 1)
 
 
 @contextmanager
-def refusing(place: object, what: str) -> Iterator[None]:
-    """Make what the system refuses an input error: of which `place`, such as a file, and that it "cannot be written"."""
+def refusing(place: object, problem: str) -> Iterator[None]:
+    """Turn an `OSError` of the block into an `InputError`: "PLACE: PROBLEM (the system's reason)".
+
+    `place` is a file, for instance, and `problem` says that it "cannot be written".
+    """
     try:
         yield
     except OSError as error:
-        raise InputError(f"{place}: {what} ({error.strerror or error})") from error
+        raise InputError(f"{place}: {problem} ({error.strerror or error})") from error
 
 
 @contextmanager
 def expecting(refusal: str, *kinds: type[Exception]) -> Iterator[None]:
-    """Make errors of these kinds, by default a `ValueError` such as of a text that is no number, an input error."""
+    """Turn exceptions of these `kinds`, by default `ValueError`, into an `InputError` with the message `refusal`.
+
+    An example is the `ValueError` of a text that is no number.
+    """
     expected = kinds or (ValueError,)
     try:
         yield
@@ -54,7 +67,7 @@ def expecting(refusal: str, *kinds: type[Exception]) -> Iterator[None]:
 
 @contextmanager
 def naming(name: object) -> Iterator[None]:
-    """Put a name, such as a file's, before the messages of input errors that do not begin with it."""
+    """Put `name`, such as a file's, before the message of an `InputError` of the block that does not begin with it."""
     try:
         yield
     except InputError as error:
@@ -65,7 +78,11 @@ def naming(name: object) -> Iterator[None]:
 
 @contextmanager
 def reading(name: object, kind: str) -> Iterator[None]:
-    """Make whatever a library raises on a damaged file an input error, and put the file's `name` before all of these."""
+    """Turn any exception that a library raises on a damaged file into an `InputError`.
+
+    The message begins with the file's `name` and says that the file cannot be read as this `kind`, such as "HDF5". Input
+    errors of the block get the `name` as in `naming`; `Cancelled` passes unchanged.
+    """
     with naming(name):
         try:
             yield
@@ -76,40 +93,41 @@ def reading(name: object, kind: str) -> Iterator[None]:
 
 
 @contextmanager
-def needing(what: str = "", of: str = "") -> Iterator[None]:
-    """Make the failed import of a package an input error that says how to install it, or `what` has it, such as an extra.
+def needing(requirement: str = "", feature: str = "") -> Iterator[None]:
+    """Turn the failed import of a package into an `InputError` that says how to install it.
 
-    Before it the error names what the package is needed by, if that is said.
+    `requirement` is what pip is told to install, such as "mphdrr[design]"; by default the package. `feature` is what needs
+    the package, and begins the message if it is given.
     """
     try:
         yield
     except ImportError as error:
-        package = (error.name or what).partition(".")[0]
-        found = f"{package} is missing: {installing(what or package)}"
-        raise InputError(f"{of}: {found}" if of else found) from None
+        package = (error.name or requirement).partition(".")[0]
+        problem = f"{package} is missing: {install_advice(requirement or package)}"
+        raise InputError(f"{feature}: {problem}" if feature else problem) from None
 
 
-def installing(what: str) -> str:
-    """How to install packages: pip's command, or where it is told how they come into Blender's own Python."""
-    if __name__.startswith("bl_ext."):  # an extension's name
+def install_advice(requirement: str) -> str:
+    """Return how to install `requirement`: pip's command, or in Blender's extension the page that explains it."""
+    if __name__.startswith("bl_ext."):  # the package's name if Blender runs it as an extension
         return 'see "Packages that Blender does not bring" in docs/first-steps.md'
-    return f'pip install "{what}"' if "[" in what else f"pip install {what}"
+    return f'pip install "{requirement}"' if "[" in requirement else f"pip install {requirement}"
 
 
 def first_line(error: BaseException) -> str:
-    """A library's error message, as one line."""
+    """Return the first line of a library's error message that is not blank, or else the error's class name."""
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     return lines[0] if lines else type(error).__name__
 
 
 def number_ranges(numbers: Sequence[int]) -> list[str]:
-    """Whole numbers in rising order as texts, such as "1-3" and "7"."""
+    """Return the ranges of whole `numbers`, given in rising order, as texts such as "1-3" and "7"."""
     cuts = [0, *(i for i in range(1, len(numbers)) if numbers[i] != numbers[i - 1] + 1), len(numbers)]
-    parts = [(numbers[a], numbers[b - 1]) for a, b in pairwise(cuts)]
-    return [f"{a}-{b}" if b > a else str(a) for a, b in parts]
+    ranges = [(numbers[start], numbers[stop - 1]) for start, stop in pairwise(cuts)]
+    return [f"{first}-{last}" if last > first else str(first) for first, last in ranges]
 
 
-def several(things: Iterable[object], shown: int = 3) -> str:
-    """The first few, and how many more."""
-    texts = [str(thing) for thing in things]
-    return ", ".join(texts[:shown]) + (f" and {len(texts) - shown} more" if len(texts) > shown else "")
+def several(items: Iterable[object], limit: int = 3) -> str:
+    """Return the first `limit` items, joined by commas, and the number of the others: "a, b, c and 2 more"."""
+    texts = [str(item) for item in items]
+    return ", ".join(texts[:limit]) + (f" and {len(texts) - limit} more" if len(texts) > limit else "")

@@ -1,4 +1,4 @@
-"""Writing files such that the old or the new one is always there, whole."""
+"""Files: written so that either the whole old or the whole new file exists at any time; and checks of paths."""
 
 import errno
 import os
@@ -18,19 +18,19 @@ from .errors import InputError, expecting, refusing
 AnyPath = str | os.PathLike[str]
 
 _TEMPORARY = re.compile(r"\.(?:[0-9a-f]{8}|([0-9a-f]{4})([0-9a-f]{8})[0-9a-f]{8})-(.+)")
-"""Names of files that are being written: by which host and process, so that what a killed one has left is known."""
-_LEFT_AFTER = 3600  # seconds: what other hosts have not touched since is not written any more
+"""Name of a temporary file: the host and process that write it, by which leftovers of killed processes are recognised."""
+_LEFT_AFTER = 3600  # seconds: another host's temporary file that is untouched for so long is a leftover
 _ATTEMPTS = 3
 _HOST = zlib.crc32(platform.node().encode()) & 0xFFFF
 
 
 @contextmanager
 def replacing(path: AnyPath) -> Iterator[Path]:
-    """Give a temporary path beside `path`; rename it to `path` on success, remove it on failure.
+    """Yield a temporary path beside `path`; rename the file there to `path` on success, remove it on failure.
 
-    Even if the program is killed or the power fails, there is either the old or the new file at `path`, whose folder must
-    exist. If `path` is a link, the file it points to is replaced. The temporary path, of the same folder and suffixes, does
-    not exist yet. For libraries that write to a path; what is in memory is written by `write_bytes`.
+    Even if the program is killed or the power fails, either the old or the new file is at `path`. The folder of `path` must
+    exist. If `path` is a link, the file that it points to is replaced. The temporary path has the same folder and suffixes,
+    and does not exist yet. This serves libraries that write to a path; data in memory are written by `write_bytes`.
     """
     refuse_folder(Path(path).absolute())
     target = Path(os.path.realpath(path))
@@ -39,7 +39,7 @@ def replacing(path: AnyPath) -> Iterator[Path]:
         if not target.parent.is_dir():
             raise InputError(f"{target.parent}: no such folder; make it first or choose another")
         try:
-            # Tried, because os.access knows neither read-only disks nor Windows' permissions.
+            # The file is created as a test: os.access knows neither read-only disks nor Windows' permissions.
             with open(temporary, "xb"):
                 pass
             temporary.unlink()
@@ -56,25 +56,28 @@ def replacing(path: AnyPath) -> Iterator[Path]:
 
 
 def write_bytes(path: AnyPath, data: bytes | memoryview) -> None:
-    """Write a file whole or not at all, also beside others that write it, or remove what they think was left."""
+    """Write a file whole or not at all, even while other processes write the same file or remove leftovers."""
     for attempt in range(1, _ATTEMPTS + 1):
         try:
             with replacing(path) as temporary:
                 temporary.write_bytes(data)
             return
         except InputError as error:
-            # Its temporary file was removed, or on Windows another is just replacing it.
+            # The temporary file was removed as a leftover, or on Windows another process is replacing the file just now.
             if attempt == _ATTEMPTS or not isinstance(error.__cause__, FileNotFoundError | PermissionError):
                 raise
 
 
 class Locked(InputError):
-    """Another process is at the same work."""
+    """Refusal of work that another process is doing at the moment."""
 
 
 @contextmanager
 def locked(path: Path, refusal: str) -> Iterator[None]:
-    """Hold a lock, whose file is made, which ends with this process; `Locked` with `refusal` where another holds it."""
+    """Hold a lock on the file `path`, which is made if it is missing; raise `Locked(refusal)` if another process holds it.
+
+    The lock ends with the block, or with this process.
+    """
     with refusing(path, "cannot be written"), open(path, "a+b") as file:
         try:
             if os.name == "nt":
@@ -94,7 +97,10 @@ def locked(path: Path, refusal: str) -> Iterator[None]:
 
 @contextmanager
 def new_folder(path: Path) -> Iterator[Path]:
-    """Give a temporary folder beside `path`; rename it to `path`, a new folder or an empty one, or remove it on failure."""
+    """Yield a temporary folder beside `path`; rename it to `path` on success, remove it on failure.
+
+    `path` must be a new folder or an empty one.
+    """
     path = folder_path(path)
     if path.exists() and (not path.is_dir() or any(path.iterdir())):
         raise InputError(f"{path}: expected a new folder or an empty one")
@@ -106,31 +112,34 @@ def new_folder(path: Path) -> Iterator[Path]:
             if path.exists():
                 path.rmdir()
             os.replace(temporary, path)
-        except InputError as error:  # of a file in it
+        except InputError as error:  # the message may name a file in the temporary folder
             raise InputError(str(error).replace(str(temporary), str(path))) from error
         finally:
             shutil.rmtree(temporary, ignore_errors=True)
 
 
-def written_name(name: str) -> str | None:
-    """The name that a temporary file of `replacing` was to get; None for other files."""
-    found = _TEMPORARY.fullmatch(name)
-    return None if found is None else found[3]
+def final_name(name: str) -> str | None:
+    """Return the name that a temporary file of `replacing` gets when it is complete; None for the name of another file."""
+    match = _TEMPORARY.fullmatch(name)
+    return None if match is None else match[3]
 
 
 def is_leftover(path: Path) -> bool:
-    """Whether a process that has ended was writing a file, or another host, which has not touched it for an hour."""
+    """Return whether `path` is a temporary file of `replacing` that nobody writes any more.
+
+    A process on this host must have ended; a file of another host must have been untouched for an hour.
+    """
     import psutil
 
-    found = _TEMPORARY.fullmatch(path.name)
-    if found is None or not found[1]:  # earlier versions named no process
-        return found is not None
-    if int(found[1], 16) == _HOST:
+    match = _TEMPORARY.fullmatch(path.name)
+    if match is None or not match[1]:  # earlier versions named no process
+        return match is not None
+    if int(match[1], 16) == _HOST:
         try:
-            return psutil.Process(int(found[2], 16)).status() == psutil.STATUS_ZOMBIE  # killed, and not yet waited for
+            return psutil.Process(int(match[2], 16)).status() == psutil.STATUS_ZOMBIE  # killed, and not yet waited for
         except psutil.NoSuchProcess:
             return True
-        except psutil.Error:  # it is another user's
+        except psutil.Error:  # another user's process
             return False
     with suppress(OSError):
         return time.time() - path.stat().st_mtime > _LEFT_AFTER
@@ -138,56 +147,62 @@ def is_leftover(path: Path) -> bool:
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Remove the files of a folder that were being written by what has ended."""
+    """Remove the temporary files in `folder` that nobody writes any more (`is_leftover`)."""
     for path in filter(is_leftover, folder.glob(".*")):
         path.unlink(missing_ok=True)
 
 
 def require_file(path: AnyPath, expected: str = "a file") -> Path:
-    """A path, if it is that of a file that can be read; `InputError` of what is missing, a folder, device or pipe."""
+    """Return `path` if it is a file that can be read; refuse a missing file, a folder, a device and a pipe.
+
+    Raises `InputError`, which names what was `expected` in place of a folder or device.
+    """
     path = Path(path)
     if "\0" in str(path):
         raise InputError(f"{str(path)!r}: not a file name (it holds a NUL)")
     with refusing(path, "cannot be read"):
         try:
-            kind = path.stat().st_mode
+            mode = path.stat().st_mode
         except FileNotFoundError:
             raise InputError(f"{path}: no such file") from None
-        if not stat.S_ISREG(kind):  # reading a pipe would block
-            found = "a folder" if stat.S_ISDIR(kind) else "neither a file nor a folder"
-            raise InputError(f"{path}: is {found}, expected {expected}")
-        path.open("rb").close()  # libraries say little about files that they may not read
+        if not stat.S_ISREG(mode):  # reading a pipe would block
+            kind = "a folder" if stat.S_ISDIR(mode) else "neither a file nor a folder"
+            raise InputError(f"{path}: is {kind}, expected {expected}")
+        path.open("rb").close()  # libraries say little about a file that the user may not read
     return path
 
 
-def ending_of(path: AnyPath, endings: Sequence[str]) -> str:
-    """Which of `endings` the name of a file has, or ""."""
+def find_ending(path: AnyPath, endings: Sequence[str]) -> str:
+    """Return the first of `endings` with which the file's name ends, whatever its case, or "" if none fits."""
     name = Path(path).name.lower()
     return next((ending for ending in endings if name.endswith(ending)), "")
 
 
 def require_ending(path: AnyPath, endings: Sequence[str]) -> str:
-    """Which of `endings` the name of a file has, or `InputError`."""
-    if ending := ending_of(path, endings):
+    """Return the first of `endings` with which the file's name ends; raise `InputError` if none fits."""
+    if ending := find_ending(path, endings):
         return ending
     raise InputError(f"{path}: expected a name ending in {', '.join(endings)}")
 
 
 def read_bytes(path: AnyPath) -> bytes:
-    """All of a file; `InputError` where `require_file` gives it, or it cannot be read."""
+    """Return all bytes of a file; raise `InputError` if it is none (`require_file`) or cannot be read."""
     with refusing(path, "cannot be read"):
         return require_file(path).read_bytes()
 
 
 def read_text(path: AnyPath, expected: str = "a text in UTF-8") -> str:
-    """The text of a file, every line's end as it is; `InputError` with what is `expected` where it is none in UTF-8."""
+    """Return the text of a UTF-8 file with its line ends unchanged and without a byte order mark.
+
+    Raises `InputError`, which says what was `expected`, if the bytes are no UTF-8.
+    """
     with expecting(f"{path}: expected {expected}", UnicodeDecodeError):
         return read_bytes(path).decode("utf-8-sig")
 
 
 def _to_disk(path: Path) -> None:
-    """Flush a file or folder to the disk, so that a power cut after the renaming finds the new file whole."""
-    # Folders can only be opened for reading, and Windows flushes only what is open for writing.
+    """Flush a file or folder to the disk, so that the new file is whole even if the power fails after the renaming."""
+    # Folders can only be opened for reading, and Windows flushes only files that are open for writing.
     descriptor = os.open(path, os.O_RDONLY if path.is_dir() else os.O_RDWR)
     try:
         os.fsync(descriptor)
@@ -199,19 +214,20 @@ def refuse_folder(path: Path) -> None:
     """Raise `InputError` if `path` is a folder, a device or a pipe, or cannot be the name of a file."""
     if _is_folder(path):
         raise InputError(f"{path}: is a folder; expected the name of a file to write")
-    if path.exists() and not path.is_file():  # which would be replaced
+    if path.exists() and not path.is_file():  # a device or pipe would be replaced by the file
         raise InputError(f"{path}: is no file; expected the name of one to write")
 
 
 def _is_folder(path: Path) -> bool:
+    """Return whether `path` is an existing folder; raise `InputError` if it cannot be the name of a file or folder."""
     if "\0" in str(path):
         raise InputError(f"{str(path)!r}: not a file name (it holds a NUL)")
-    with refusing(repr(str(path)), "not a file name"):  # such as one that is too long
+    with refusing(repr(str(path)), "not a file name"):  # such as a name that is too long
         return path.is_dir()
 
 
 def folder_path(path: AnyPath) -> Path:
-    """The absolute path of a folder, there or not; `InputError` where it cannot be one's name, such as an empty one."""
+    """Return the absolute path of a folder, which need not exist; raise `InputError` if it cannot be a folder's name."""
     if not os.fspath(path):
         raise InputError("expected the name of a folder, got an empty one (. is the current folder)")
     folder = Path(path).absolute()
@@ -220,7 +236,10 @@ def folder_path(path: AnyPath) -> Path:
 
 
 def ensure_folder(path: AnyPath) -> Path:
-    """Make the folder `path` and its parents unless they exist; `InputError` if it cannot be made or written to."""
+    """Make the folder `path` and its parents unless they exist, and return its absolute path.
+
+    Raises `InputError` if the folder cannot be made or written to.
+    """
     folder = folder_path(path)
     probe = folder / f".{uuid.uuid4().hex[:8]}"
     with refusing(folder, "cannot be written"):

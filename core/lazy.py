@@ -1,4 +1,4 @@
-"""Packages whose public names are imported when they are first asked for."""
+"""Lazy packages: a public name is imported when it is used for the first time."""
 
 import ast
 import contextlib
@@ -12,23 +12,23 @@ from .errors import needing
 
 
 def public(package: str, extra: str = "") -> tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]:
-    """``__getattr__``, ``__dir__`` and ``__all__`` of a package whose ``if TYPE_CHECKING:`` imports its public names.
+    """Return ``__getattr__``, ``__dir__`` and ``__all__`` of a package whose ``if TYPE_CHECKING:`` imports its public names.
 
-    Modules of the package itself can be asked for, but are not in ``__all__``. `extra` is what to install
-    where an import fails.
+    Modules that the block imports from the package itself are attributes, too, but not in ``__all__``. `extra` is what pip
+    is told to install if an import fails, such as "mphdrr[learning]".
     """
     module = sys.modules[package]
     tree = ast.parse(Path(str(module.__file__)).read_text(encoding="utf-8"))
-    (block,) = (each for each in tree.body if isinstance(each, ast.If))
-    places = {name.name: line.module for line in block.body if isinstance(line, ast.ImportFrom) for name in line.names}
+    (block,) = (node for node in tree.body if isinstance(node, ast.If))
+    modules = {name.name: node.module for node in block.body if isinstance(node, ast.ImportFrom) for name in node.names}
 
-    def getattribute(name: str) -> Any:
-        if name not in places:
+    def import_attribute(name: str) -> Any:
+        if name not in modules:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
         with needing(extra) if extra else contextlib.nullcontext():
-            found = import_module(f".{places[name] or name}", package)
-        found = getattr(found, name) if places[name] else found
-        setattr(module, name, found)
-        return found
+            attribute = import_module(f".{modules[name] or name}", package)
+        attribute = getattr(attribute, name) if modules[name] else attribute
+        setattr(module, name, attribute)
+        return attribute
 
-    return getattribute, lambda: sorted({*vars(module), *places}), [name for name, place in places.items() if place]
+    return import_attribute, lambda: sorted({*vars(module), *modules}), [n for n, source in modules.items() if source]

@@ -1,6 +1,6 @@
-"""Recording of warnings for the user, by thread.
+"""Recording of warnings for the user, separately for each thread.
 
-`warnings.catch_warnings` is not safe for threads: of two that overlap, the one that ends last restores the other's
+`warnings.catch_warnings` is not safe for threads: when two blocks overlap, the one that ends last restores the other's
 record, and all later warnings go there. Here each warning goes to a recorder of its own thread, and the original state
 is restored when no recorder is left.
 """
@@ -17,60 +17,60 @@ from .errors import InputWarning, warn
 T = TypeVar("T")
 
 _lock = threading.Lock()
-_recorders: list[tuple[int, list[str]]] = []  # thread and record, oldest first
-_filters: list[Any] = []  # the lists that `_ALWAYS` was put into
+_recorders: list[tuple[int, list[str]]] = []  # thread and recorded texts, oldest first
+_filters: list[Any] = []  # the filter lists of `warnings` into which `_ALWAYS` was put
 _ALWAYS = ("always", None, InputWarning, None, 0)
 
 
 @contextmanager
 def recorded_warnings() -> Iterator[list[str]]:
-    """Collect the texts of all `InputWarning` that this thread gives in the block; other warnings are shown as usual.
+    """Yield a list that collects the texts of all `InputWarning` that this thread issues in the block.
 
-    Of nested recorders in a thread the innermost collects them.
+    Other warnings are shown as usual. If a thread has nested recorders, the innermost collects the warnings.
     """
-    mine = (threading.get_ident(), list[str]())
+    recorder = (threading.get_ident(), list[str]())
     with _lock:
         if not isinstance(warnings.showwarning, _Route):
             warnings.showwarning = _Route(warnings.showwarning)
         warnings.simplefilter("always", InputWarning)  # by default Python shows each only once
         _filters.append(warnings.filters)
-        _recorders.append(mine)
+        _recorders.append(recorder)
     try:
-        yield mine[1]
+        yield recorder[1]
     finally:
         with _lock:
-            _recorders[:] = [other for other in _recorders if other is not mine]
+            _recorders[:] = [entry for entry in _recorders if entry is not recorder]
             if not _recorders:
                 _restore()
 
 
 @dataclass(frozen=True, eq=False)
 class Remembered(Generic[T]):
-    """What was made once for several uses, and the warnings that were given when it was made."""
+    """Value that is made once for several uses, with the warnings that were issued when it was made."""
 
     value: T
     warnings: list[str]
 
     def again(self) -> T:
-        """The value, with the warnings of its making."""
+        """Issue the recorded warnings and return the value."""
         for text in self.warnings:
             warn(text)
         return self.value
 
 
 def remembered(make: Callable[[], T]) -> Remembered[T]:
-    """What `make` makes, and its warnings, which nobody sees before they are asked for."""
+    """Call `make`, record its warnings instead of showing them, and return both as a `Remembered`."""
     with recorded_warnings() as warnings:
         return Remembered(make(), warnings)
 
 
 class _Route:
-    """Replaces `warnings.showwarning`: passes warnings to the thread's recorder, or to what was there before."""
+    """Substitute for `warnings.showwarning`, which passes a warning to the thread's recorder, else to the `original`."""
 
-    def __init__(self, before: Callable[..., Any]) -> None:
-        self.before = before
+    def __init__(self, original: Callable[..., Any]) -> None:
+        self.original = original
 
-    def __call__(self, message: Warning | str, category: type[Warning], *where: Any, **more: Any) -> None:
+    def __call__(self, message: Warning | str, category: type[Warning], *place: Any, **options: Any) -> None:
         if issubclass(category, InputWarning):
             thread = threading.get_ident()
             with _lock:
@@ -78,14 +78,15 @@ class _Route:
             if record is not None:
                 record.append(str(message))
                 return
-        self.before(message, category, *where, **more)
+        self.original(message, category, *place, **options)
 
 
 def _restore() -> None:
-    # If another program has replaced it since, that program restores it.
+    """Restore the state of `warnings` from before the first recorder."""
+    # If another program has replaced `showwarning` in the meantime, that program restores it.
     if isinstance(warnings.showwarning, _Route):
-        warnings.showwarning = warnings.showwarning.before
-    for filters in (*_filters, warnings.filters):  # catch_warnings of others works on copies
+        warnings.showwarning = warnings.showwarning.original
+    for filters in (*_filters, warnings.filters):  # `catch_warnings` of another program works on copies
         while _ALWAYS in filters:
             filters.remove(_ALWAYS)
     _filters.clear()

@@ -1,4 +1,4 @@
-"""The table of the kinds of scanners, complete: what reads a kind's name imports it from here."""
+"""The complete table of the kinds of scanners, by name; code that reads a kind's name imports the table from here."""
 
 from .geometry.scanner import SCANNERS as SCANNERS
 from .geometry.scanner import Scanner
@@ -8,6 +8,6 @@ from .xray.system import XraySystem as XraySystem
 
 
 def scanner_kind(name: str) -> type[Scanner]:
-    """The class of a kind of scanner, or `InputError`."""
+    """Return the class of the kind of scanner with this name; raise `InputError` if there is none."""
     one_of(name, SCANNERS, "kind of scanner")
     return SCANNERS[name]

@@ -1,4 +1,4 @@
-"""Add > mphDRR: an operator for every kind of phantom, and one for phantoms that a TOML file describes."""
+"""Operators that add phantoms: one for every kind, and one for phantoms that a TOML file describes."""
 
 from typing import Any
 
@@ -7,7 +7,7 @@ from bpy.props import BoolProperty, FloatProperty, FloatVectorProperty, StringPr
 
 from ..addon.blender import file_properties, jobs, layouts, storage
 from ..addon.phantoms import phantoms
-from ..addon.phantoms.phantom_properties import FILE, FITTED, PhantomSettings, identifier, sampling, settings_class
+from ..addon.phantoms.phantom_properties import AUTO_SIZE, FILE, PhantomSettings, identifier, sampling, settings_class
 from ..addon.runs import projection_properties
 from ..addon.scanner import scanner
 from ..core import Phantom, euler_pose, read_phantom
@@ -15,7 +15,7 @@ from ..core.phantoms.kinds import KINDS
 
 
 class AddPhantom(jobs.JobOperator):
-    """Mix into an operator that has a phantom's settings."""
+    """Base class of operators with the settings of a phantom, which they add to the scene."""
 
     attenuation: BoolProperty(
         name="With Attenuation",
@@ -27,7 +27,7 @@ class AddPhantom(jobs.JobOperator):
     psi: FloatProperty(name="Psi", description="Turn about the phantom's own axis, done first", subtype="ANGLE")
 
     def invoke(self: Any, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
-        """From the window: attenuation, too, where the scanner sees that alone; else a model that suits the phantom."""
+        """Choose attenuation for a scanner that sees nothing else, or a model that suits the phantom, and run the job."""
         sees_activity = scanner.sees_activity(scanner.active_scanner(context.scene))
         if not self.properties.is_property_set("attenuation"):
             self.attenuation = not sees_activity
@@ -46,11 +46,11 @@ class AddPhantom(jobs.JobOperator):
 
     def adding(self: Any, name: str) -> jobs.Job:
         pose = euler_pose(self.phi, self.theta, self.psi, self.location)
-        return phantoms.adding(self, name, pose, self.attenuation)
+        return phantoms.add_phantom_job(self, name, pose, self.attenuation)
 
 
 class AddKind(AddPhantom):
-    """What the operators of all kinds do."""
+    """Base class of the operators that add one kind of phantom."""
 
     dialog = {"confirm_text": "Add", "width": 340}
 
@@ -58,7 +58,7 @@ class AddKind(AddPhantom):
         return self.adding(self.name)
 
 
-# The operator that adds one kind: its settings are its arguments.
+# Operators that add one kind each; the settings of the kind are the operator's arguments.
 ADD_KINDS = tuple(
     settings_class(
         kind,
@@ -73,20 +73,20 @@ ADD_KINDS = tuple(
 
 
 class MPHDRR_OT_import_phantom(PhantomSettings, AddPhantom, bpy.types.Operator):
-    """Add the phantom that a TOML file describes as a volume; its text becomes one of the .blend"""
+    """Add the phantom that a TOML file describes as a volume; its text is kept in the .blend"""
 
     __annotations__ = {
         "filepath": file_properties.file_property("Phantom to read"),
         "filter_glob": file_properties.shown_files((".toml",)),
-        "name": StringProperty(name="Name", description="Of the object; empty: the phantom's", options={"SKIP_SAVE"}),
+        "name": StringProperty(name="Name", description="Object's name; empty: phantom's", options={"SKIP_SAVE"}),
         **sampling(),
-        **FITTED,
+        **AUTO_SIZE,
     }
     identifier = FILE
     asks_for = "filepath"
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        path = self.given_file("set filepath to a phantom's TOML file")
+        path = self.required_file("set filepath to a phantom's TOML file")
         return self.adding(self.name or read_phantom(path).name or path.stem)
 
     def phantom(self) -> Phantom:

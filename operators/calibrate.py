@@ -1,4 +1,4 @@
-"""Geometry > Calibrate: modules where images of point sources have them, as a job."""
+"""Geometry > Calibrate: fit the modules' positions to images of point sources, as a job."""
 
 import bpy
 from bpy.props import BoolProperty, FloatProperty
@@ -9,8 +9,8 @@ from ..addon.scanner import selection
 
 
 class MPHDRR_OT_calibrate(jobs.JobOperator, bpy.types.Operator):
-    """Find where the scanner's modules are from images of point sources, as a calibration recipe (.toml) says; arrows lead
-    from nominal to found pinholes
+    """Fit the positions of the scanner's modules to images of point sources by a calibration recipe (.toml); arrows lead
+    from nominal to fitted pinholes
     """
 
     poll = reports.needs(selection.SCANNER)
@@ -19,7 +19,7 @@ class MPHDRR_OT_calibrate(jobs.JobOperator, bpy.types.Operator):
     filepath: file_properties.file_property("Recipe of the calibration")
     filter_glob: file_properties.shown_files([".toml"])
     apply: BoolProperty(
-        name="Apply", description="Move the modules to what is found, not only show it", default=True, options={"SKIP_SAVE"},
+        name="Apply", description="Move the modules, not only show the shifts", default=True, options={"SKIP_SAVE"},
     )  # fmt: skip
     exaggeration: FloatProperty(
         name="Exaggeration", min=0.0, soft_max=1000.0,
@@ -27,5 +27,5 @@ class MPHDRR_OT_calibrate(jobs.JobOperator, bpy.types.Operator):
     )  # fmt: skip
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        path = self.given_file("set filepath to a calibration recipe (.toml)")
-        return calibrating.calibrating(context, path, self.apply, self.exaggeration)
+        path = self.required_file("set filepath to a calibration recipe (.toml)")
+        return calibrating.calibrate_job(context, path, self.apply, self.exaggeration)

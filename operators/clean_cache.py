@@ -1,4 +1,4 @@
-"""The cache of the preferences."""
+"""Operator that deletes the cache of the preferences."""
 
 import bpy
 

@@ -1,4 +1,4 @@
-"""What is done to a phantom in the scene: its voxels made again, its pose applied, its outline shown."""
+"""Operators on a phantom in the scene: make its voxels again, apply its pose, show its outline."""
 
 import bpy
 
@@ -7,14 +7,14 @@ from ..addon.phantoms import phantoms
 
 
 class _EditPhantom(jobs.JobOperator):
-    """Mix into an operator that makes the active phantom's voxels."""
+    """Base class of operators that make the active phantom's voxels again."""
 
-    bake = False
+    bake = False  # whether the pose becomes part of the voxels
 
     poll = reports.needs(phantoms.ACTIVE)
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        return phantoms.updating(context.object, self.bake)
+        return phantoms.update_phantom_job(context.object, self.bake)
 
 
 class MPHDRR_OT_update_phantom(_EditPhantom, bpy.types.Operator):

@@ -1,4 +1,4 @@
-"""The active volume: slices through it, a CT's attenuation, its files cleaned up or found again."""
+"""Operators on volumes: slices, attenuation and dose of the active one, files to clean up, to collect or to find again."""
 
 import bpy
 from bpy.props import EnumProperty, FloatProperty, FloatVectorProperty, StringProperty
@@ -15,7 +15,7 @@ class MPHDRR_OT_add_slices(Reported, bpy.types.Operator):
     """Show an axial, a coronal and a sagittal slice of the active volume as planes that go with it"""
 
     place: FloatVectorProperty(
-        name="Place", description="Where the slices meet: share of the way along each of the grid's axes", size=3, min=0.0,
+        name="Place", description="Point where the slices meet, as shares of the grid's axes", size=3, min=0.0,
         max=1.0, default=(0.5, 0.5, 0.5), options={"SKIP_SAVE"},
     )  # fmt: skip
 
@@ -23,8 +23,8 @@ class MPHDRR_OT_add_slices(Reported, bpy.types.Operator):
 
     def act(self, context: bpy.types.Context) -> str:
         shape = context.object.mphdrr_volume.shape
-        at = [min(int(share * n), n - 1) for share, n in zip(self.place, shape, strict=True)]
-        return f"Added {len(slices.add_slices(context.object, at))} slices"
+        index = [min(int(share * n), n - 1) for share, n in zip(self.place, shape, strict=True)]
+        return f"Added {len(slices.add_slices(context.object, index))} slices"
 
 
 class MPHDRR_OT_remove_slices(Reported, bpy.types.Operator):
@@ -37,10 +37,12 @@ class MPHDRR_OT_remove_slices(Reported, bpy.types.Operator):
 
 
 def _is_activity(context: bpy.types.Context) -> bool:
+    """Return whether the active object is a volume of activity."""
     return volumes.is_volume(context.object) and volumes.quantity_of(context.object) == "activity"
 
 
 def _is_ct(context: bpy.types.Context) -> bool:
+    """Return whether the active object is a volume of CT numbers."""
     return volumes.is_volume(context.object) and volumes.quantity_of(context.object) == "hu"
 
 
@@ -57,7 +59,7 @@ class MPHDRR_OT_ct_to_attenuation(jobs.JobOperator, bpy.types.Operator):
     poll = needs((_is_ct, "No CT is active: select a volume of CT numbers (hu)"))
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        return volume_import.converting(context.object, decimals.typed(self.energy))
+        return volume_import.attenuation_job(context.object, decimals.typed(self.energy))
 
 
 class MPHDRR_OT_add_dose_map(jobs.JobOperator, bpy.types.Operator):
@@ -65,7 +67,7 @@ class MPHDRR_OT_add_dose_map(jobs.JobOperator, bpy.types.Operator):
 
     isotope: EnumProperty(
         name="Isotope",
-        description="What decays",
+        description="Isotope that decays",
         items=choices.items({}, ((name, name, "") for name in decays())),
         default="Tc-99m",
     )
@@ -73,7 +75,7 @@ class MPHDRR_OT_add_dose_map(jobs.JobOperator, bpy.types.Operator):
     poll = needs((_is_activity, "No activity is active: select a volume of activity"))
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        return volume_import.dosing(context.object, self.isotope)
+        return volume_import.dose_job(context.object, self.isotope)
 
 
 class MPHDRR_OT_clean_volume_files(Reported, bpy.types.Operator):
@@ -87,25 +89,25 @@ class MPHDRR_OT_clean_volume_files(Reported, bpy.types.Operator):
         if not unused:
             return self.execute(context)
         message = "Neither Undo nor other .blend files that use this folder will find them again."
-        return ask_to_remove(self, context, event, f"Remove {storage.summary(unused)}?", message)
+        return ask_to_remove(self, context, event, f"Remove {storage.summarize_unused(unused)}?", message)
 
     def act(self, context: bpy.types.Context) -> str:
         return storage.remove_unused()
 
 
 class MPHDRR_OT_collect_files(Reported, bpy.types.Operator):
-    """Copy every file outside that the scene uses, such as its workbook, into the folder beside the .blend, so that both can
-    be moved together. Says what is missing
+    """Copy every outside file that the scene uses, such as its workbook, into the folder beside the .blend, so that both can
+    be moved together. Missing files are reported
     """
 
     poll = needs((lambda context: bpy.data.filepath, "Save the .blend first: its folder is beside it"))
 
     def act(self, context: bpy.types.Context) -> str:
-        return storage.collect()
+        return storage.collect_files()
 
 
 class MPHDRR_OT_add_looks(Reported, bpy.types.Operator):
-    """Put the looks of volumes into the Asset Browser, as a library of its own: dragged onto a volume, a look replaces its
+    """Put the looks of volumes into the Asset Browser, as a library of their own: dragged onto a volume, a look replaces its
     colours, also on its slices, and the display range stays
     """
 
@@ -113,7 +115,7 @@ class MPHDRR_OT_add_looks(Reported, bpy.types.Operator):
     bl_options = {"REGISTER"}
 
     directory: StringProperty(
-        name="Folder", description="Where the library is written; empty: the extension's own folder", subtype="DIR_PATH"
+        name="Folder", description="Folder of the library to write; empty: the extension's own", subtype="DIR_PATH"
     )
 
     def act(self, context: bpy.types.Context) -> str:
@@ -122,9 +124,9 @@ class MPHDRR_OT_add_looks(Reported, bpy.types.Operator):
             raise InputError("no folder given: this is no installed extension, so it has none of its own")
         volume_materials.write_assets(folder)
         libraries = context.preferences.filepaths.asset_libraries
-        if not any(storage.absolute(each.path) == folder for each in libraries):
+        if not any(storage.absolute(library.path) == folder for library in libraries):
             library = libraries.new(name="mphDRR", directory=str(folder))
-            library.import_method = "APPEND"  # for each volume one of its own, whose display range can be set
+            library.import_method = "APPEND"  # gives each volume a copy of the look, with a display range of its own
         return f"Looks are in the Asset Browser's library mphDRR: {folder}"
 
 
@@ -133,10 +135,12 @@ class MPHDRR_OT_remake_volumes(jobs.JobOperator, bpy.types.Operator):
 
     bl_label = "Make Missing Volumes Again"
 
-    poll = needs((lambda context: recovery.missing(context.scene)[0], "No phantom or map misses its file of voxels"))
+    poll = needs(
+        (lambda context: recovery.missing_volumes(context.scene)[0], "No phantom or map misses its file of voxels")
+    )
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        return recovery.remaking(context.scene)
+        return recovery.remake_job(context.scene)
 
 
 class MPHDRR_OT_find_volume_files(Reported, bpy.types.Operator):
@@ -144,7 +148,7 @@ class MPHDRR_OT_find_volume_files(Reported, bpy.types.Operator):
 
     bl_label = "Find Missing Volume Files"
 
-    directory: StringProperty(name="Folder", description="Where to look", subtype="DIR_PATH", options={"SKIP_SAVE"})
+    directory: StringProperty(name="Folder", description="Folder to search", subtype="DIR_PATH", options={"SKIP_SAVE"})
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         context.window_manager.fileselect_add(self)

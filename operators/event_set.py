@@ -1,4 +1,4 @@
-"""Event sets: a recipe written and tried on the phantom in the scene, a set made as a job, an event opened in the scene."""
+"""Operators on event sets: write a recipe, try it on the phantom in the scene, make a set, open an event in the scene."""
 
 import bpy
 from bpy.props import EnumProperty
@@ -11,13 +11,13 @@ from ..core.events.templates import TEMPLATES
 
 class MPHDRR_OT_new_event_recipe(reports.Reported, ExportHelper, bpy.types.Operator):
     """Write a recipe for events with comments in it, to be edited and tried. Its scanner is the scene's workbook, or the
-    example's where there is none
+    example if there is none
     """
 
     filename_ext = ".toml"
     filter_glob: file_properties.shown_files((".toml",))
     like: EnumProperty(
-        name="Like", description="What the recipe begins with",
+        name="Like", description="Template of the recipe",
         items=choices.items({}, ((name, name.capitalize(), text) for name, text in TEMPLATES.items())),
     )  # fmt: skip
 
@@ -26,8 +26,8 @@ class MPHDRR_OT_new_event_recipe(reports.Reported, ExportHelper, bpy.types.Opera
 
 
 class MPHDRR_OT_try_event(jobs.JobOperator, bpy.types.Operator):
-    """Put the recipe's next event on the phantom in the scene: its kind, settings and pose. Makes a phantom where there is
-    none. The number goes up by one; the same number always is the same phantom
+    """Put the recipe's next event on the phantom in the scene: its kind, settings and pose. Makes a phantom if there is
+    none. The number goes up by one; the same number is always the same phantom
     """
 
     bl_label = "Another Phantom of the Recipe"
@@ -37,12 +37,14 @@ class MPHDRR_OT_try_event(jobs.JobOperator, bpy.types.Operator):
     folder: event_properties.FOLDER
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        return event_sets.trying(context, *self.given(context.scene.mphdrr_events, "recipe", "number", "folder"))
+        return event_sets.try_event_job(
+            context, *self.setting_values(context.scene.mphdrr_events, "recipe", "number", "folder")
+        )
 
 
 class MPHDRR_OT_make_event_set(jobs.JobOperator, bpy.types.Operator):
-    """Make the events of the recipe in a folder, those that it does not have yet. Cancelled, it keeps what is made, and goes
-    on from there the next time
+    """Make the recipe's events that a folder does not have yet. If it is cancelled, the finished events stay, and the next
+    run continues from there
     """
 
     recipe: event_properties.RECIPE
@@ -50,12 +52,12 @@ class MPHDRR_OT_make_event_set(jobs.JobOperator, bpy.types.Operator):
     count: event_properties.COUNT
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        return event_sets.making(*self.given(context.scene.mphdrr_events, "recipe", "folder", "count"))
+        return event_sets.make_set_job(*self.setting_values(context.scene.mphdrr_events, "recipe", "folder", "count"))
 
 
 class MPHDRR_OT_open_event(jobs.JobOperator, bpy.types.Operator):
-    """Open an event of a set in the scene, in place of the one opened before: its truth as a volume, its phantom at its pose
-    with its settings, hidden, and its projections as a run
+    """Open an event of a set in the scene, in place of the one opened before: its truth as a volume, its phantom with its
+    pose and settings, hidden, and its projections as a run
     """
 
     folder: event_properties.FOLDER
@@ -63,4 +65,6 @@ class MPHDRR_OT_open_event(jobs.JobOperator, bpy.types.Operator):
     model: event_properties.MODEL
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        return event_sets.opening(context, *self.given(context.scene.mphdrr_events, "folder", "opened", "model"))
+        return event_sets.open_event_job(
+            context, *self.setting_values(context.scene.mphdrr_events, "folder", "opened", "model")
+        )

@@ -1,4 +1,4 @@
-"""File > Export > Pinhole Geometry: the scanner as a workbook, or as another program's file."""
+"""File > Export > Pinhole Geometry: write the scanner as a workbook, or as another program's file."""
 
 from pathlib import Path
 
@@ -16,7 +16,7 @@ class MPHDRR_OT_export_geometry(jobs.ExportJob, bpy.types.Operator):
     """Write the scanner as it stands in the scene to a workbook, into a copy of the one it came from"""
 
     bl_label = "Export Pinhole Geometry"
-    bl_options = {"REGISTER", "UNDO"}  # the scanner takes the new workbook for its own
+    bl_options = {"REGISTER", "UNDO"}  # with Undo, because the new workbook becomes the scanner's
 
     poll = reports.needs(selection.SCANNER)
 
@@ -33,14 +33,14 @@ class MPHDRR_OT_export_geometry(jobs.ExportJob, bpy.types.Operator):
     def ask(self, context: bpy.types.Context) -> set[str] | None:
         workbook = scanner.required_scanner(context.scene).mphdrr_scanner.workbook
         if not self.filepath and workbook:
-            # Not the workbook itself: overwriting it takes typing its name.
+            # The suggested name is not the workbook's own, which has to be typed to be overwritten.
             path = storage.absolute(workbook)
             self.filepath = str(path.with_stem(f"{path.stem.removesuffix('-edited')}-edited"))
         return super().ask(context)
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        path = self.given_file("set filepath to a name ending in .xlsx")
-        return scanner_files.exporting_scanner(scanner.required_scanner(context.scene), path, self.use_template)
+        path = self.required_file("set filepath to a name ending in .xlsx")
+        return scanner_files.export_workbook_job(scanner.required_scanner(context.scene), path, self.use_template)
 
 
 class MPHDRR_OT_export_for_program(jobs.ExportJob, bpy.types.Operator):
@@ -54,23 +54,23 @@ class MPHDRR_OT_export_for_program(jobs.ExportJob, bpy.types.Operator):
 
     endings = ("",)
     filepath: file_properties.file_property("File to write, or new folder for formats of several files")
-    format: EnumProperty(name="Format", description="What is written", items=_FORMATS)
+    format: EnumProperty(name="Format", description="Format of the file", items=_FORMATS)
 
     def check(self, context: bpy.types.Context) -> bool:
-        """Give the name the format's suffix."""
+        """Give the file name the format's suffix; return whether it has changed."""
         path, suffixes = Path(self.filepath), FORMATS[self.format].suffixes
         if not path.name or path.name.lower().endswith(suffixes or ()):
             return False
-        known = {suffix for format in FORMATS.values() for suffix in format.suffixes}
-        stem = path.with_suffix("") if path.suffix.lower() in known else path
-        before, self.filepath = self.filepath, str(stem) + (suffixes[0] if suffixes else "")
-        return before != self.filepath
+        all_suffixes = {suffix for format in FORMATS.values() for suffix in format.suffixes}
+        stem = path.with_suffix("") if path.suffix.lower() in all_suffixes else path
+        old_path, self.filepath = self.filepath, str(stem) + (suffixes[0] if suffixes else "")
+        return old_path != self.filepath
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        path, images = self.given_file("set filepath"), context.scene.mphdrr_projections
+        path, images = self.required_file("set filepath"), context.scene.mphdrr_projections
         shape, magnification = (images.height, images.width), decimals.typed(images.magnification)
         collection, detector = scanner.required_scanner(context.scene), images.detector.lower()
-        return scanner_files.exporting_for_program(collection, path, self.format, shape, detector, magnification)
+        return scanner_files.export_program_job(collection, path, self.format, shape, detector, magnification)
 
     def draw(self, context: bpy.types.Context) -> None:
         self.layout.prop(self, "format")

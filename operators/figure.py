@@ -1,4 +1,4 @@
-"""File > Export > mphDRR Figure, Picture and Animation: what papers and talks show of what is in the scene."""
+"""File > Export > mphDRR Figure, Picture and Animation: draw or render the scene for papers and talks."""
 
 from typing import Any
 
@@ -11,10 +11,10 @@ from ..addon.figures import figures
 from ..addon.scanner import scanner
 from ..addon.volumes import volumes
 from ..core.errors import InputError
-from ..core.figures.kinds import FILMS, PAPERS, SAMPLES, How
+from ..core.figures.kinds import FILMS, PAPERS, SAMPLES, Rendering
 from ..core.figures.page import LARGEST, SUFFIXES
 
-_PIXELS = {"description": "Pixels; 0: what suits the figure", "min": 0, "max": LARGEST, "subtype": "PIXEL"}
+_PIXELS = {"description": "Pixels; 0: as suits the figure", "min": 0, "max": LARGEST, "subtype": "PIXEL"}
 _STYLES = ((name, name.title(), f"On {name} paper") for name in PAPERS)
 _SHOWN: reports.Need = (
     lambda context: scanner.active_scanner(context.scene) or volumes.volume_objects(context.scene),
@@ -22,8 +22,8 @@ _SHOWN: reports.Need = (
 )
 
 
-class _Drawing(jobs.ExportJob):
-    """What operators that draw a figure share."""
+class FigureOperator(jobs.ExportJob):
+    """Base class of the operators that export a figure."""
 
     endings: tuple[str, ...] = SUFFIXES
     filepath: file_properties.file_property("File to write")
@@ -32,10 +32,10 @@ class _Drawing(jobs.ExportJob):
     height: IntProperty(name="Height", **_PIXELS)
     modules: StringProperty(
         name="Modules",
-        description="Such as 1-40 or 1-20,41; empty: all, of a picture those selected or a ring, of one module the active",
+        description="Such as 1-40 or 1-20,41; empty: all, or in a picture those selected or a ring, or the active one",
     )
     labels: BoolProperty(name="Labels", description="Write titles, axes and scales on rendered figures", default=True)
-    style: EnumProperty(name="Style", description="Of rendered figures", items=items({}, _STYLES), default="dark")
+    style: EnumProperty(name="Style", description="Style of rendered figures", items=items({}, _STYLES), default="dark")
     samples: IntProperty(
         name="Samples", description="Rays per pixel of rendered figures: the more, the smoother and slower",
         default=SAMPLES, min=1, soft_max=256,
@@ -50,36 +50,36 @@ class _Drawing(jobs.ExportJob):
         return super().ask(context)
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        own: Any = self
-        path = self.given_file(f"set filepath to a name ending in {' or '.join(self.endings)}")
-        if bool(own.width) != bool(own.height):
+        operator: Any = self  # the type checker does not know Blender's properties
+        path = self.required_file(f"set filepath to a name ending in {' or '.join(self.endings)}")
+        if bool(operator.width) != bool(operator.height):
             raise InputError("size: give both width and height, or neither")
-        size = (own.width, own.height) if own.width else None
-        how = {name: value for name, value in self.as_keywords().items() if name in How._fields}
-        name = own.figure.lower().replace("_", "-")
-        return figures.figure_job(context, name, [path], size, own.modules or None, **how)
+        size = (operator.width, operator.height) if operator.width else None
+        style = {name: value for name, value in self.as_keywords().items() if name in Rendering._fields}
+        name = operator.figure.lower().replace("_", "-")
+        return figures.figure_job(context, name, [path], size, operator.modules or None, **style)
 
 
-class MPHDRR_OT_export_figure(_Drawing, bpy.types.Operator):
+class MPHDRR_OT_export_figure(FigureOperator, bpy.types.Operator):
     """Draw a figure of the scanner, the volume or the last projections as PNG, or as SVG whose labels are text"""
 
-    figure: EnumProperty(name="Figure", description="What is shown", items=figures.kind_items(), default="SCANNER")
+    figure: EnumProperty(name="Figure", description="Kind of the figure", items=figures.kind_items(), default="SCANNER")
 
 
-class MPHDRR_OT_render_picture(_Drawing, bpy.types.Operator):
+class MPHDRR_OT_render_picture(FigureOperator, bpy.types.Operator):
     """Render the volume in the scanner for a paper, with scale, colour bar and rays of the selected modules or a ring"""
 
     figure = "PICTURE"
 
 
-class MPHDRR_OT_render_animation(_Drawing, bpy.types.Operator):
+class MPHDRR_OT_render_animation(FigureOperator, bpy.types.Operator):
     """Render pictures and an MP4 of the volume in the scanner: once around it, or one module lit after the other"""
 
     endings = FILMS
     figure: EnumProperty(
-        name="Animation", description="What happens", items=figures.kind_items(True), default="TURNTABLE"
+        name="Animation", description="Kind of the animation", items=figures.kind_items(True), default="TURNTABLE"
     )
     seconds: FloatProperty(
-        name="Seconds", description="How long it takes", default=How().seconds, min=0.01, soft_max=60.0
+        name="Seconds", description="Duration of the animation", default=Rendering().seconds, min=0.01, soft_max=60.0
     )
-    fps: IntProperty(name="Frames per Second", default=How().fps, description="Pictures", min=1, max=60)
+    fps: IntProperty(name="Frames per Second", default=Rendering().fps, description="Pictures", min=1, max=60)

@@ -1,4 +1,4 @@
-"""File > Import > Pinhole Geometry: a workbook becomes a scanner, with the column map dialog where headings are unclear."""
+"""File > Import > Pinhole Geometry: build the scanner of a workbook, with a dialog if the headings are not recognised."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -17,14 +17,14 @@ from . import column_map_dialog
 
 
 def ask_to_replace(operator: bpy.types.Operator, context: bpy.types.Context) -> set[str]:
-    """Open the dialog of an operator whose button replaces a scanner that has changed."""
+    """Open the dialog of an operator that asks whether to replace a scanner that has changed."""
     return context.window_manager.invoke_props_dialog(
         operator, width=440, title="Replace the Scanner?", confirm_text="Replace"
     )
 
 
 def draw_losses(layout: bpy.types.UILayout, losses: Iterable[str]) -> None:
-    """Draw in that dialog what goes with the scanner."""
+    """Draw the changes of the scanner that are lost if it is replaced."""
     layout.label(text="Importing again drops these changes:", icon="ERROR")
     column = layout.column(align=True)
     for line in losses:
@@ -44,16 +44,16 @@ class MPHDRR_OT_import_geometry(bpy.types.Operator):
         options={"SKIP_SAVE"},
     )  # fmt: skip
     columns: StringProperty(
-        name="Column Map", description="File (.toml) that says which columns hold what. Empty: read the headings",
+        name="Column Map", description="File (.toml) with the meaning of the columns. Empty: read the headings",
         subtype="FILE_PATH", options={"SKIP_SAVE"},
     )  # fmt: skip
     choose_columns: BoolProperty(
         name="Choose Columns",
-        description="Say in a dialog which columns hold what. It opens by itself where the headings are not understood",
+        description="Set the meaning of the columns in a dialog. It opens by itself if the headings are not recognised",
         options={"SKIP_SAVE"},
     )
     chosen_columns: StringProperty(
-        name="Chosen Columns", description="The column map that the dialog gave, TOML", options={"HIDDEN", "SKIP_SAVE"}
+        name="Chosen Columns", description="Column map of the dialog, TOML", options={"HIDDEN", "SKIP_SAVE"}
     )
     plate_thickness: FloatProperty(
         name="Plate (mm)", description="Thickness in mm of the aperture plate that holds the pinhole",
@@ -90,9 +90,9 @@ class MPHDRR_OT_import_geometry(bpy.types.Operator):
                 column_maps.fill(form, self._workbook(), self._columns())
                 return self._ask_columns(context)
             with reports.warnings_reported(self):
-                first, *more = self._kinds()
-                system = read_scanner(self._workbook(), first, self._columns())
-                self._others = [read_scanner(self._workbook(), kind) for kind in more]
+                first_kind, *further_kinds = self._kinds()
+                system = read_scanner(self._workbook(), first_kind, self._columns())
+                self._further_scanners = [read_scanner(self._workbook(), kind) for kind in further_kinds]
         except InputError as error:
             if self._dialog_can_help(form, error):
                 return self._ask_columns(context)
@@ -100,7 +100,7 @@ class MPHDRR_OT_import_geometry(bpy.types.Operator):
             self.report({"ERROR"}, reports.in_window(error))
             return {"CANCELLED"}
         if not self.replace and self._has_window():
-            names = self.name or scanner.default_name(system), *map(self._name_of, self._others)
+            names = self.name or scanner.default_name(system), *map(self._scanner_name, self._further_scanners)
             self._losses = scanner.losses_of(context.scene, *names)
             if self._losses:
                 self._dialog = "REPLACE"
@@ -109,10 +109,11 @@ class MPHDRR_OT_import_geometry(bpy.types.Operator):
         return reports.run_reported(self, lambda: self._build(context, system))
 
     def _build(self, context: bpy.types.Context, system: Scanner) -> str:
+        """Build the workbook's scanners in the scene, `system` last; return the operator's message."""
         camera = context.scene.camera
-        for other in self._others:
-            scanner.build_scanner(context.scene, other, self._name_of(other), replace=self.replace)
-        context.scene.camera = camera  # which may be none: then the first of the scanner that is built last
+        for further in self._further_scanners:
+            scanner.build_scanner(context.scene, further, self._scanner_name(further), replace=self.replace)
+        context.scene.camera = camera  # if it is none, the first camera of `system` becomes the scene's
         collection = scanner.build_scanner(
             context.scene,
             system,
@@ -125,8 +126,8 @@ class MPHDRR_OT_import_geometry(bpy.types.Operator):
         context.view_layer.update()  # so that scripts find the children's matrix_world in place
         self._dialog = ""
         column_maps.clear(context.window_manager.mphdrr_columns)
-        more = "".join(f" and {len(other)} of the kind {other.kind}" for other in self._others)
-        return f"Imported {len(system)} modules{more} into '{collection.name}'"
+        further_modules = "".join(f" and {len(each)} of the kind {each.kind}" for each in self._further_scanners)
+        return f"Imported {len(system)} modules{further_modules} into '{collection.name}'"
 
     def cancel(self, context: bpy.types.Context) -> None:
         column_maps.clear(context.window_manager.mphdrr_columns)
@@ -139,37 +140,41 @@ class MPHDRR_OT_import_geometry(bpy.types.Operator):
         if self._dialog == "REPLACE":
             draw_losses(layout, self._losses)
             return
-        if context.space_data.type == "FILE_BROWSER":  # not in the panel of the last operation
+        if context.space_data.type == "FILE_BROWSER":  # otherwise this is the panel of the last operation
             layout.operator("mphdrr.browse_example", icon="FILE_FOLDER")
         names = ("name", "plate_thickness", "wall_thickness", "image_size", "columns", "choose_columns")
         layouts.draw_all(layouts.labelled(layout), self, *names)
 
-    _dialog: Literal["", "COLUMNS", "REPLACE"] = ""  # which one is open
-    _losses: list[str] | tuple[str, ...] = ()
-    _others: list[Scanner]
+    _dialog: Literal["", "COLUMNS", "REPLACE"] = ""  # the open dialog
+    _losses: list[str] | tuple[str, ...] = ()  # changes of the scene's scanner that are lost if it is replaced
+    _further_scanners: list[Scanner]  # the workbook's scanners beside the first
 
-    def _name_of(self, other: Scanner) -> str:
-        return f"{self.name} {other.kind}" if self.name else scanner.default_name(other)
+    def _scanner_name(self, further: Scanner) -> str:
+        """Return the name in the scene of a further scanner of the workbook."""
+        return f"{self.name} {further.kind}" if self.name else scanner.default_name(further)
 
     def _has_window(self) -> bool:
+        """Return whether the operator can open a dialog: it was called in a window, not by a script."""
         return self.options.is_invoke and not bpy.app.background
 
     def _workbook(self) -> Path:
+        """Return the path of the workbook; raise `InputError` if none is given."""
         if not self.filepath:
             raise InputError("no file given: set filepath to a workbook (.xlsx)")
         return Path(bpy.path.abspath(self.filepath))
 
     def _kinds(self) -> tuple[str, ...]:
-        """The kinds of scanners in the workbook; a column map is of pinholes."""
+        """Return the kinds of scanners in the workbook; with a column map it is read as pinholes."""
         return (kinds_in(self._workbook()) if self._columns() is None else ()) or (PinholeSystem.kind,)
 
     def _columns(self) -> ColumnMap | None:
+        """Return the column map of the dialog or of the given file, if any."""
         if self.chosen_columns:
             return ColumnMap.from_toml(self.chosen_columns)
         return ColumnMap.read(bpy.path.abspath(self.columns)) if self.columns else None
 
     def _dialog_can_help(self, form: column_maps.ColumnMapProperties, error: InputError) -> bool:
-        """Whether the column map dialog can answer what the reader refused; its settings are then filled."""
+        """Return whether the column map dialog can resolve the reader's refusal; if so, fill the dialog's settings."""
         if self._dialog == "COLUMNS":
             form.refusal = reports.in_window(error)
             return True
@@ -179,6 +184,7 @@ class MPHDRR_OT_import_geometry(bpy.types.Operator):
             return False
 
     def _ask_columns(self, context: bpy.types.Context) -> set[str]:
+        """Open the column map dialog."""
         self._dialog = "COLUMNS"
         return context.window_manager.invoke_props_dialog(
             self, width=column_map_dialog.WIDTH, title=f"Columns of {self._workbook().name}", confirm_text="Import"

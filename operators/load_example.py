@@ -1,4 +1,4 @@
-"""The example in one click, and its workbook in the file browser."""
+"""Operators that load the example, and that choose its workbook in the file browser."""
 
 from collections.abc import Sequence
 
@@ -17,18 +17,18 @@ class MPHDRR_OT_load_example(jobs.JobOperator, bpy.types.Operator):
     """Load the bundled scanner of 80 modules with a phantom, and show what every module, or every X-ray tube, sees of it"""
 
     example: EnumProperty(
-        name="Example", description="What is loaded", items=choices.items({}, example.EXAMPLES), options={"SKIP_SAVE"}
+        name="Example", description="Example to load", items=choices.items({}, example.EXAMPLES), options={"SKIP_SAVE"}
     )
 
     poll = needs((lambda context: not jobs.is_running(), "Another job is running: wait for it or cancel it"))
 
     def ask(self, context: bpy.types.Context) -> set[str] | None:
-        """Whether to drop changes of the example that is there."""
+        """Ask whether to drop the changes of an example that is already in the scene."""
         self._losses = scanner.losses_of(context.scene, EXAMPLE.stem)
         return ask_to_replace(self, context) if self._losses else None
 
     def draw(self, context: bpy.types.Context) -> None:
-        if self._losses:  # not in the panel of the last operation
+        if self._losses:  # empty in the panel of the last operation
             draw_losses(self.layout, self._losses)
 
     def job(self, context: bpy.types.Context) -> jobs.Job:

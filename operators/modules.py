@@ -1,4 +1,4 @@
-"""What a user does with modules: show, aim, duplicate, remove, tidy, renumber, check and map them."""
+"""Operators on modules: show, aim, duplicate, remove, tidy, renumber, check and map them."""
 
 import math
 
@@ -17,7 +17,7 @@ class MPHDRR_OT_show_modules(selection.OnScanner, bpy.types.Operator):
     last: IntProperty(name="Last", description="Last module number of the range", default=1)
     mode: EnumProperty(
         name="Mode",
-        description="What becomes of the modules of the range, and of the others",
+        description="What to do with the modules of the range and the others",
         items=[
             ("ONLY", "Show Only", "Show the modules of the range and hide all others", 0),
             ("SHOW", "Show", "Show the modules of the range; the others stay as they are", 1),
@@ -32,15 +32,15 @@ class MPHDRR_OT_show_modules(selection.OnScanner, bpy.types.Operator):
 
 
 class MPHDRR_OT_isolate_ring(selection.OnModules, bpy.types.Operator):
-    """Show only the modules of the active module's ring; where only they are shown, show all"""
+    """Show only the modules of the active module's ring; if only they are shown, show all"""
 
     def change(self, context: bpy.types.Context, collection: bpy.types.Collection) -> str:
-        found, ring = scanner.modules(collection), selection.selected_modules(context)[0].mphdrr_module.ring
-        own = {o for o in found if o.mphdrr_module.ring == ring}
-        is_isolated = own == {o for o in found if o.mphdrr_module.visible}
-        for camera in found:
-            scanner.set_visible(camera, is_isolated or camera in own)
-        return "All modules visible" if is_isolated else f"Ring {ring + 1}: {len(own)} modules visible"
+        cameras, ring = scanner.modules(collection), selection.selected_modules(context)[0].mphdrr_module.ring
+        in_ring = {camera for camera in cameras if camera.mphdrr_module.ring == ring}
+        is_isolated = in_ring == {camera for camera in cameras if camera.mphdrr_module.visible}
+        for camera in cameras:
+            scanner.set_visible(camera, is_isolated or camera in in_ring)
+        return "All modules visible" if is_isolated else f"Ring {ring + 1}: {len(in_ring)} modules visible"
 
 
 class MPHDRR_OT_look_through_module(selection.OnScanner, bpy.types.Operator):
@@ -54,7 +54,7 @@ class MPHDRR_OT_look_through_module(selection.OnScanner, bpy.types.Operator):
         if context.area is not None and context.area.type == "VIEW_3D":
             context.area.spaces.active.region_3d.view_perspective = "CAMERA"
             if not bpy.app.background:
-                bpy.ops.view3d.view_center_camera()  # all of its image, beside the headers
+                bpy.ops.view3d.view_center_camera()  # fits the camera's whole image beside the headers
                 context.area.spaces.active.region_3d.view_camera_zoom -= 6.0
         return f"Looking through {context.scene.camera.name}"
 
@@ -87,9 +87,9 @@ class MPHDRR_OT_duplicate_modules(selection.OnModules, bpy.types.Operator):
 
     def change(self, context: bpy.types.Context, collection: bpy.types.Collection) -> str:
         modules = selection.selected_modules(context)
-        made = module_edits.duplicate(collection, modules, self.count, self.angle, self.follow_ring)
-        selection.select(context, made)
-        return f"Made {modules_text([o.mphdrr_module.number for o in made])}"
+        copies = module_edits.duplicate_modules(collection, modules, self.count, self.angle, self.follow_ring)
+        selection.select(context, copies)
+        return f"Made {modules_text([camera.mphdrr_module.number for camera in copies])}"
 
 
 class MPHDRR_OT_remove_modules(selection.OnModules, bpy.types.Operator):
@@ -97,8 +97,8 @@ class MPHDRR_OT_remove_modules(selection.OnModules, bpy.types.Operator):
 
     def change(self, context: bpy.types.Context, collection: bpy.types.Collection) -> str:
         modules = selection.selected_modules(context)
-        text = modules_text([o.mphdrr_module.number for o in modules])
-        module_edits.remove(collection, modules)
+        text = modules_text([camera.mphdrr_module.number for camera in modules])
+        module_edits.remove_modules(collection, modules)
         return f"Removed {text}"
 
 
@@ -108,11 +108,11 @@ class MPHDRR_OT_tidy_modules(selection.OnScanner, bpy.types.Operator):
     """
 
     def change(self, context: bpy.types.Context, collection: bpy.types.Collection) -> str:
-        tidied = [module_edits.tidy(each) for each in scanner.scanners(context.scene)]
-        made, removed = [n for numbers, _ in tidied for n in numbers], sum(n for _, n in tidied)
-        done = [f"made {modules_text(made)}"] if made else []
-        done += [f"removed {removed} parts without a camera"] if removed else []
-        return " and ".join(done).capitalize() or "All modules are in order"
+        results = [module_edits.tidy(scanner_collection) for scanner_collection in scanner.scanners(context.scene)]
+        new, n_removed = [n for numbers, _ in results for n in numbers], sum(n for _, n in results)
+        changes = [f"made {modules_text(new)}"] if new else []
+        changes += [f"removed {n_removed} parts without a camera"] if n_removed else []
+        return " and ".join(changes).capitalize() or "All modules are in order"
 
 
 class MPHDRR_OT_renumber_modules(selection.OnScanner, bpy.types.Operator):
@@ -120,7 +120,7 @@ class MPHDRR_OT_renumber_modules(selection.OnScanner, bpy.types.Operator):
 
     order: EnumProperty(
         name="Order",
-        description="What the numbers follow",
+        description="Order that the numbers follow",
         items=(
             ("RINGS", "By Ring and Azimuth", "Ring by ring along +z, and along each ring from its largest gap on", 0),
             ("LIST", "As Listed", "The present order: that of the workbook, then added modules", 1),
@@ -169,22 +169,22 @@ class MPHDRR_OT_check_geometry(selection.OnScanner, bpy.types.Operator):
     """
 
     def change(self, context: bpy.types.Context, collection: bpy.types.Collection) -> str:
-        found, concerned = scanner.check_geometry(collection)
-        if not found:
+        findings, cameras = scanner.check_geometry(collection)
+        if not findings:
             return "Nothing found"
-        if concerned:
-            selection.select(context, concerned)
-        return f"{len(found)} findings at {len(concerned)} modules: see the Design panel"
+        if cameras:
+            selection.select(context, cameras)
+        return f"{len(findings)} findings at {len(cameras)} modules: see the Design panel"
 
 
 class MPHDRR_OT_add_map(jobs.JobOperator, bpy.types.Operator):
-    """Calculate what the scanner, with ideal modules, does in every voxel around the isocentre, and show it as a volume,
+    """Calculate a quantity of the scanner, with ideal modules, in every voxel around the isocentre, and show it as a volume,
     in place of the scanner's last map of this quantity
     """
 
     poll = reports.needs(selection.SCANNER)
 
-    quantity: EnumProperty(name="Quantity", description="What is mapped", items=maps.QUANTITIES)
+    quantity: EnumProperty(name="Quantity", description="Quantity to map", items=maps.QUANTITIES)
     voxels: IntProperty(
         name="Voxels", description="Voxels along each side of the map", default=64, min=2, soft_max=256, max=1024
     )
@@ -192,7 +192,7 @@ class MPHDRR_OT_add_map(jobs.JobOperator, bpy.types.Operator):
         name="Side (mm)", description="Side of the map's cube in mm; 0 takes the diameter of the ROI", default=0.0,
         min=0.0, soft_max=500.0,
     )  # fmt: skip
-    within_roi: BoolProperty(name="Within ROI", description="Leave out what lies outside the ROI sphere", default=True)
+    within_roi: BoolProperty(name="Within ROI", description="Set voxels outside the ROI sphere to 0", default=True)
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        return maps.mapping(context.scene, self.quantity, self.voxels, decimals.typed(self.side), self.within_roi)
+        return maps.map_job(context.scene, self.quantity, self.voxels, decimals.typed(self.side), self.within_roi)

@@ -1,4 +1,4 @@
-"""Design > Optimise: a scanner found by gradients, as a job."""
+"""Design > Optimise: optimise a scanner by gradients, as a job."""
 
 import bpy
 
@@ -7,8 +7,8 @@ from ..addon.scanner import optimising
 
 
 class MPHDRR_OT_optimise(jobs.JobOperator, bpy.types.Operator):
-    """Find the scanner that a design recipe (.toml) wants. It moves in the scene meanwhile: the active one, if the recipe's
-    has as many modules, else a new one. Cancel takes it back, Finish Now keeps the best so far
+    """Optimise a scanner by a design recipe (.toml). It moves in the scene meanwhile: the active scanner if it has as many
+    modules as the recipe's, else a new one. Cancel restores it, Finish Now keeps the best so far
     """
 
     bl_label = "Optimise Scanner"
@@ -18,4 +18,4 @@ class MPHDRR_OT_optimise(jobs.JobOperator, bpy.types.Operator):
     filter_glob: file_properties.shown_files([".toml"])
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        return optimising.optimizing(context.scene, self.given_file("set filepath to a design recipe (.toml)"))
+        return optimising.optimize_job(context.scene, self.required_file("set filepath to a design recipe (.toml)"))

@@ -1,4 +1,4 @@
-"""The active volume as the active module sees it: a frustum of pictures, or back on its own voxels."""
+"""Operators on the active volume in the coordinates of the active module: a frustum of pictures, or a resampled volume."""
 
 import bpy
 
@@ -8,31 +8,35 @@ from ..addon.scanner import selection
 from ..addon.volumes import volumes
 
 
-class _InPerspective(perspective_properties.PerspectiveSettings, jobs.JobOperator):
-    """Mix into an operator that takes the active volume into the coordinates of the active module."""
+class _PerspectiveOperator(perspective_properties.PerspectiveSettings, jobs.JobOperator):
+    """Base class of the operators that take the active volume into the coordinates of the active module."""
 
     poll = reports.needs((selection.active_module, "No module is active: import a geometry first"), volumes.ACTIVE)
 
 
-class MPHDRR_OT_show_in_perspective(_InPerspective, bpy.types.Operator):
+class MPHDRR_OT_show_in_perspective(_PerspectiveOperator, bpy.types.Operator):
     """Show the active volume in the active module's own coordinates, column, row and magnification k: a frustum of pictures,
-    each the volume's mean along the pixels' rays in its layer. Seen from the pinhole they lie on one another. It goes with
-    the module; the settings are what the panel says now, unless a script gives others
+    each the volume's mean along the pixels' rays in its layer. Seen from the pinhole they cover each other. The frustum
+    moves with the module; the settings are the panel's, unless a script gives others
     """
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        return frustums.showing(context, *self.given(context.scene.mphdrr_perspective, "planes", "uniform"))
+        return frustums.frustum_job(
+            context, *self.setting_values(context.scene.mphdrr_perspective, "planes", "uniform")
+        )
 
 
-class MPHDRR_OT_resample_in_perspective(_InPerspective, bpy.types.Operator):
-    """Take the active volume through the active module's cells, one for each pixel and layer of depth, and back to its own
-    voxels, as a new volume: what these cells keep of it. Beyond what the module sees, it is empty
+class MPHDRR_OT_resample_in_perspective(_PerspectiveOperator, bpy.types.Operator):
+    """Resample the active volume to the active module's cells, one for each pixel and layer of depth, and back to its own
+    voxels, as a new volume, which shows the detail that these cells keep. Outside the module's field of view it is empty
     """
 
     bl_label = "Volume Through Module"
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        return frustums.resampling(context, *self.given(context.scene.mphdrr_perspective, "cells", "uniform"))
+        return frustums.resample_job(
+            context, *self.setting_values(context.scene.mphdrr_perspective, "cells", "uniform")
+        )
 
 
 class MPHDRR_OT_clear_perspective(reports.Reported, bpy.types.Operator):

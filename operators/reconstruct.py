@@ -1,4 +1,4 @@
-"""Reconstruct or back-project the shown run, as jobs; show what came of the last reconstruction."""
+"""Operators that reconstruct or back-project the shown run, as jobs, and that show slices of the last reconstruction."""
 
 import bpy
 
@@ -9,14 +9,13 @@ from ..addon.runs import runs
 from .render_projections import ShowPicture
 
 _DONE: Need = (lambda _: ids.RECONSTRUCTION in bpy.data.images, "No reconstruction yet: reconstruct a run first")
-_NOTHING = "Nothing to go on from: its method has no iterations, or the file of the last one is not beside its voxels"
-_RUN: Need = (lambda context: runs.shown(context.scene) is not None, "No run yet: render the projections first")
+_NOTHING = "Nothing to continue: the method has no iterations, or the file of the last one is not beside its voxels"
+_RUN: Need = (lambda context: runs.shown_run(context.scene) is not None, "No run yet: render the projections first")
 
 
 class MPHDRR_OT_reconstruct(reconstruction_properties.ReconstructionSettings, jobs.JobOperator, bpy.types.Operator):
-    """Find the volume that the shown run's projections are of. It is in the scene from its first iterations on, the truth is
-    hidden; Cancel asks whether to keep what there is. The settings are what the panel says now, unless a script gives
-    others
+    """Reconstruct the volume of the shown run's projections. It is in the scene from its first iterations on, the truth is
+    hidden; Cancel asks whether to keep what there is. The settings are the panel's, unless a script gives others
     """
 
     bl_label = "Reconstruct Projections"
@@ -24,17 +23,17 @@ class MPHDRR_OT_reconstruct(reconstruction_properties.ReconstructionSettings, jo
     poll = needs(_RUN)
 
     def ask(self, context: bpy.types.Context) -> set[str] | None:
-        """Nothing; but of a button the method is one that suits the run."""
-        of_counts = runs.holds_counts(context.scene)
-        if of_counts is not None:
-            reconstruction_properties.fit_method(context.scene.mphdrr_reconstruction, of_counts)
+        """Choose a method that suits the run when the button is pressed; ask nothing."""
+        are_counts = runs.holds_counts(context.scene)
+        if are_counts is not None:
+            reconstruction_properties.fit_method(context.scene.mphdrr_reconstruction, are_counts)
         return super().ask(context)
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        return reconstructions.reconstructing(
+        return reconstructions.reconstruct_job(
             context,
             reconstruction_properties.settings_recipe(
-                self.given_or(context.scene.mphdrr_reconstruction), self.properties.is_property_set
+                self.setting_getter(context.scene.mphdrr_reconstruction), self.properties.is_property_set
             ),
         )
 
@@ -42,16 +41,16 @@ class MPHDRR_OT_reconstruct(reconstruction_properties.ReconstructionSettings, jo
 class MPHDRR_OT_continue_reconstruction(jobs.JobOperator, bpy.types.Operator):
     """Do ten more iterations of the last reconstruction, of the same run with the same settings, in the same volume"""
 
-    poll = needs(_DONE, (reconstructions.resumable, _NOTHING))
+    poll = needs(_DONE, (reconstructions.resume_path, _NOTHING))
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        return reconstructions.continuing(context)
+        return reconstructions.continue_job(context)
 
 
 class MPHDRR_OT_backproject(reconstruction_properties.BackprojectionSettings, jobs.JobOperator, bpy.types.Operator):
-    """Put together what the shown run's modules say of each voxel along their rays, as a volume. It is no reconstruction: a
-    value is that of whole rays, not of the voxel. Voxels are those of a reconstruction, as the panel says now, unless a
-    script gives others
+    """Combine the shown run's projections along their rays in each voxel of a volume. It is no reconstruction: a value is
+    that of whole rays, not of the voxel. Voxels are those of a reconstruction, with the panel's settings, unless a script
+    gives others
     """
 
     bl_label = "Back-Project Projections"
@@ -59,8 +58,10 @@ class MPHDRR_OT_backproject(reconstruction_properties.BackprojectionSettings, jo
     poll = needs(_RUN)
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        get = self.given_or(context.scene.mphdrr_reconstruction)
-        return backprojections.backprojecting(context, reconstruction_properties.voxels_recipe(get), get("how").lower())
+        get = self.setting_getter(context.scene.mphdrr_reconstruction)
+        return backprojections.backproject_job(
+            context, reconstruction_properties.voxels_recipe(get), get("how").lower()
+        )
 
 
 class MPHDRR_OT_show_reconstruction(ShowPicture, bpy.types.Operator):

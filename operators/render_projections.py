@@ -1,4 +1,4 @@
-"""Project a volume into the scanner's modules, as a job; load its settings, show and export its result."""
+"""Operators that project a volume into the scanner's modules, as a job, load settings, and show or export the run."""
 
 import math
 from pathlib import Path
@@ -19,7 +19,7 @@ from ..core.runs.presets import PRESETS
 
 class MPHDRR_OT_render_projections(projection_properties.ProjectionSettings, jobs.JobOperator, bpy.types.Operator):
     """Project the volume into every module: exact line integrals or SPECT counts, stored as images and as a file beside
-    the .blend. The settings are what the panel says now, unless a script gives others
+    the .blend. The settings are the panel's, unless a script gives others
     """
 
     volume: StringProperty(name="Volume", description="Name of the volume object to project", options={"SKIP_SAVE"})
@@ -33,8 +33,8 @@ class MPHDRR_OT_render_projections(projection_properties.ProjectionSettings, job
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
         collection = scanner.required_scanner(context.scene)
-        own_angle = self.properties.is_property_set("opening_angle")
-        angle = self.opening_angle if own_angle else collection.mphdrr_scanner.opening_angle
+        has_angle = self.properties.is_property_set("opening_angle")
+        angle = self.opening_angle if has_angle else collection.mphdrr_scanner.opening_angle
         recipe = projection_properties.settings_recipe(
             lambda name: self._setting(context.scene, name),
             self.properties.is_property_set,
@@ -44,24 +44,27 @@ class MPHDRR_OT_render_projections(projection_properties.ProjectionSettings, job
         return rendering.render_job(context, recipe, self.volume, self.mu)
 
     def _setting(self, scene: bpy.types.Scene, name: str) -> Any:
-        """A setting given to the operator, else the panel's; a coefficient that is given replaces the panel's material."""
+        """Return a setting of the operator if a script gives it, else the panel's.
+
+        A given attenuation coefficient replaces the panel's material.
+        """
         coefficient = name.replace("_material", "_mu")
         if not self.properties.is_property_set(name) and self.properties.is_property_set(coefficient):
             return "NUMBER"
-        return self.given_or(scene.mphdrr_projections)(name)
+        return self.setting_getter(scene.mphdrr_projections)(name)
 
 
 class MPHDRR_OT_use_preset(reports.Reported, bpy.types.Operator):
-    """Count photons, with isotope, aperture and crystal chosen together; time, noise, attenuation and the detector's own
-    blur stay as they are
+    """Count photons, with isotope, aperture and crystal chosen together; time, noise, attenuation and the detector's
+    intrinsic blur stay as they are
     """
 
     bl_label = "Physics Preset"
 
     preset: EnumProperty(
         name="Preset",
-        description="What is imaged with which camera",
-        items=choices.items({}, ((each.name, each.label, each.text) for each in PRESETS.values())),
+        description="Isotope with aperture and crystal",
+        items=choices.items({}, ((preset.name, preset.label, preset.text) for preset in PRESETS.values())),
     )
 
     def act(self, context: bpy.types.Context) -> None:
@@ -69,8 +72,8 @@ class MPHDRR_OT_use_preset(reports.Reported, bpy.types.Operator):
 
 
 class MPHDRR_OT_load_recipe(reports.Reported, ImportHelper, bpy.types.Operator):
-    """Set the panel as a recipe (.toml) or a run (.h5, .npz, .pt) says: model, detector, noise, modules and, where the
-    scene has objects of their names, volumes. By default the recipe of the last run
+    """Set the panel to the settings of a recipe (.toml) or a run (.h5, .npz, .pt): model, detector, noise, modules and, if
+    the scene has objects of their names, volumes. By default the recipe of the last run
     """
 
     filter_glob: file_properties.shown_files((".toml", *FORMATS))
@@ -84,10 +87,10 @@ class MPHDRR_OT_load_recipe(reports.Reported, ImportHelper, bpy.types.Operator):
 
 
 class ShowPicture(reports.Reported):
-    """Mix into an operator that shows one of the pictures that are made here."""
+    """Base class of the operators that show a picture in an Image Editor."""
 
     bl_options = set()
-    picture = ids.MOSAIC
+    picture = ids.MOSAIC  # name of Blender's image
 
     def act(self, context: bpy.types.Context) -> None:
         if not images.show_below(bpy.data.images[self.picture], context):
@@ -109,9 +112,11 @@ class MPHDRR_OT_export_dataset(jobs.ExportJob, bpy.types.Operator):
     filter_glob: file_properties.shown_files(FORMATS)
 
     def draw(self, context: bpy.types.Context) -> None:
-        """Beside the file browser: where the run is not of the scene as it is now."""
+        """Draw the changes of the scene since the run, beside the file browser."""
         for line in runs.change_lines(context.scene):
             self.layout.label(text=line, icon="ERROR")
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        return rendering.exporting(context.scene, self.given_file("set filepath to a name ending in .h5, .npz or .pt"))
+        return rendering.export_job(
+            context.scene, self.required_file("set filepath to a name ending in .h5, .npz or .pt")
+        )

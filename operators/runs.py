@@ -1,4 +1,4 @@
-"""The scene's runs: show one, remove one, compare two."""
+"""Operators on the scene's runs: show one, remove one, compare two, take efficiencies from a flood."""
 
 from typing import Any
 
@@ -13,14 +13,15 @@ from ..core import InputError, Progress, read_run
 from ..core.runs.comparing import difference, difference_sheet
 from ..core.runs.flood_files import write_flood
 
-_others: list[tuple[str, str, str]] = []  # Blender keeps no texts of such a list: they must live on here
+_choices: list[tuple[str, str, str]] = []  # kept here, because Blender keeps no copies of an enumeration's texts
 
 
 def _required_run(scene: bpy.types.Scene, index: int) -> bpy.types.PropertyGroup:
-    found = scene.mphdrr_projections.runs
-    if not 0 <= index < len(found):
-        raise InputError(f"index {index}: the scene has {len(found)} runs, counted from 0")
-    return found[index]
+    """Return the run at an index of the scene's list; raise `InputError` if there is none."""
+    scene_runs = scene.mphdrr_projections.runs
+    if not 0 <= index < len(scene_runs):
+        raise InputError(f"index {index}: the scene has {len(scene_runs)} runs, counted from 0")
+    return scene_runs[index]
 
 
 _LISTED: Need = (lambda context: context.scene.mphdrr_projections.runs, "No runs yet: render the projections first")
@@ -29,7 +30,7 @@ _LISTED: Need = (lambda context: context.scene.mphdrr_projections.runs, "No runs
 class MPHDRR_OT_show_run(jobs.JobOperator, bpy.types.Operator):
     """Show a run of the list: its images, the mosaic and the planes in the scene. Modules and volumes stay as they are"""
 
-    bl_options = {"REGISTER", "UNDO", "INTERNAL"}  # a click in the list
+    bl_options = {"REGISTER", "UNDO", "INTERNAL"}  # internal, because it is called by a click in the list
 
     poll = needs(_LISTED)
 
@@ -37,7 +38,7 @@ class MPHDRR_OT_show_run(jobs.JobOperator, bpy.types.Operator):
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
         _required_run(context.scene, self.index)
-        return rendering.showing_job(context.scene, self.index)
+        return rendering.show_run_job(context.scene, self.index)
 
 
 class MPHDRR_OT_remove_run(Reported, bpy.types.Operator):
@@ -50,7 +51,7 @@ class MPHDRR_OT_remove_run(Reported, bpy.types.Operator):
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         item = _required_run(context.scene, self.index)
         message = "Neither Undo nor the .blend as it was saved will find its file again."
-        return ask_to_remove(self, context, event, f"Remove {item.name!r} ({runs.size_text([item])})?", message)
+        return ask_to_remove(self, context, event, f"Remove {item.name!r} ({runs.file_size_text([item])})?", message)
 
     def act(self, context: bpy.types.Context) -> str:
         _required_run(context.scene, self.index)
@@ -58,16 +59,16 @@ class MPHDRR_OT_remove_run(Reported, bpy.types.Operator):
 
 
 def _other_runs(self: Any, context: bpy.types.Context | None) -> list[tuple[str, str, str]]:
-    """The runs that are not shown, by their places in the list."""
-    found = context.scene.mphdrr_projections.runs if context is not None else ()
-    shown = runs.shown(context.scene) if context is not None else None
-    _others[:] = [(str(i), item.name, item.summary) for i, item in enumerate(found) if item != shown]
-    return _others
+    """Return the choices of runs that are not shown, by their indices in the list."""
+    scene_runs = context.scene.mphdrr_projections.runs if context is not None else ()
+    shown_run = runs.shown_run(context.scene) if context is not None else None
+    _choices[:] = [(str(i), item.name, item.summary) for i, item in enumerate(scene_runs) if item != shown_run]
+    return _choices
 
 
 class MPHDRR_OT_flood_efficiency(jobs.ExportJob, bpy.types.Operator):
-    """Find the efficiencies of pixels, and dead and hot ones, from the shown run of an even source (import the flood as
-    measured counts first). They are written to a file, which Efficiency under Physics then names
+    """Calculate the efficiencies of pixels, and find dead and hot ones, from the shown run of an even source (import the
+    flood as measured counts first). They are written to a file, which Efficiency under Physics then names
     """
 
     bl_label = "Efficiencies from Flood"
@@ -78,17 +79,17 @@ class MPHDRR_OT_flood_efficiency(jobs.ExportJob, bpy.types.Operator):
     poll = needs(_LISTED)
 
     order: IntProperty(
-        name="Order", description="Largest power of the smooth trend that is taken off; 0: of a source so far away that it "
-        "has none", default=2, min=0, soft_max=4,
+        name="Order", description="Largest power of the smooth trend that is divided out; 0: for a source so far away that "
+        "there is none", default=2, min=0, soft_max=4,
     )  # fmt: skip
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        flood = storage.absolute(runs.required(context.scene, "take efficiencies from").file)
-        path = self.given_file("expected a name ending in .npy")
+        flood = storage.absolute(runs.required_run(context.scene, "take efficiencies from").file)
+        path = self.required_file("expected a name ending in .npy")
         order, scene_uid = self.order, context.scene.session_uid
 
         def finish(lines: list[str]) -> str:
-            scene = jobs.scene_again(scene_uid, "the efficiencies are")
+            scene = jobs.require_scene(scene_uid, "the efficiencies are")
             scene.mphdrr_projections.efficiency_of_modules = storage.stored_path(path)
             return " ".join(lines)
 
@@ -102,25 +103,25 @@ class MPHDRR_OT_compare_runs(jobs.JobOperator, bpy.types.Operator):
 
     poll = needs(_LISTED)
 
-    other: EnumProperty(name="Other", description="What is subtracted", items=_other_runs, options={"SKIP_SAVE"})
+    other: EnumProperty(name="Other", description="Run to subtract", items=_other_runs, options={"SKIP_SAVE"})
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        shown = runs.shown(context.scene)
-        if shown is None or not self.other:
+        minuend = runs.shown_run(context.scene)
+        if minuend is None or not self.other:
             raise InputError("there is no other run to compare with: keep the shown one and render again")
-        other = _required_run(context.scene, int(self.other))
-        paths = [rendering.file_of(item.file) for item in (shown, other)]
-        names = f"{shown.name!r} minus {other.name!r}"
+        subtrahend = _required_run(context.scene, int(self.other))
+        paths = [rendering.run_file_path(item.file) for item in (minuend, subtrahend)]
+        names = f"{minuend.name!r} minus {subtrahend.name!r}"
 
         def work(progress: Progress) -> Any:
-            one, two = map(read_run, paths)
-            found = difference(one, two)
-            return found, difference_sheet(one, found), one.system.numbers.tolist()
+            first, second = map(read_run, paths)
+            result = difference(first, second)
+            return result, difference_sheet(first, result), first.system.numbers.tolist()
 
-        def finish(result: Any) -> str:
-            found, drawn, numbers = result
-            text = f"{names}: {found.text}"
-            images.show_below(images.store_difference(drawn, numbers, found.unit, text), bpy.context)
+        def finish(results: Any) -> str:
+            result, sheet, numbers = results
+            text = f"{names}: {result.text}"
+            images.show_below(images.store_difference(sheet, numbers, result.unit, text), bpy.context)
             return text
 
         return jobs.Job("Comparing", work, finish)

@@ -1,4 +1,4 @@
-"""Closed mesh objects become a volume of activity or attenuation, and volumes become meshes."""
+"""Operators that make a volume of closed mesh objects, and a mesh of a volume."""
 
 import bpy
 from bpy.props import EnumProperty, FloatProperty, IntProperty, StringProperty
@@ -9,8 +9,8 @@ from ..addon.volumes import meshes, volumes
 
 
 class MPHDRR_OT_voxelize_objects(jobs.JobOperator, bpy.types.Operator):
-    """Make a volume of the selected closed meshes, modifiers included: a voxel holds the share that they cover. An
-    object's custom property 'activity' or 'mu' counts instead of the value; later names cover earlier ones
+    """Make a volume of the selected closed meshes, modifiers included: a voxel gets the value times the share that they
+    cover. An object's custom property 'activity' or 'mu' replaces the value; later names cover earlier ones
     """
 
     bl_label = "Voxelize Meshes"
@@ -18,7 +18,7 @@ class MPHDRR_OT_voxelize_objects(jobs.JobOperator, bpy.types.Operator):
 
     quantity: EnumProperty(
         name="Quantity",
-        description="What the volume holds",
+        description="Quantity of the volume",
         items=choices.items(choices.QUANTITIES, (("activity", "Activity", "kBq/mL"), ("mu", "Attenuation", "1/mm"))),
     )
     value: FloatProperty(name="Value", description="Inside, in kBq/mL or 1/mm", default=100.0, min=0.0, precision=4)
@@ -33,7 +33,7 @@ class MPHDRR_OT_voxelize_objects(jobs.JobOperator, bpy.types.Operator):
     poll = reports.needs((lambda context: _chosen(context), "Select closed mesh objects first"))
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        return meshes.voxelizing(
+        return meshes.voxelize_job(
             _chosen(context), typed(self.value), self.quantity, self.voxels, typed(self.voxel_size), self.name
         )
 
@@ -51,10 +51,10 @@ class MPHDRR_OT_mesh_from_volume(jobs.JobOperator, bpy.types.Operator):
     poll = reports.needs(volumes.ACTIVE)
 
     def job(self, context: bpy.types.Context) -> jobs.Job:
-        return meshes.extracting(context.object, typed(self.level) or None)
+        return meshes.mesh_job(context.object, typed(self.level) or None)
 
 
 def _chosen(context: bpy.types.Context) -> list[bpy.types.Object]:
-    """The selected mesh objects by name, without the scanner's own."""
-    found = [o for o in context.selected_objects if o.type == "MESH" and o.mphdrr_module.part == "NONE"]
-    return sorted(found, key=lambda o: o.name)
+    """Return the selected mesh objects, except the scanner's parts, sorted by name."""
+    objects = [item for item in context.selected_objects if item.type == "MESH" and item.mphdrr_module.part == "NONE"]
+    return sorted(objects, key=lambda item: item.name)

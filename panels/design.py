@@ -1,4 +1,4 @@
-"""Sidebar, Geometry > Design: values and readouts (`following.py`) of the active module, and of all modules."""
+"""Sidebar, Geometry > Design: values and readouts (`addon/scanner/following.py`) of the active module or of all modules."""
 
 import json
 from collections.abc import Sequence
@@ -12,12 +12,12 @@ from ..addon.scanner import columns, following, module_values, pinholes, scanner
 from .geometry import ScannerPanel
 from .sidebar import draw_facts, draw_text
 
-_MOST_FINDINGS = 8
-_ANYWHERE = np.ones((1, 3))  # mm
+_MAX_FINDINGS = 8  # number of findings that are shown
+_ANY_POINT = np.ones((1, 3))  # mm; a point at which a module that can be aimed has a pose
 
 
 class MPHDRR_PT_design(ScannerPanel, bpy.types.Panel):
-    """The active module, or all at once, with checks and exports."""
+    """Change the active module or all modules at once, check and export them."""
 
     def draw_scanner(self, context: bpy.types.Context, collection: bpy.types.Collection) -> None:
         layout = self.layout
@@ -26,12 +26,11 @@ class MPHDRR_PT_design(ScannerPanel, bpy.types.Panel):
             box = layout.box().column(align=True)
             box.label(text=properties.untidy.capitalize(), icon="ERROR")
             box.operator("mphdrr.tidy_modules", icon="BRUSH_DATA")
-        edited = sum(not following.shows_its_field(camera) for camera in scanner.modules(collection))
-        if edited:
+        n_edited = sum(not following.has_field_of_view(camera) for camera in scanner.modules(collection))
+        if n_edited:
             box = layout.box().column(align=True)
-            draw_text(
-                box, f"Lens or sensor edited of {edited} camera{'s' * (edited > 1)}: not what the projections show"
-            )
+            cameras = f"{n_edited} camera{'s' * (n_edited > 1)}"
+            draw_text(box, f"Lens or sensor of {cameras} edited: projections show something else")
             box.operator("mphdrr.reset_cameras", icon="CAMERA_DATA")
         camera, state = selection.active_module(context), context.scene.mphdrr_geometry
         row = layout.row(align=True)
@@ -48,7 +47,7 @@ class MPHDRR_PT_design(ScannerPanel, bpy.types.Panel):
         row = layouts.invoking(layout.row(align=True))
         row.operator("mphdrr.duplicate_modules", text="Duplicate", icon="DUPLICATE")
         row.operator("mphdrr.remove_modules", text="Remove", icon="TRASH")
-        if module_values.kind_of(collection).aimed(_ANYWHERE) is not None:
+        if module_values.kind_of(collection).aimed(_ANY_POINT) is not None:
             row = layout.row(align=True)
             row.prop(properties, "keep_aimed", toggle=True, icon="CON_TRACKTO")
             row.operator("mphdrr.aim_modules")
@@ -61,6 +60,7 @@ class MPHDRR_PT_design(ScannerPanel, bpy.types.Panel):
 
 
 def _draw_all(layout: bpy.types.UILayout, collection: bpy.types.Collection) -> None:
+    """Draw the values of all modules together, and the buttons that work on the whole scanner."""
     properties, kind = collection.mphdrr_scanner, module_values.kind_of(collection)
     column = _draw_values(layout, properties, kind, properties.mixed.split())
     if pinholes.has_pinholes(kind):
@@ -74,11 +74,11 @@ def _draw_all(layout: bpy.types.UILayout, collection: bpy.types.Collection) -> N
         findings = json.loads(properties.findings)
         if not findings:
             layout.label(text="Nothing found", icon="CHECKMARK")
-        for text in findings[:_MOST_FINDINGS]:
+        for text in findings[:_MAX_FINDINGS]:
             draw_text(layout, text)
-        if len(findings) > _MOST_FINDINGS:
-            more = iface("... and {count} more").format(count=len(findings) - _MOST_FINDINGS)
-            layout.label(text=more, icon="BLANK1")
+        if len(findings) > _MAX_FINDINGS:
+            text = iface("... and {count} more").format(count=len(findings) - _MAX_FINDINGS)
+            layout.label(text=text, icon="BLANK1")
     column = layouts.invoking(layout.column(align=True))
     if pinholes.has_pinholes(kind):
         column.operator_menu_enum("mphdrr.add_map", "quantity", text="Add Map", icon="OUTLINER_DATA_VOLUME")
@@ -89,7 +89,7 @@ def _draw_all(layout: bpy.types.UILayout, collection: bpy.types.Collection) -> N
 
 
 def _draw_pinholes(layout: bpy.types.UILayout, column: bpy.types.UILayout, properties: bpy.types.PropertyGroup) -> None:
-    """Draw how collimators are built, and the readouts of all modules together."""
+    """Draw the collimators' construction, and the readouts of all modules together."""
     column.separator()
     column.prop(properties, "plate_thickness", text="Plate (mm)")
     column.prop(properties, "wall_thickness", text="Wall (mm)")
@@ -104,7 +104,8 @@ def _draw_pinholes(layout: bpy.types.UILayout, column: bpy.types.UILayout, prope
     )
 
 
-def _draw_module(layout: bpy.types.UILayout, camera: bpy.types.Object, kind: module_values.Kind) -> None:
+def _draw_module(layout: bpy.types.UILayout, camera: bpy.types.Object, kind: module_values.ScannerType) -> None:
+    """Draw the values and readouts of one module, given by its camera."""
     module = camera.mphdrr_module
     _draw_values(layout, module, kind, mixed=())
     for text in (module.problem, module.finding):
@@ -124,23 +125,27 @@ def _draw_module(layout: bpy.types.UILayout, camera: bpy.types.Object, kind: mod
 
 
 def _draw_values(
-    layout: bpy.types.UILayout, values: bpy.types.PropertyGroup, kind: module_values.Kind, mixed: Sequence[str]
+    layout: bpy.types.UILayout, values: bpy.types.PropertyGroup, kind: module_values.ScannerType, mixed: Sequence[str]
 ) -> bpy.types.UILayout:
-    """Draw the values of a module's columns, those by formula last; "mixed" stands beside those that differ."""
-    column, last = layouts.labelled(layout.column(align=True)), module_values.designed(kind)
-    for one in kind.columns.scalars.values():
-        if one not in last:
-            column.prop(values, one.field, text=_label(one, mixed))
-    if last:
-        column.row(align=True).prop(values, "length_mode", expand=True)
-    for one in last:
-        row = column.row(align=True)
-        row.enabled = values.length_mode == "TYPED"  # otherwise it follows the others
-        row.prop(values, one.field, text=_label(one, mixed))
-    return column
+    """Draw the values of the columns in the table of a kind of scanner, those with a formula last.
+
+    `mixed` are the fields whose values differ from module to module, which the labels say. Returns the drawn column.
+    """
+    layout_column, with_formula = layouts.labelled(layout.column(align=True)), module_values.formula_columns(kind)
+    for column in kind.columns.scalars.values():
+        if column not in with_formula:
+            layout_column.prop(values, column.field, text=_label(column, mixed))
+    if with_formula:
+        layout_column.row(align=True).prop(values, "length_mode", expand=True)
+    for column in with_formula:
+        row = layout_column.row(align=True)
+        row.enabled = values.length_mode == "TYPED"  # otherwise the formula sets the value
+        row.prop(values, column.field, text=_label(column, mixed))
+    return layout_column
 
 
 def _label(column: module_values.Column, mixed: Sequence[str]) -> str:
+    """Return the label of a column's values, with the unit, or with "mixed" if its field is in `mixed`."""
     name = iface(columns.short_label(column))
     if column.field in mixed:
         return iface("{name}, mixed").format(name=name)

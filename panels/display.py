@@ -1,4 +1,4 @@
-"""How the projections are shown: in the 3D view's sidebar, and in the Image Editor's beside the pictures."""
+"""Display settings of the projections, in the 3D view's sidebar and in the Image Editor's, beside the pictures."""
 
 import bpy
 from bpy.app.translations import pgettext_iface as iface
@@ -9,8 +9,8 @@ from ..addon.scanner import selection
 from .sidebar import ImagesSidebar, Popover, draw_facts
 
 
-class _Display:
-    """Mix into a panel that shows the settings of colours and window."""
+class _DisplayPanel:
+    """Mixin of panels with the settings of colours and window."""
 
     bl_label = "Display"
 
@@ -33,25 +33,25 @@ class _Display:
 
 
 def _draw_totals(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
-    """What sums up the active module's image of the last run."""
+    """Draw total and maximum of the active module's projection."""
     mosaic, camera = bpy.data.images[ids.MOSAIC], selection.active_module(context)
-    shown, index = images.tiles(mosaic) or {}, tiles.active_tile(context, mosaic)
-    if camera is None or index is None or "totals" not in shown:
+    summary, index = images.tiles(mosaic) or {}, tiles.active_tile(context, mosaic)
+    if camera is None or index is None or "totals" not in summary:
         return
     column = layout.column(align=True)
-    text = iface("{name}, central half ({unit})") if shown["half"] else "{name} ({unit})"
-    column.label(text=text.format(name=camera.name, unit=shown["unit"]), translate=False)
+    text = iface("{name}, central half ({unit})") if summary["half"] else "{name} ({unit})"
+    column.label(text=text.format(name=camera.name, unit=summary["unit"]), translate=False)
     numbers = column.split(factor=0.4)
     numbers.active = False
-    total, most = (f"{shown[name][index]:.6g}" for name in ("totals", "maxima"))
-    draw_facts(numbers, (shown["summed"].capitalize(), total), ("Maximum", most))
+    total, maximum = (f"{summary[name][index]:.6g}" for name in ("totals", "maxima"))
+    draw_facts(numbers, (summary["summed"].capitalize(), total), ("Maximum", maximum))
 
 
-class MPHDRR_PT_display(_Display, Popover, bpy.types.Panel):
-    """Colours and window of the last run's pictures, and where they stand in the scene."""
+class MPHDRR_PT_display(_DisplayPanel, Popover, bpy.types.Panel):
+    """Set colours and window of the last run's pictures, and their place in the scene."""
 
     def draw(self, context: bpy.types.Context) -> None:
-        _Display.draw(self, context)
+        _DisplayPanel.draw(self, context)
         layout, settings = self.layout, context.scene.mphdrr_display
         column = layout.column(align=True)
         column.prop(settings, "planes")
@@ -62,5 +62,5 @@ class MPHDRR_PT_display(_Display, Popover, bpy.types.Panel):
         layouts.draw_all(column, settings, "backgrounds", "plane_opacity")
 
 
-class MPHDRR_PT_display_of_images(_Display, ImagesSidebar, bpy.types.Panel):
-    """Beside the pictures."""
+class MPHDRR_PT_display_of_images(_DisplayPanel, ImagesSidebar, bpy.types.Panel):
+    """Set colours and window of the pictures."""

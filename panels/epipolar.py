@@ -1,4 +1,4 @@
-"""The picked pixel, its ray and epipolar lines: in the 3D view's sidebar, and in the Image Editor's."""
+"""The picked pixel, its ray and its epipolar lines, in the 3D view's sidebar and in the Image Editor's."""
 
 import bpy
 from bpy.app.translations import pgettext_iface as iface
@@ -8,8 +8,8 @@ from ..addon.perspective import epipolar
 from .sidebar import ImagesSidebar, Sidebar, draw_facts, draw_text
 
 
-class _Epipolar:
-    """Mix into a panel that shows the picked pixel."""
+class _EpipolarPanel:
+    """Mixin of panels that show the picked pixel."""
 
     bl_label = "Epipolar Lines"
     bl_options = {"DEFAULT_CLOSED"}
@@ -29,25 +29,25 @@ class _Epipolar:
         row = layout.row(align=True)
         row.use_property_split = False
         layouts.draw_all(row, settings, "column", "row")
-        found, problem = epipolar.shown(context.scene)
+        pixel, problem = epipolar.picked_or_problem(context.scene)
         if problem:
             draw_text(layout, problem)
-        if found is None:
+        if pixel is None:
             return
         column = layout.column(align=True)
         column.prop(settings, "along", slider=True)
         column.prop(settings, "k")
         draw_facts(
             layout.split(factor=0.4),
-            ("Depth", f"{found.depth:.2f} mm"),
-            ("Marker", ", ".join(f"{x:.2f}" for x in found.marker) + " mm"),
-            ("Seen by", iface("{seen} of {count} modules").format(seen=found.seen_by, count=len(found.run.numbers))),
+            ("Depth", f"{pixel.depth:.2f} mm"),
+            ("Marker", ", ".join(f"{x:.2f}" for x in pixel.marker) + " mm"),
+            ("Seen by", iface("{seen} of {count} modules").format(seen=pixel.seen_by, count=len(pixel.run.numbers))),
         )
 
 
-class MPHDRR_PT_epipolar(_Epipolar, Sidebar, bpy.types.Panel):
+class MPHDRR_PT_epipolar(_EpipolarPanel, Sidebar, bpy.types.Panel):
     bl_parent_id = "MPHDRR_PT_projections"
 
 
-class MPHDRR_PT_epipolar_of_images(_Epipolar, ImagesSidebar, bpy.types.Panel):
-    """Beside the pictures."""
+class MPHDRR_PT_epipolar_of_images(_EpipolarPanel, ImagesSidebar, bpy.types.Panel):
+    """Show the picked pixel's ray and its epipolar lines."""

@@ -1,4 +1,4 @@
-"""Sidebar, first step: the scanner and its modules."""
+"""Sidebar, Geometry: the scanner and the list of its modules."""
 
 import json
 
@@ -13,7 +13,7 @@ from .sidebar import Folded, draw_facts, draw_text
 
 
 class MPHDRR_UL_modules(bpy.types.UIList):
-    """The modules among a scanner's objects, by number."""
+    """List of the modules among a scanner's objects, by number."""
 
     def draw_item(
         self, context: bpy.types.Context, layout: bpy.types.UILayout, data: bpy.types.Collection, item: bpy.types.Object,
@@ -23,9 +23,9 @@ class MPHDRR_UL_modules(bpy.types.UIList):
         row = layout.row(align=True)
         row.active = module.visible
         columns = row.row(align=True)
-        columns.alert = bool(module.problem or module.finding) or not following.shows_its_field(item)
+        columns.alert = bool(module.problem or module.finding) or not following.has_field_of_view(item)
         length = f"{module.collimator_length:.1f}" if pinholes.has_pinholes(kind_of(data)) else ""
-        _columns(columns, item.name, f"{module.pinhole_distance:.1f}", length)
+        _draw_columns(columns, item.name, f"{module.pinhole_distance:.1f}", length)
         if columns.alert:
             columns.label(text="", icon="ERROR")
         row.prop(module, "visible", text="", icon="HIDE_OFF" if module.visible else "HIDE_ON", emboss=False)
@@ -37,16 +37,14 @@ class MPHDRR_UL_modules(bpy.types.UIList):
         self, context: bpy.types.Context, data: bpy.types.Collection, property: str
     ) -> tuple[list[int], list[int]]:
         items = getattr(data, property)
-        wanted = self.filter_name.lower()
-        flags = [
-            self.bitflag_filter_item if o.mphdrr_module.is_module and wanted in o.name.lower() else 0 for o in items
-        ]
+        text = self.filter_name.lower()
+        flags = [self.bitflag_filter_item if o.mphdrr_module.is_module and text in o.name.lower() else 0 for o in items]
         by_number = sorted(range(len(items)), key=lambda i: (items[i].mphdrr_module.index, items[i].name))
-        return flags, np.argsort(by_number).tolist()  # the place of each item
+        return flags, np.argsort(by_number).tolist()  # the new place of each item
 
 
 class MPHDRR_PT_geometry(Folded, bpy.types.Panel):
-    """Import, which scanner it is, and which part of it is shown."""
+    """Import a scanner, choose one of several, and show part of its modules."""
 
     bl_order = ids.ORDER_GEOMETRY
 
@@ -77,18 +75,18 @@ class MPHDRR_PT_geometry(Folded, bpy.types.Panel):
         )
         row = layout.row(align=True)
         for first, last in json.loads(properties.quick_ranges or "[]"):
-            _show(row, f"{first}-{last}", first, last, "ONLY")
-        _show(row, "All", 0, 0, "ALL")
+            _draw_show(row, f"{first}-{last}", first, last, "ONLY")
+        _draw_show(row, "All", 0, 0, "ALL")
         row = layout.row(align=True)
         row.operator("mphdrr.import_geometry", text="Import Workbook")
         row.operator("mphdrr.add_xray_system")
 
 
 class ScannerPanel(Folded):
-    """Mixed into panels inside Geometry that need a scanner; they draw by `draw_scanner`."""
+    """Mixin of panels inside Geometry that need a scanner and draw it in `draw_scanner`."""
 
     bl_parent_id = "MPHDRR_PT_geometry"
-    bl_order = 1  # after the modules
+    bl_order = 1  # after the panel of the modules
 
     poll = layouts.shown_where(lambda context: scanner.active_scanner(context.scene) is not None)
 
@@ -113,15 +111,15 @@ class MPHDRR_PT_modules(ScannerPanel, bpy.types.Panel):
         row.prop(state, "first")
         row.prop(state, "last")
         row = column.row(align=True)
-        _show(row, "Show Only", state.first, state.last, "ONLY")
-        _show(row, "Show", state.first, state.last, "SHOW", icon="HIDE_OFF")
-        _show(row, "Hide", state.first, state.last, "HIDE", icon="HIDE_ON")
+        _draw_show(row, "Show Only", state.first, state.last, "ONLY")
+        _draw_show(row, "Show", state.first, state.last, "SHOW", icon="HIDE_OFF")
+        _draw_show(row, "Hide", state.first, state.last, "HIDE", icon="HIDE_ON")
 
         head = layout.row(align=True)
         head.active = False
-        _columns(head, "  Module", "b (mm)", "l (mm)" if pinholes.has_pinholes(kind_of(collection)) else "")
+        _draw_columns(head, "  Module", "b (mm)", "l (mm)" if pinholes.has_pinholes(kind_of(collection)) else "")
         head.label(text="", icon="BLANK1")
-        head.separator(factor=2.0)  # the list's scroll bar
+        head.separator(factor=2.0)  # above the list's scroll bar
         layout.template_list(
             "MPHDRR_UL_modules", "", collection, "all_objects", state, "active_index", rows=5, maxrows=5
         )
@@ -134,12 +132,13 @@ class MPHDRR_PT_modules(ScannerPanel, bpy.types.Panel):
         row = layout.row(align=True)
         for name in ("show_rays", "show_frustums", "show_detectors"):
             row.prop(state, name, toggle=True)
-        one = row.row(align=True)
-        one.active = state.show_rays or state.show_frustums or state.show_detectors
-        one.prop(state, "sight_all", text="All", toggle=True)
+        all_modules = row.row(align=True)
+        all_modules.active = state.show_rays or state.show_frustums or state.show_detectors
+        all_modules.prop(state, "sight_all", text="All", toggle=True)
 
 
-def _columns(layout: bpy.types.UILayout, name: str, *numbers: str) -> None:
+def _draw_columns(layout: bpy.types.UILayout, name: str, *numbers: str) -> None:
+    """Draw a row of the list of modules: a name and right-aligned numbers."""
     split = layout.split(factor=0.46, align=True)
     split.label(text=name)
     for text in numbers:
@@ -148,6 +147,7 @@ def _columns(layout: bpy.types.UILayout, name: str, *numbers: str) -> None:
         cell.label(text=text)
 
 
-def _show(layout: bpy.types.UILayout, text: str, first: int, last: int, mode: str, icon: str = "NONE") -> None:
+def _draw_show(layout: bpy.types.UILayout, text: str, first: int, last: int, mode: str, icon: str = "NONE") -> None:
+    """Draw a button that shows or hides the modules from number `first` to `last`."""
     button = layout.operator("mphdrr.show_modules", text=text, icon=icon)
     button.first, button.last, button.mode = first, last, mode

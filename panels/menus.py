@@ -1,6 +1,7 @@
-"""Add > mphDRR, Object > mphDRR, and Image > mphDRR Projections: every command, so that the menus' search (F3) finds it.
+"""Menus Add > mphDRR, Object > mphDRR and Image > mphDRR Projections, with every command, so that the search (F3) finds it.
 
-What adds something is under Add > mphDRR, what reads and writes files also under File (`addon/registration.py`).
+Commands that add something are under Add > mphDRR; those that read or write files are also under File
+(`addon/registration.py`).
 """
 
 import bpy
@@ -54,8 +55,8 @@ class MPHDRR_MT_modules(bpy.types.Menu):
         layout.separator()
         state = context.scene.mphdrr_geometry
         text = iface("Show Only Modules {first} to {last}").format(first=state.first, last=state.last)
-        shown = layout.operator("mphdrr.show_modules", text=text)
-        shown.first, shown.last, shown.mode = state.first, state.last, "ONLY"
+        show = layout.operator("mphdrr.show_modules", text=text)
+        show.first, show.last, show.mode = state.first, state.last, "ONLY"
         layout.operator("mphdrr.show_modules", text="Show All Modules", icon="HIDE_OFF").mode = "ALL"
         camera = selection.listed_module(context.scene)
         look = layout.operator("mphdrr.look_through_module", text="Look Through Active Module")
@@ -79,12 +80,12 @@ class MPHDRR_MT_modules(bpy.types.Menu):
 
 
 class MPHDRR_MT_module(bpy.types.Menu):
-    """What is done most often, as a pie (`addon/registration.py`)."""
+    """Pie menu of the most frequent commands, which opens by a key (`addon/registration.py`)."""
 
     bl_label = "mphDRR Module"
 
     def draw(self, context: bpy.types.Context) -> None:
-        pie = invoking(self.layout.menu_pie())  # west, east, south, north, and between them
+        pie = invoking(self.layout.menu_pie())  # entries to the west, east, south, north, and between them
         draw_module(pie, selection.active_module(context))
         pie.operator("mphdrr.render_projections", icon="RENDER_STILL")
         pie.operator("mphdrr.reconstruct", icon="OUTLINER_OB_VOLUME")
@@ -93,7 +94,7 @@ class MPHDRR_MT_module(bpy.types.Menu):
 
 
 def draw_module(layout: bpy.types.UILayout, camera: bpy.types.Object | None) -> None:
-    """What is done with one module."""
+    """Draw the commands that work on one module, given by its camera, or on module 1."""
     look = layout.operator("mphdrr.look_through_module", text="Look Through", icon="OUTLINER_OB_CAMERA")
     look.number = camera.mphdrr_module.number if camera else 1
     layout.operator("mphdrr.isolate_ring", icon="HIDE_OFF")
@@ -102,7 +103,7 @@ def draw_module(layout: bpy.types.UILayout, camera: bpy.types.Object | None) -> 
 
 
 def draw_in_context_menu(menu: bpy.types.Menu, context: bpy.types.Context) -> None:
-    """Draw the active module's commands in Blender's menu of an object."""
+    """Draw the active module's commands in Blender's context menu of an object."""
     camera = selection.module_of(context.object)
     if camera is not None:
         menu.layout.separator()

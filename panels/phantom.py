@@ -1,4 +1,4 @@
-"""Sidebar, second step: the phantom, its numbers and looks; below it, the active volume as the active module sees it."""
+"""Sidebar, Phantom: the active volume with its numbers, its look, its phantom's settings, and its view by a module."""
 
 import bpy
 from bpy.app.translations import pgettext_iface as iface
@@ -21,13 +21,13 @@ class MPHDRR_PT_phantom(Folded, bpy.types.Panel):
 
     def draw(self, context: bpy.types.Context) -> None:
         layout = layouts.invoking(layouts.labelled(self.layout))
-        adding = layout.column()
-        row = adding.row(align=True)
+        top = layout.column()
+        row = top.row(align=True)
         row.menu("MPHDRR_MT_add", text="Add Phantom", icon="OUTLINER_DATA_VOLUME")
         row.operator("mphdrr.import_volume", text="Import Volume", icon="IMPORT")
         if storage.missing_volumes():
-            _draw_missing(adding.column(align=True), context.scene)
-        item = volumes.meant(context)
+            _draw_missing(top.column(align=True), context.scene)
+        item = volumes.panel_volume(context)
         if item is not None:
             _draw_numbers(layout, item)
             row = layout.split(factor=0.32, align=True)
@@ -40,21 +40,20 @@ class MPHDRR_PT_phantom(Folded, bpy.types.Panel):
 
 
 def _draw_missing(column: bpy.types.UILayout, scene: bpy.types.Scene) -> None:
-    """The volumes whose files are gone: what can be made again, and what else to do."""
-    again, others = recovery.missing(scene)
+    """Draw the volumes whose files are gone: a button that makes phantoms again, and advice for other volumes."""
+    remakeable, lost = recovery.missing_volumes(scene)
     column.alert = True
     column.label(text="Files of voxels are missing", icon="ERROR")
-    if again:
-        names = ", ".join(item.name for item in again)
-        column.operator(
-            "mphdrr.remake_volumes", text=iface("Make Again: {names}").format(names=names), icon="FILE_REFRESH"
-        )
-    if others:
-        draw_text(column, recovery.what_to_do(others), "BLANK1")
+    if remakeable:
+        text = iface("Make Again: {names}").format(names=", ".join(item.name for item in remakeable))
+        column.operator("mphdrr.remake_volumes", text=text, icon="FILE_REFRESH")
+    if lost:
+        draw_text(column, recovery.advice(lost), "BLANK1")
     column.operator("mphdrr.find_volume_files", icon="VIEWZOOM")
 
 
 def _draw_numbers(layout: bpy.types.UILayout, item: bpy.types.Object) -> None:
+    """Draw the facts about a volume, and its message, if any."""
     settings = item.mphdrr_volume
     draw_facts(
         layout.split(factor=0.34),
@@ -63,7 +62,7 @@ def _draw_numbers(layout: bpy.types.UILayout, item: bpy.types.Object) -> None:
         ("Size", " × ".join(f"{s:.3g}" for s in settings.spacing) + " mm"),
         ("Values", f"{settings.minimum:.4g} to {settings.maximum:.4g} {settings.unit}".removesuffix(" 1")),
         *([("State", volumes.state_text(item))] if item.data.is_sequence else []),
-        ("File", volumes.file_state(item)),
+        ("File", volumes.file_note(item)),
     )
     if settings.message:
         column = layout.column()
@@ -73,15 +72,15 @@ def _draw_numbers(layout: bpy.types.UILayout, item: bpy.types.Object) -> None:
         _draw_update(layout, item)
 
 
-class _OfVolume(Popover):
-    """Mix into panels of the volume that is meant; they draw by `draw_volume`."""
+class _VolumePanel(Popover):
+    """Mixin of panels about the active volume (`volumes.panel_volume`), which draw it in `draw_volume`."""
 
-    poll = layouts.shown_where(volumes.meant)
+    poll = layouts.shown_where(volumes.panel_volume)
 
     def draw(self, context: bpy.types.Context) -> None:
-        layout, item = layouts.invoking(layouts.labelled(self.layout)), volumes.meant(context)  # type: ignore[attr-defined]
+        layout, item = layouts.invoking(layouts.labelled(self.layout)), volumes.panel_volume(context)  # type: ignore[attr-defined]
         if item is not None:  # the scene may have changed since poll
-            layout.context_pointer_set("object", item)  # which the buttons work on, active or not
+            layout.context_pointer_set("object", item)  # the buttons work on this volume, active or not
             self.draw_volume(layout, context, item)
 
     def draw_volume(self, layout: bpy.types.UILayout, context: bpy.types.Context, item: bpy.types.Object) -> None:
@@ -89,8 +88,8 @@ class _OfVolume(Popover):
         raise NotImplementedError
 
 
-class MPHDRR_PT_look(_OfVolume, bpy.types.Panel):
-    """How the volume is drawn, and what is made of it."""
+class MPHDRR_PT_look(_VolumePanel, bpy.types.Panel):
+    """Set how the volume is drawn, and add slices or a volume made from it."""
 
     def draw_volume(self, layout: bpy.types.UILayout, context: bpy.types.Context, item: bpy.types.Object) -> None:
         settings = item.mphdrr_volume
@@ -102,7 +101,7 @@ class MPHDRR_PT_look(_OfVolume, bpy.types.Panel):
         column.prop(settings, "display_low", text=iface("Low, {unit}").format(unit=settings.unit))
         column.prop(settings, "display_high", text=iface("High, {unit}").format(unit=settings.unit))
         looks = layout.grid_flow(columns=2, align=True)
-        looks.use_property_split = False  # or each name stands beside its button
+        looks.use_property_split = False  # otherwise each name stands beside its button
         for name, *_ in phantom_properties.LOOKS[: None if settings.quantity in ("hu", "mu") else 4]:
             looks.prop_enum(settings, "look", name)
         if settings.look not in ("DENSITY", "BRIGHTEST"):
@@ -113,32 +112,32 @@ class MPHDRR_PT_look(_OfVolume, bpy.types.Panel):
             column.prop(item.data, "sequence_mode", text="Then")
         if slices.planes_of(item):
             column = layout.column(align=True)
-            for axis, name in enumerate(slices.names(item)):
+            for axis, name in enumerate(slices.plane_names(item)):
                 column.prop(settings, "slices", index=axis, text=name)
             column.operator("mphdrr.remove_slices", icon="X")
         else:
             layout.operator("mphdrr.add_slices", icon="MESH_PLANE")
 
 
-class MPHDRR_PT_phantom_settings(_OfVolume, bpy.types.Panel):
-    """What the phantom is made from."""
+class MPHDRR_PT_phantom_settings(_VolumePanel, bpy.types.Panel):
+    """Change the numbers from which the phantom is made."""
 
     bl_label = "Settings"
 
-    poll = layouts.shown_where(lambda context: phantoms.settings_of(volumes.meant(context)) is not None)
+    poll = layouts.shown_where(lambda context: phantoms.settings_of(volumes.panel_volume(context)) is not None)
 
     def draw_volume(self, layout: bpy.types.UILayout, context: bpy.types.Context, item: bpy.types.Object) -> None:
         phantoms.settings_of(item).draw_settings(layout)
         column = layout.column(align=True)
         _draw_update(column, item)
         column.operator("mphdrr.apply_phantom_pose", icon="OBJECT_ORIGIN")
-        shown = phantoms.outline_of(item) is not None
-        text = "Hide Outline" if shown else "Show Outline"
-        column.operator("mphdrr.show_phantom_outline", text=text, icon="SHADING_WIRE", depress=shown)
+        has_outline = phantoms.outline_of(item) is not None
+        text = "Hide Outline" if has_outline else "Show Outline"
+        column.operator("mphdrr.show_phantom_outline", text=text, icon="SHADING_WIRE", depress=has_outline)
 
 
 def _draw_update(layout: bpy.types.UILayout, item: bpy.types.Object) -> None:
-    """The button that makes a phantom as its settings say."""
+    """Draw the button that makes a phantom again with its present settings."""
     row = layout.row(align=True)
     row.alert = item.mphdrr_volume.outdated
     row.context_pointer_set("object", item)
@@ -146,10 +145,10 @@ def _draw_update(layout: bpy.types.UILayout, item: bpy.types.Object) -> None:
     row.operator("mphdrr.update_phantom", text=text, icon="FILE_REFRESH")
 
 
-class MPHDRR_PT_perspective(_OfVolume, bpy.types.Panel):
-    """The volume in the coordinates of the active module: column, row and depth."""
+class MPHDRR_PT_perspective(_VolumePanel, bpy.types.Panel):
+    """Show the volume in the coordinates of the active module: column, row and depth."""
 
-    poll = layouts.shown_where(lambda context: selection.active_module(context) and volumes.meant(context))
+    poll = layouts.shown_where(lambda context: selection.active_module(context) and volumes.panel_volume(context))
 
     def draw_volume(self, layout: bpy.types.UILayout, context: bpy.types.Context, item: bpy.types.Object) -> None:
         settings, camera = context.scene.mphdrr_perspective, selection.active_module(context)
@@ -168,9 +167,9 @@ class MPHDRR_PT_perspective(_OfVolume, bpy.types.Panel):
 
 
 def _draw_frustum(column: bpy.types.UILayout, scene: bpy.types.Scene, frustum: bpy.types.Object) -> None:
-    """What is shown, and what has changed since."""
+    """Draw the volume and module of a frustum, and what has changed since it was made."""
     module = "?" if frustum.parent is None else frustum.parent.name
-    text = iface("Shown: {volume}, by {module}").format(volume=frustums.volume_of(frustum), module=module)
+    text = iface("Shown: {volume}, by {module}").format(volume=frustums.volume_name(frustum), module=module)
     column.label(text=text, translate=False)
     if changed := frustums.changes(scene, frustum):
         column.alert = True

@@ -1,4 +1,4 @@
-"""The live preview's box in the 3D view is dragged with the mouse."""
+"""Gizmo by which the mouse drags the live preview's box in the 3D view."""
 
 from typing import Any
 
@@ -9,7 +9,7 @@ from ..addon.runs import preview, preview_drawing
 
 
 class MPHDRR_GT_preview(bpy.types.Gizmo):
-    """What the mouse finds of the box, which `preview_drawing` draws."""
+    """Gizmo of the live preview's box, which `preview_drawing` draws."""
 
     bl_idname = "MPHDRR_GT_preview"
 
@@ -35,7 +35,7 @@ class MPHDRR_GT_preview(bpy.types.Gizmo):
 
 
 class MPHDRR_GGT_preview(bpy.types.GizmoGroup):
-    """The box of the live preview."""
+    """Gizmo group with the box of the live preview."""
 
     bl_idname = "MPHDRR_GGT_preview"
     bl_space_type = "VIEW_3D"

@@ -1,17 +1,17 @@
-"""Sidebar, third and last step: the projections, and the dataset that they give."""
+"""Sidebar, Projections and Export: settings of the Render job, and the files and pictures of a run."""
 
 import bpy
 from bpy.app.translations import pgettext_iface as iface
 
 from ..addon.blender import ids, layouts
 from ..addon.runs import preview, rendering, runs
-from ..addon.runs.projection_properties import drawn, makes_counts
+from ..addon.runs.projection_properties import makes_counts, panel_properties
 from ..addon.scanner import scanner
 from ..addon.volumes import volumes
 from .sidebar import Folded, Popover, draw_text
 
 _MAIN = ("model", "time", "hole", "height", "width")
-"""A beginner's settings, which the panel itself shows."""
+"""Settings that beginners need, which the panel itself shows."""
 _PHYSICS = (
     "photons", "isotope", "panel", "window", "sensor", "sensor_thickness", "materials",
     "aperture_material", "aperture_mu", "crystal_material", "crystal_mu",
@@ -30,20 +30,23 @@ class MPHDRR_PT_projections(Folded, bpy.types.Panel):
         settings = context.scene.mphdrr_projections
         column = layout.column(align=True)
         column.prop(settings, "volume", placeholder="Active volume")
-        layouts.draw_settings(column, settings, (each for each in drawn(settings, "model") if each[0] in _MAIN))
+        main = (setting for setting in panel_properties(settings, "model") if setting[0] in _MAIN)
+        layouts.draw_settings(column, settings, main)
         collection = scanner.active_scanner(context.scene)
-        own = collection and scanner.own_pixels(collection)
+        pixels = collection and scanner.fixed_pixels(collection)
         split = column.split(factor=0.4)
         name = split.row()
-        name.alignment = "RIGHT"  # as the settings' names
+        name.alignment = "RIGHT"  # like the settings' names
         name.label(text="Pixels")
-        if own:  # as its views are, whatever the settings for other scanners
-            split.label(text=iface("{columns} × {rows}, its own").format(rows=own[0], columns=own[1]), translate=False)
+        if pixels:  # the scanner's views have these pixels, whatever the settings are
+            split.label(
+                text=iface("{columns} × {rows}, its own").format(rows=pixels[0], columns=pixels[1]), translate=False
+            )
         else:
-            pixels = split.row(align=True)
-            pixels.use_property_split = False
-            pixels.prop(settings, "width", text="X")
-            pixels.prop(settings, "height", text="Y")
+            numbers = split.row(align=True)
+            numbers.use_property_split = False
+            numbers.prop(settings, "width", text="X")
+            numbers.prop(settings, "height", text="Y")
         row = layouts.invoking(layout.row())
         row.scale_y = 1.4
         row.enabled = _can_render(context)
@@ -54,7 +57,7 @@ class MPHDRR_PT_projections(Folded, bpy.types.Panel):
             column = layout.column(align=True)
             column.active = False
             draw_text(column, session.problem)
-            column.label(text=iface("{size} of voxels kept in memory").format(size=session.kept))
+            column.label(text=iface("{size} of voxels kept in memory").format(size=session.cache_size))
         if rendering.integrates_activity(context):
             draw_text(layout, "Line integrals of activity: for counts choose the model SPECT Counts.", icon="INFO")
         row = layout.row(align=True)
@@ -63,12 +66,12 @@ class MPHDRR_PT_projections(Folded, bpy.types.Panel):
 
 
 def _can_render(context: bpy.types.Context) -> bool:
-    """Whether there is a scanner and a volume."""
+    """Return whether the scene has a scanner and a volume."""
     return scanner.active_scanner(context.scene) is not None and bool(volumes.volume_objects(context.scene))
 
 
 class MPHDRR_PT_physics(Popover, bpy.types.Panel):
-    """What photons, aperture, crystal and noise are like."""
+    """Set photons, aperture, crystal and noise."""
 
     poll = layouts.shown_where(lambda context: context.scene.mphdrr_projections.model != "INVERSE_SQUARE")
 
@@ -79,7 +82,8 @@ class MPHDRR_PT_physics(Popover, bpy.types.Panel):
         column = layout.column(align=True)
         if settings.model == "EMISSION":
             column.prop(settings, "mu", placeholder="None")
-        layouts.draw_settings(column, settings, (each for each in drawn(settings, "model") if each[0] in _PHYSICS))
+        physics = (setting for setting in panel_properties(settings, "model") if setting[0] in _PHYSICS)
+        layouts.draw_settings(column, settings, physics)
         row = layout.row(heading="Poisson Noise")
         row.active = makes_counts(settings)
         row.prop(settings, "noise", text="")
@@ -89,7 +93,7 @@ class MPHDRR_PT_physics(Popover, bpy.types.Panel):
 
 
 class MPHDRR_PT_advanced(Popover, bpy.types.Panel):
-    """What few change: the hole's edge, rays, the virtual detector, which modules, what computes."""
+    """Set what is rarely changed: the hole's edge, rays, the virtual detector, the modules, the backend."""
 
     def draw(self, context: bpy.types.Context) -> None:
         layout = layouts.labelled(self.layout)
@@ -98,8 +102,8 @@ class MPHDRR_PT_advanced(Popover, bpy.types.Panel):
         if settings.model == "EMISSION" and collection is not None:
             column.prop(collection.mphdrr_scanner, "opening_angle")
         for table in ("model", "frames", "detector", "compute"):
-            others = (each for each in drawn(settings, table) if each[0] not in (*_MAIN, *_PHYSICS))
-            layouts.draw_settings(column, settings, others)
+            rest = (setting for setting in panel_properties(settings, table) if setting[0] not in (*_MAIN, *_PHYSICS))
+            layouts.draw_settings(column, settings, rest)
         column.prop(settings, "all_modules")
         if not settings.all_modules:
             layouts.draw_all(column, settings, "first", "last")
@@ -123,7 +127,7 @@ class MPHDRR_PT_export(Folded, bpy.types.Panel):
         both.operator("mphdrr.render_picture")
         both.operator("mphdrr.render_animation")
         if run_file:
-            kept = run_file if run_file.startswith("//") else iface("Kept when the .blend is saved")
-            layout.label(text=kept, translate=False, icon="FILE")
+            text = run_file if run_file.startswith("//") else iface("Kept when the .blend is saved")
+            layout.label(text=text, translate=False, icon="FILE")
         for line in runs.change_lines(context.scene):
             draw_text(layout, line)

@@ -1,4 +1,4 @@
-"""The scene's runs: their list, what has changed since the shown one was rendered, and comparing, in both sidebars."""
+"""The scene's runs in both sidebars: their list, the changes since the shown one was rendered, and the comparison of two."""
 
 import bpy
 from bpy.app.translations import pgettext_iface as iface
@@ -10,7 +10,7 @@ from .sidebar import Folded, ImagesSidebar, draw_text
 
 
 class MPHDRR_UL_runs(bpy.types.UIList):
-    """The runs, the shown one marked, also where it is of another state of the scene."""
+    """List of the runs, with a mark at the shown one, and a warning if the scene has changed since."""
 
     def draw_item(
         self, context: bpy.types.Context, layout: bpy.types.UILayout, data: bpy.types.PropertyGroup,
@@ -25,12 +25,12 @@ class MPHDRR_UL_runs(bpy.types.UIList):
         )
         size = row.row()
         size.alignment, size.active = "RIGHT", False
-        size.label(text=runs.size_text([item]))
+        size.label(text=runs.file_size_text([item]))
         row.prop(item, "keep", text="", icon="PINNED" if item.is_kept else "UNPINNED", emboss=False)
 
 
-class _Runs:
-    """Mix into a panel that shows the runs."""
+class _RunsPanel:
+    """Mixin of panels that show the runs."""
 
     bl_label = "Runs"
 
@@ -49,12 +49,12 @@ class _Runs:
         buttons.operator("mphdrr.remove_run", text="", icon="REMOVE").index = settings.active_run
         column = layout.column(align=True)
         column.active = False
-        for part in settings.run_summary.split(", ", 1):
-            column.label(text=part)
+        for line in settings.run_summary.split(", ", 1):
+            column.label(text=line)
         row = layouts.invoking(layout.row(align=True))
         row.operator("mphdrr.show_projections", text="Show Mosaic", icon="IMAGE_DATA")
         if len(settings.runs) > 1:
-            column.label(text=iface("All runs: {size}").format(size=runs.size_text(settings.runs)))
+            column.label(text=iface("All runs: {size}").format(size=runs.file_size_text(settings.runs)))
             row = row.row(align=True)
             row.enabled = not jobs.is_running()
             row.operator_menu_enum("mphdrr.compare_runs", "other", text="Compare With", icon="SELECT_DIFFERENCE")
@@ -62,16 +62,16 @@ class _Runs:
                 draw_text(layout, text, icon="INFO")
 
 
-class MPHDRR_PT_runs(_Runs, Folded, bpy.types.Panel):
+class MPHDRR_PT_runs(_RunsPanel, Folded, bpy.types.Panel):
     bl_order = ids.ORDER_RUNS
 
 
-class MPHDRR_PT_runs_of_images(_Runs, ImagesSidebar, bpy.types.Panel):
-    """Beside the pictures."""
+class MPHDRR_PT_runs_of_images(_RunsPanel, ImagesSidebar, bpy.types.Panel):
+    """Show, keep, compare and remove the scene's runs."""
 
 
 def draw_changes(layout: bpy.types.UILayout, scene: bpy.types.Scene) -> None:
-    """What has changed since the shown run was rendered, and a button that renders again; nothing where it is current."""
+    """Draw the changes since the shown run was rendered, if any, and a button that renders again."""
     lines = runs.change_lines(scene)
     if not lines:
         return
@@ -85,5 +85,5 @@ def draw_changes(layout: bpy.types.UILayout, scene: bpy.types.Scene) -> None:
         return
     row = layouts.invoking(box.row())
     row.alert, row.enabled = False, not jobs.is_running()
-    again = row.operator("mphdrr.render_projections", text="Render Again", icon="FILE_REFRESH")
-    again.volume = runs.volume_to_render(scene)
+    button = row.operator("mphdrr.render_projections", text="Render Again", icon="FILE_REFRESH")
+    button.volume = runs.volume_to_render(scene)

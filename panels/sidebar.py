@@ -1,4 +1,4 @@
-"""What panels share: where they are, and how they show numbers and texts."""
+"""Base classes of the panels by their place in the window, and functions that draw facts and texts."""
 
 import textwrap
 
@@ -6,11 +6,11 @@ import bpy
 
 from ..addon.blender import ids
 
-_LINE = 32  # letters that fit into the sidebar at its usual width
+_LINE_LENGTH = 32  # number of letters that fit into the sidebar at its usual width
 
 
 class Sidebar:
-    """Mixed into the panels of the extension's tab."""
+    """Mixin of the panels in the extension's tab of the 3D view's sidebar."""
 
     bl_space_type = "VIEW_3D"
     bl_region_type = "UI"
@@ -18,26 +18,26 @@ class Sidebar:
 
 
 class Folded(Sidebar):
-    """Mixed into panels that are closed to begin with: all but the next step."""
+    """Mixin of sidebar panels that are closed at first: all but the next step."""
 
     bl_options = {"DEFAULT_CLOSED"}
 
 
 class Popover(Sidebar):
-    """Mixed into panels that a button opens: what few change."""
+    """Mixin of panels that a button opens, with settings that are rarely changed."""
 
     bl_options = {"INSTANCED"}
-    bl_ui_units_x = 13  # as wide as the sidebar: labels fit in it
+    bl_ui_units_x = 13  # the sidebar's width, into which labels fit
 
 
 class ImagesSidebar(Sidebar):
-    """Mixed into panels of the Image Editor, beside the pictures."""
+    """Mixin of panels in the Image Editor's sidebar, beside the pictures."""
 
     bl_space_type = "IMAGE_EDITOR"
 
 
 def draw_facts(split: bpy.types.UILayout, *facts: tuple[str, str]) -> None:
-    """Draw names and their values, side by side."""
+    """Draw names and values side by side, in the two columns of `split`."""
     names, values = split.column(align=True), split.column(align=True)
     for name, value in facts:
         names.label(text=name)
@@ -45,7 +45,7 @@ def draw_facts(split: bpy.types.UILayout, *facts: tuple[str, str]) -> None:
 
 
 def draw_text(layout: bpy.types.UILayout, text: str, icon: str = "ERROR") -> None:
-    """Draw a text in lines that fit into a narrow sidebar."""
+    """Draw a text in lines that fit into a narrow sidebar, with an icon before the first one."""
     column = layout.column(align=True)
-    for i, line in enumerate(textwrap.wrap(text, _LINE)):
+    for i, line in enumerate(textwrap.wrap(text, _LINE_LENGTH)):
         column.label(text=line, icon="BLANK1" if i else icon)

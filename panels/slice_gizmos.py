@@ -1,4 +1,4 @@
-"""Arrows in the 3D view that move the active volume's slices along with the mouse."""
+"""Gizmos in the 3D view by which the mouse moves the active volume's slices."""
 
 import bpy
 from mathutils import Matrix, Vector
@@ -6,18 +6,18 @@ from mathutils import Matrix, Vector
 from ..addon.blender.layouts import shown_where
 from ..addon.volumes import slices
 
-_COLORS = ((1.0, 0.2, 0.32), (0.55, 0.86, 0.0), (0.16, 0.56, 1.0))  # of Blender's axes
+_COLORS = ((1.0, 0.2, 0.32), (0.55, 0.86, 0.0), (0.16, 0.56, 1.0))  # the colours of Blender's axes
 
 
 class MPHDRR_GGT_slices(bpy.types.GizmoGroup):
-    """An arrow at a corner of each slice."""
+    """Gizmo group with an arrow at a corner of each slice."""
 
     bl_idname = "MPHDRR_GGT_slices"
     bl_space_type = "VIEW_3D"
     bl_region_type = "WINDOW"
     bl_options = {"3D", "PERSISTENT"}
 
-    poll = shown_where(lambda context: slices.sliced(context) is not None)
+    poll = shown_where(lambda context: slices.active_sliced_volume(context) is not None)
 
     def setup(self, context: bpy.types.Context) -> None:
         for axis, color in enumerate(_COLORS):
@@ -27,19 +27,21 @@ class MPHDRR_GGT_slices(bpy.types.GizmoGroup):
             arrow.use_draw_modal = True
 
             def get(axis: int = axis) -> float:
-                item = slices.sliced(bpy.context)
-                return 0.0 if item is None else slices.way(item, axis)[1].length * item.mphdrr_volume.slices[axis]
+                item = slices.active_sliced_volume(bpy.context)
+                return (
+                    0.0 if item is None else slices.slice_track(item, axis)[1].length * item.mphdrr_volume.slices[axis]
+                )
 
             def set(value: float, axis: int = axis) -> None:
-                item = slices.sliced(bpy.context)
+                item = slices.active_sliced_volume(bpy.context)
                 if item is not None:
-                    slices.move(item, axis, value / slices.way(item, axis)[1].length)
+                    slices.move_slice(item, axis, value / slices.slice_track(item, axis)[1].length)
 
             arrow.target_set_handler("offset", get=get, set=set)
 
     def draw_prepare(self, context: bpy.types.Context) -> None:
-        item = slices.sliced(context)
+        item = slices.active_sliced_volume(context)
         for axis, arrow in enumerate(self.gizmos if item is not None else ()):
-            start, step = slices.way(item, axis)
+            start, step = slices.slice_track(item, axis)
             turn = Vector((0.0, 0.0, 1.0)).rotation_difference(step).to_matrix().to_4x4()
             arrow.matrix_basis = Matrix.Translation(start) @ turn

@@ -56,7 +56,7 @@ class Front:
         axes.curve(xs, ys, "#2f6fb3", 0.16)
         for x, y, row in zip(xs, ys, rows, strict=True):
             words = f"{next(iter(row.values())):g}" + ("" if row["passes"] else " fails")
-            page.text(words, axes.to(x, y)[0] + 0.4 * em, axes.to(x, y)[1] - 0.4 * em, 0.9 * em, INK)
+            page.text(words, axes.point(x, y)[0] + 0.4 * em, axes.point(x, y)[1] - 0.4 * em, 0.9 * em, INK)
         return page
 
 

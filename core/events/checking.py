@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..errors import InputError, refusing
-from ..files import AnyPath, ensure_folder, is_leftover, written_name
+from ..files import AnyPath, ensure_folder, final_name, is_leftover
 from ..memory import cores
 from ..progress import Progress, tell
 from .event_files import FileLocation, read_header, verify
@@ -233,7 +233,7 @@ def _foreign_files(target: SetFolder) -> Iterator[Fault]:
                 continue
             if is_leftover(path):
                 yield Fault("leftover", path, f"{path}: left by an interrupted process")
-            elif written_name(name) is None:  # otherwise a process is writing it
+            elif final_name(name) is None:  # otherwise a process is writing it
                 yield Fault("foreign", path, f"{path}: does not belong to this set")
 
 

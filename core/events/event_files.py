@@ -244,7 +244,7 @@ def read_truth(file: Any, grid: Grid, region: tuple[slice, ...] = (), out: Float
     if "truth" in file:
         return read_array(file, "truth", region, out)
     values = np.zeros(grid.n_voxels, np.float32)
-    values[hdf5.numbers(file["truth_index"])] = hdf5.numbers(file["truth_values"])
+    values[hdf5.read_numbers(file["truth_index"])] = hdf5.read_numbers(file["truth_values"])
     region_values = values.reshape(grid.shape)[region]
     if out is None:
         return region_values

@@ -43,7 +43,7 @@ def _stored_array(name: str, description: str) -> Any:
 
     def read(event: Event) -> Floats:
         with event.opened() as file:
-            return np.asarray(hdf5.numbers(event._dataset(file, name)), np.float64)
+            return np.asarray(hdf5.read_numbers(event._dataset(file, name)), np.float64)
 
     return property(read, doc=description)
 

@@ -89,7 +89,7 @@ def torch_dataset(
     ...     for batch in loader:
     ...         batch["counts"], batch["truth"]  # (4, 80, 256, 256), (4, 256, 256, 256)
     """
-    with needing(of="torch_dataset"):
+    with needing(feature="torch_dataset"):
         from .torch_events import TorchEvents
 
     instance(events, EventSet, "torch_dataset")

@@ -1,7 +1,7 @@
-"""The kinds of figures, one line each; command line and Blender follow from this table.
+"""Table of the kinds of figures, from which command line and Blender take their choices.
 
-A new kind is a line here: one that is drawn has a function of a page and a subject, one that is rendered says what is put
-into the studio (`addon.figures.figures`).
+A new kind is a line in `KINDS`: a drawn one has a function of a page and a subject, a rendered one has a `Studio`, which
+`addon.figures.stage` builds.
 """
 
 import math
@@ -12,68 +12,71 @@ from ..errors import InputError
 from ..validation import one_of
 from . import mosaics, sums, virtual_c_arm
 from .page import DARK, SUFFIXES, Page
-from .subject import Subject
+from .subject import FigureSubject
 
 PAPERS = {"dark": DARK, "light": "#ffffff"}
-"""What rendered figures lie on, by their style."""
+"""Paper colours of rendered figures, by their style."""
 
 
 FILMS = (".mp4",)
 SAMPLES = 16
-"""Rays per pixel; what noise they leave is smoothed."""
+"""Rays per pixel of rendered figures; the remaining noise is smoothed."""
 
 
-class How(NamedTuple):
-    """How figures are rendered."""
+class Rendering(NamedTuple):
+    """Settings of rendered figures."""
 
     labels: bool = True
     samples: int = SAMPLES
-    style: str = "dark"  # of `PAPERS`
-    seconds: float = 8.0  # of an animation
-    fps: int = 24  # its pictures in a second
+    style: str = "dark"  # a key of `PAPERS`
+    seconds: float = 8.0  # duration of an animation
+    fps: int = 24  # pictures of an animation per second
 
     @property
     def frames(self) -> int:
-        """The number of an animation's pictures."""
+        """Number of pictures of an animation."""
         return max(1, round(self.seconds * self.fps))
 
 
 class Studio(NamedTuple):
-    """What a rendered figure shows besides the scanner's modules."""
+    """Contents of a rendered figure besides the scanner's modules, and its camera."""
 
-    volume: bool = False
-    rays: bool = False  # the modules' principal rays
-    cut: bool = False  # the modules between the isocentre and the viewer fade
-    near: float = 0.0  # ROI radii from the isocentre to the picture's edge; 0: the whole scanner fits
-    lens: float = 50.0  # mm, of a camera whose film is 36 mm wide: a short one shows what is near large
-    lit: bool = False  # the chosen modules are lit and have rays, and the others stay
+    volume: bool = False  # whether the volume is shown
+    rays: bool = False  # whether the modules' principal rays are shown
+    cut: bool = False  # whether the modules between the isocentre and the viewer fade
+    near: float = 0.0  # distance from the isocentre to the picture's edge, ROI radii; 0: the whole scanner fits
+    lens: float = 50.0  # focal length, mm, for a film 36 mm wide; a short one shows near objects large
+    lit: bool = False  # whether only the chosen modules are lit and have rays, while the others stay visible
 
 
 class FigureKind(NamedTuple):
-    """One kind of figure."""
+    """A kind of figure: its names, its needs, and how it is drawn or rendered."""
 
-    name: str  # on the command line
-    label: str  # in menus
+    name: str  # name on the command line
+    label: str  # name in menus
     summary: str  # one line of help
-    needs: tuple[str, ...]  # of `subject.NEEDS`
-    size: tuple[int, int]  # width and height, pixels, where none is given
-    draw: Callable[[Page, Subject], None] | None = None
-    studio: Studio | None = None  # of a figure that Blender renders
-    one_module: bool = False  # it shows the first of the chosen modules
-    motion: Literal["turn", "light"] | None = None  # of an animation
+    needs: tuple[str, ...]  # names among `subject.NEEDS`
+    size: tuple[int, int]  # default width and height, pixels
+    draw: Callable[[Page, FigureSubject], None] | None = None  # function that draws a flat figure
+    studio: Studio | None = None  # contents and camera of a figure that Blender renders
+    one_module: bool = False  # whether it shows only the first of the chosen modules
+    motion: Literal["turn", "light"] | None = None  # course of an animation: once around, or module by module
 
     @property
     def suffixes(self) -> tuple[str, ...]:
-        """How the names of its files end."""
+        """File endings of its formats."""
         return FILMS if self.motion else SUFFIXES
 
-    def page(self, size: tuple[int, int] | None, how: How) -> Page:
-        """A page for it; only rendered figures have a style. Raises InputError of what no animation can be."""
-        page = Page(*(size or self.size), PAPERS["light" if self.studio is None else how.style])
+    def page(self, size: tuple[int, int] | None, options: Rendering) -> Page:
+        """Return an empty page for a figure of this kind; `size` is width and height, pixels, None for the default.
+
+        Raises `InputError` for an animation with odd sides, no duration or no pictures.
+        """
+        page = Page(*(size or self.size), PAPERS["light" if self.studio is None else options.style])
         if self.motion and (page.width % 2 or page.height % 2):
-            raise InputError(f"size {page.width}x{page.height}: of an animation both must be even")
-        if not (0 < how.seconds < math.inf and how.fps > 0):
-            raise InputError(f"{how.seconds:g} s of {how.fps} pictures each: expected more than 0 of both")
+            raise InputError(f"size {page.width}x{page.height}: both must be even for an animation")
+        if not (0 < options.seconds < math.inf and options.fps > 0):
+            raise InputError(f"{options.seconds:g} s of {options.fps} pictures each: expected more than 0 for both")
         return page
 
 
@@ -126,6 +129,6 @@ KINDS = {
 
 
 def figure_kind(name: str) -> FigureKind:
-    """The kind of that name."""
+    """Return the kind of this name; raise `InputError` if there is none."""
     one_of(name, KINDS, "figure")
     return KINDS[name]

@@ -1,4 +1,4 @@
-"""What a figure is of."""
+"""Subject of a figure: a scanner, a volume, a run, and how they are to be shown."""
 
 from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -16,34 +16,34 @@ if TYPE_CHECKING:
     from ..runs.run import ProjectionRun
 
 NEEDS = ("scanner", "volume", "run")
-"""What a figure may need: fields of `Subject`."""
+"""Fields of `FigureSubject` that a figure may need."""
 
 
-def require(needs: Sequence[str], have: Container[str], figure: str, missing: Mapping[str, str]) -> None:
-    """Refuse a figure that needs what is missing; `missing` says for each need what to do."""
+def require(needs: Sequence[str], available: Container[str], figure: str, missing: Mapping[str, str]) -> None:
+    """Raise `InputError` if a need of a figure is not among those at hand; `missing` holds the advice for each need."""
     for need in needs:
-        if need not in have:
+        if need not in available:
             raise InputError(f"figure {figure}: {missing[need]}")
 
 
 @dataclass(frozen=True, eq=False)
-class Subject:
-    """A scanner, a volume and projections, each only where there is one."""
+class FigureSubject:
+    """Scanner, volume and projections of a figure; those that are not at hand are None."""
 
     scanner: Scanner | None = None
     construction: Construction = field(default_factory=Construction)
-    """How the scanner's collimators are built."""
+    """Construction of the scanner's collimators."""
     volume: Volume | None = None
     run: "ProjectionRun | None" = None
     name: str = ""
-    """What the volume is called."""
+    """Name of the volume."""
     pose: Floats | None = None
-    """World-from-phantom (4, 4), mm, where the volume is a phantom."""
+    """World-from-phantom transform (4, 4), mm, if the volume is a phantom."""
     display: Display = field(default_factory=Display)
-    """How projections are shown."""
+    """Colours and scale of projections."""
     modules: str | None = None
-    """Which modules, such as "1-40" or "1-20,41"; all where it is None."""
+    """Numbers of the modules to show, such as "1-40" or "1-20,41"; None for all."""
 
-    def chosen(self, system: AnyScanner) -> AnyScanner:
-        """The modules of `system` that are to be shown."""
+    def select_modules(self, system: AnyScanner) -> AnyScanner:
+        """Return the modules of `system` that the figure shows."""
         return chosen_modules(system, self.modules)

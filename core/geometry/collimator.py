@@ -1,7 +1,8 @@
-"""A module's collimator: a plate with a knife-edged pinhole, and walls behind it. The one description of its shape.
+"""Shape of a module's collimator: a plate with a knife-edged pinhole, and walls behind it.
 
 The mesh, the solids in files and in Monte Carlo programs, the geometry checks and the physics of the knife edge all use
-it. Depths are along the module's axis, mm from the pinhole's centre, positive towards the crystal. From front to back:
+this one description. Depths are along the module's axis, mm from the pinhole's centre, positive towards the crystal. From
+front to back:
 
 - The hole is narrowest at depth 0, where its diameter is d, and opens as a double cone of full angle alpha through the
   whole plate: its radius at depth s is ``d/2 + |s| tan(alpha/2)``.
@@ -33,12 +34,12 @@ _SHOULDER = 0.01  # the channel begins wider than the hole by this fraction of t
 
 
 def edge_slope(opening_angle: float) -> float:
-    """``tan(alpha / 2)``: growth of a knife-edged hole's radius per distance from the edge."""
+    """Return ``tan(alpha / 2)``, the growth of a knife-edged hole's radius per distance from the edge."""
     return math.tan(opening_angle / 2)
 
 
 def angle_from_degrees(degrees: float, name: str = "opening_degrees") -> float:
-    """The opening angle, rad, of an option in degrees; `InputError` unless it is between 0 and 180."""
+    """Return an opening angle, given in degrees, in rad; raise `InputError` unless it is between 0 and 180 degrees."""
     degrees = positive(degrees, name, "degrees")
     if degrees >= 180:
         raise InputError(f"{name}: expected less than 180 degrees, got {degrees:g}")
@@ -47,10 +48,10 @@ def angle_from_degrees(degrees: float, name: str = "opening_degrees") -> float:
 
 @dataclass(frozen=True)
 class Construction:
-    """How the collimators of a scanner are built: thicknesses of plates and walls, mm, and the knife edge.
+    """Construction of a scanner's collimators: thicknesses of plates and walls, mm, and the knife edge.
 
-    `opening_angle` is the full angle alpha of the hole's double cone, rad. `edge_at` says where in the plate the edge is;
-    front is the face towards the ROI. The edge is always at the pinhole's centre, so this moves the plate.
+    `opening_angle` is the full angle alpha of the hole's double cone, rad. `edge_at` is the place of the edge in the plate;
+    front is the face towards the ROI. The edge is always at the pinhole's centre, so `edge_at` moves the plate.
     """
 
     plate_thickness: float = 2.0
@@ -79,35 +80,34 @@ class Construction:
 
 @dataclass(frozen=True)
 class Collimator:
-    """One module's collimator: d of the hole, l from its centre to the crystal's front face, and Ld of the crystal, mm."""
+    """Collimator of one module."""
 
-    diameter: float
-    length: float
-    detector_side: float
+    diameter: float  # d of the pinhole, mm
+    length: float  # l from the pinhole's centre to the crystal's front face, mm
+    detector_side: float  # Ld of the crystal, mm
     construction: Construction = Construction()
 
     def __post_init__(self) -> None:
         plate, angle = self.construction.plate_thickness, math.degrees(self.construction.opening_angle)
+        crystal = f"less than the crystal's {self.detector_side:g} mm"
         if not plate < self.length:
-            most = f"the collimator's {self.length:g} mm"
-            raise InputError(f"aperture plate: expected less than {most}, got {plate:g} mm")
+            length = f"the collimator's {self.length:g} mm"
+            raise InputError(f"aperture plate: expected less than {length}, got {plate:g} mm")
         if not 0 < self.diameter < self.detector_side:
-            most = f"the crystal's {self.detector_side:g} mm"
-            raise InputError(f"pinhole diameter: expected more than 0 and less than {most}, got {self.diameter:g} mm")
+            raise InputError(f"pinhole diameter: expected more than 0 and {crystal}, got {self.diameter:g} mm")
         width = 2 * max(radius for _, radius in self.hole_profile)
         if not width < self.detector_side:
-            found = f"with {plate:g} mm and an opening angle of {angle:g} degrees its hole is {width:.4g} mm wide"
-            most = f"the crystal's {self.detector_side:g} mm"
+            hole = f"with {plate:g} mm and an opening angle of {angle:g} degrees its hole is {width:.4g} mm wide"
             advice = "choose a thinner plate or a smaller angle"
-            raise InputError(f"aperture plate: {found}, expected less than {most}; {advice}")
+            raise InputError(f"aperture plate: {hole}, expected {crystal}; {advice}")
 
     def hole_radius(self, depth: float) -> float:
-        """Radius of the hole, mm, at a depth within the plate: ``d/2 + |s| tan(alpha/2)``."""
+        """Return the hole's radius, mm, at a depth s within the plate: ``d/2 + |s| tan(alpha/2)``."""
         return self.diameter / 2 + abs(depth) * edge_slope(self.construction.opening_angle)
 
     @property
     def hole_profile(self) -> list[tuple[float, float]]:
-        """The corners (depth, radius), mm, of the hole's profile from the plate's front to its back: 2 or 3."""
+        """Corners (depth, radius), mm, of the hole's profile from the plate's front to its back: 2 or 3 of them."""
         faces = (self.construction.front, 0.0, self.construction.back)
         return [(depth, self.hole_radius(depth)) for depth in dict.fromkeys(faces)]
 
@@ -119,7 +119,7 @@ class Collimator:
 
     @property
     def front_half_width(self) -> float:
-        """Half-width, mm, of the plate's front face; at the crystal that of the outside is Ld/2 + wall."""
+        """Half-width, mm, of the plate's front face; at the crystal, the outside has the half-width Ld/2 + wall."""
         return max(self.hole_radius(self.construction.front), self._shoulder) + self.construction.wall_thickness
 
     @property
@@ -129,17 +129,17 @@ class Collimator:
         return rim + _SHOULDER * (self.detector_side / 2 - rim)
 
     def open_share(self, slope: float) -> float:
-        """Fraction of the hole's area that is open to parallel rays of a slope, mm across the axis per mm along it (>= 0).
+        """Return the fraction of the hole's area that is open to parallel rays of the `slope` tan(angle to the axis) >= 0.
 
         A ray passes if it is within the hole at the edge and at both faces of the plate, because the hole consists of
         cones. So the open area is the intersection of three discs, shifted along the rays.
         """
         n = 512
         across = self.diameter / 2 * np.sin((np.arange(n) + 0.5) / n * np.pi / 2)  # half of the symmetric disc
-        low, high = np.full(n, -np.inf), np.full(n, np.inf)
+        low, high = np.full(n, -np.inf), np.full(n, np.inf)  # ends of the open chord at each `across`, mm
         for depth, radius in self.hole_profile:
-            half = np.sqrt(np.maximum(radius**2 - across**2, 0.0))
-            low, high = np.maximum(low, -depth * slope - half), np.minimum(high, -depth * slope + half)
-        # In steps of an angle, because the chords' lengths behave like a square root at the disc's rim.
+            half_chord = np.sqrt(np.maximum(radius**2 - across**2, 0.0))
+            low, high = np.maximum(low, -depth * slope - half_chord), np.minimum(high, -depth * slope + half_chord)
+        # The steps are even in an angle, because the chords' lengths behave like a square root at the disc's rim.
         steps = self.diameter / 2 * np.cos((np.arange(n) + 0.5) / n * np.pi / 2) * (np.pi / 2 / n)
         return float(2 * (np.maximum(high - low, 0.0) * steps).sum() / (np.pi / 4 * self.diameter**2))

@@ -1,4 +1,4 @@
-"""Systems from a few parameters: rings of modules on an ellipse or on flat plates.
+"""Generators of systems from a few parameters: rings of modules on an ellipse or on flat plates.
 
 Azimuths are polar angles about the isocentre, rad, from +x towards +y, as in the users' workbook.
 """
@@ -19,8 +19,8 @@ from .system import PinholeSystem
 Spacing = Literal["angle", "arc"]
 
 FULL_TURN = 2 * math.pi
-_MOST_MODULES = 10_000
-# Chords that an arc's length is summed from: they fall short of it by 1e-9.
+_MAX_MODULES = 10_000
+# Number of chords whose lengths are summed to an arc's length, which they miss by 1e-9 of it.
 _ARC_STEPS = 1 << 15
 
 
@@ -41,7 +41,7 @@ def ellipse_rings(
     rotation: float = 0.0,
     mirrored: bool = False,
 ) -> PinholeSystem:
-    """A system of rings of modules on an ellipse around the isocentre, ring by ring.
+    """Return a system of rings of modules on an ellipse around the isocentre, ring by ring.
 
     Parameters
     ----------
@@ -54,7 +54,8 @@ def ellipse_rings(
     pinhole_diameter, detector_side, detector_thickness, roi_radius
         d, Ld, Td and R, mm; one number, or one for each module of the system.
     collimator_length
-        l, mm, likewise. Default: from the design formula, `core.geometry.design_formulas.collimator_length`.
+        l, mm; one number, or one for each module of the system. Default: from the design formula,
+        `core.geometry.design_formulas.collimator_length`.
     start, end
         Azimuths of a ring's first and last module, rad, in either direction. A full turn apart, they describe a closed
         ring, whose last module is one step before `end`.
@@ -75,7 +76,7 @@ def ellipse_rings(
     else:
         azimuths = radians(modules, "azimuths", (None,) * min(np.ndim(modules), 2))
     sizes = (pinhole_diameter, detector_side, detector_thickness, roi_radius)
-    return _rings(ellipse.at(azimuths), z, mirrored, collimator_length, *sizes)
+    return _system_of_rings(ellipse.points_at(azimuths), z, mirrored, collimator_length, *sizes)
 
 
 def plate_rings(
@@ -91,12 +92,12 @@ def plate_rings(
     closed: bool = True,
     mirrored: bool = False,
 ) -> PinholeSystem:
-    """A system of rings of modules on flat plates, ring by ring and plate by plate.
+    """Return a system of rings of modules on flat plates, ring by ring and plate by plate.
 
     The n modules of a plate stand in the middles of n equal parts of it, and aim at the isocentre like all modules.
-    `modules` is their number on each plate in each ring, or one number for each plate (0 for none).
+    `modules` is the number of modules on each plate in each ring, or a sequence with one number for each plate (0 for none).
     `vertices` (V, 2) are x and y of the plates' edges, mm, in order, such as those of `regular_polygon`; if `closed`, a
-    plate joins the last to the first. The other parameters are as in `ellipse_rings`.
+    plate joins the last to the first. The other parameters are described at `ellipse_rings`.
     """
     corners = real_array(vertices, "vertices", (None, 2))
     if len(corners) < 2 + closed:
@@ -107,18 +108,18 @@ def plate_rings(
         counts = np.broadcast_to(modules, len(starts)) if np.ndim(modules) == 0 else np.asarray(modules)
     except ValueError:  # lists of different lengths
         counts = np.empty(0)
-    whole = counts.shape == (len(starts),) and counts.dtype.kind in "iu"
-    if not whole or counts.min() < 0 or not 0 < counts.max() <= _MOST_MODULES:
-        expected = f"a whole number up to {_MOST_MODULES}, or one for each of the {len(starts)} plates"
+    are_integers = counts.shape == (len(starts),) and counts.dtype.kind in "iu"
+    if not are_integers or counts.min() < 0 or not 0 < counts.max() <= _MAX_MODULES:
+        expected = f"a whole number up to {_MAX_MODULES}, or one for each of the {len(starts)} plates"
         raise InputError(f"modules: expected {expected}, got {modules}")
-    shares = np.concatenate([(np.arange(n) + 0.5) / n for n in counts if n])[:, None]
-    places = (1 - shares) * np.repeat(starts, counts, axis=0) + shares * np.repeat(ends, counts, axis=0)
+    fractions = np.concatenate([(np.arange(n) + 0.5) / n for n in counts if n])[:, None]  # positions along the plate
+    positions = (1 - fractions) * np.repeat(starts, counts, axis=0) + fractions * np.repeat(ends, counts, axis=0)
     sizes = (pinhole_diameter, detector_side, detector_thickness, roi_radius)
-    return _rings(places, z, mirrored, collimator_length, *sizes)
+    return _system_of_rings(positions, z, mirrored, collimator_length, *sizes)
 
 
 def regular_polygon(sides: int, apothem: float, rotation: float = 0.0) -> Floats:
-    """Vertices (sides, 2), mm, of a regular polygon around the isocentre, for `plate_rings`.
+    """Return the vertices (sides, 2), mm, of a regular polygon around the isocentre, for `plate_rings`.
 
     The plates are `apothem` mm from the isocentre; the middle of the first has the azimuth `rotation`, rad.
     """
@@ -131,40 +132,47 @@ def regular_polygon(sides: int, apothem: float, rotation: float = 0.0) -> Floats
 
 
 def even_azimuths(ellipse: Ellipse, modules: Any, start: float, end: float, spacing: str) -> Floats:
-    """Azimuths (M,), rad, of evenly spaced modules on an ellipse. Parameters as in `ellipse_rings`."""
+    """Return the azimuths (M,), rad, of evenly spaced modules on an ellipse.
+
+    `modules` is their number; `start` and `end` are the azimuths of the first and last, rad, and `spacing` is "angle" or
+    "arc", as described at `ellipse_rings`.
+    """
     count = whole_number(modules, "modules")
-    if count > _MOST_MODULES:
-        raise InputError(f"modules: expected at most {_MOST_MODULES} in a ring, got {count}")
+    if count > _MAX_MODULES:
+        raise InputError(f"modules: expected at most {_MAX_MODULES} in a ring, got {count}")
     start, end = (float(real_array(x, name, ())) for x, name in ((start, "start"), (end, "end")))
     turn = abs(end - start)
     if turn > FULL_TURN + 1e-9:
         raise InputError(f"start and end: expected at most a full turn apart, got {math.degrees(turn):g} degrees")
     closed = turn >= FULL_TURN - 1e-9
-    shares = np.linspace(0, 1, count, endpoint=not closed)
+    fractions = np.linspace(0, 1, count, endpoint=not closed)  # positions between start and end
     if spacing == "angle":
-        return start + shares * (end - start)
+        return start + fractions * (end - start)
     if spacing != "arc":
         raise InputError(f"spacing {spacing!r}: expected 'angle' or 'arc'")
-    fine = np.linspace(start, end, _ARC_STEPS + 1)
-    chords = np.linalg.norm(np.diff(ellipse.at(fine), axis=0), axis=1)
-    travelled = np.concatenate([[0.0], np.cumsum(chords)])
-    return np.interp(shares * travelled[-1], travelled, fine)
+    steps = np.linspace(start, end, _ARC_STEPS + 1)
+    chords = np.linalg.norm(np.diff(ellipse.points_at(steps), axis=0), axis=1)
+    arc_lengths = np.concatenate([[0.0], np.cumsum(chords)])
+    return np.interp(fractions * arc_lengths[-1], arc_lengths, steps)
 
 
-def _rings(
-    places: Floats, z: ArrayLike, mirrored: bool, collimator_length: ArrayLike | None, *sizes: ArrayLike
+def _system_of_rings(
+    positions: Floats, z: ArrayLike, mirrored: bool, collimator_length: ArrayLike | None, *sizes: ArrayLike
 ) -> PinholeSystem:
-    """Modules at `places` ((rings,) M, 2), mm, in rings at `z`; `sizes` are d, Ld, Td and R."""
+    """Return the system of modules at x and y `positions` ((rings,) M, 2) in rings at heights `z`, mm.
+
+    `sizes` are d, Ld, Td and R, mm; the other arguments are described at `ellipse_rings`.
+    """
     heights = np.atleast_1d(real_array(z, "z", (None,) * min(np.ndim(z), 2)))
     heights = heights[:, None] if heights.ndim == 1 else heights
-    places = places[None] if places.ndim == 2 else places
+    xy = positions[None] if positions.ndim == 2 else positions
     try:
-        shape = np.broadcast_shapes(heights.shape, places.shape[:2])
+        shape = np.broadcast_shapes(heights.shape, xy.shape[:2])
     except ValueError:
-        rings, n = places.shape[:2]
+        rings, n = xy.shape[:2]
         expected = f"one number, one for each of {f'the {rings}' if rings > 1 else 'the'} rings, or rings x {n}"
         raise InputError(f"z: expected {expected}, got shape {' x '.join(map(str, np.shape(z)))}") from None
-    centers = np.concatenate([np.broadcast_to(places, (*shape, 2)), np.broadcast_to(heights, shape)[..., None]], axis=2)
+    centers = np.concatenate([np.broadcast_to(xy, (*shape, 2)), np.broadcast_to(heights, shape)[..., None]], axis=2)
     if mirrored:
         if np.any(heights == 0):
             raise InputError("mirrored: a ring at z = 0 is its own mirror image; expected z other than 0")

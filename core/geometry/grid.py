@@ -1,4 +1,4 @@
-"""The lattice of voxels: shape and affine."""
+"""Grid of voxels: shape, and affine matrix from index to world."""
 
 from __future__ import annotations
 
@@ -14,14 +14,16 @@ from .frames import affine_matrix, checked_affine, moved
 
 @dataclass(frozen=True, eq=False)
 class Grid:
-    """A lattice of voxels: their numbers (n_x, n_y, n_z) along the index axes, and the affine (4, 4) to world mm.
+    """Lattice of voxels.
 
-    The affine acts on column vectors, and an integer index is the voxel's CENTRE. It may be any that is invertible:
-    rotated, sheared, anisotropic, mirrored.
+    The affine matrix acts on column vectors, and an integer index is a voxel's CENTRE. Any invertible matrix is allowed: the
+    grid may be rotated, sheared, anisotropic or mirrored.
     """
 
     shape: tuple[int, int, int]
+    """Numbers of voxels (n_x, n_y, n_z) along the index axes."""
     affine: Floats
+    """Matrix (4, 4) from index to world, mm."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "shape", whole_shape(self.shape, "grid shape", 3))
@@ -29,7 +31,7 @@ class Grid:
 
     @classmethod
     def centered(cls, shape: ArrayLike, spacing: ArrayLike, center: ArrayLike = (0.0, 0.0, 0.0)) -> Grid:
-        """An axis-aligned grid with its middle at `center`, world mm.
+        """Return an axis-aligned grid with its middle at `center`, world mm.
 
         `shape`, in voxels, and `spacing`, in mm, are three numbers along x, y, z or one for all.
         """
@@ -39,7 +41,7 @@ class Grid:
         return cls(counts, affine_matrix(np.diag(spacing), first))
 
     def box(self, start: ArrayLike, shape: tuple[int, ...]) -> Grid:
-        """The grid of a box of these voxels, or beside them: of `shape` voxels from the one with the index `start` on."""
+        """Return the grid of a box of `shape` voxels that begins at the index `start`; it may reach beyond this grid."""
         affine = self.affine.copy()
         affine[:3, 3] += affine[:3, :3] @ np.asarray(start)
         return Grid(shape, affine)  # type: ignore[arg-type]
@@ -56,12 +58,12 @@ class Grid:
 
     @property
     def n_voxels(self) -> int:
-        """Number of voxels."""
+        """Number of all voxels."""
         return int(np.prod(self.shape, dtype=object))
 
-    @cached_property  # needed for every part of every image
+    @cached_property  # because every part of every image needs it
     def index_from_world(self) -> Floats:
-        """Matrix (4, 4) from world mm to index, on column vectors."""
+        """Matrix (4, 4) from world, mm, to index, for column vectors."""
         return freeze(np.linalg.inv(self.affine))
 
     @property
@@ -70,7 +72,7 @@ class Grid:
         return (self.affine @ [*((np.array(self.shape) - 1) / 2), 1.0])[:3]
 
     def corners(self) -> Floats:
-        """World points (8, 3), mm, of the box's outer corners (voxel faces, not centres)."""
+        """Return the world points (8, 3), mm, of the grid's outer corners, which are corners of voxels, not centres."""
         unit = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), axis=-1).reshape(8, 3)
         return moved(self.affine, unit * np.array(self.shape) - 0.5)
 
@@ -83,12 +85,12 @@ class Grid:
         return hash((self.shape, self.affine.tobytes()))
 
 
-def same_grid(one: Grid, other: Grid) -> bool:
-    """Whether two grids have the same voxels, up to a thousandth of a voxel, which files may round away."""
-    return one.shape == other.shape and bool(np.abs(one.corners() - other.corners()).max() <= 1e-3 * one.spacing.min())
+def same_grid(a: Grid, b: Grid) -> bool:
+    """Return whether two grids have the same voxels within a thousandth of a voxel, which files may round away."""
+    return a.shape == b.shape and bool(np.abs(a.corners() - b.corners()).max() <= 1e-3 * a.spacing.min())
 
 
 def grid_around(points: Floats, spacing: float) -> Grid:
-    """The axis-aligned grid of cubes that holds world `points` (n, 3), mm, with at least half a voxel around them."""
+    """Return the axis-aligned grid of cubic voxels that holds world `points` (n, 3), mm, and half a voxel around them."""
     low, high = points.min(axis=0), points.max(axis=0)
     return Grid.centered(np.ceil((high - low) / spacing) + 2, spacing, (low + high) / 2)

@@ -1,7 +1,7 @@
-"""The solids of modules: collimators with their aperture plates, and crystals, for display, checks and files.
+"""Solids of modules, collimators with their aperture plates and crystals, for display, checks and files.
 
-A solid's coordinates are those of the module's camera space, mm: the pinhole at the origin, X = -u, Y = v, Z = -k. So the
-crystal reaches from Z = l to l + Td, and the collimator stands in front of it, around the pinhole.
+The coordinates of a solid are those of the module's camera space, mm: the pinhole at the origin, X = -u, Y = v, Z = -k. So
+the crystal reaches from Z = l to l + Td, and the collimator stands in front of it, around the pinhole.
 """
 
 from dataclasses import dataclass
@@ -20,8 +20,8 @@ from .part_colors import PartKind
 Solid = tuple[Floats, NDArray[np.int32]]
 """Vertices (V, 3), mm, and quads (F, 4), counter-clockwise seen from outside."""
 
-# Points on a ring: a multiple of 8, so that squares have points at their corners. The polygon is inscribed in the hole's
-# circle: 99.84 % of the area is open.
+# Number of points on a ring: a multiple of 8, so that squares have points at their corners. The polygon is inscribed in the
+# hole's circle: 99.84 % of the area is open.
 _N = 64
 _ANGLE = 2 * np.pi * np.arange(_N) / _N
 _CIRCLE = np.stack([np.cos(_ANGLE), np.sin(_ANGLE)], axis=1)
@@ -30,43 +30,43 @@ _SQUARE = _CIRCLE / np.abs(_CIRCLE).max(axis=1, keepdims=True)  # half-width 1, 
 
 _FACES = [[0, 3, 2, 1], [4, 5, 6, 7], [0, 1, 5, 4], [1, 2, 6, 5], [2, 3, 7, 6], [3, 0, 4, 7]]
 BOX_FACES = freeze(np.array(_FACES, np.int32))
-"""A box's quads (6, 4), where corners 0 to 3 go around one end, and 4 to 7 around the other."""
+"""Quads (6, 4) of a box whose corners 0 to 3 go around one end, and 4 to 7 around the other."""
 
 
 @dataclass(frozen=True, eq=False)
 class ModulePart:
-    """The collimator, with its aperture plate, or the crystal of the module with that number."""
+    """Solid part of a module: its collimator with the aperture plate, or its crystal."""
 
-    number: int
+    number: int  # number of the module
     kind: PartKind
-    name: str  # such as "Module 07 collimator"; names sort like the modules' numbers
-    solid: Solid  # in the module's camera space
+    name: str  # name such as "Module 07 collimator", which sorts like the module's number
+    solid: Solid  # surface in the module's camera space, mm
     pose: Floats  # (4, 4), world from camera space, mm
 
     @property
     def vertices(self) -> Floats:
-        """(V, 3), world mm."""
+        """Vertices (V, 3) of the surface, world mm."""
         return moved(self.pose, self.solid[0])
 
     @property
     def triangles(self) -> NDArray[np.int32]:
-        """(F, 3), counter-clockwise seen from outside."""
+        """Triangles (F, 3) of the surface as indices of vertices, counter-clockwise seen from outside."""
         return self.solid[1][:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3)
 
 
 def collimator_solid(collimator: Collimator) -> Solid:
-    """The collimator's surface: one closed surface of genus 1.
+    """Return the surface of a collimator, one closed surface of genus 1.
 
-    Its rings of points run along the hole from the plate's front to its back, along the channel to the crystal, and along
-    the outside back to the front; quads join each ring to the next and the last to the first.
+    Rings of points run along the hole from the plate's front to its back, along the channel to the crystal, and along the
+    outside back to the front; quads join each ring to the next and the last to the first.
     """
-    built, l = collimator.construction, collimator.length
+    construction, l = collimator.construction, collimator.length
     rings = (
         *((_CIRCLE, radius, depth) for depth, radius in collimator.hole_profile),
-        (_SQUARE, collimator.channel_half_width, built.back),
+        (_SQUARE, collimator.channel_half_width, construction.back),
         (_SQUARE, collimator.detector_side / 2, l),
-        (_SQUARE, collimator.detector_side / 2 + built.wall_thickness, l),
-        (_SQUARE, collimator.front_half_width, built.front),
+        (_SQUARE, collimator.detector_side / 2 + construction.wall_thickness, l),
+        (_SQUARE, collimator.front_half_width, construction.front),
     )
     vertices = np.empty((len(rings), _N, 3))
     for ring, (points, size, depth) in zip(vertices, rings, strict=True):
@@ -76,7 +76,7 @@ def collimator_solid(collimator: Collimator) -> Solid:
 
 @lru_cache
 def _ring_faces(n: int) -> NDArray[np.int32]:
-    """Quads that join each of `n` rings of `_N` points to the next and the last to the first."""
+    """Return the quads that join each of `n` rings of `_N` points to the next and the last to the first."""
     ring, point = np.divmod(np.arange(n * _N), _N)
     following_ring, following_point = (ring + 1) % n, (point + 1) % _N
     corners = (ring, point), (following_ring, point), (following_ring, following_point), (ring, following_point)
@@ -84,15 +84,15 @@ def _ring_faces(n: int) -> NDArray[np.int32]:
 
 
 def crystal_solid(collimator_length: float, detector_side: float, detector_thickness: float) -> Solid:
-    """The crystal: a box of side Ld, from depth l to l + Td."""
-    h = detector_side / 2
+    """Return the surface of a crystal, a box of side Ld from depth l to l + Td; arguments in mm."""
+    half = detector_side / 2
+    corners = (-half, -half), (half, -half), (half, half), (-half, half)
     front, back = collimator_length, collimator_length + detector_thickness
-    vertices = np.array([[x, y, z] for z in (front, back) for x, y in ((-h, -h), (h, -h), (h, h), (-h, h))])
-    return vertices, BOX_FACES
+    return np.array([[x, y, z] for z in (front, back) for x, y in corners]), BOX_FACES
 
 
 def surface_fault(solid: Solid) -> str | None:
-    """What is wrong with a surface: it is not closed and consistently oriented, or it is inside out. None if nothing is."""
+    """Return what is wrong with a surface, for messages; None if it is closed, consistently oriented and not inside out."""
     vertices, faces = solid
     starts, ends = faces.ravel().astype(np.int64), np.roll(faces, -1, axis=1).ravel().astype(np.int64)
     n = len(vertices)
@@ -105,7 +105,7 @@ def surface_fault(solid: Solid) -> str | None:
 
 
 def check_watertight(solid: Solid) -> None:
-    """Raise `InputError` if the surface has a `surface_fault`."""
+    """Raise `InputError` unless a collimator's surface is closed, consistently oriented and not inside out."""
     fault = surface_fault(solid)
     if fault:
         raise InputError(f"collimator mesh: it {fault}")

@@ -1,4 +1,4 @@
-"""Views from infinity: parallel rays, as in a parallel-beam tomograph."""
+"""Views with parallel rays, whose sources are at infinity, as in a parallel-beam tomograph."""
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -16,35 +16,35 @@ def parallel_views(
     elevation: ArrayLike = 0.0,
     center: ArrayLike = (0.0, 0.0, 0.0),
 ) -> Views:
-    """Views whose sources are at infinity, around the z axis.
+    """Return parallel views from sources at infinity around the z axis.
 
-    They are what `PinholeSystem.views` shows of modules ever farther away: the source of angle phi and elevation theta lies
-    in the direction ``(cos theta cos phi, cos theta sin phi, sin theta)``, the rays run the other way, and images have u
-    and v of `module_frames`. At elevation 0 columns go along ``u = (sin phi, -cos phi, 0)`` and rows along +z.
+    They are the limit of `PinholeSystem.views` for modules that are ever farther away: the source of angle phi and elevation
+    theta lies in the direction ``(cos theta cos phi, cos theta sin phi, sin theta)``, the rays run the other way, and images
+    have the u and v of `module_frames`. At elevation 0, columns go along ``u = (sin phi, -cos phi, 0)`` and rows along +z.
 
     Parameters
     ----------
     angles : array (M,)
-        Of the sources around z, from x towards y, rad.
+        Azimuths phi of the sources around z, from x towards y, rad.
     shape
-        Pixels (n_v, n_u).
+        Numbers of pixels (n_v, n_u) of each image.
     pitch
-        Of the pixels, mm: one number, or (pitch_u, pitch_v).
+        Pitch of the pixels, mm: one number, or (pitch_u, pitch_v).
     elevation : number or array (M,)
-        Of the sources over the plane z = 0, rad, from -pi/2 to pi/2.
+        Elevations theta of the sources over the plane z = 0, rad, from -pi/2 to pi/2.
     center
-        World point (3,), mm, that all images have in their middle.
+        World point (3,), mm, in the middle of all images.
 
     Returns
     -------
     Views
-        Parallel ones. Their detectors and, in place of the sources, the points from which `Views.rays` begins, are 1 m and
-        four diagonals of the image from `center`; a projector's rays are whole lines.
+        Parallel views. Their detectors, and the points from which `Views.rays` begins in place of the sources, are 1 m plus
+        four image diagonals from `center`. A projector's rays are whole lines.
 
     Raises
     ------
     InputError
-        No angles, or an argument of another shape or out of its range.
+        If there are no angles, or an argument has another shape or is out of its range.
 
     Examples
     --------
@@ -60,8 +60,8 @@ def parallel_views(
     if np.abs(elevation).max() > np.pi / 2 + 1e-12:
         raise InputError(f"elevation: expected from -pi/2 to pi/2 rad, got {elevation[np.abs(elevation).argmax()]:g}")
     center = real_array(center, "center", (3,))
-    across = np.cos(elevation)
-    towards = np.stack([across * np.cos(angles), across * np.sin(angles), np.sin(elevation)], axis=1)
-    u, v, k = module_frames(towards).transpose(1, 0, 2)
-    reach = 1000.0 + 4.0 * float(np.hypot(shape[0] * pitch_v, shape[1] * pitch_u))
-    return Views(center - reach * k, center + reach * k, pitch_u * u, pitch_v * v, shape, parallel=True)
+    cosine = np.cos(elevation)
+    directions = np.stack([cosine * np.cos(angles), cosine * np.sin(angles), np.sin(elevation)], axis=1)
+    u, v, k = module_frames(directions).transpose(1, 0, 2)
+    distance = 1000.0 + 4.0 * float(np.hypot(shape[0] * pitch_v, shape[1] * pitch_u))
+    return Views(center - distance * k, center + distance * k, pitch_u * u, pitch_v * v, shape, parallel=True)

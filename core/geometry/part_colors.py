@@ -1,4 +1,4 @@
-"""How the parts of modules look, in Blender and in exported solids."""
+"""Colours and surfaces of the parts of modules, in Blender and in exported solids."""
 
 from typing import Literal, NamedTuple
 
@@ -6,16 +6,16 @@ PartKind = Literal["collimator", "crystal", "source", "panel"]
 
 
 class Look(NamedTuple):
-    """How a part is shown: linear RGBA colour, metallic and roughness from 0 to 1."""
+    """Surface of a part as it is rendered."""
 
-    color: tuple[float, float, float, float]
-    metallic: float
-    roughness: float
+    color: tuple[float, float, float, float]  # linear RGBA, 0 to 1
+    metallic: float  # 0 to 1
+    roughness: float  # 0 to 1
 
 
 LOOKS: dict[PartKind, Look] = {
     "collimator": Look((0.36, 0.39, 0.43, 1.0), metallic=0.85, roughness=0.42),  # tungsten: grey metal
     "crystal": Look((0.05, 0.22, 0.85, 0.85), metallic=0.0, roughness=0.12),  # scintillator: clear blue
-    "source": Look((0.85, 0.45, 0.05, 1.0), metallic=0.3, roughness=0.4),  # the tube of an X-ray source
-    "panel": Look((0.08, 0.45, 0.30, 0.6), metallic=0.0, roughness=0.3),  # thin, so that one sees through it: green
+    "source": Look((0.85, 0.45, 0.05, 1.0), metallic=0.3, roughness=0.4),  # the tube of an X-ray source: orange
+    "panel": Look((0.08, 0.45, 0.30, 0.6), metallic=0.0, roughness=0.3),  # an X-ray detector, translucent: green
 }

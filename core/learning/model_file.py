@@ -1,7 +1,7 @@
-"""Model files (.pt): a network's weights, and what it was trained on, for and how well; reading one runs none of it.
+"""Model files (.pt): a network's weights with its recipe, scanner and training data; reading one runs no code of it.
 
-The file is one of `torch.save`, so a zip, whose comment holds the SHA-256 of all bytes before the digest. Only tensors,
-texts and numbers in it are read.
+The file is written by `torch.save`, so it is a zip, whose comment holds the SHA-256 of all bytes before the digest. Only
+tensors, texts and numbers are read from it.
 """
 
 import hashlib
@@ -32,54 +32,54 @@ from ..validation import one_of
 from ..volumes.volume import Volume
 from .judging.methods import JudgedMethod
 from .networks import NETWORKS
-from .recipe import TrainingRecipe, parsed
-from .setup import Setup
+from .recipe import TrainingRecipe, parse_recipe
+from .setup import ScannerSetup
 
 _FORMAT, _VERSION = "mphDRR network", 1
 _SEAL = b"mphDRR sha256 "
-_DIGEST = 64  # characters
-_END = b"PK\x05\x06"  # of a zip's last record, which without a comment has 22 bytes
+_DIGEST = 64  # length of the digest, characters
+_END = b"PK\x05\x06"  # start of a zip's last record, which has 22 bytes without a comment
 ALLOWED = ("scanner", "grid", "physics")
-"""What may be allowed to differ from what a network was trained for."""
+"""Conditions of training that a user may allow to differ."""
 _NO_PHYSICS = ("time", "background")
-"""Entries of a model's record that may differ: a network is given counts and background of each scan."""
-_LATER = {
+"""Entries of a model's record that may differ, since a network gets counts and background of each scan."""
+_DEFAULTS = {
     "start": 0.0, "efficiency": 1.0, "energy_fwhm": None, "lines": "together", "plate_thickness": None,
     "wall_thickness": None,
 }  # fmt: skip
-"""Entries that records of earlier versions lack, and what they stand for."""
-_KEPT = 4
-_SETUPS: dict[Any, Setup] = {}
-"""Setups that all networks share, the last used last, and how many are kept."""
-_FAR = 2.0  # times fewer or more counts than any that it was trained on
+"""Values of entries that records of earlier versions lack."""
+_MAX_SETUPS = 4
+_SETUPS: dict[Any, ScannerSetup] = {}
+"""Cache of setups for all networks, the last used one last, of at most `_MAX_SETUPS`."""
+_COUNTS_FACTOR = 2.0  # factor beyond the counts of the training data from which on a warning is given
 
 
 @dataclass(frozen=True, eq=False)
-class Contents:
-    """What a model file holds: the weights, and texts and numbers about them."""
+class ModelContents:
+    """Contents of a model file: the weights, and texts and numbers about them."""
 
     weights: Mapping[str, torch.Tensor]
-    recipe: str  # TOML
-    scanner: str  # `Setup.scanner`
-    shape: Sequence[int]  # of the grid
-    affine: Sequence[Sequence[float]]
-    physics: str  # `Setup.physics`
-    fixed: Mapping[str, Any]  # the network's arguments that followed from the setup
-    counts: Sequence[float]  # fewest and most of a scan that it was trained on
+    recipe: str  # recipe of the training, TOML
+    scanner: str  # `ScannerSetup.scanner`
+    shape: Sequence[int]  # shape of the grid
+    affine: Sequence[Sequence[float]]  # affine matrix of the grid, world mm from index
+    physics: str  # `ScannerSetup.physics`
+    fixed: Mapping[str, Any]  # the network's keyword-only arguments, by `Network.fixed`
+    counts: Sequence[float]  # fewest and most counts of a scan of the training data
     trained_on: Mapping[str, Any]
-    """Events by their recipes' hashes; name of the set, hash, model, levels, number of samples."""
-    curve: Sequence[Mapping[str, float]]
-    judgement: Mapping[str, Any] | None = None
+    """Training data: events by their recipes' hashes; name of the set, hash, model, levels, number of samples."""
+    curve: Sequence[Mapping[str, float]]  # learning curve
+    judgement: Mapping[str, Any] | None = None  # the judge's record, if the network was judged
     versions: Mapping[str, str] = field(default_factory=versions)
 
     @cached_property
     def grid(self) -> Grid:
-        """The voxels of its volumes."""
+        """Voxels of the network's volumes."""
         n_x, n_y, n_z = self.shape
         return Grid((n_x, n_y, n_z), np.array(self.affine))
 
-    def differing(self, setup: Setup) -> list[str]:
-        """Which of `ALLOWED` are others than those that it was trained for."""
+    def differing(self, setup: ScannerSetup) -> list[str]:
+        """Return the names in `ALLOWED` of the conditions in which a setup differs from the training."""
         is_same = {
             "scanner": setup.scanner == self.scanner,
             "grid": same_grid(setup.A.grid, self.grid),
@@ -89,30 +89,31 @@ class Contents:
 
 
 def _physics(text: str) -> dict[str, Any]:
-    known = _LATER | json.loads(text)
-    times = known["time"] if isinstance(known.get("time"), list) else []  # one stands for all: then it is a scale
-    return {name: value for name, value in known.items() if name not in _NO_PHYSICS} | {"times": times}
+    """Return a model's record, as JSON text, without the entries that may differ, and with defaults for missing ones."""
+    record = _DEFAULTS | json.loads(text)
+    times = record["time"] if isinstance(record.get("time"), list) else []  # a single time is a mere scale
+    return {name: value for name, value in record.items() if name not in _NO_PHYSICS} | {"times": times}
 
 
-def write_model(contents: Contents, path: AnyPath) -> None:
-    """Write a model file, sealed; `InputError` for another ending than .pt, or where it cannot be written."""
+def write_model(contents: ModelContents, path: AnyPath) -> None:
+    """Write a model file with its seal; raise `InputError` for another ending than .pt, or if it cannot be written."""
     require_ending(path, (".pt",))
     memory = io.BytesIO()
-    about = {name: value for name, value in vars(contents).items() if name in Contents.__annotations__}
+    about = {name: value for name, value in vars(contents).items() if name in ModelContents.__annotations__}
     weights = {name: values.detach().cpu().contiguous() for name, values in about.pop("weights").items()}
     torch.save({"format": _FORMAT, "version": _VERSION, "weights": weights, "about": json.dumps(about)}, memory)
-    write_bytes(path, sealed(memory.getvalue()))
+    write_bytes(path, seal(memory.getvalue()))
 
 
-def sealed(data: bytes) -> bytes:
-    """A zip without a comment, with one that seals it."""
+def seal(data: bytes) -> bytes:
+    """Return the bytes of a zip without a comment with the seal as its comment."""
     assert data[-22:-18] == _END and data[-2:] == bytes(2)
     data = data[:-2] + (len(_SEAL) + _DIGEST).to_bytes(2, "little") + _SEAL
     return data + hashlib.sha256(data).hexdigest().encode()
 
 
-def _read(path: Path) -> tuple[Contents, str]:
-    """What a file holds, and its digest; `InputError` where it is damaged or holds anything but data."""
+def _read_sealed(path: Path) -> tuple[ModelContents, str]:
+    """Read a file's contents and digest; raise `InputError` if it is damaged or holds anything but data."""
     data = read_bytes(path)
     body, digest = data[:-_DIGEST], data[-_DIGEST:].decode("latin-1")
     with naming(path):
@@ -121,18 +122,18 @@ def _read(path: Path) -> tuple[Contents, str]:
         if hashlib.sha256(body).hexdigest() != digest:
             raise InputError("damaged: its bytes are not those that were written")
         with reading(path, "a model: it holds more than numbers and texts, nothing of which was run"):
-            found = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
-        if not isinstance(found, dict) or found.get("format") != _FORMAT:
+            saved = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
+        if not isinstance(saved, dict) or saved.get("format") != _FORMAT:
             raise InputError("no model file of mphDRR")
-        if found["version"] != _VERSION:
-            raise InputError(f"format {found['version']}; this mphDRR reads {_VERSION}, a newer one may read it")
+        if saved["version"] != _VERSION:
+            raise InputError(f"format {saved['version']}; this mphDRR reads {_VERSION}, a newer one may read it")
         with reading(path, "a model file"):
-            return Contents(found["weights"], **json.loads(found["about"])), digest
+            return ModelContents(saved["weights"], **json.loads(saved["about"])), digest
 
 
 @dataclass(frozen=True, eq=False)
 class TrainedNetwork:
-    """A network of a model file: ``model(run)`` reconstructs a run.
+    """A network from a model file: ``model(run)`` reconstructs a run.
 
     >>> model = mph.learning.read_model("model.pt")
     >>> volume = model(mph.read_run("run.h5"))
@@ -140,85 +141,89 @@ class TrainedNetwork:
 
     path: Path
     sha256: str
-    contents: Contents
+    contents: ModelContents
 
     def __call__(self, run: ProjectionRun, allow: Sequence[str] = ()) -> Volume:
-        """The volume of a run by the same scanner and physics, on the network's grid.
+        """Reconstruct a run by the same scanner and physics, on the network's grid.
 
         Parameters
         ----------
         run
-            Simulated or measured, of counts.
+            Simulated or measured counts.
         allow
-            Which of "scanner", "grid" and "physics" may be others than those that it was trained for.
+            Names among "scanner", "grid" and "physics" of conditions that may differ from the training's.
 
         Warns
         -----
         InputWarning
-            What is allowed differs, or the run has far fewer or more counts than what it was trained on.
+            An allowed condition differs, or the run has far fewer or more counts than the training data.
         """
-        told = {"reconstruction.method": str(self.path), "reconstruction.allow": tuple(allow) or None}
-        return reconstruct_run(run, run.recipe.updated(told), method=self.method).volume
+        settings = {"reconstruction.method": str(self.path), "reconstruction.allow": tuple(allow) or None}
+        return reconstruct_run(run, run.recipe.updated(settings), method=self.method).volume
 
     @cached_property
     def recipe(self) -> TrainingRecipe:
-        """How it was trained."""
-        return parsed(self.contents.recipe, f"{self.path}: its recipe")
+        """Recipe of the training."""
+        return parse_recipe(self.contents.recipe, f"{self.path}: its recipe")
 
     @cached_property
     def network(self) -> torch.nn.Module:
-        """The network itself."""
-        model = NETWORKS[self.recipe["network.kind"]].load()
+        """The network itself, with its weights, in evaluation mode."""
+        network_class = NETWORKS[self.recipe["network.kind"]].load()
         with reading(self.path, "weights of this version's network"):
-            network: torch.nn.Module = model(**self.recipe.network, **self.contents.fixed)
+            network: torch.nn.Module = network_class(**self.recipe.network, **self.contents.fixed)
             network.load_state_dict(dict(self.contents.weights))
         return network.eval()
 
     @property
     def label(self) -> str:
-        """What it is called: that it is a network, which, and its file."""
+        """Name in messages and records, with the kind of network and its file."""
         return f"Network {self.path.name} ({NETWORKS[self.recipe['network.kind']].label})"
 
     @property
     def method(self) -> Method:
-        """It as a method of `reconstruct_run`."""
+        """The network as a method of `reconstruct_run`."""
         text = NETWORKS[self.recipe["network.kind"]].text
         return Method(self.label, text, self.reconstruct, objective="", grid=self.contents.grid)
 
     @cached_property
     def fingerprint(self) -> str:
-        """SHA-256 of all that its volumes depend on: another one than that of its file once that holds a judge's table."""
-        told = hashlib.sha256(repr((self.contents.recipe, self.contents.scanner, self.contents.physics)).encode())
+        """SHA-256 of all that its volumes depend on; unlike the file's, it does not change with a judge's table."""
+        digest = hashlib.sha256(repr((self.contents.recipe, self.contents.scanner, self.contents.physics)).encode())
         for name, values in sorted(self.contents.weights.items()):
-            told.update(name.encode() + values.numpy().tobytes())
-        return told.hexdigest()
+            digest.update(name.encode() + values.numpy().tobytes())
+        return digest.hexdigest()
 
     def judged(self, name: str) -> JudgedMethod:
-        """It under a name in the judge's table; scanners and physics that it was not trained for are judged, too."""
+        """Return the network as a method for the judge, under a name in its table.
+
+        It is also judged on scanners and physics that it was not trained for.
+        """
 
         def volume(run: ProjectionRun) -> Volume:
-            with recorded_warnings():  # the judge knows what differs
+            """Reconstruct a run without warnings, since the judge knows what differs."""
+            with recorded_warnings():
                 return self(run, ("scanner", "physics"))
 
         return JudgedMethod(
-            name, volume, self.fingerprint, self.contents.trained_on["events"], lambda: self._used[-1].saved
+            name, volume, self.fingerprint, self.contents.trained_on["events"], lambda: self._last_setup[-1].saved
         )
 
-    def setup(self, A: Projector) -> Setup:
-        """What it is told of a scanner, kept for the next scans by it, and for other networks."""
-        own = tuple(self.recipe[key] for key in ("osem.subsets", "osem.after", "network.permuted"))
-        made = Setup(A, *own)
-        if getattr(A.model, "mu", None) is not None:  # of which the record has the grid alone
-            return made
-        key = made.scanner, made.physics, A.grid.shape, A.grid.affine.tobytes(), own
-        _SETUPS[key] = _SETUPS.pop(key, made)
-        if len(_SETUPS) > _KEPT:
+    def setup(self, A: Projector) -> ScannerSetup:
+        """Return the setup of a projector, cached for later scans by the same scanner and for other networks."""
+        settings = tuple(self.recipe[key] for key in ("osem.subsets", "osem.after", "network.permuted"))
+        setup = ScannerSetup(A, *settings)
+        if getattr(A.model, "mu", None) is not None:  # its record does not identify mu, so it cannot be cached
+            return setup
+        key = setup.scanner, setup.physics, A.grid.shape, A.grid.affine.tobytes(), settings
+        _SETUPS[key] = _SETUPS.pop(key, setup)
+        if len(_SETUPS) > _MAX_SETUPS:
             del _SETUPS[next(iter(_SETUPS))]
         return _SETUPS[key]
 
     @cached_property
-    def _used(self) -> list[Setup]:
-        """The setup of the last scan, in a list of one."""
+    def _last_setup(self) -> list[ScannerSetup]:
+        """Setup of the last scan, in a list of one."""
         return []
 
     def reconstruct(
@@ -229,64 +234,64 @@ class TrainedNetwork:
         background: ArrayLike = 0.0,
         progress: Progress | None = None,
     ) -> Reconstruction:
-        """The volume that counts are of.
+        """Reconstruct a volume from counts.
 
         Parameters
         ----------
         A : Projector
-            Of emission, on the grid that it was trained for.
+            A projector of emission, on the network's grid.
         images
             Counts (M, n_v, n_u).
         allow
-            As for a call.
+            Names in `ALLOWED` of conditions that may differ from the training's.
         background
-            Counts expected besides those of the volume and of the projector's model.
+            Expected counts besides those of the volume and of the projector's model.
         progress
             Called before and after.
         """
         data, setup = CountData.of(self.label, A, images, background), self.setup(A)
-        self._used[:] = [setup]
-        doubts = [*self._allowed(setup, allow), *self._far(float(data.counts.sum()))]
+        self._last_setup[:] = [setup]
+        doubts = [*self._allowed_differences(setup, allow), *self._count_differences(float(data.counts.sum()))]
         for text in doubts:
             warn(text, 2)
         tell(progress, 0, 1)
         sample = setup.sample(data.counts, np.array(data.background), np.zeros(A.shape_in, np.float32))
         with torch.no_grad():
-            found = self.network(setup, sample)[-1][0, 0] * sample.scale[0]
+            volume = self.network(setup, sample)[-1][0, 0] * sample.scale[0]
         tell(progress, 1, 1)
-        known = {
+        record = {
             "method": self.label, "network": self.recipe["network.kind"], "file": str(self.path), "sha256": self.sha256,
             "allow": list(allow), "flatters": doubts, "stopped": "iterations",
         }  # fmt: skip
         note = ". ".join([f"Reconstructed by a {self.label[0].lower()}{self.label[1:]}, sha256 {self.sha256}", *doubts])
-        return Reconstruction(Volume(found.float().numpy(), A.grid, note=note), np.zeros(0), known)
+        return Reconstruction(Volume(volume.float().numpy(), A.grid, note=note), np.zeros(0), record)
 
-    def _allowed(self, setup: Setup, allow: Sequence[str]) -> list[str]:
-        """Words on what differs and is allowed; `InputError` where it is not."""
+    def _allowed_differences(self, setup: ScannerSetup, allow: Sequence[str]) -> list[str]:
+        """Return warnings about differences that are allowed; raise `InputError` for those that are not."""
         for name in allow:
             one_of(name, ALLOWED, "allow")
         differing = self.contents.differing(setup)
         refused = [name for name in differing if name not in allow]
         if refused:
-            words = " and ".join(refused)
-            raise InputError(f"{self.path}: trained for another {words}; --allow {' '.join(refused)} takes it anyway")
+            names = " and ".join(refused)
+            raise InputError(f"{self.path}: trained for another {names}; --allow {' '.join(refused)} takes it anyway")
         return [f"{self.path.name} was trained for another {name}, which was allowed" for name in differing]
 
-    def _far(self, counts: float) -> list[str]:
-        """Words on a scan of far fewer or more counts than the network has learned from."""
-        fewest, most = self.contents.counts
-        if fewest / _FAR <= counts <= most * _FAR:
+    def _count_differences(self, counts: float) -> list[str]:
+        """Return a list with a warning if a scan has far fewer or more counts than the training data, else an empty one."""
+        smallest, largest = self.contents.counts
+        if smallest / _COUNTS_FACTOR <= counts <= largest * _COUNTS_FACTOR:
             return []
-        return [f"{self.path.name} was trained on {fewest:.3g} to {most:.3g} counts, this scan has {counts:.3g}"]
+        return [f"{self.path.name} was trained on {smallest:.3g} to {largest:.3g} counts, this scan has {counts:.3g}"]
 
 
 def read_model(path: AnyPath) -> TrainedNetwork:
-    """The network of a model file; `InputError`, in one line, where the file is damaged or holds anything but data."""
-    contents, digest = _read(Path(path))
+    """Read the network of a model file; raise `InputError` if it is damaged or holds anything but data."""
+    contents, digest = _read_sealed(Path(path))
     return TrainedNetwork(Path(path), digest, contents)
 
 
 def with_judgement(path: AnyPath, judgement: Mapping[str, Any]) -> TrainedNetwork:
-    """Write its judge's table, anything JSON can hold, into a model file."""
+    """Write the judge's record, any JSON values, into a model file, and return the network."""
     write_model(replace(read_model(path).contents, judgement=judgement), path)
     return read_model(path)

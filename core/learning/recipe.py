@@ -1,4 +1,4 @@
-"""Recipes of trainings: from which events which network learns, and how, in TOML."""
+"""Training recipes: event set, network and training settings, in TOML."""
 
 import functools
 import hashlib
@@ -20,64 +20,65 @@ from ..validation import one_of
 from .networks import NETWORKS
 
 VERSION = 1
-"""The version of the recipes' language."""
+"""Version of the recipes' language."""
 _KIND = "after-osem"
 _TEMPLATE = Path(__file__).parent / "templates" / "training.toml"
 _ROWS = by_key((
-    Setting("data.events", str, None, "Folder of the event set that is learned from", is_path=True),
-    Setting("data.model", str, None, "Whose images, by the model's name in the set's recipe", "the only one of counts"),
-    Setting("data.train", str, "train", "The split whose events are learned from"),
-    Setting("data.validation", str, "validation", "The split whose events tell how well it is learned"),
+    Setting("data.events", str, None, "Folder of the event set to learn from", is_path=True),
+    Setting("data.model", str, None, "Model of the set's recipe whose images are used", "the only one of counts"),
+    Setting("data.train", str, "train", "Split of the set whose events are used for training"),
+    Setting("data.validation", str, "validation", "Split of the set whose events are used for validation"),
     Setting("data.levels", float, None, "Shares of the acquisition time, in turn", "those of the set's recipe", above=0,
             sizes=()),
-    Setting("data.draws", int, 1, "How often noise is drawn for each event", least=1),
+    Setting("data.draws", int, 1, "Number of noise draws per event", least=1),
     like("grid.voxels", "reconstruction.voxels", default=(64,), absent=""),
     like("grid.spacing", "reconstruction.spacing", absent=""),
     like("grid.center", "reconstruction.center"),
-    Setting("osem.subsets", int, 10, "Of the modules", least=1),
-    Setting("osem.after", int, (2, 8, 16), "Iterations of OSEM after which the network is given its volume", least=1,
+    Setting("osem.subsets", int, 10, "Number of OSEM subsets", least=1),
+    Setting("osem.after", int, (2, 8, 16), "Iterations of OSEM whose volumes the network gets", least=1,
             sizes=()),
     Setting("network.kind", str, _KIND, "The network's name in `NETWORKS`"),
     Setting("network.permuted", int, None, "Permute the poses among the modules with this seed, to see what they are "
             "worth", least=0),
-    Setting("network.weights_from", str, None, "Model file (.pt) whose weights of equal name and shape it begins with",
+    Setting("network.weights_from", str, None, "Model file (.pt) whose weights of equal name and shape are loaded first",
             "random weights", is_path=True),
-    Setting("training.steps", int, 3000, "How many steps", least=1),
-    Setting("training.batch", int, 1, "Scans in each step, of all devices together", least=1),
-    Setting("training.rate", float, 1.5e-3, "Learning rate, at its largest", above=0, most=1),
+    Setting("training.steps", int, 3000, "Number of steps", least=1),
+    Setting("training.batch", int, 1, "Scans in each step, on all devices together", least=1),
+    Setting("training.rate", float, 1.5e-3, "Largest learning rate", above=0, most=1),
     Setting("training.seed", int, 0, "Seed of weights, order and noise", least=0, most=2**31 - 1),
-    Setting("training.precision", str, None, "Numbers that the network computes in", "bf16-mixed where the processor "
-            "multiplies matrices of it, else 32", words=named(("32", "bf16-mixed", "16-mixed"))),
+    Setting("training.precision", str, None, "Precision of the network's computing", "bf16-mixed where the processor "
+            "multiplies such matrices, else 32", words=named(("32", "bf16-mixed", "16-mixed"))),
     Setting("training.threads", int, None, "Processor threads", "all", least=1),
-    Setting("training.accelerator", str, "auto", "What it computes on", words=named(("auto", "cpu", "gpu"))),
-    Setting("training.devices", int, 1, "GPUs, or processes of a CPU, on each node", least=1),
+    Setting("training.accelerator", str, "auto", "Device that computes", words=named(("auto", "cpu", "gpu"))),
+    Setting("training.devices", int, 1, "GPUs, or CPU processes, on each node", least=1),
     Setting("training.nodes", int, 1, "Machines", least=1),
-    Setting("training.strategy", str, "auto", "How devices share the work, by Lightning's name for it, such as ddp"),
+    Setting("training.strategy", str, "auto", "Lightning's name of how devices share the work, such as ddp"),
 ))  # fmt: skip
 TABLES = tuple(dict.fromkeys(key.partition(".")[0] for key in _ROWS))
 
 
 @functools.cache
 def network_settings(kind: str) -> Mapping[str, Setting]:
-    """A network's own settings: the arguments of its class, but those that follow from a setup, which only have names.
+    """Return the settings of a network by key: the positional arguments of its class.
 
-    `InputError` where torch or MONAI is missing.
+    Keyword-only arguments are no settings: `Network.fixed` derives them from the scanner's setup. Raises `InputError` if
+    torch or MONAI is missing.
     """
-    network, found, text = NETWORKS[kind].load(), [], f"Of {NETWORKS[kind].label}"
+    network, settings, text = NETWORKS[kind].load(), [], f"Setting of the network {NETWORKS[kind].label}"
     for name, argument in inspect.signature(network).parameters.items():
         if argument.kind is argument.KEYWORD_ONLY:
             continue
-        one, sizes = (argument.default[0], ()) if isinstance(argument.default, tuple) else (argument.default, None)
-        least = int(name not in network.may_be_0) if type(one) is int else None
-        found.append(Setting(f"network.{name}", type(one), argument.default, text, least=least, sizes=sizes))
-    return by_key(found)
+        example, sizes = (argument.default[0], ()) if isinstance(argument.default, tuple) else (argument.default, None)
+        least = int(name not in network.may_be_0) if type(example) is int else None
+        settings.append(Setting(f"network.{name}", type(example), argument.default, text, least=least, sizes=sizes))
+    return by_key(settings)
 
 
 @dataclass(frozen=True)
 class TrainingRecipe(Values):
-    """What a network is trained on, and how: values of settings by their keys, such as "training.batch".
+    """Recipe of a training: values of settings by their keys, such as "training.batch".
 
-    Made by `read_recipe`, or `parsed`; `InputError` names the entry that cannot be understood.
+    Create it with `read_recipe` or `parse_recipe`; `InputError` names the entry that cannot be understood.
     """
 
     text: str = ""
@@ -96,38 +97,38 @@ class TrainingRecipe(Values):
 
     @property
     def rows(self) -> Mapping[str, Setting]:
-        """The settings that there are, with those of the network."""
+        """All settings, those of the network included."""
         return {**_ROWS, **network_settings(self.given.get("network.kind", _KIND))}
 
     @property
     def processes(self) -> int:
-        """Devices of all nodes."""
+        """Number of devices of all nodes."""
         return int(self["training.devices"] * self["training.nodes"])
 
     @functools.cached_property
     def grid(self) -> Grid:
-        """The voxels of the network's volumes."""
+        """Voxels of the network's volumes."""
         return grid_of(self, "grid")
 
     @property
     def network(self) -> dict[str, Any]:
-        """The arguments of the network's class that are given."""
-        own = network_settings(self["network.kind"])
-        return {key.partition(".")[2]: value for key, value in self.given.items() if key in own}
+        """Explicitly set arguments of the network's class."""
+        settings = network_settings(self["network.kind"])
+        return {key.partition(".")[2]: value for key, value in self.given.items() if key in settings}
 
     def path(self, key: str) -> Path:
-        """A file or folder that the recipe names."""
+        """Return the path of a file or folder that the recipe names under `key`."""
         return Path(os.path.normpath(self.folder / self[key]))
 
     @functools.cached_property
     def fingerprint(self) -> str:
-        """SHA-256 of all that decides over the weights; comments and the number of threads do not count."""
-        told = {key: value for key, value in self.given.items() if key != "training.threads"}
-        return hashlib.sha256(repr(sorted(told.items())).encode()).hexdigest()
+        """SHA-256 of all settings that determine the weights, without comments and the number of threads."""
+        settings = {key: value for key, value in self.given.items() if key != "training.threads"}
+        return hashlib.sha256(repr(sorted(settings.items())).encode()).hexdigest()
 
 
-def parsed(text: str, name: str = "recipe", folder: Path | None = None) -> TrainingRecipe:
-    """The recipe in a text in TOML; messages call it `name`, and its paths are relative to `folder`."""
+def parse_recipe(text: str, name: str = "recipe", folder: Path | None = None) -> TrainingRecipe:
+    """Parse the recipe of a training in TOML; messages call it `name`, and its paths are relative to `folder`."""
     with naming(name):
         values = parse_toml(text, name)
         check_entries(values, VERSION, ("version", *TABLES))
@@ -136,12 +137,15 @@ def parsed(text: str, name: str = "recipe", folder: Path | None = None) -> Train
 
 
 def read_recipe(path: AnyPath) -> TrainingRecipe:
-    """The recipe of a training in a TOML file; paths in it are relative to its folder. `InputError` names the entry."""
-    return parsed(toml_text(path), str(path), Path(path).absolute().parent)
+    """Read the recipe of a training from a TOML file; its paths are relative to the file's folder.
+
+    Raises `InputError`, which names the entry that cannot be understood.
+    """
+    return parse_recipe(toml_text(path), str(path), Path(path).absolute().parent)
 
 
 def template_text(network: str = _KIND) -> str:
-    """A commented recipe (TOML) to begin with, of a network in `NETWORKS`; `InputError` for another name."""
+    """Return a commented recipe (TOML) for a network in `NETWORKS` as a start; raise `InputError` for another name."""
     one_of(network, NETWORKS, "network")
     text = _TEMPLATE.read_text(encoding="utf-8")
     return text.replace(f"\nkind = {toml_value(_KIND)}\n", f"\nkind = {toml_value(network)}\n", 1)

@@ -1,4 +1,4 @@
-"""Points and lines under homogeneous transforms, such as those of `Views.perspective_matrices`."""
+"""Points and lines under homogeneous 4 x 4 transforms, such as those of `Views.perspective_matrices`."""
 
 import numpy as np
 
@@ -7,7 +7,7 @@ from ..validation import real_array
 
 
 def transform_points(matrix: ArrayLike, points: ArrayLike) -> Floats:
-    """Points after a homogeneous transform: multiplied by its matrix, divided by the last number.
+    """Apply a homogeneous transform to points: multiply by its matrix, then divide by the fourth coordinate.
 
     Parameters
     ----------
@@ -17,27 +17,30 @@ def transform_points(matrix: ArrayLike, points: ArrayLike) -> Floats:
     Returns
     -------
     array (…, 3)
-        Infinite, or not a number, where a point is taken to infinity.
+        Infinite or NaN for a point that the transform takes to infinity.
     """
     matrix = real_array(matrix, "transform", (4, 4))
     points = real_array(points, "points", (3,), batch=True)
-    moved = points @ matrix[:, :3].T + matrix[:, 3]
+    homogeneous = points @ matrix[:, :3].T + matrix[:, 3]
     with np.errstate(divide="ignore", invalid="ignore"):
-        return np.asarray(moved[..., :3] / moved[..., 3:])
+        return np.asarray(homogeneous[..., :3] / homogeneous[..., 3:])
 
 
 def line_through(first: ArrayLike, second: ArrayLike) -> Floats:
-    """The lines through two points each, (…, 3), as Plücker matrices (…, 4, 4): ``a b^T - b a^T`` of homogeneous points."""
-    points = (real_array(each, "points of a line", (3,), batch=True) for each in (first, second))
-    a, b = (np.insert(each, 3, 1.0, axis=-1) for each in points)
+    """Return the lines through pairs of points (…, 3) as Plücker matrices (…, 4, 4).
+
+    The matrix is ``a b^T - b a^T`` of the homogeneous points a and b.
+    """
+    points = (real_array(point, "points of a line", (3,), batch=True) for point in (first, second))
+    a, b = (np.insert(point, 3, 1.0, axis=-1) for point in points)
     outer = a[..., :, None] * b[..., None, :]
     return outer - outer.swapaxes(-1, -2)
 
 
 def transform_lines(matrix: ArrayLike, lines: ArrayLike) -> Floats:
-    """Lines after a homogeneous transform `matrix` (4, 4), as Plücker matrices (…, 4, 4): ``H L H^T``.
+    """Apply a homogeneous transform H (4, 4) to lines given as Plücker matrices L (…, 4, 4): ``H L H^T``.
 
-    It is the line through what `transform_points` makes of the line's points, times a factor.
+    The result is, up to a factor, the line through the line's points after `transform_points`.
     """
     matrix = real_array(matrix, "transform", (4, 4))
     return np.asarray(matrix @ real_array(lines, "lines", (4, 4), batch=True) @ matrix.T)

@@ -1,4 +1,4 @@
-"""Each camera predicts the others: what one view's image and its opinion of depth say that other views should see."""
+"""Prediction of one view's image from another's, with a distribution of its pixel values over depth."""
 
 from typing import Any
 
@@ -13,33 +13,33 @@ from .perspective_grid import PerspectiveGrid, depths_in_views
 from .places import gather
 from .resampling import camera_to_camera
 
-_NEAREST = 1e-3  # of the farthest depth: closer to a source, nothing is predicted
+_NEAREST = 1e-3  # share of the farthest depth; closer to a source, nothing is predicted
 
 
 def spread_along_rays(image: ArrayOrTensor, distribution: ArrayOrTensor, g: PerspectiveGrid) -> ArrayOrTensor:
-    """One view's image, shared out among the cells along its rays: ``g.image`` of the result is `image` again.
+    """Share out one view's image among the cells along its rays, such that ``g.image`` of the result is `image` again.
 
     Parameters
     ----------
     image : array or tensor (…, n_v, n_u)
         Line integrals, value x mm.
     distribution : array or tensor (…, n_u, n_v, n_k)
-        Which share of a pixel's line integral comes from each cell along its ray: numbers of at least 0, which are divided
-        by their sum along the ray. Of a volume in the view's coordinates, `to_perspective`, it is the array times
+        Share of a pixel's line integral that comes from each cell along its ray: values of at least 0, which are divided
+        by their sum along the ray. For a volume in the view's coordinates, `to_perspective`, it is the array times
         ``g.ray_lengths()``.
     g : PerspectiveGrid
-        The view's.
+        The view's cells.
 
     Returns
     -------
     array or tensor (…, n_u, n_v, n_k)
-        Values that keep density, as ``to_perspective`` makes them: image times share by the ray's length in the cell. A
-        tensor's gradient follows, in both arguments.
+        Mean values of the cells, as ``to_perspective`` returns them: image times share, divided by the ray's length in the
+        cell. A tensor's gradient follows, in both arguments.
 
     Raises
     ------
     InputError
-        Shares below 0, or only 0 along a ray whose pixel is not 0.
+        There are shares below 0, or only zeros along a ray whose pixel is not 0.
     """
     instance(g, PerspectiveGrid, "spread_along_rays")
     image = checked(image, "image", g.shape[1::-1], False, batch=True)
@@ -59,29 +59,28 @@ def predict_views(
     planes: int | None = None,
     progress: Progress | None = None,
 ) -> tuple[ArrayOrTensor, ArrayOrTensor]:
-    """The images that views should see of what is given in the coordinates of one.
+    """Predict the images of other views from values in the coordinates of one view.
 
     Parameters
     ----------
     array : array or tensor (…, n_u, n_v, n_k)
-        Values that keep density, as `to_perspective` and `spread_along_rays` make them.
+        Mean values of cells, as `to_perspective` and `spread_along_rays` return them.
     g : PerspectiveGrid
-        The array's.
+        The cells of the array.
     views : Views
-        Whose images are predicted; `g`'s own may be among them.
+        Views whose images are predicted; the view of `g` may be among them.
     planes : int, optional
-        Planes of the perspective grids in which the views' images are summed; they reach over the depths of all of `g`.
-        None: as many as `g` has cells along its longest axis.
+        Number of planes of the perspective grids in which the views' images are summed; the grids extend over all depths of
+        `g`. None: as many as `g` has cells along its longest axis.
     progress
-        Called as ``progress(views done, views)``; what it raises stops the work.
+        Called as ``progress(views done, views)``; an exception raised there stops the work.
 
     Returns
     -------
     images : array or tensor (…, M, n_v, n_u)
         Line integrals, value x mm: means over the pixels' areas. A tensor's gradient follows.
     covered : array or tensor (M, n_v, n_u) of bool
-        The pixels whose rays meet the cells of `g`. Beyond these cells nothing is known: what a view sees outside of them is
-        missing in its prediction.
+        Pixels whose rays meet the cells of `g`. Values outside these cells are unknown, and are missing in the predictions.
 
     Raises
     ------
@@ -90,9 +89,9 @@ def predict_views(
 
     Notes
     -----
-    The values are interpolated between the cells' places, twice as densely at least as these are, but at no more than 8
-    points along each axis of a new cell. With pixels or planes that cover more than 4 cells, details between are missed.
-    Interpolation smooths the values by about a cell, and so the images.
+    The values are interpolated linearly between the cells' places at two or more points per cell, but at no more than
+    8 points along each axis of a new cell. With pixels or planes that cover more than 4 cells, details between the points
+    are missed. Interpolation smooths the values, and so the images, by about a cell.
     """
     instance(g, PerspectiveGrid, "predict_views")
     instance(views, Views, "predict_views")
@@ -107,10 +106,10 @@ def predict_views(
     for n, depths in enumerate(depths_in_views(views, corners)):
         near, far = float(depths.min()), float(depths.max())
         if views.parallel or far > 0:
-            h = PerspectiveGrid(views, n, n_k, near if views.parallel else max(near, _NEAREST * far), far, "depth")
-            images.append(h.image(camera_to_camera(array, g, h)))
-            covered.append(_meet(g, h))
-        else:  # all of it is behind the source
+            g_n = PerspectiveGrid(views, n, n_k, near if views.parallel else max(near, _NEAREST * far), far, "depth")
+            images.append(g_n.image(camera_to_camera(array, g, g_n)))
+            covered.append(_covered_pixels(g, g_n))
+        else:  # all cells are behind the source
             images.append(zeros((*array.shape[:-3], *views.shape), array))
             covered.append(np.zeros(views.shape, bool))
         tell(progress, n + 1, len(views))
@@ -122,14 +121,14 @@ def predict_views(
 
 
 def prediction_errors(images: ArrayOrTensor, predicted: ArrayOrTensor, covered: ArrayOrTensor) -> ArrayOrTensor:
-    """What views saw less what was predicted, where that says something, else 0.
+    """Return measured minus predicted images; 0 where the prediction does not cover a pixel.
 
     Parameters
     ----------
     images : array or tensor (…, M, n_v, n_u)
-        What the views saw: line integrals, value x mm.
+        Measured line integrals, value x mm.
     predicted, covered : arrays or tensors
-        What `predict_views` returned for the same views.
+        Results of `predict_views` for the same views.
 
     Returns
     -------
@@ -139,27 +138,28 @@ def prediction_errors(images: ArrayOrTensor, predicted: ArrayOrTensor, covered: 
     images, predicted = promote(images, predicted)
     shape = tuple(predicted.shape[-3:])
     if tuple(images.shape[-3:]) != shape or tuple(covered.shape) != shape:
-        shapes = ", ".join(shape_text(tuple(each.shape)) for each in (images, predicted, covered))
+        shapes = ", ".join(shape_text(tuple(array.shape)) for array in (images, predicted, covered))
         expected = "images, predictions and pixels covered of one shape"
         raise InputError(f"prediction errors: expected {expected}, got {shapes}")
     differences: Any = images - predicted
     return differences * cast_like(covered, differences)
 
 
-def _meet(g: PerspectiveGrid, h: PerspectiveGrid) -> Any:
-    """Which pixels (n_v, n_u) of `h` have cells whose places lie in `g`."""
-    nothing, seen = np.zeros(h.shape, np.float32), np.zeros(h.shape, np.int32)
-    zero, matrix = np.zeros((1, *g.shape), np.float32), g.index_matrix @ h.inverse
-    gather(nothing, h.planes_at(np.arange(h.n_k)), zero, matrix[None], seen=seen)
-    return seen.any(axis=2).T
+def _covered_pixels(source: PerspectiveGrid, target: PerspectiveGrid) -> Any:
+    """Return whether each pixel (n_v, n_u) of `target` has a cell whose place lies within `source`."""
+    points, n_covering = np.zeros(target.shape, np.float32), np.zeros(target.shape, np.int32)
+    array, matrix = np.zeros((1, *source.shape), np.float32), source.index_matrix @ target.inverse
+    gather(points, target.planes_at(np.arange(target.n_k)), array, matrix[None], seen=n_covering)
+    return n_covering.any(axis=2).T
 
 
 def _require_shares(image: ArrayOrTensor, distribution: ArrayOrTensor) -> None:
-    plain = distribution.detach() if is_tensor(distribution) else distribution
-    if plain.min() < 0:
-        raise InputError(f"depth distribution: expected shares of 0 or more, got {float(plain.min()):g}")
-    lost = (plain.sum(-1) == 0) & (image.swapaxes(-1, -2) != 0)
-    if lost.any():
-        index = np.argwhere(lost.cpu().numpy() if is_tensor(lost) else lost)[0]
+    """Raise `InputError` for shares (…, n_u, n_v, n_k) below 0, or all 0 along a ray whose pixel of `image` is not 0."""
+    shares = distribution.detach() if is_tensor(distribution) else distribution
+    if shares.min() < 0:
+        raise InputError(f"depth distribution: expected shares of 0 or more, got {float(shares.min()):g}")
+    lacking = (shares.sum(-1) == 0) & (image.swapaxes(-1, -2) != 0)
+    if lacking.any():
+        index = np.argwhere(lacking.cpu().numpy() if is_tensor(lacking) else lacking)[0]
         ray = f"the ray of column {index[-2]}, row {index[-1]}"
         raise InputError(f"depth distribution: it is 0 all along {ray}, whose pixel is not 0")

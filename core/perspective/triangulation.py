@@ -1,4 +1,4 @@
-"""The place of a marker from its images in several views, how well it is known, and whether the images fit together.
+"""Position of a marker from its pixels in several views, its covariance, and tests of whether the pixels fit together.
 
 References
 ----------
@@ -20,65 +20,65 @@ from .view_rays import Indices, rays_by_depth, view_indices
 
 _STEPS = 200
 _HALVINGS = 40
-# How far a step moves the images, as a share of the pixels' numbers: steps below the first change the sum of squares, which
-# has its least value there, by little more than rounding; those below the second are rounding.
+# Shift of the pixels by a step, as a share of the largest column or row. Near its minimum, a step below the first limit
+# changes the sum of squares by little more than rounding; a step below the second one is rounding.
 _NEAR, _ROUNDING = 1e-6, 1e-11
 _NO_PLACE = "triangulation: found no place in front of the sources; expected rays that meet there"
-# Rays that are less apart, rad, meet where rounding has them meet.
+# Rays at a smaller angle, rad, have an intersection that rounding decides.
 _LEAST_ANGLE = 1e-7
 
 
 @dataclass(frozen=True, eq=False)
 class MarkerFit:
-    """A marker's place by `fit_marker`, and how its images fit. Arrays of N are in the order of `modules`."""
+    """Position of a marker by `fit_marker`, and its agreement with the pixels. Arrays of N are in the order of `modules`."""
 
-    modules: Indexes  # (N,), the views' indices, from 0
-    point: Floats  # (3,), the most likely place, world mm
-    covariance: Floats  # (3, 3), mm^2, of the place: the inverse of the Fisher information
-    residuals: Floats  # (N, 2), the given pixels less those of the place: columns and rows
-    chi2: float  # the residuals' sum of squares in units of sigma
-    degrees: int  # of freedom of chi2: 2 N - 3
-    p_value: float  # the chance of at least this chi2 if sigma is right: if it is small, something does not fit
-    misfits: Floats  # (N,), by how much chi2 falls where a module is left out; NaN if there are only two
-    misfit_p_values: Floats  # (N,), the chance of at least this misfit if the image fits (chi2 of 2 degrees)
+    modules: Indexes  # (N,), indices of the views, from 0
+    point: Floats  # (3,), most likely position, world mm
+    covariance: Floats  # (3, 3), mm^2, covariance of the position: inverse of the Fisher information
+    residuals: Floats  # (N, 2), measured pixels minus those of the position: columns and rows
+    chi2: float  # sum of squared residuals in units of sigma
+    degrees: int  # degrees of freedom of chi2: 2 N - 3
+    p_value: float  # probability of at least this chi2 if sigma is right; a small one means that something does not fit
+    misfits: Floats  # (N,), decrease of chi2 if a module is left out; NaN if there are only two
+    misfit_p_values: Floats  # (N,), probability of at least this misfit if the pixel fits (chi2 with 2 degrees)
 
     @property
     def standard_deviations(self) -> Floats:
-        """The place's along x, y and z (3,), mm."""
+        """Standard deviations (3,), mm, of the position along x, y and z."""
         return np.sqrt(np.diag(self.covariance))
 
     @property
     def worst(self) -> int | None:
-        """Where in `modules` the image is that fits worst with the others; None for two modules, which say the same."""
+        """Index in `modules` of the pixel that fits worst with the others; None for two modules, whose misfits are equal."""
         return None if len(self.modules) < 3 else int(self.misfits.argmax())
 
 
 def triangulate(views: Views, modules: Indices, pixels: ArrayLike, sigma: ArrayLike = 1.0) -> Floats:
-    """The most likely place (3,), world mm, of a point that views have at `pixels`: the one with the smallest chi2.
+    """Return the most likely position (3,), world mm, of a point from its `pixels` in several views: that of the least chi2.
 
-    Parameters and errors are those of `fit_marker`, whose place it is. Only the ratios of sigmas count.
+    Parameters and errors are those of `fit_marker`, whose `MarkerFit.point` this is. Only the ratios of sigmas matter.
 
     Examples
     --------
     >>> triangulate(views, [0, 3, 17], [(120.2, 131.0), (98.7, 140.3), (127.5, 127.5)])
     """
-    return _fitted(views, modules, pixels, sigma)[0]
+    return _fit(views, modules, pixels, sigma)[0]
 
 
 def fit_marker(views: Views, modules: Indices, pixels: ArrayLike, sigma: ArrayLike = 1.0) -> MarkerFit:
-    """The most likely place of a marker from its images, its covariance, and how the images fit together.
+    """Fit the position of a marker to its pixels in several views; return it with covariance and tests of the pixels.
 
-    The sum of squares of the residuals, in units of sigma, is made smallest by Gauss and Newton's steps from the point that
-    is nearest to all rays. Exact images give the point exactly.
+    The sum of squared residuals, in units of sigma, is minimised by Gauss-Newton steps from the point nearest to all rays.
+    Exact pixels give the point exactly.
 
-    An image that is wrong by many sigma draws the place towards it, and all residuals grow. So `MarkerFit.misfits` measures
-    each residual by its own covariance, ``sigma_i - J_i C J_i^T``: that is by how much chi2 falls without this image, to
-    first order.
+    A pixel that is wrong by many sigma draws the position towards it, and all residuals grow. Therefore `MarkerFit.misfits`
+    measures each residual by its own covariance, ``sigma_i - J_i C J_i^T``: to first order it is the decrease of chi2
+    without this pixel.
 
     Parameters
     ----------
     views : Views
-        Pinhole or parallel ones.
+        Pinhole or parallel views.
     modules : array of int (N,)
         Indices of the views, from 0: two or more, each once.
     pixels : array (N, 2)
@@ -89,131 +89,140 @@ def fit_marker(views: Views, modules: Indices, pixels: ArrayLike, sigma: ArrayLi
     Raises
     ------
     InputError
-        Fewer than two views, one of them twice, or a view that does not exist; rays that are parallel or meet behind a
-        source; a place that sigma leaves unknown, as its standard deviation is larger than its distance from a source.
+        There are fewer than two views, one of them twice, or a view that does not exist; the rays are parallel or meet
+        behind a source; or sigma leaves the position unknown: its standard deviation exceeds its distance from a source.
 
     Examples
     --------
     >>> fit = fit_marker(views, [0, 3, 17], pixels, sigma=0.3)
     >>> fit.point, fit.standard_deviations, fit.p_value
     """
-    point, index, residuals, whitening, slopes = _fitted(views, modules, pixels, sigma)
-    information = np.einsum("nij,nik->jk", slopes, slopes)
+    point, index, residuals, whitening, derivatives = _fit(views, modules, pixels, sigma)
+    information = np.einsum("nij,nik->jk", derivatives, derivatives)
     covariance = np.linalg.inv(information)
     covariance = (covariance + covariance.T) / 2
-    along = float(np.linalg.eigvalsh(covariance)[-1])
+    largest_variance = float(np.linalg.eigvalsh(covariance)[-1])
     if not views.parallel:
         distance = float(np.linalg.norm(point - views.sources[index], axis=1).min())
-        if not math.sqrt(along) < distance:
-            unknown = f"the depth unknown, by {math.sqrt(along):.3g} mm at {distance:.3g} mm from a source"
-            found = f"the rays are so nearly parallel that sigma leaves {unknown}"
-            raise InputError(f"triangulation: {found}; expected views farther apart, or a smaller sigma")
+        if not math.sqrt(largest_variance) < distance:
+            size = f"{math.sqrt(largest_variance):.3g} mm at {distance:.3g} mm from a source"
+            reason = f"the rays are so nearly parallel that sigma leaves the depth unknown, by {size}"
+            raise InputError(f"triangulation: {reason}; expected views farther apart, or a smaller sigma")
     whitened = np.einsum("nij,nj->ni", whitening, residuals)
     chi2 = float((whitened**2).sum())
     misfits = np.full(len(index), np.nan)
     if len(index) > 2:
-        own = np.eye(2) - slopes @ covariance @ slopes.swapaxes(1, 2)
-        misfits = np.einsum("ni,nij,nj->n", whitened, np.linalg.pinv(own, rcond=1e-9, hermitian=True), whitened)
+        # 1 - leverage: the covariance of each whitened residual after the fit.
+        remaining = np.eye(2) - derivatives @ covariance @ derivatives.swapaxes(1, 2)
+        misfits = np.einsum("ni,nij,nj->n", whitened, np.linalg.pinv(remaining, rcond=1e-9, hermitian=True), whitened)
     degrees = 2 * len(index) - 3
-    place = freeze(index), freeze(point), freeze(covariance), freeze(residuals)
-    p_value, p_values = _chance(chi2, degrees), np.exp(-misfits / 2)
-    return MarkerFit(*place, chi2, degrees, p_value, freeze(misfits), freeze(p_values))
+    fitted = freeze(index), freeze(point), freeze(covariance), freeze(residuals)
+    p_value, misfit_p_values = _survival_probability(chi2, degrees), np.exp(-misfits / 2)
+    return MarkerFit(*fitted, chi2, degrees, p_value, freeze(misfits), freeze(misfit_p_values))
 
 
-def _fitted(
+def _fit(
     views: Views, modules: Indices, pixels: ArrayLike, sigma: ArrayLike
 ) -> tuple[Floats, Indexes, Floats, Floats, Floats]:
-    """Place, views, residuals (N, 2), matrices (N, 2, 2) that make their variance 1, and slopes (N, 2, 3) after these."""
+    """Return the most likely position of a marker with the terms of its residuals.
+
+    These are position (3,), indices of the views (N,), residuals (N, 2) in pixels, whitening matrices (N, 2, 2), which scale
+    residuals to variance 1, and derivatives (N, 2, 3) of the whitened pixels by the position.
+    """
     index = view_indices(views, modules, "triangulation")
     if index.ndim != 1 or len(index) < 2:
         raise InputError(f"triangulation: expected two or more views, got {index.size}")
-    kinds, counts = np.unique(index, return_counts=True)
+    unique, counts = np.unique(index, return_counts=True)
     if counts.max() > 1:
-        found = f"view {kinds[counts.argmax()]} {counts.max()} times"
-        raise InputError(f"triangulation: expected each view once, got {found}")
+        repeated = f"view {unique[counts.argmax()]} {counts.max()} times"
+        raise InputError(f"triangulation: expected each view once, got {repeated}")
     pixels = real_array(pixels, "pixels", (len(index), 2))
     whitening = _whitening(sigma, len(index))
     point = _nearest_to_rays(views, index, pixels)
     matrices = views[index].projection_matrices()
-    largest = 1 + np.abs(pixels).max()
-    center = point  # steps are small: counted from here, nothing cancels
-    offsets = matrices[:, :, :3] @ center + matrices[:, :, 3]
+    largest_pixel = 1 + np.abs(pixels).max()
+    origin = point  # steps relative to it are small and lose no digits
+    offsets = matrices[:, :, :3] @ origin + matrices[:, :, 3]
     shift = np.zeros(3)
     state = _residuals(matrices, offsets, shift, pixels, whitening)
     if state is None:
-        found = f"the rays meet behind the source of image {offsets[:, 2].argmin() + 1} of {len(index)}"
+        position = f"behind the source of image {offsets[:, 2].argmin() + 1} of {len(index)}"
         expected = "the images of one point in front of all sources, as (column, row)"
-        raise InputError(f"triangulation: {found}; expected {expected}")
-    last = math.inf
+        raise InputError(f"triangulation: the rays meet {position}; expected {expected}")
+    last_change = math.inf
     for _ in range(_STEPS):
-        residuals, slopes = state
-        step = np.linalg.lstsq(slopes.reshape(-1, 3), residuals.ravel(), rcond=None)[0]
-        moved = np.abs(np.linalg.solve(whitening, (slopes @ step)[..., None])).max() / largest
-        near = moved <= _NEAR
-        if near and moved >= last:
-            if moved > _ROUNDING:
+        residuals, derivatives = state
+        step = np.linalg.lstsq(derivatives.reshape(-1, 3), residuals.ravel(), rcond=None)[0]
+        change = np.abs(np.linalg.solve(whitening, (derivatives @ step)[..., None])).max() / largest_pixel
+        is_near = change <= _NEAR
+        if is_near and change >= last_change:
+            if change > _ROUNDING:
                 raise InputError(_NO_PLACE)
             break
-        most = math.inf if near else float((residuals**2).sum())
+        limit = math.inf if is_near else float((residuals**2).sum())
         for halving in range(_HALVINGS):
-            taken = _residuals(matrices, offsets, shift + step / 2**halving, pixels, whitening)
-            if taken is not None and float((taken[0] ** 2).sum()) <= most:
+            next_state = _residuals(matrices, offsets, shift + step / 2**halving, pixels, whitening)
+            if next_state is not None and float((next_state[0] ** 2).sum()) <= limit:
                 break
         else:
             raise InputError(_NO_PLACE)
-        shift, state, last = shift + step / 2**halving, taken, moved
-        if moved == 0:
+        shift, state, last_change = shift + step / 2**halving, next_state, change
+        if change == 0:
             break
     else:
         raise InputError(_NO_PLACE)
-    residuals, slopes = state
-    return center + shift, index, np.linalg.solve(whitening, residuals[..., None])[..., 0], whitening, slopes
+    residuals, derivatives = state
+    return origin + shift, index, np.linalg.solve(whitening, residuals[..., None])[..., 0], whitening, derivatives
 
 
 def _residuals(
     matrices: Floats, offsets: Floats, shift: Floats, pixels: Floats, whitening: Floats
 ) -> tuple[Floats, Floats] | None:
-    """For a place: pixels less its own, in units of sigma (N, 2), and slopes of its own (N, 2, 3); None behind a source."""
+    """Return the whitened residuals (N, 2) and the derivatives (N, 2, 3) of the whitened pixels at a position.
+
+    The position is an origin, whose homogeneous pixels are `offsets` (N, 3), plus `shift` (3,). None if the position is
+    behind a source.
+    """
     homogeneous = matrices[:, :, :3] @ shift + offsets
     factor = homogeneous[:, 2:]
     if not (factor > 0).all():
         return None
-    seen = homogeneous[:, :2] / factor
-    slopes = (matrices[:, :2, :3] - seen[:, :, None] * matrices[:, 2:, :3]) / factor[..., None]
-    return np.einsum("nij,nj->ni", whitening, pixels - seen), whitening @ slopes
+    projected = homogeneous[:, :2] / factor
+    derivatives = (matrices[:, :2, :3] - projected[:, :, None] * matrices[:, 2:, :3]) / factor[..., None]
+    return np.einsum("nij,nj->ni", whitening, pixels - projected), whitening @ derivatives
 
 
 def _nearest_to_rays(views: Views, index: Indexes, pixels: Floats) -> Floats:
-    """The point with the smallest sum of squared distances from the pixels' rays."""
+    """Return the point (3,), mm, with the smallest sum of squared distances from the pixels' rays."""
     starts, directions = rays_by_depth(views, index, pixels)
     directions = directions / np.linalg.norm(directions, axis=1, keepdims=True)
     angle = float(np.linalg.norm(np.cross(directions[:, None], directions[None]), axis=-1).max())
     if angle < _LEAST_ANGLE:
-        found = f"the rays are parallel to {angle:.1g} rad, so nothing says how deep the point is"
-        raise InputError(f"triangulation: {found}; expected views from different directions")
-    across = np.eye(3) - directions[:, :, None] * directions[:, None]
-    middle = starts.mean(axis=0)
-    # By least squares, not by its normal equations: rays may be nearly parallel.
-    rows = np.einsum("nij,nj->ni", across, starts - middle)
-    return np.asarray(middle + np.linalg.lstsq(across.reshape(-1, 3), rows.ravel(), rcond=None)[0])
+        reason = f"the rays are parallel to {angle:.1g} rad, so the depth of the point is unknown"
+        raise InputError(f"triangulation: {reason}; expected views from different directions")
+    projections = np.eye(3) - directions[:, :, None] * directions[:, None]
+    center = starts.mean(axis=0)
+    # Solved by least squares, not by normal equations, since rays may be nearly parallel.
+    rows = np.einsum("nij,nj->ni", projections, starts - center)
+    return np.asarray(center + np.linalg.lstsq(projections.reshape(-1, 3), rows.ravel(), rcond=None)[0])
 
 
 def _whitening(sigma: ArrayLike, n: int) -> Floats:
-    """Matrices (n, 2, 2) that make residuals of covariance `sigma` ones of variance 1."""
+    """Return matrices (n, 2, 2) that scale residuals of covariance `sigma` to variance 1."""
     if np.ndim(sigma) == 3:
         covariances = real_array(sigma, "sigma", (n, 2, 2))
         scale = np.abs(covariances).max(axis=(1, 2))
-        skewed = np.abs(covariances[:, 0, 1] - covariances[:, 1, 0]) > 1e-9 * scale
-        least = np.linalg.eigvalsh(covariances)[:, 0]
-        bad = skewed | ~(least > 1e-12 * scale)
+        asymmetric = np.abs(covariances[:, 0, 1] - covariances[:, 1, 0]) > 1e-9 * scale
+        smallest = np.linalg.eigvalsh(covariances)[:, 0]
+        bad = asymmetric | ~(smallest > 1e-12 * scale)
         if bad.any():
             raise InputError(f"sigma: expected covariances, symmetric and above 0; {int(bad.argmax())} is not")
         return np.linalg.inv(np.linalg.cholesky(covariances))
     return np.eye(2) / lengths(sigma, "sigma", n, "px")[:, None, None]
 
 
-def _chance(chi2: float, degrees: int) -> float:
-    """The probability of at least `chi2` for an odd number of degrees of freedom (Abramowitz and Stegun 26.4.4)."""
+def _survival_probability(chi2: float, degrees: int) -> float:
+    """Return the probability of at least `chi2` for an odd number of degrees of freedom (Abramowitz and Stegun 26.4.4)."""
     half = chi2 / 2
     total = math.erfc(math.sqrt(half))
     for i in range(1, (degrees - 1) // 2 + 1):

@@ -1,7 +1,7 @@
-"""The pinhole: sample points in the hole and in its knife edge, and what they transmit.
+"""Aperture: sample points in a pinhole and in its knife edge, and the fractions of photons that pass there.
 
-All lengths, slopes and coefficients may be numbers, arrays or tensors that broadcast; functions that need to know are given
-the `library` whose functions take them, numpy or torch.
+All lengths, slopes and coefficients may be numbers, arrays or tensors that broadcast. `library` is the module whose
+functions take them, NumPy or torch.
 """
 
 import functools
@@ -17,36 +17,39 @@ from ..errors import InputError
 
 _GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
 
-# More points than this would take hours.
-_MOST_POINTS = 1000
-# Points across the fine lattice that other point sets are compared with.
+# Largest number of points; with more, a projection would take hours.
+_MAX_POINTS = 1000
+# Number of points across the fine lattice to which other point sets are compared.
 _LATTICE = 160
-# Positions of the pixels' edges that are tried across an image.
-_PLACES = 32
+# Number of tried positions of the pixels' edges across an image.
+_POSITIONS = 32
 
 # Gauss-Laguerre nodes and weights beyond the rim: exact along the axis, where transmission falls exponentially.
 _ROOT = math.sqrt(2)
 _EDGE_RINGS = ((2 - _ROOT, (2 + _ROOT) / 4), (2 + _ROOT, (2 - _ROOT) / 4))
-_FEWEST_EDGE_ANGLES = 7
-# Beyond this attenuation nothing passes that counts.
-_MOST_ATTENUATION = 12.0
+_MIN_EDGE_ANGLES = 7
+# Attenuation mu * path beyond which transmission is negligible.
+_MAX_ATTENUATION = 12.0
 
 
-def _rings_of_plate() -> list[tuple[float, float]]:
-    """Nodes and weights beyond the rim in a plate, by its attenuation: aslant, its edge is up to twice as wide."""
+def _plate_nodes() -> list[tuple[float, float]]:
+    """Return quadrature nodes and weights beyond the rim in a plate, in units of its attenuation.
+
+    They reach to 2, because the edge is up to twice as wide for oblique lines.
+    """
     (x, w), (y, v) = (np.polynomial.legendre.leggauss(n) for n in (6, 4))  # type: ignore[no-untyped-call]
-    x, y = (x + 1) / 2, (y + 1) / 2  # denser at the rim
+    x, y = (x + 1) / 2, (y + 1) / 2  # squared below, so that nodes are denser at the rim
     return [*zip((x**2).tolist(), (w * x).tolist(), strict=True), *zip((1 + y).tolist(), (v / 2).tolist(), strict=True)]
 
 
-_RINGS_OF_PLATE = _rings_of_plate()
+_PLATE_RINGS = _plate_nodes()
 
 
 def disk_points(n: int) -> Floats:
-    """n points (n, 2) of equal weight in the unit disk: Vogel's spiral (Mathematical Biosciences 44 (1979) 179-189).
+    """Return n points (n, 2) of equal weight in the unit disk: Vogel's spiral (Mathematical Biosciences 44 (1979) 179-189).
 
     The points are shifted and stretched slightly to have the disk's mean, 0, and its variance, 1/4 in every direction,
-    so that even a few give a blur of the right width. One point is the centre; two cannot have this variance.
+    so that even a few give a blur of the right width. One point is the centre; two points cannot have this variance.
     """
     if n == 1:
         return np.zeros((1, 2))
@@ -60,14 +63,15 @@ def disk_points(n: int) -> Floats:
 
 @functools.lru_cache(maxsize=4096)
 def points_needed(tolerance: float, shadow: float, pitch: tuple[float, float], blur: tuple[float, float]) -> int:
-    """The smallest number of `disk_points` (1, 3, 4, ... in steps of a quarter) that images a point source accurately.
+    """Return the smallest number of `disk_points` (1, 3, 4, ... in steps of a quarter) that images a point accurately.
 
     The absolute errors of the image's pixels add up to at most a fraction `tolerance` of its counts, wherever the
     pixels' edges lie. Errors of many point sources add up to at most the same fraction, so the bound holds for any
     activity whose points cast such shadows.
 
-    `shadow` is the diameter of the hole's shadow on the crystal and `pitch` the pixel size along u and v, mm. `blur` is the
-    rectangle, mm, that stands for all other blur: a voxel's image, the detector. More than 1000 points are refused.
+    `shadow` is the diameter of the hole's shadow on the crystal and `pitch` the pixel size along u and v, mm. `blur` are the
+    sides of a rectangle, mm, that represents all other blur: a voxel's image, the detector. Raises `InputError` if more than
+    1000 points are needed.
     """
     ticks = (np.arange(_LATTICE) + 0.5) / _LATTICE * 2 - 1
     lattice = np.stack(np.meshgrid(ticks, ticks), axis=-1).reshape(-1, 2)
@@ -75,158 +79,163 @@ def points_needed(tolerance: float, shadow: float, pitch: tuple[float, float], b
     n = 1
     while np.abs(_point_images(disk_points(n), shadow, pitch, blur) - exact).sum(axis=(0, 2)).max() > tolerance:
         n = 3 if n == 1 else n + math.ceil(n / 4)
-        if n > _MOST_POINTS:
+        if n > _MAX_POINTS:
             hole = f"a hole whose shadow of {shadow:.3g} mm falls on pixels of {pitch[0]:.3g} mm"
-            found = f"aperture_tolerance {tolerance:g} takes more than {_MOST_POINTS} points of {hole}"
-            raise InputError(f"{found}: allow more, or give aperture_points")
+            problem = f"aperture_tolerance {tolerance:g} takes more than {_MAX_POINTS} points of {hole}"
+            raise InputError(f"{problem}: allow a larger tolerance, or give aperture_points")
     return n
 
 
 def _point_images(points: Floats, shadow: float, pitch: tuple[float, float], blur: tuple[float, float]) -> Floats:
-    """Image of a point source through equally weighted `points` of the unit disk, as fractions of its counts.
+    """Return the image of a point source through equally weighted `points` of the unit disk, as fractions of its counts.
 
-    Its shape is (n_v, places, n_u, places), for evenly spaced positions of the pixels' edges along v and u.
+    Its shape is (n_v, positions, n_u, positions), for evenly spaced positions of the pixels' edges along v and u. The other
+    arguments are those of `points_needed`.
     """
-    along: list[Floats] = []
-    counts: list[int] = []
+    profiles: list[Floats] = []  # fraction of each point's counts in each pixel, along u and v
+    n_positions: list[int] = []
     for middles, size, width in zip(points.T * (shadow / 2), pitch, blur, strict=True):
-        extent = 1.2 * shadow + width  # of the image
+        extent = 1.2 * shadow + width  # size of the image on the crystal, mm
         size = min(size, extent)  # a wider pixel cuts the image no more often
-        places = math.ceil(_PLACES * size / extent)
+        n = math.ceil(_POSITIONS * size / extent)
         half = math.ceil(extent / 2 / size) + 1
-        edges = np.arange(-half * places, half * places) * (size / places)
-        before = np.clip((edges - middles[:, None]) / max(width, 1e-9 * size) + 0.5, 0, 1)
-        along.append(before[:, places:] - before[:, :-places])
-        counts.append(places)
-    images = along[1].T @ along[0] / len(points)
-    return images.reshape(-1, counts[1], images.shape[1] // counts[0], counts[0])
+        edges = np.arange(-half * n, half * n) * (size / n)
+        fraction_below = np.clip((edges - middles[:, None]) / max(width, 1e-9 * size) + 0.5, 0, 1)
+        profiles.append(fraction_below[:, n:] - fraction_below[:, :-n])
+        n_positions.append(n)
+    images = profiles[1].T @ profiles[0] / len(points)
+    return images.reshape(-1, n_positions[1], images.shape[1] // n_positions[0], n_positions[0])
 
 
 @dataclass(frozen=True)
 class KnifeEdge:
-    """A double-cone hole in the middle of a plate: material fills r > radius + |z| tan(alpha / 2) between its faces."""
+    """Double-cone hole in the middle of a plate: material fills r > radius + |z| tan(alpha / 2) between the faces."""
 
-    radius: ArrayOrTensor  # of the hole, mm
-    mu: ArrayOrTensor  # 1/mm
+    radius: ArrayOrTensor  # radius of the hole, mm
+    mu: ArrayOrTensor  # attenuation coefficient of the plate, 1/mm
     tangent: ArrayOrTensor  # tan(alpha / 2)
-    plate: ArrayOrTensor = None  # thickness, mm; None: infinite
+    plate: ArrayOrTensor = None  # thickness of the plate, mm; None: infinite
 
     def transmission(
         self, x: ArrayOrTensor, y: ArrayOrTensor, slope_u: ArrayOrTensor, slope_v: ArrayOrTensor, library: Any = np
     ) -> ArrayOrTensor:
-        """Fraction exp(-mu path) of the photons that pass the edge on lines that cross z = 0 outside the hole.
+        """Return the fraction exp(-mu path) of the photons that pass the edge on lines that cross z = 0 outside the hole.
 
-        Such a line is inside the material between the two cones; one that is steeper than the cone never leaves it. It
-        crosses at (x, y), mm from the hole's centre, and goes by the slopes, mm along u and v per mm along the axis.
-        Through a plate with faces, lines of any slope pass, inside the hole and outside.
+        A line crosses z = 0 at (x, y), mm from the hole's centre, with slopes in mm along u and v per mm along the axis. In
+        an infinite plate its path in the material is that between the two cones; a line steeper than the cone never leaves
+        it. A plate with faces is passed by lines of any slope, inside the hole and outside.
         """
         if self.plate is not None:
             return self._through_plate(x, y, slope_u, slope_v, library)
-        slope = slope_u**2 + slope_v**2
+        squared_slope = slope_u**2 + slope_v**2
         along = x * slope_u + y * slope_v
         beyond = x * x + y * y - self.radius**2
-        passes = slope < self.tangent**2
-        opens = library.where(passes, self.tangent**2 - slope, 1.0)
+        passes = squared_slope < self.tangent**2
+        opening = library.where(passes, self.tangent**2 - squared_slope, 1.0)
         depth = 0.0
         for side in (along, -along):  # |(x, y) + z slope| = radius + z tangent, solved for z, on either side
             closing = self.radius * self.tangent - side
-            depth = depth + beyond / ((closing**2 + opens * beyond) ** 0.5 + closing)
-        return library.where(passes, library.exp(-self.mu * depth * (1 + slope) ** 0.5), 0.0)
+            depth = depth + beyond / ((closing**2 + opening * beyond) ** 0.5 + closing)
+        return library.where(passes, library.exp(-self.mu * depth * (1 + squared_slope) ** 0.5), 0.0)
 
     def _through_plate(self, x: Any, y: Any, slope_u: Any, slope_v: Any, library: Any) -> ArrayOrTensor:
-        slope, face = slope_u**2 + slope_v**2, self.plate / 2
+        """Return the `transmission` of a plate with faces at z = -plate / 2 and plate / 2."""
+        squared_slope, face = slope_u**2 + slope_v**2, self.plate / 2
         along, beyond = x * slope_u + y * slope_v, x * x + y * y - self.radius**2
-        steeper = slope - self.tangent**2
-        safe = library.where(abs(steeper) < 1e-12, 1e-12 + 0 * steeper, steeper)
+        steepness = squared_slope - self.tangent**2
+        steepness = library.where(abs(steepness) < 1e-12, 1e-12 + 0 * steepness, steepness)
         depth = 0.0
         for side in (along, -along):  # |(x, y) + z slope| > radius + z tangent, on either side
             half = side - self.radius * self.tangent
-            root = half * half - safe * beyond
+            root = half * half - steepness * beyond
             crosses = root > 0
             root = library.where(crosses, root, 1.0) ** 0.5
-            ends = [(-half - sign * root) / safe for sign in (1, -1)]
+            ends = [(-half - sign * root) / steepness for sign in (1, -1)]
             first, last = (library.where(z > 0, library.where(z < face, z, face), 0.0) for z in ends)
-            hole = library.where(crosses, last - first, 0.0)  # less steep, it is what lies beside
-            depth = depth + library.where(safe > 0, face - hole, -hole)
-        return library.exp(-self.mu * depth * (1 + slope) ** 0.5)
+            # Between its roots a line steeper than the cone is in the hole. A less steep one is in the material, and its
+            # roots come in falling order.
+            between = library.where(crosses, last - first, 0.0)
+            depth = depth + library.where(steepness > 0, face - between, -between)
+        return library.exp(-self.mu * depth * (1 + squared_slope) ** 0.5)
 
-    def through(self, slope_u: ArrayOrTensor, slope_v: ArrayOrTensor, library: Any = np) -> ArrayOrTensor:
-        """Fraction of the photons that pass the plate where it is solid."""
+    def solid_transmission(self, slope_u: ArrayOrTensor, slope_v: ArrayOrTensor, library: Any = np) -> ArrayOrTensor:
+        """Return the fraction of the photons of these slopes that pass the plate where it is solid."""
         if self.plate is None:
             return 0.0
         return library.exp(-self.mu * self.plate * (1 + slope_u**2 + slope_v**2) ** 0.5)
 
     def reach(self, depth: Any, along: Any, across: Any) -> Any:
-        """How far from the hole's middle, mm, lines pass a `depth` of the edge, mm along the axis.
+        """Return the distance, mm, from the hole's centre at which lines pass a `depth` of the edge, mm along the axis.
 
-        Their slopes are `along` the way from the middle to where they cross the hole's plane, and `across` it. Between faces
-        this is exact where either is 0: parallel lines that pass up to some depth fill an ellipse.
+        The distance is measured in the hole's plane; `along` and `across` are the line's slopes along and across the
+        direction from the centre to its crossing. Parallel lines that pass up to some depth fill an ellipse; between the
+        faces of a plate this is exact if either slope is 0.
         """
-        steep = self.tangent + abs(along)
-        longer = depth * steep / (2 * self.tangent)  # on the side where the edge recedes from the line
+        steepness = self.tangent + abs(along)
+        longer = depth * steepness / (2 * self.tangent)  # part of the depth where the edge recedes from the line
         if self.plate is not None:
             longer = np.minimum(longer, self.plate / 2)
-        return ((self.radius + (depth - longer) * steep) ** 2 - (depth / 2 * across) ** 2) ** 0.5
+        return ((self.radius + (depth - longer) * steepness) ** 2 - (depth / 2 * across) ** 2) ** 0.5
 
     def points(self, n: int) -> list[tuple[ArrayOrTensor, ArrayOrTensor, ArrayOrTensor]]:
-        """Sample points beyond the rim: (x, y) in mm, and the area, mm^2, that each represents.
+        """Return sample points beyond the rim: x and y, mm, and the area, mm^2, that each represents.
 
-        They are about as dense as `n` points in the hole. The sum of area times transmission is exact along the axis.
-        At 0.7 of the cone's slope it is about 0.1 % of the hole's area off, and close to the cone 1 %.
+        They are about as dense as `n` points in the hole. The sum of area times transmission is exact along the axis. Its
+        error is about 0.1 % of the hole's area at 0.7 of the cone's slope, and 1 % close to the cone.
         """
-        depth = self.tangent / (2 * self.mu)  # where a fraction exp(-1) of the rays along the axis pass
+        depth = self.tangent / (2 * self.mu)  # distance beyond the rim at which exp(-1) of the axial photons pass
         rings: Any = [(node, weight * math.exp(node)) for node, weight in _EDGE_RINGS]
         if self.plate is not None:
-            most = ((self.mu * self.plate) ** -4 + _MOST_ATTENUATION**-4) ** -0.25  # the smaller one
-            rings = [(most * node, most * weight) for node, weight in _RINGS_OF_PLATE]
+            attenuation = ((self.mu * self.plate) ** -4 + _MAX_ATTENUATION**-4) ** -0.25  # a smooth minimum
+            rings = [(attenuation * node, attenuation * weight) for node, weight in _PLATE_RINGS]
         # An odd number, so that no two points are opposite: opposite points transmit the same.
-        angles = max(_FEWEST_EDGE_ANGLES, math.ceil(2 * math.sqrt(math.pi * n)) | 1)
+        n_angles = max(_MIN_EDGE_ANGLES, math.ceil(2 * math.sqrt(math.pi * n)) | 1)
         points = []
         for ring, (node, weight) in enumerate(rings):
             radius = self.radius + depth * node
-            area = 2 * math.pi * radius / angles * depth * weight
-            turned = 2 * math.pi * (np.arange(angles) + ring / 2) / angles
-            points += [(radius * math.cos(angle), radius * math.sin(angle), area) for angle in turned]
+            area = 2 * math.pi * radius / n_angles * depth * weight
+            angles = 2 * math.pi * (np.arange(n_angles) + ring / 2) / n_angles
+            points += [(radius * math.cos(angle), radius * math.sin(angle), area) for angle in angles]
         return points
 
 
 @dataclass(frozen=True)
 class Opening:
-    """A point of the pinhole's plane that rays start from, and the area that it represents."""
+    """Point of the pinhole's plane from which rays start, and the area that it represents."""
 
     x: ArrayOrTensor  # mm from the hole's centre along u
-    y: ArrayOrTensor  # along v
+    y: ArrayOrTensor  # mm from the hole's centre along v
     hole: ArrayOrTensor  # represented area of the hole, mm^2
-    knife: KnifeEdge | None = None  # without one the hole is open to every direction
-    beyond: Sequence[tuple[ArrayOrTensor, ...]] = ()  # represented points of the edge: x, y, area
+    knife: KnifeEdge | None = None  # edge of the hole; without one the hole is open to every direction
+    edge_points: Sequence[tuple[ArrayOrTensor, ...]] = ()  # represented points of the edge: x and y, mm, area, mm^2
 
     def area(self, slope_u: ArrayOrTensor, slope_v: ArrayOrTensor, library: Any = np) -> ArrayOrTensor:
-        """Area, mm^2, open to photons with slopes in mm along u and v per mm along the axis.
+        """Return the area, mm^2, open to photons with slopes in mm along u and v per mm along the axis.
 
-        What would pass the plate were it solid is not in it.
+        It is less than the sum over the points by the photons that would pass the plate if it were solid.
         """
         if self.knife is None:
             return self.hole
         passes = within_cone(slope_u, slope_v, self.knife.tangent, library)
-        area, through = self.hole * passes, self.knife.through(slope_u, slope_v, library) * passes
-        for x, y, size in self.beyond:
-            area = area + size * (self.knife.transmission(x, y, slope_u, slope_v, library) * passes - through)
+        area, solid = self.hole * passes, self.knife.solid_transmission(slope_u, slope_v, library) * passes
+        for x, y, size in self.edge_points:
+            area = area + size * (self.knife.transmission(x, y, slope_u, slope_v, library) * passes - solid)
         return area
 
 
 def openings(n: int, diameter: ArrayOrTensor, knife: KnifeEdge | None = None) -> list[Opening]:
-    """Points that represent a hole of the given diameter, mm, by `n` points, and its edge."""
-    hole = math.pi / 4 * diameter**2 / n
-    beyond = [] if knife is None else knife.points(n)
+    """Return the openings that represent a hole of this diameter, mm, by `n` points, and its edge by further ones."""
+    area = math.pi / 4 * diameter**2 / n
+    edge_points = [] if knife is None else knife.points(n)
     if n == 1:  # all rays start from the centre
-        return [Opening(0.0, 0.0, hole, knife, beyond)]
-    in_hole = [Opening(x * (diameter / 2), y * (diameter / 2), hole, knife) for x, y in disk_points(n).tolist()]
-    return in_hole + [Opening(x, y, 0.0, knife, ((x, y, area),)) for x, y, area in beyond]
+        return [Opening(0.0, 0.0, area, knife, edge_points)]
+    in_hole = [Opening(x * (diameter / 2), y * (diameter / 2), area, knife) for x, y in disk_points(n).tolist()]
+    return in_hole + [Opening(x, y, 0.0, knife, ((x, y, size),)) for x, y, size in edge_points]
 
 
 def within_cone(
     slope_u: ArrayOrTensor, slope_v: ArrayOrTensor, tangent: ArrayOrTensor, library: Any = np
 ) -> ArrayOrTensor:
-    """1 where lines are less steep than the cone, tan(psi) < tangent, else 0."""
-    slope = slope_u**2 + slope_v**2
-    return library.ones_like(slope) * (slope < tangent**2)
+    """Return 1 for lines that are less steep than the cone, slope^2 < tangent^2, else 0."""
+    squared_slope = slope_u**2 + slope_v**2
+    return library.ones_like(squared_slope) * (squared_slope < tangent**2)

@@ -1,6 +1,6 @@
-"""The crystal: the photons it stops and at which depth, its pixels' shares, and its blur.
+"""Crystal: fractions of the photons that it stops by depth, fractions of pixels within its side, and its blur.
 
-Functions of cosines and positions take arrays, or tensors and their `library`, torch.
+Functions of cosines and positions take arrays, or tensors with torch as their `library`.
 """
 
 import math
@@ -20,43 +20,47 @@ def absorbed_share(
     layer: int,
     library: Any = np,
 ) -> ArrayOrTensor:
-    """Fraction of the photons that are assigned to ``depths[layer]``: of 0 alone, or of depths from 0 to `thickness`.
+    """Return the fraction of the photons that are absorbed and assigned to ``depths[layer]``.
 
-    A fraction exp(-mu z / cosine) of the photons reaches depth z. A photon absorbed between two depths is shared
-    between them by linear interpolation, so the total, ``1 - exp(-mu thickness / cosine)``, and the mean depth are
-    exact at every angle. `cosine` is that of the angle to the crystal's normal; `mu` is in 1/mm and `thickness` in mm.
+    `depths`, mm, are 0 alone, or several from 0 to `thickness`. A fraction exp(-mu z / cosine) of the photons reaches depth
+    z. A photon absorbed between two depths is shared between them by linear interpolation, so the total, ``1 - exp(-mu
+    thickness / cosine)``, and the mean depth are exact at every angle. `cosine` is that of the angle to the crystal's
+    normal; `mu` is in 1/mm and `thickness` in mm.
     """
     exp, expm1 = library.exp, library.expm1
     rate = mu / cosine
 
-    def reached(first: int) -> ArrayOrTensor:
-        """Mean fraction of photons that reach the depths from `first` to the next one."""
-        if first < 0:
+    def mean_survival(i: int) -> ArrayOrTensor:
+        """Return the mean fraction of photons that reach the depths between ``depths[i]`` and the next one."""
+        if i < 0:
             return 1.0
-        if first == len(depths) - 1:
+        if i == len(depths) - 1:
             return exp(-rate * thickness)
-        start, step = depths[first], depths[first + 1] - depths[first]
+        start, step = depths[i], depths[i + 1] - depths[i]
         return exp(-rate * start) * -expm1(-rate * step) / (rate * step)
 
-    return reached(layer - 1) - reached(layer)
+    return mean_survival(layer - 1) - mean_survival(layer)
 
 
 def recorded_depths(mu: float, thickness: float) -> tuple[float, float]:
-    """Mean, and standard deviation, of the depths, mm, at which a crystal stops photons along its normal."""
+    """Return mean and standard deviation, mm, of the depths at which a crystal stops photons along its normal.
+
+    `mu` is its attenuation coefficient, 1/mm, and `thickness` is in mm.
+    """
     tau = mu * thickness
-    left = math.exp(-tau) / -math.expm1(-tau)
-    return (1 - tau * left) / mu, math.sqrt(1 - tau**2 * left * (1 + left)) / mu
+    odds = math.exp(-tau) / -math.expm1(-tau)  # photons that pass, relative to those that are stopped
+    return (1 - tau * odds) / mu, math.sqrt(1 - tau**2 * odds * (1 + odds)) / mu
 
 
 def share_inside(middle: ArrayOrTensor, size: ArrayOrTensor, side: ArrayOrTensor) -> ArrayOrTensor:
-    """Fractions of intervals of length `size` around `middle` that lie within `side` / 2 of 0, all in mm."""
+    """Return the fraction of an interval of length `size` around `middle` that lies within `side` / 2 of 0, all in mm."""
     first, last = (middle - size / 2).clip(min=-side / 2), (middle + size / 2).clip(max=side / 2)
     return (last - first).clip(min=0) / size
 
 
 def gaussian_blur(n: int, sigma: float) -> Floats:
-    """Matrix (n, n) that blurs n pixels with a Gaussian of `sigma` pixels, integrated over each receiving pixel."""
-    with np.errstate(divide="ignore"):  # no blur, of some modules: 1 on the diagonal
+    """Return the matrix (n, n) that blurs n pixels with a Gaussian of `sigma` pixels, integrated over the blurred pixels."""
+    with np.errstate(divide="ignore"):  # a sigma of 0, no blur, gives 1 on the diagonal
         edges = (np.arange(n + 1) - 0.5) / (sigma * math.sqrt(2))
     kernel = np.diff([0.5 * math.erf(x) for x in edges])
     distance = np.abs(np.arange(n)[:, None] - np.arange(n))

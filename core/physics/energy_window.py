@@ -1,4 +1,4 @@
-"""Energy windows: the photons that a detector of finite energy resolution counts in them, and scatter found by them.
+"""Energy windows: photons that a detector of finite energy resolution counts in them, and scatter estimated from them.
 
 References
 ----------
@@ -21,26 +21,29 @@ from .isotopes import Isotope, Line, Window
 
 FWHM_PER_SIGMA = 2 * math.sqrt(2 * math.log(2))
 
-_LEAST_SHARE = 1e-4
-"""Lines that count less, as a share of the one that counts most, are left out."""
+_MIN_SHARE = 1e-4
+"""Photons of a line, relative to the line with the most counted photons, up to which the line is left out."""
 
 
 def acceptance(energy: float, window: Window, fwhm: float) -> float:
-    """Share of the photons of an `energy` that are measured within a `window`; energies blur with this FWHM. All in keV."""
+    """Return the share of the photons of an `energy` whose measured energy lies within a `window`; all in keV.
+
+    `fwhm` is that of the Gaussian energy resolution.
+    """
     scale = math.sqrt(2) * fwhm / FWHM_PER_SIGMA
     low, high = ((edge - energy) / scale for edge in window)
-    if low > 0:  # the difference of two numbers close to 1
+    if low > 0:  # for a window above the energy a difference of two erf close to 1 would lose digits
         return (math.erfc(low) - math.erfc(high)) / 2
     return (math.erf(high) - math.erf(low)) / 2
 
 
 def counted_lines(isotope: Isotope, window: Window, energy_fwhm: float | None = None) -> tuple[Line, ...]:
-    """The lines that count in a `window`, keV: their energies, keV, in order, and photons per decay that are counted.
+    """Return the photon lines that are counted in a `window`, keV: energies, keV, in order, and counted photons per decay.
 
     `energy_fwhm` is the FWHM of the energy resolution at the strongest line within the window, as a share of its energy; at
-    another energy E the FWHM is in proportion to sqrt(E). None: all photons of the lines within the window count, no
-    others. Lines that count less than 1e-4 of the one that counts most are left out. `InputError` where no line that the
-    resolution could refer to is within the window.
+    another energy E the FWHM is proportional to sqrt(E). With None, exactly the photons of the lines within the window are
+    counted. Lines with less than 1e-4 of the counted photons of the strongest one are left out. Raises `InputError` if the
+    resolution cannot refer to a line because none is within the window.
     """
     lines = sorted(isotope.lines_within(*window))
     if energy_fwhm is None:
@@ -52,15 +55,16 @@ def counted_lines(isotope: Isotope, window: Window, energy_fwhm: float | None = 
     def fwhm(energy: float) -> float:
         return energy_fwhm * math.sqrt(reference * energy)
 
-    found = [(energy, photons * acceptance(energy, window, fwhm(energy))) for energy, photons in sorted(isotope.lines)]
-    most = max(photons for _, photons in found)
-    return tuple((energy, photons) for energy, photons in found if photons > _LEAST_SHARE * most)
+    counted = [(energy, n * acceptance(energy, window, fwhm(energy))) for energy, n in sorted(isotope.lines)]
+    strongest = max(photons for _, photons in counted)
+    return tuple((energy, photons) for energy, photons in counted if photons > _MIN_SHARE * strongest)
 
 
 def peak_shares(isotope: Isotope, windows: Sequence[Window | None], energy_fwhm: float) -> tuple[float, float, float]:
-    """Shares of the photons of the peak's lines that are measured in the lower, the peak and the upper window; 0 of None.
+    """Return the shares of the peak's photons that are counted in the lower, the peak and the upper window.
 
-    The lines are those within the peak window, and `energy_fwhm` is that of `counted_lines`.
+    The peak's photons are those of the lines within the peak window. The share of a missing window, None, is 0.
+    `energy_fwhm` is the FWHM at the strongest of the lines, as a share of its energy.
     """
     peak = windows[1]
     lines = () if peak is None else isotope.lines_within(*peak)
@@ -70,8 +74,8 @@ def peak_shares(isotope: Isotope, windows: Sequence[Window | None], energy_fwhm:
     total = sum(photons for _, photons in lines)
 
     def share(window: Window | None) -> float:
-        own = ((e, photons, energy_fwhm * math.sqrt(reference * e)) for e, photons in lines)
-        return 0.0 if window is None else sum(photons * acceptance(e, window, fwhm) for e, photons, fwhm in own) / total
+        blurred = ((e, photons, energy_fwhm * math.sqrt(reference * e)) for e, photons in lines)
+        return 0.0 if window is None else sum(n * acceptance(e, window, fwhm) for e, n, fwhm in blurred) / total
 
     lower, middle, upper = map(share, windows)
     return lower, middle, upper
@@ -86,42 +90,42 @@ def energy_window_scatter(
     efficiency: ArrayLike = 1.0,
     shares: Sequence[float] | None = None,
 ) -> tuple[Floats, Floats]:
-    """Scattered photons in the peak window, from the counts in the windows below and above it.
+    """Estimate the scattered photons in the peak window from the counts in the windows below and above it.
 
-    With both it is ``(lower / w_l + upper / w_u) * w_p / 2`` (triple energy window, Ogawa 1991). That is exact where the
-    continuum under the peak is linear in energy, and the centers of the two windows lie as far from the peak's, to either
-    side. Without one of them the continuum falls to 0 there, as a triangle: half of the other's density (double energy
-    window, Jaszczak 1984, with k = 1/2 for windows of one width).
+    From both windows the estimate is ``(lower / w_l + upper / w_u) * w_p / 2`` (triple energy window, Ogawa 1991). That is
+    exact if the continuum under the peak is linear in energy, and the two windows' centres are equally far from the peak's,
+    on either side. If one window is missing, the continuum is taken to fall to 0 there, as a triangle: half of the other
+    window's density (double energy window, Jaszczak 1984, with k = 1/2 for windows of one width).
 
     Parameters
     ----------
     lower, peak, upper : array (M, n_v, n_u)
-        Counts in the windows, of which `lower` or `upper` may be None. Those of the peak only say the shape: where chance
-        makes the estimate larger than them it stays so, since what is cut off there would be missing in the mean.
+        Counts in the windows, of which `lower` or `upper` may be None. Without `shares`, only the shape of `peak` is used:
+        an estimate that exceeds the peak's counts by chance is not cut off, because the cut would bias the mean.
     widths : sequence of 3 numbers
         Widths of the three windows, keV; that of a missing window may be None.
     fwhm : float, optional
         FWHM, in pixels, of a Gaussian that smooths the estimate: scatter is smoother than noise. Its weights within the
-        image sum to 1 for each pixel, so an even estimate stays as it is.
+        image sum to 1 for each pixel, so a constant estimate is unchanged.
     efficiency : number or array (M, n_v, n_u)
-        Of the pixels, as in `Emission`: photons are smoothed, of which each pixel counts its share. Those of dead and hot
-        pixels, 0, are no part of it, and the smoothed estimate of them is 0.
+        Efficiency of the pixels, as in `Emission`: the photons are smoothed, and each pixel counts its share of them. Pixels
+        of efficiency 0, dead or hot, do not contribute, and their smoothed estimate is 0.
     shares : sequence of 3 numbers, optional
-        Of the photons that are not scattered, those measured in the three windows (`peak_shares`). What the peak's tails add
-        to the outer windows is then no scatter: with T the estimate as above, P the peak's counts and
-        ``t = w_p / 2 (a_l / w_l + a_u / w_u) / a_p`` it is ``(T - t P) / (1 - t)``, by chance below 0 here and there. None:
-        no tails.
+        Shares a_l, a_p and a_u of the unscattered photons that are counted in the three windows (`peak_shares`). The photons
+        that the peak's tails add to the outer windows are then not taken for scatter: with T the estimate above, P the
+        peak's counts and ``t = w_p / 2 (a_l / w_l + a_u / w_u) / a_p`` the estimate is ``(T - t P) / (1 - t)``, which may be
+        below 0 by chance. Default: no tails.
 
     Returns
     -------
     scatter, variance : array (M, n_v, n_u)
-        The estimate, and the variance that it has because the counts are independent Poisson numbers.
+        The estimate, and its variance if the counts are independent Poisson numbers.
 
     Raises
     ------
     InputError
-        Both windows are missing, shapes differ, counts are negative, or a width is not a number above 0; or there are no
-        fewer photons per keV beside the peak than in it.
+        If both windows are missing, shapes differ, counts are negative, a width is not a number above 0, or the peak has no
+        more unscattered photons per keV than its tails.
     """
     name = "energy window scatter"
     shape = np.shape(peak)
@@ -149,15 +153,15 @@ def energy_window_scatter(
     if tails:
         if not 0 < tails < 1:
             raise InputError(f"{name}: shares: expected less of the photons per keV beside the peak than in it")
-        of_peak = real_array(peak, f"{name}: peak", shape)
-        scatter = (scatter - tails * of_peak) / (1 - tails)
-        variance = (variance + tails**2 * of_peak) / (1 - tails) ** 2
+        peak_counts = real_array(peak, f"{name}: peak", shape)
+        scatter = (scatter - tails * peak_counts) / (1 - tails)
+        variance = (variance + tails**2 * peak_counts) / (1 - tails) ** 2
     if fwhm is None:
         return scatter, variance
     sigma = positive(fwhm, f"{name}: fwhm", "pixels") / FWHM_PER_SIGMA
-    along_v, along_u = (gaussian_blur(n, sigma) for n in shape[1:])
-    counting = np.broadcast_to(real_array(efficiency, f"{name}: efficiency", None), shape)
-    around = along_v @ counting @ along_u.T
-    factors: Floats = np.divide(counting, around, out=np.zeros(shape), where=counting > 0)
-    scatter, variance = (np.where(counting > 0, x, 0.0) for x in (scatter, variance))
-    return factors * (along_v @ scatter @ along_u.T), factors**2 * (along_v**2 @ variance @ (along_u**2).T)
+    blur_v, blur_u = (gaussian_blur(n, sigma) for n in shape[1:])
+    efficiencies = np.broadcast_to(real_array(efficiency, f"{name}: efficiency", None), shape)
+    blurred = blur_v @ efficiencies @ blur_u.T
+    factors: Floats = np.divide(efficiencies, blurred, out=np.zeros(shape), where=efficiencies > 0)
+    scatter, variance = (np.where(efficiencies > 0, x, 0.0) for x in (scatter, variance))
+    return factors * (blur_v @ scatter @ blur_u.T), factors**2 * (blur_v**2 @ variance @ (blur_u**2).T)

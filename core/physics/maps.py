@@ -1,4 +1,4 @@
-"""Maps of a system's performance, as volumes. A voxel's value is that at its centre, and 0 where no module sees it."""
+"""Maps of a system's performance, as volumes. A voxel's value is that at its centre, and 0 if no module sees the centre."""
 
 import math
 from collections.abc import Callable
@@ -18,7 +18,7 @@ from .optics import Optics, chosen_optics
 from .performance import resolution, seen, sensitivity
 from .sampling import TOLERANCE, sampling_gaps
 
-# Points times modules in one block, whose temporaries stay in the processor's cache.
+# Product of points and modules in one block, small enough for the processor's cache.
 _BLOCK = 1 << 17
 
 
@@ -30,16 +30,17 @@ def sensitivity_map(
     progress: Progress | None = None,
     **settings: Any,
 ) -> Volume:
-    """Sum of the modules' `sensitivity`, counts per decay; times 1e6 that is cps/MBq.
+    """Return a volume with the sum of the modules' `sensitivity`, counts per decay (times 1e6: cps/MBq).
 
-    Parameters are as there. ``progress(done, total)`` is called between blocks of voxels and may raise `Cancelled`.
+    `optics` and `settings` are those of `sensitivity`. ``progress(done, total)`` is called between blocks of voxels and may
+    raise `Cancelled`.
     """
     optics = chosen_optics(optics, settings)
     return _map(system, grid, "sensitivity", lambda points: sensitivity(system, points, optics=optics).sum(1), progress)
 
 
 def modules_map(system: PinholeSystem, grid: Grid, *, progress: Progress | None = None) -> Volume:
-    """Number of modules that see each voxel (see `seen`)."""
+    """Return a volume with the number of modules that see each voxel (see `seen`)."""
     return _map(system, grid, "modules", lambda points: seen(system, points).sum(axis=1, dtype=np.float64), progress)
 
 
@@ -51,38 +52,38 @@ def resolution_map(
     progress: Progress | None = None,
     **settings: Any,
 ) -> Volume:
-    """Resolution of the projections, FWHM in mm: the count-weighted root mean square of the modules' `resolution`.
+    """Return a volume with the projections' resolution, FWHM in mm: the count-weighted RMS of the modules' `resolution`.
 
     The variance of all photons together is the mean of the modules' variances. A reconstruction that models the blur
-    may do better, and one from few counts worse. Parameters are as in `sensitivity_map`.
+    may do better, and one from few counts worse. The arguments are those of `sensitivity_map`.
     """
     optics = chosen_optics(optics, settings)
 
-    def combined(points: Floats) -> Floats:
-        fwhm, counts = (of(system, points, optics=optics) for of in (resolution, sensitivity))
+    def combined_fwhm(points: Floats) -> Floats:
+        fwhm, counts = resolution(system, points, optics=optics), sensitivity(system, points, optics=optics)
         total = counts.sum(axis=1)
         return np.sqrt((counts * np.nan_to_num(fwhm) ** 2).sum(axis=1) / np.where(total > 0, total, 1))
 
-    return _map(system, grid, "resolution", combined, progress)
+    return _map(system, grid, "resolution", combined_fwhm, progress)
 
 
 def completeness_map(
     system: PinholeSystem, grid: Grid, *, tolerance: float = TOLERANCE, progress: Progress | None = None
 ) -> Volume:
-    """Completeness of the angular sampling, from 0 to 1: 1 - gap / 90 degrees, with the gap of `sampling_gaps`.
+    """Return a volume with the completeness of the angular sampling: 1 - gap / 90 degrees, from 0 to 1 (`sampling_gaps`).
 
-    It is 1 where every plane through the voxel meets a pinhole that sees it (Tuy's condition), and 0 where at most one
-    module sees the voxel. `tolerance` is that of the gap, rad.
+    It is 1 if every plane through the voxel meets a pinhole that sees it (Tuy's condition), and 0 if at most one module sees
+    the voxel. `tolerance` is the accuracy of the gap, rad.
     """
 
-    def share(points: Floats) -> Floats:
+    def completeness(points: Floats) -> Floats:
         return 1 - sampling_gaps(system, points, tolerance=tolerance) / (math.pi / 2)
 
-    return _map(system, grid, "completeness", share, progress)
+    return _map(system, grid, "completeness", completeness, progress)
 
 
 def within_roi(volume: Volume, system: PinholeSystem) -> Volume:
-    """A copy of a map with 0 in all voxels whose centres lie outside the largest ROI sphere."""
+    """Return a copy of a map with 0 in all voxels whose centres lie outside the largest ROI sphere."""
     squares = np.zeros(volume.grid.shape)
     axes = np.ogrid[tuple(slice(n) for n in volume.grid.shape)]
     for row in volume.grid.affine[:3]:
@@ -94,7 +95,7 @@ def within_roi(volume: Volume, system: PinholeSystem) -> Volume:
 def _map(
     system: PinholeSystem, grid: Grid, quantity: str, value: Callable[[Floats], Floats], progress: Progress | None
 ) -> Volume:
-    """The volume of `value`, a function of points (P, 3), block by block."""
+    """Return the volume with the values of the function `value` of points (P, 3), mm, computed block by block."""
     instance(system, PinholeSystem, "system")
     instance(grid, Grid, "grid")
     require(4.2 * grid.n_voxels, "a volume of {} x {} x {} voxels".format(*grid.shape))
@@ -116,4 +117,4 @@ MAPS: dict[str, Callable[..., Volume]] = {
     "resolution": resolution_map,
     "completeness": completeness_map,
 }
-"""The maps, by the quantity of their volumes."""
+"""Functions that make the maps, by the quantity of their volumes."""

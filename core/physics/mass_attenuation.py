@@ -1,4 +1,4 @@
-"""Mass attenuation coefficients of the elements from NIST, 10 to 1000 keV: the table in mass_attenuation.txt."""
+"""Mass attenuation coefficients of the elements, 10 to 1000 keV, from NIST's table in mass_attenuation.txt."""
 
 from functools import cache
 from pathlib import Path
@@ -6,18 +6,18 @@ from pathlib import Path
 import numpy as np
 
 LOWEST_ENERGY, HIGHEST_ENERGY = 10.0, 1000.0
-"""Range of the table, keV."""
+"""Range of the table's energies, keV."""
 
 Point = tuple[float, float]
-"""An energy, keV, and the coefficient there, cm^2/g."""
+"""Energy, keV, and the coefficient at this energy, cm^2/g."""
 
 
 @cache
 def mass_attenuation(symbol: str, energy: float) -> float:
-    """Mass attenuation coefficient of an element, cm^2/g, at an energy, keV.
+    """Return the mass attenuation coefficient, cm^2/g, of the element with this symbol at an energy, keV.
 
-    A cubic in the logarithms through the four nearest energies of the table that no absorption edge separates from `energy`;
-    at an edge it is the coefficient above it.
+    It is interpolated by a cubic in the logarithms through the four nearest energies of the table that no absorption edge
+    separates from `energy`. At an edge it is the coefficient above the edge.
     """
     points, edges = table()[symbol]
     first = [(edge, above) for edge, _, above in edges if edge <= energy][-1:]
@@ -28,18 +28,18 @@ def mass_attenuation(symbol: str, energy: float) -> float:
     start = np.clip(np.searchsorted(energies, energy) - 2, 0, len(energies) - count)
     nearest = slice(start, start + count)
     curve = np.polyfit(np.log(energies[nearest] / energy), np.log(values[nearest]), count - 1)
-    return float(np.exp(curve[-1]))  # its value at log(1)
+    return float(np.exp(curve[-1]))  # the cubic's value at log(1)
 
 
 def table_lines(name: str) -> list[str]:
-    """The lines of one of the tables in this folder, without its comments."""
+    """Read the lines of a table in this folder, without its comments."""
     text = Path(__file__).with_name(name).read_text(encoding="ascii")
     return [line for line in text.splitlines() if not line.startswith("#")]
 
 
 @cache
 def table() -> dict[str, tuple[list[Point], list[tuple[float, float, float]]]]:
-    """For each element's symbol its points, and its absorption edges: energy, coefficient below and above."""
+    """Read the table: by symbol the element's points, and its absorption edges: energy, coefficient below and above."""
     elements: dict[str, tuple[list[Point], list[tuple[float, float, float]]]] = {}
     energies: list[float] = []
     for name, *values in map(str.split, table_lines("mass_attenuation.txt")):

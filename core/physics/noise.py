@@ -6,12 +6,12 @@ from ..arrays import Array, ArrayLike, Integers
 from ..errors import InputError
 from ..validation import real_array, seed_number
 
-# numpy draws no Poisson numbers with a larger mean.
+# Largest mean of which NumPy draws Poisson numbers.
 _LARGEST_MEAN = 9e18
 
 
 def sample_counts(mean: ArrayLike, seed: int) -> Integers:
-    """Counts drawn from Poisson distributions with given means.
+    """Draw counts from Poisson distributions with these means.
 
     `mean` is (M, n_v, n_u) or any array whose first axis is the views. Each view has its own random generator, made from
     the seed, a whole number from 0 to 2^64 - 1, and the view's index, so its counts do not depend on the other views.
@@ -25,11 +25,11 @@ def sample_counts(mean: ArrayLike, seed: int) -> Integers:
 
 
 def draw_counts(mean: Array, seed: int, out: Array) -> None:
-    """`sample_counts` of an array of numbers into another of the same shape, which may be `mean` itself."""
+    """Draw the counts of `sample_counts` into the array `out`, which has the shape of `mean` or is `mean` itself."""
     seed = seed_number(seed)
     if mean.size and not 0 <= mean.min() <= mean.max() <= _LARGEST_MEAN:
         raise InputError(f"expected counts: must lie from 0 to {_LARGEST_MEAN:g}, got {mean.min():g} to {mean.max():g}")
     for view, (expected, counts) in enumerate(zip(mean, out, strict=True)):
         generator = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(view,)))
-        there = expected != 0  # what is expected to be 0 is 0, and takes no random number
-        counts[there] = generator.poisson(expected[there])
+        nonzero = expected != 0  # a mean of 0 gives 0, and takes no random number
+        counts[nonzero] = generator.poisson(expected[nonzero])

@@ -1,6 +1,6 @@
-"""The counting law: what share of its decays a place's photons are counted of, through the hole and in the crystal.
+"""Pinhole sensitivity law: the fraction of decays at a point that are detected, through hole, edge, septa and crystal.
 
-Sensitivity, resolution, maps, pixels of projections and cameras in torch all take it from here.
+Sensitivity, resolution, maps, pixels of projections and cameras in torch all take the law from here.
 
 References
 ----------
@@ -33,40 +33,40 @@ Edge = Literal["paix", "path"]
 _UNITS = {
     "aperture_mu": "1/mm", "opening_angle": "rad", "crystal_mu": "1/mm", "photons_per_decay": "", "plate_thickness": "mm",
 }  # fmt: skip
-"""Numbers above 0."""
+"""Units of the attributes that are numbers above 0."""
 _NUMBERS = (*_UNITS, "intrinsic_fwhm")
 
 
 @dataclass(frozen=True, eq=False)
 class Optics:
-    """Hole, edge, walls, cone, crystal and photons of modules, as keywords of `Emission`, which explains them.
+    """Properties of modules that decide how many photons they detect: hole, edge, walls, cone, crystal and photons.
 
-    Numbers are of all modules together, or arrays (M,) with one for each, or tensors of either shape: then all that is
-    computed with them is part of their graph.
+    The attributes are keywords of `Emission`, which explains them. A number holds for all modules, or is an array (M,) with
+    one number for each, or a tensor of either shape, whose graph then contains all results.
 
     Attributes
     ----------
     aperture_mu, crystal_mu
-        Attenuation coefficients, 1/mm; None: nothing penetrates the aperture, the crystal stops all photons.
+        Attenuation coefficients, 1/mm. None: no photon penetrates the aperture, the crystal stops all photons.
     opening_angle
-        Full angle of the knife edge's double cone, rad.
+        Full angle alpha of the knife edge's double cone, rad.
     edge : str
-        ``"paix"`` or ``"path"``.
+        Model of the edge: ``"paix"``, a larger effective diameter, or ``"path"``, attenuation along each path.
     depth_layers : int
-        Depths in the crystal at which photons are recorded.
+        Number of depths in the crystal at which photons are recorded.
     plate_thickness
-        The aperture plate's, mm, with edge ``"path"``; None: infinite.
+        Thickness of the aperture plate, mm, with edge ``"path"``. None: infinite.
     intrinsic_fwhm
         FWHM of the detector's blur, mm on the crystal.
     photons_per_decay
-        That are counted.
+        Number of photons per decay that are counted.
     within_crystal, within_walls, within_cone : bool
-        What stops photons, beside the hole.
+        Whether photons are lost outside the crystal's side, the collimator's walls, or the cone of the knife edge.
 
     Raises
     ------
     InputError
-        Settings do not go together.
+        If settings do not go together.
     """
 
     aperture_mu: ArrayOrTensor = None
@@ -81,11 +81,11 @@ class Optics:
     within_cone: bool = False
     plate_thickness: ArrayOrTensor = None
 
-    library = np  # whose functions take the numbers, and all that is computed with them: set where values enter
+    library = np  # NumPy or torch, whose functions take the numbers; set again when numbers are set
 
     def __post_init__(self) -> None:
         for name in _NUMBERS:
-            object.__setattr__(self, name, _checked(getattr(self, name), name))
+            object.__setattr__(self, name, _check_number(getattr(self, name), name))
         if self.edge not in ("paix", "path"):
             raise InputError(f"edge: expected 'paix' or 'path', got {self.edge!r}")
         if self.edge == "path" and self.aperture_mu is None:
@@ -100,21 +100,22 @@ class Optics:
         object.__setattr__(self, "library", namespace(*self.numbers.values()))
 
     def __getstate__(self) -> dict[str, Any]:
-        """What is pickled and copied: a module cannot be."""
+        """Return the attributes that are pickled and copied: all but `library`, since a Python module cannot be pickled."""
         return {name: value for name, value in self.__dict__.items() if name != "library"}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
+        """Restore pickled attributes, and `library`."""
         self.__dict__.update(state, library=namespace(*state.values()))
 
     @classmethod
     def of(cls, system: PinholeSystem, lines: Sequence[tuple[float, float]] = (), **settings: Any) -> Self:
-        """The optics of a system's modules for photons of these `lines`: energies, keV, and numbers per decay.
+        """Return the optics of a system's modules for photons of these `lines`: energies, keV, and numbers per decay.
 
-        `settings` are the attributes, but coefficients may be names of materials (`module_coefficients`), and without
-        `photons_per_decay` all photons of the lines are counted; of no lines, one per decay.
+        `settings` are attributes, but the attenuation coefficients may be names of materials (`module_coefficients`). The
+        default of `photons_per_decay` is the number of all photons of the lines; without lines, one per decay.
         """
         names = "aperture_mu", "crystal_mu"
-        angle = _checked(settings.get("opening_angle", OPENING_ANGLE), "opening_angle")
+        angle = _check_number(settings.get("opening_angle", OPENING_ANGLE), "opening_angle")
         aperture, crystal = map(settings.get, names)
         coefficients = module_coefficients(aperture, crystal, lines, system, angle)
         if settings.get("photons_per_decay") is None:
@@ -123,25 +124,28 @@ class Optics:
 
     @property
     def numbers(self) -> dict[str, ArrayOrTensor]:
-        """The attributes that are numbers, by name, without those that are None."""
+        """Attributes that are numbers, by name, without those that are None."""
         return {name: getattr(self, name) for name in _NUMBERS if getattr(self, name) is not None}
 
     def with_numbers(self, numbers: Mapping[str, ArrayOrTensor]) -> Self:
-        """The same with other numbers, which are not checked."""
+        """Return a copy with other `numbers`, by attribute, which are not checked."""
         changed = copy.copy(self)
         changed.__dict__.update(numbers, library=namespace(*{**self.numbers, **numbers}.values()))
         return changed
 
     def promoted(self, *values: ArrayOrTensor) -> tuple[Any, ...]:
-        """The optics and `values`, their numbers as tensors of one type and device if any is a tensor."""
-        own = {name: value for name, value in self.numbers.items() if not isinstance(value, float)}
-        promoted = promote(*values, *own.values())
-        optics = self.with_numbers(dict(zip(own, promoted[len(values) :], strict=True)))
+        """Return the optics and the `values`, all as tensors of one type and device if any is a tensor."""
+        arrays = {name: value for name, value in self.numbers.items() if not isinstance(value, float)}
+        promoted = promote(*values, *arrays.values())
+        optics = self.with_numbers(dict(zip(arrays, promoted[len(values) :], strict=True)))
         optics.__dict__["library"] = namespace(*promoted)
         return optics, *promoted[: len(values)]
 
     def of_modules(self, which: Any, n: int) -> Self:
-        """The optics of the modules `which` (an index, indices or a slice) of `n`; `InputError` if they are not of `n`."""
+        """Return the optics of the modules `which` (an index, indices or a slice) of `n`.
+
+        Raises `InputError` if an attribute has numbers for another number of modules.
+        """
         arrays = {name: value for name, value in self.numbers.items() if np.ndim(value)}
         for name, value in arrays.items():
             if value.shape != (n,):
@@ -151,50 +155,54 @@ class Optics:
 
     @property
     def tangent(self) -> ArrayOrTensor:
-        """``tan(alpha / 2)`` of the knife edge's cone."""
+        """Slope ``tan(alpha / 2)`` of the knife edge's cone."""
         angle = self.opening_angle
         return edge_slope(angle) if isinstance(angle, float) else self.library.tan(angle / 2)
 
     def effective_diameter(self, diameter: ArrayOrTensor) -> ArrayOrTensor:
-        """d_e, mm, of holes of a diameter d, mm: opaque holes that let as many photons pass along the axis.
+        """Return the effective diameter d_e, mm, of holes of diameter d, mm.
 
-        ``d_e^2 = d (d + 2 / mu tan(alpha / 2))`` (Paix); with edge ``"path"`` it is ``2 / mu^2 tan^2(alpha / 2)`` more.
+        An opaque hole of this diameter lets as many photons pass along the axis. It is ``d_e^2 = d (d + 2 / mu tan(alpha /
+        2))`` (Paix); with edge ``"path"`` there is a further term ``2 / mu^2 tan^2(alpha / 2)``.
         """
         if self.aperture_mu is None:
             return diameter
-        depth = 2 / self.aperture_mu * self.tangent
-        squared = diameter * (diameter + depth) + (depth**2 / 2 if self.edge == "path" else 0.0)
+        widening = 2 / self.aperture_mu * self.tangent
+        squared = diameter * (diameter + widening) + (widening**2 / 2 if self.edge == "path" else 0.0)
         return squared**0.5
 
     def half_value_diameter(self, diameter: ArrayOrTensor) -> ArrayOrTensor:
-        """Diameter ``d + ln(2) / mu tan(alpha / 2)``, mm, at which a knife edge transmits half of the axial photons.
+        """Return the diameter, mm, at which a knife edge transmits half of the axial photons.
 
-        At radius r the edge is ``2 (r - d / 2) / tan(alpha / 2)`` thick. So this is the full width at half maximum of the
-        hole's shadow: Accorsi and Metzler's resolution-equivalent diameter.
+        It is ``d + ln(2) / mu tan(alpha / 2)``. At radius r the edge is ``2 (r - d / 2) / tan(alpha / 2)`` thick. So this is
+        the full width at half maximum of the hole's shadow: Accorsi and Metzler's resolution-equivalent diameter.
         """
         return diameter if self.aperture_mu is None else diameter + math.log(2) / self.aperture_mu * self.tangent
 
     def openings(self, diameter: ArrayOrTensor, n: int = 1) -> list[Opening]:
-        """Where photons cross the plane of a hole of a diameter, mm: n points of the hole, and those of its edge."""
+        """Return the openings that represent a hole of this `diameter`, mm: `n` points in it, and points in its edge."""
         if self.edge == "paix":
             return openings(n, self.effective_diameter(diameter))
         return openings(n, diameter, self.knife(diameter))
 
     def through_plate(self, built: Collimator) -> float:
-        """Photons that pass the solid plate beside a module's hole, by those through the hole, along the axis; at most."""
+        """Return the ratio of axial photons that pass the solid plate beside the hole to those through the hole, at most.
+
+        `built` is the module's collimator.
+        """
         if self.plate_thickness is None:
             return 0.0
         widest = max(radius for _, radius in built.hole_profile)
-        beside = (2 * built.front_half_width) ** 2 - math.pi * widest**2
-        hole = math.pi / 4 * self.effective_diameter(built.diameter) ** 2
-        return float(math.exp(-self.aperture_mu * self.plate_thickness) * beside / hole)
+        plate_area = (2 * built.front_half_width) ** 2 - math.pi * widest**2
+        hole_area = math.pi / 4 * self.effective_diameter(built.diameter) ** 2
+        return float(math.exp(-self.aperture_mu * self.plate_thickness) * plate_area / hole_area)
 
     def knife(self, diameter: ArrayOrTensor) -> KnifeEdge:
-        """The knife edge of a hole of a diameter, mm."""
+        """Return the knife edge of a hole of this `diameter`, mm."""
         return KnifeEdge(diameter / 2, self.aperture_mu, self.tangent, self.plate_thickness)
 
     def depths(self, thickness: ArrayOrTensor) -> list[ArrayOrTensor]:
-        """Depths in a crystal, mm, at which photons are recorded, from its front to its back."""
+        """Return the depths in a crystal of this `thickness`, mm, at which photons are recorded, from front to back."""
         return [thickness * (layer / max(1, self.depth_layers - 1)) for layer in range(self.depth_layers)]
 
     def counted(
@@ -205,28 +213,29 @@ class Optics:
         thickness: ArrayOrTensor,
         layer: int = 0,
     ) -> tuple[ArrayOrTensor, ArrayOrTensor]:
-        """The law: what of a decay's photons pass one point of the hole and are recorded in one layer, and their cosine.
+        """Return the sensitivity law for one opening and one depth layer, mm^2, and the cosine of the angle to the axis.
 
-        It is in mm^2: a square millimetre that lies across the axis, `distance` mm behind the hole, records
-        ``counted / distance^2`` photons of a decay that is spread over a mm of line. With the hole's area pi d^2 / 4 it is
-        ``photons_per_decay d^2 cos^4(psi) / 16``, psi being the angle to the axis, times what cone and crystal leave.
+        The law's value c is defined by its use: a square millimetre normal to the axis, at the distance D behind the hole,
+        records ``c / D^2`` photons of a line source with one decay per mm. For the hole's area pi d^2 / 4 it is
+        ``photons_per_decay d^2 cos^4(psi) / 16``, with the angle psi to the axis, times the fractions of the photons that
+        pass the cone and are stopped by the crystal.
 
         Parameters
         ----------
         slope_u, slope_v
-            Slopes of the photons' lines, mm along u and v per mm along the axis.
+            Slopes of the photons' paths, mm along u and v per mm along the axis.
         opening
-            The point.
+            Point of the hole, with the area that it represents.
         thickness
-            The crystal's, mm.
+            Thickness of the crystal, mm.
         layer
-            Which of `depths`.
+            Index of the depth layer in `depths`.
         """
         squared_secant = 1 + slope_u**2 + slope_v**2
         cosine = 1 / squared_secant**0.5
-        squared = cosine * cosine  # many times faster than a power
+        squared_cosine = cosine * cosine  # many times faster than a power
         area, depths = opening.area(slope_u, slope_v, self.library), self.depths(thickness)
-        counted = self.photons_per_decay / (4 * math.pi) * (squared * squared) * area
+        counted = self.photons_per_decay / (4 * math.pi) * (squared_cosine * squared_cosine) * area
         if self.crystal_mu is not None:
             counted = counted * absorbed_share(cosine, self.crystal_mu, thickness, depths, layer, self.library)
         if self.within_cone:
@@ -244,37 +253,43 @@ class Optics:
         layer: int = 0,
         cells: int = 1,
     ) -> ArrayOrTensor:
-        """What pixels count per (decay / mm^3 mm) along rays that start from one point of the hole.
+        """Return each pixel's weight for rays through one opening: expected counts per unit line integral.
+
+        The unit of the line integral is decays / mm^3 x mm.
 
         Parameters
         ----------
         along
-            Where in the pixels the rays end on the crystal along u and v, mm from its middle and point-inverted.
+            Positions along u and v at which the rays end on the crystal, mm from its middle and point-inverted.
         pitch
-            The pixels' size on the crystal, mm along u and v.
+            Size of the pixels on the crystal, mm along u and v.
         length, side, thickness
             Collimator length l, and the crystal's side and thickness, mm.
         opening, layer
-            The same as in `counted`.
+            Point of the hole and index of the depth layer, as in `counted`.
         cells
-            Rays of a pixel: along each side, a ray stands for this part of it where the crystal or a wall ends.
+            Number of rays along each side of a pixel. A ray represents 1 / `cells` of the side where the crystal or a wall
+            cuts the pixel.
         """
         distance = length + self.depths(thickness)[layer]
         starts = opening.x, opening.y
-        slope_u, slope_v = ((place + start) / distance for place, start in zip(along, starts, strict=True))
+        slope_u, slope_v = ((end + start) / distance for end, start in zip(along, starts, strict=True))
         counted, _ = self.counted(slope_u, slope_v, opening, thickness, layer)
         weights = counted * (pitch[0] * pitch[1] / distance**2)
-        for place, size, start in zip(along, pitch, starts, strict=True):
+        for end, size, start in zip(along, pitch, starts, strict=True):
             if self.within_crystal:
-                weights = weights * share_inside(place, size / cells, side)
+                weights = weights * share_inside(end, size / cells, side)
             if self.within_walls:
-                shrink = length / distance  # back to where the rays cross the crystal's front
-                weights = weights * share_inside(shrink * place - (1 - shrink) * start, shrink * size / cells, side)
+                shrink = length / distance  # scales a position at the layer's depth back to the crystal's front
+                weights = weights * share_inside(shrink * end - (1 - shrink) * start, shrink * size / cells, side)
         return weights
 
 
-def _checked(value: Any, name: str) -> Any:
-    """A number as a float, numbers as an array or tensor, None as it is; `InputError` where they are out of range."""
+def _check_number(value: Any, name: str) -> Any:
+    """Return the attribute `name` as a float, an array or a tensor; None stays None where it is allowed.
+
+    Raises `InputError` if a number is out of range.
+    """
     if value is None and name in ("aperture_mu", "crystal_mu", "plate_thickness"):
         return None
     if is_tensor(value):
@@ -292,9 +307,9 @@ def _checked(value: Any, name: str) -> Any:
 
 
 IDEAL = Optics()
-"""Nothing penetrates, all photons that pass the hole are counted, one of each decay."""
+"""Optics without penetration that count all photons that pass the hole, one per decay."""
 
 
 def chosen_optics(optics: Optics | None, settings: Mapping[str, Any]) -> Optics:
-    """`optics` with some attributes changed; without any, ideal ones."""
+    """Return `optics`, by default ideal ones, with the attributes in `settings` changed."""
     return replace(optics or IDEAL, **settings) if settings else optics or IDEAL

@@ -8,7 +8,7 @@ import numpy as np
 
 from ..arrays import Array, Floats, Floats32, checked
 from ..errors import InputError
-from ..geometry.frames import module_frames, tilted
+from ..geometry.frames import module_frames, tilt_frames
 from ..geometry.system import PinholeSystem
 from ..volumes.volume import Volume
 from .emission import Emission
@@ -40,10 +40,10 @@ class GeometryGradient(NamedTuple):
         by_centers, by_tilt = self.centers.copy(), np.empty_like(self.centers)
         for axis, step in enumerate(_STEP * np.eye(3)):
             far = step * system.pinhole_distance[:, None]
-            aimed = tilted(module_frames(system.centers + far), system.tilt)
-            aimed = aimed - tilted(module_frames(system.centers - far), system.tilt)
+            aimed = tilt_frames(module_frames(system.centers + far), system.tilt)
+            aimed = aimed - tilt_frames(module_frames(system.centers - far), system.tilt)
             nominal = module_frames(system.centers)
-            turned = tilted(nominal, system.tilt + step) - tilted(nominal, system.tilt - step)
+            turned = tilt_frames(nominal, system.tilt + step) - tilt_frames(nominal, system.tilt - step)
             by_centers[:, axis] += np.einsum("mij,mij->m", self.frames, aimed) / (2 * far[:, axis])
             by_tilt[:, axis] = np.einsum("mij,mij->m", self.frames, turned) / (2 * _STEP)
         return by_centers, by_tilt

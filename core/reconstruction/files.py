@@ -7,7 +7,7 @@ import numpy as np
 
 from ..errors import InputError, reading
 from ..files import AnyPath, require_ending, write_bytes
-from ..hdf5 import numbers, opened, pack
+from ..hdf5 import opened, pack, read_numbers
 from ..validation import instance, require_finite
 from ..volumes.formats import hdf5
 from ..volumes.volume_files import read_volume
@@ -50,8 +50,8 @@ def read_reconstruction(path: AnyPath) -> Reconstruction:
             raise InputError("it holds a volume, but no reconstruction: use it as start with read_volume")
         if int(group.attrs["format_version"]) > _FORMAT_VERSION:
             raise InputError(f"written by a newer mphDRR (format {group.attrs['format_version']}); update to read it")
-        objective = np.asarray(numbers(group["objective"]), np.float64)
-        state = {name: numbers(array) for name, array in group.get("state", {}).items()}
+        objective = np.asarray(read_numbers(group["objective"]), np.float64)
+        state = {name: read_numbers(array) for name, array in group.get("state", {}).items()}
         if objective.ndim != 1:
             raise InputError(f"objective: expected one number for each iteration, got {objective.ndim} axes")
         for name, array in (("objective", objective), *state.items()):

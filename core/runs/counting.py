@@ -10,7 +10,7 @@ import numpy as np
 from ..arrays import Array, Floats
 from ..errors import InputError, reading
 from ..files import AnyPath, require_file
-from ..hdf5 import datasets, numbers, opened
+from ..hdf5 import datasets, opened, read_numbers
 from ..physics.dead_time import live_shares
 from ..projector.models import each_pixel
 from ..volumes.formats import numpy_files
@@ -27,7 +27,7 @@ def read_efficiency(path: AnyPath) -> Array:
             arrays = numpy_files.load(Path(path))
         else:
             with opened(path, whole=True) as file:
-                arrays = {name: numbers(item) for name, item in datasets(file).items()}
+                arrays = {name: read_numbers(item) for name, item in datasets(file).items()}
         if len(arrays) != 1 and EFFICIENCY not in arrays:
             raise InputError(f"expected one array, or one called {EFFICIENCY}, found {', '.join(arrays) or 'none'}")
         return arrays.get(EFFICIENCY, next(iter(arrays.values())))

@@ -19,7 +19,7 @@ from ..geometry.grid import Grid
 from ..geometry.scanner import Scanner
 from ..geometry.system import PinholeSystem
 from ..geometry.views import Views
-from ..hdf5 import attributes, datasets, numbers, opened, pack
+from ..hdf5 import attributes, datasets, opened, pack, read_numbers
 from ..scanner_kinds import scanner_kind
 from ..volumes.formats import numpy_files
 from ..volumes.volume import Volume
@@ -201,7 +201,7 @@ def _packed_hdf5(arrays: _Arrays, attributes: dict[str, Any]) -> memoryview:
 
 def _read_hdf5(path: Path) -> _Contents:
     with opened(path, whole=True) as file:
-        return {name: numbers(item) for name, item in datasets(file).items()}, attributes(file)
+        return {name: read_numbers(item) for name, item in datasets(file).items()}, attributes(file)
 
 
 def _packed_npz(described: _Arrays, attributes: dict[str, Any]) -> memoryview:
@@ -232,7 +232,7 @@ def _read_pt(path: Path) -> _Contents:
 
 
 def _torch() -> Any:
-    with needing(of=".pt files, unlike .h5 and .npz"):
+    with needing(feature=".pt files, unlike .h5 and .npz"):
         import torch
     return torch
 

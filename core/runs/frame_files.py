@@ -16,7 +16,7 @@ import numpy as np
 from ..arrays import Array, Floats
 from ..errors import InputError, reading
 from ..files import AnyPath, require_file
-from ..hdf5 import datasets, numbers, opened
+from ..hdf5 import datasets, opened, read_numbers
 from ..memory import require
 from ..progress import Progress, tell
 from ..recording import recorded_warnings
@@ -224,7 +224,7 @@ def _hdf5(path: Path, layout: Layout) -> Counts:
             arrays[layout.dataset.strip("/")] = file[layout.dataset]  # of an array's names, the visit gives one
         dataset = arrays[_chosen(arrays, layout)]
         _require_memory(dataset.shape, dataset.dtype.itemsize)
-        return _counts(numbers(dataset))
+        return _counts(read_numbers(dataset))
 
 
 def _chosen(arrays: dict[str, Any], layout: Layout) -> str:

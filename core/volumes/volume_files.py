@@ -6,7 +6,7 @@ from pathlib import Path
 from numpy.typing import ArrayLike
 
 from ..errors import InputError, naming, reading, refusing
-from ..files import AnyPath, ending_of, replacing, require_ending, require_file
+from ..files import AnyPath, find_ending, replacing, require_ending, require_file
 from ..progress import Progress
 from ..validation import instance, real_array
 from .formats import dicom, hdf5, metaimage, nifti, nrrd, numpy_files
@@ -103,7 +103,7 @@ def _contents(path: Path, series: str | None, progress: Progress | None) -> Cont
         is_folder = path.is_dir()
     if not is_folder:
         require_file(path)
-    ending = ending_of(path, READ_FORMATS)
+    ending = find_ending(path, READ_FORMATS)
     is_series = is_folder or ending == ".dcm" or (not ending and dicom.is_dicom(path))
     with naming(path):
         if not (ending or is_series):

@@ -1,9 +1,9 @@
-"""X-ray systems from a few parameters: sources on an arc or a ring, and opposite each of them its panel.
+"""X-ray systems from a few parameters: sources on an arc or a ring, each with a panel on the opposite side.
 
-Without arguments, both give 24 sources that suit the users' scanner, whose modules fill the azimuths from 14.3 to 255.6
+Without arguments, both return 24 sources that suit the users' scanner, whose modules fill the azimuths from 14.3 to 255.6
 degrees within 120 mm of the plane z = 0, and see a sphere of 75 mm: an arc in the open side, so high that most of each cone
-passes below the modules opposite, and a ring above all modules. Neighbouring panels overlap: they stand for what each source
-sees of one detector. Azimuths are polar angles about the isocentre, rad, from +x towards +y.
+passes below the modules opposite, and a ring above all modules. Neighbouring panels overlap: each stands for the part of
+one detector that its source sees. Azimuths are polar angles about the isocentre, rad, from +x towards +y.
 """
 
 import math
@@ -34,7 +34,7 @@ def xray_arc(
     filters: Any = "Al 2.5",
     focal_spot: ArrayLike = 1.0,
 ) -> XraySystem:
-    """Sources on an arc, such as in the open side of the scanner, and panels opposite.
+    """Create sources on an arc, such as in the open side of the scanner, with panels on the opposite side.
 
     Parameters
     ----------
@@ -43,7 +43,7 @@ def xray_arc(
     start, end
         Azimuths of the first and the last source, rad; a full turn apart they form a closed ring, see `xray_ring`.
     source_radius, panel_radius
-        Distances of the sources and of the panels' middles from the isocentre, mm.
+        Distances of the sources and of the panels' centres from the isocentre, mm.
     panel_size
         Width and height of the panels, mm, or one number for both. They are at right angles to the ray through the
         isocentre, with their rows along the arc: where the sources are above its plane, the panels are tilted.
@@ -56,26 +56,26 @@ def xray_arc(
     """
     count = whole_number(n, "number of sources")
     first, last = (float(radians(value, name)) for value, name in ((start, "start"), (end, "end")))
-    turn = abs(last - first)
-    if turn > FULL_TURN + 1e-9:
-        raise InputError(f"start and end: expected at most a full turn apart, got {math.degrees(turn):g} degrees")
+    span = abs(last - first)
+    if span > FULL_TURN + 1e-9:
+        raise InputError(f"start and end: expected at most a full turn apart, got {math.degrees(span):g} degrees")
     distance, height = positive(source_radius, "source_radius", "mm"), float(real_array(z, "z", ()))
     if abs(height) >= distance:
         raise InputError(f"z: expected less than the sources' {distance:g} mm from the isocentre, got {height:g}")
-    azimuths = np.linspace(first, last, count, endpoint=turn < FULL_TURN - 1e-9)  # a closed ring has no end
-    around = math.sqrt(distance**2 - height**2)
-    sources = np.stack([around * np.cos(azimuths), around * np.sin(azimuths), np.full(count, height)], axis=1)
+    azimuths = np.linspace(first, last, count, endpoint=span < FULL_TURN - 1e-9)  # a closed ring has no end
+    radius = math.sqrt(distance**2 - height**2)
+    sources = np.stack([radius * np.cos(azimuths), radius * np.sin(azimuths), np.full(count, height)], axis=1)
     u, v, k = module_frames(sources).transpose(1, 0, 2)
-    (width, tall), (n_v, n_u) = lengths(panel_size, "panel_size", 2), whole_shape(shape, "shape", 2)
+    (panel_width, panel_height), (n_v, n_u) = lengths(panel_size, "panel_size", 2), whole_shape(shape, "shape", 2)
     centers = positive(panel_radius, "panel_radius", "mm") * k
-    own = {"filters": filters, "focal_spot": focal_spot}
-    return XraySystem(sources, centers, width / n_u * u, tall / n_v * v, (n_v, n_u), kvp, mas, **own)  # type: ignore[arg-type]
+    tube = {"filters": filters, "focal_spot": focal_spot}
+    return XraySystem(sources, centers, panel_width / n_u * u, panel_height / n_v * v, (n_v, n_u), kvp, mas, **tube)  # type: ignore[arg-type]
 
 
 def xray_ring(n: int = 24, *, z: float = 310.0, start: float = 0.0, **settings: Any) -> XraySystem:
-    """A closed ring of sources above the modules, or below with z < 0, and tilted panels on the other side.
+    """Create a closed ring of sources above the modules, or below with z < 0, with tilted panels on the opposite side.
 
     `start` is the azimuth of the first source, rad; the settings are those of `xray_arc`.
     """
-    usual = {"source_radius": 400.0, "panel_size": 300.0}
-    return xray_arc(n, z=z, start=start, end=start + FULL_TURN, **{**usual, **settings})
+    defaults = {"source_radius": 400.0, "panel_size": 300.0}
+    return xray_arc(n, z=z, start=start, end=start + FULL_TURN, **{**defaults, **settings})

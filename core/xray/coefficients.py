@@ -1,4 +1,4 @@
-"""Coefficients of materials at many energies, and tables of air and water: photon_data.txt."""
+"""Photon coefficients of materials at many energies, and the tables of air and water in photon_data.txt."""
 
 from functools import cache
 from pathlib import Path
@@ -10,34 +10,38 @@ from ..errors import InputError
 from ..physics.materials import MATERIALS, attenuation
 from ..validation import freeze
 
-_SYMBOLS = {next(iter(made.composition)): name for name, made in MATERIALS.items() if len(made.composition) == 1}
-"""Materials that are elements, by their symbols."""
+_SYMBOLS = {next(iter(m.composition)): name for name, m in MATERIALS.items() if len(m.composition) == 1}
+"""Names of the materials that are elements, by their symbols."""
 
 
 def attenuations(material: str, energies: Floats) -> Floats:
-    """Linear attenuation coefficients (n,), 1/mm, of one of `MATERIALS`, or an element such as "Al", at energies, keV."""
+    """Return linear attenuation coefficients (n,), 1/mm, of a material at energies (n,), keV.
+
+    `material` is a name of `MATERIALS` or an element such as "Al".
+    """
     return _attenuations(_SYMBOLS.get(material, material), tuple(energies.tolist()))
 
 
 @cache
 def _attenuations(material: str, energies: tuple[float, ...]) -> Floats:
+    """Return the coefficients (n,), 1/mm, of a name of `MATERIALS` or an element, read-only and cached."""
     return freeze(np.array([attenuation(material, energy) for energy in energies]))
 
 
 def energy_absorption(material: str, energies: Floats) -> Floats:
-    """Mass energy-absorption coefficients (n,), cm^2/g, of "air" or "water" at energies (n,), keV, of 10 to 1000."""
+    """Return mass energy-absorption coefficients (n,), cm^2/g, of "air" or "water" at 10 to 1000 keV."""
     table = photon_data()
-    return between(energies, table[0], table[1 if material == "air" else 2])
+    return interpolate_log(energies, table[0], table[1 if material == "air" else 2])
 
 
 @cache
 def photon_data() -> Floats:
-    """The columns (9, n) of photon_data.txt."""
+    """Return the columns (9, n) of photon_data.txt."""
     return table_numbers("photon_data.txt").T
 
 
 def table_numbers(name: str) -> Floats:
-    """The numbers of a table in this folder, row by row, with zeros where a row is shorter than others."""
+    """Return the numbers of a text table in this folder (rows, columns); short rows are filled up with zeros."""
     rows = [line.split() for line in table_lines(name)]
     numbers = np.zeros((len(rows), max(map(len, rows))))
     for row, values in zip(numbers, rows, strict=True):
@@ -46,20 +50,23 @@ def table_numbers(name: str) -> Floats:
 
 
 def table_lines(name: str) -> list[str]:
-    """The lines of a table in this folder, without its comments."""
+    """Return the lines of a text table in this folder, without comments."""
     text = Path(__file__).with_name(name).read_text(encoding="ascii")
     return [line for line in text.splitlines() if not line.startswith("#")]
 
 
-def between(energies: Floats, known: Floats, values: Floats) -> Floats:
-    """Positive `values` at `known` energies, at others: a cubic in the logarithms through the four nearest."""
-    if energies.min() < known[0] or energies.max() > known[-1]:
-        given = f"energies {energies.min():g} to {energies.max():g} keV"
-        raise InputError(f"{given}: expected {known[0]:g} to {known[-1]:g} keV")
-    first = np.clip(np.searchsorted(known, energies) - 2, 0, len(known) - 4)[:, None] + np.arange(4)
-    x, at, y = np.log(energies)[:, None], np.log(known)[first], np.log(values)[first]
+def interpolate_log(energies: Floats, table_energies: Floats, values: Floats) -> Floats:
+    """Interpolate positive values at other energies: the cubic through the four nearest points, in logarithms of both.
+
+    `values` belong to the ascending `table_energies`. Raises `InputError` for energies outside of them.
+    """
+    if energies.min() < table_energies[0] or energies.max() > table_energies[-1]:
+        requested = f"energies {energies.min():g} to {energies.max():g} keV"
+        raise InputError(f"{requested}: expected {table_energies[0]:g} to {table_energies[-1]:g} keV")
+    nearest = np.clip(np.searchsorted(table_energies, energies) - 2, 0, len(table_energies) - 4)[:, None] + np.arange(4)
+    x, nodes, y = np.log(energies)[:, None], np.log(table_energies)[nearest], np.log(values)[nearest]
     total = np.zeros(len(energies))
     for i in range(4):
-        others = [j for j in range(4) if j != i]
-        total += y[:, i] * np.prod((x - at[:, others]) / (at[:, i : i + 1] - at[:, others]), axis=1)
+        rest = [j for j in range(4) if j != i]
+        total += y[:, i] * np.prod((x - nodes[:, rest]) / (nodes[:, i : i + 1] - nodes[:, rest]), axis=1)
     return np.exp(total)

@@ -1,4 +1,4 @@
-"""From counts back to materials: decomposition ray by ray, images at one energy, correction of beam hardening."""
+"""Material decomposition: paths from counts, images at one energy, correction of beam hardening."""
 
 from collections.abc import Sequence
 
@@ -10,39 +10,39 @@ from ..validation import instance, none_below_0, real_array, whole_number
 from .coefficients import attenuations
 from .spectral import SpectralTransmission
 
-_RAYS = 8192  # computed at once
-_PRECISION = 1e-9  # of paths, mm and relative
-_BOLDEST = 1.5  # change of a logarithm of counts in one step
-_DARKEST = 1e-200  # counts
-_DEEPEST = 2000.0  # mm of water
+_RAYS = 8192  # number of rays computed at once
+_PRECISION = 1e-9  # precision of paths, mm and relative
+_MAX_CHANGE = 1.5  # largest change of a logarithm of counts in one step
+_MIN_COUNTS = 1e-200  # lower limit of expected counts
+_MAX_WATER = 2000.0  # longest path through water, mm
 
 
 def decompose(counts: ArrayLike, m: SpectralTransmission, mAs: ArrayLike, iterations: int = 100) -> Floats:
-    """The paths through each material of every ray that make its counts most likely: (materials, ...), mm.
+    """Return the maximum-likelihood paths through each material for every ray's counts: (materials, ...), mm.
 
     Parameters
     ----------
     counts
-        (bins, ...), Poisson-distributed; with the model's views (bins, M, n_v, n_u).
+        Poisson-distributed counts (bins, ...); with the model's views (bins, M, n_v, n_u).
     m, mAs
         The model, and the exposure as for `SpectralTransmission.expected`.
     iterations
-        At most so many steps of Fisher scoring. Each ray goes on until its step is below a billionth of its paths.
+        Largest number of steps of Fisher scoring. A ray is finished when its step is below a billionth of its paths.
 
     Returns
     -------
     array
-        May be negative: paths are not bounded, so that estimates have no bias by that.
+        Paths may be negative: they are not bounded, since bounds would bias the estimates.
 
     Raises
     ------
     InputError
-        Fewer bins than materials, negative counts, other shapes.
+        There are fewer bins than materials, negative counts, or wrong shapes.
 
     Warns
     -----
     InputWarning
-        Some rays have no such paths, as where a bin counted nothing: they are left as they are after the last step.
+        Some rays have not converged, for example where a bin has no counts: their paths are those of the last step.
     """
     instance(m, SpectralTransmission, "decompose")
     n_bins, n = m.weights.shape[0], len(m.materials)
@@ -51,113 +51,115 @@ def decompose(counts: ArrayLike, m: SpectralTransmission, mAs: ArrayLike, iterat
     values = _checked_counts(counts, m)
     scale = m.scale(values.shape[1:], mAs).ravel()
     rays = values.reshape(n_bins, -1)
-    paths, lost = np.empty((n, rays.shape[1])), 0
+    paths, n_lost = np.empty((n, rays.shape[1])), 0
     for start in range(0, rays.shape[1], _RAYS):
-        part = slice(start, start + _RAYS)
-        paths[:, part], of_part = _most_likely(rays[:, part], m, scale[part], whole_number(iterations, "iterations"))
-        lost += of_part
-    if lost:
-        warn(f"decompose: {lost} of {rays.shape[1]} rays did not settle, as where bins counted nothing", 2)
+        batch = slice(start, start + _RAYS)
+        paths[:, batch], n_left = _most_likely(rays[:, batch], m, scale[batch], whole_number(iterations, "iterations"))
+        n_lost += n_left
+    if n_lost:
+        warn(f"decompose: {n_lost} of {rays.shape[1]} rays did not converge, as where bins have no counts", 2)
     return paths.reshape(n, *values.shape[1:])
 
 
 def _most_likely(counts: Floats, m: SpectralTransmission, scale: Floats, iterations: int) -> tuple[Floats, int]:
-    """Paths (materials, N) of N rays, and how many of them did not settle."""
+    """Return the maximum-likelihood paths (materials, N) of N rays, and the number of rays that did not converge."""
     open_beam = m.weights.sum(axis=1)
-    slopes = m.weights @ m.mu.T / open_beam[:, None]
+    mean_mu = m.weights @ m.mu.T / open_beam[:, None]
     depths = np.log(open_beam[:, None] * scale / np.maximum(counts, 0.5))
-    paths = np.linalg.pinv(slopes) @ depths * 0.5  # towards thin rays, where the slopes hold
-    left = np.arange(len(scale))
+    paths = np.linalg.pinv(mean_mu) @ depths * 0.5  # half of it, since mean_mu holds for short paths
+    active = np.arange(len(scale))
     mean, jacobian = _model(m, paths, scale)
-    likely = _log_likelihood(counts, mean)
-    share = np.ones(len(scale))
+    likelihood = _log_likelihood(counts, mean)
+    damping = np.ones(len(scale))
     for _ in range(iterations):
-        step = _step(counts[:, left], mean, jacobian) * share
-        trial = paths[:, left] + step
-        new_mean, new_jacobian = _model(m, trial, scale[left])
-        new = _log_likelihood(counts[:, left], new_mean)
-        better = new >= likely - 1e-12 * np.abs(likely)
-        paths[:, left[better]] = trial[:, better]
-        mean = np.where(better, new_mean, mean)
-        jacobian = np.where(better, new_jacobian, jacobian)
-        likely = np.where(better, new, likely)
-        small = np.abs(step).max(axis=0) <= _PRECISION * (1 + np.abs(trial).max(axis=0))
-        going = ~(small & (better | (share < 1e-6)))
-        share = np.where(better, np.minimum(2 * share, 1), share / 4)[going]
-        left, mean, jacobian, likely = left[going], mean[:, going], jacobian[:, :, going], likely[going]
-        if not len(left):
+        step = _step(counts[:, active], mean, jacobian) * damping
+        trial = paths[:, active] + step
+        new_mean, new_jacobian = _model(m, trial, scale[active])
+        new_likelihood = _log_likelihood(counts[:, active], new_mean)
+        improved = new_likelihood >= likelihood - 1e-12 * np.abs(likelihood)
+        paths[:, active[improved]] = trial[:, improved]
+        mean = np.where(improved, new_mean, mean)
+        jacobian = np.where(improved, new_jacobian, jacobian)
+        likelihood = np.where(improved, new_likelihood, likelihood)
+        is_small = np.abs(step).max(axis=0) <= _PRECISION * (1 + np.abs(trial).max(axis=0))
+        todo = ~(is_small & (improved | (damping < 1e-6)))
+        damping = np.where(improved, np.minimum(2 * damping, 1), damping / 4)[todo]
+        active, mean, jacobian, likelihood = active[todo], mean[:, todo], jacobian[:, :, todo], likelihood[todo]
+        if not len(active):
             break
-    return paths, len(left)
+    return paths, len(active)
 
 
 def _model(m: SpectralTransmission, paths: Floats, scale: Floats) -> tuple[Floats, Floats]:
-    """The model's means and derivatives, the means above 0 even where nothing passes."""
+    """Return the model's expected counts and their derivatives, with counts above 0 even where no photon passes."""
     mean, jacobian = m.model(paths, scale)
-    return np.maximum(mean, _DARKEST), jacobian
+    return np.maximum(mean, _MIN_COUNTS), jacobian
 
 
 def _step(counts: Floats, mean: Floats, jacobian: Floats) -> Floats:
-    """Steps (materials, N) of Fisher scoring, no bolder than `_BOLDEST`."""
+    """Return steps (materials, N) of Fisher scoring, shortened where they change a count by more than `_MAX_CHANGE`."""
     score = np.einsum("bmn,bn->nm", jacobian, counts / mean - 1)
     fisher = np.einsum("bin,bjn->nij", jacobian, jacobian / mean[:, None])
     floor = 1e-13 * np.trace(fisher, axis1=1, axis2=2)[:, None, None] + np.finfo(float).tiny
     step = np.linalg.solve(fisher + floor * np.eye(fisher.shape[1]), score[..., None])[..., 0].T
     change = np.abs(np.einsum("bmn,mn->bn", jacobian, step) / mean).max(axis=0)
-    return step * np.minimum(1, _BOLDEST / np.maximum(change, _BOLDEST))
+    return step * np.minimum(1, _MAX_CHANGE / np.maximum(change, _MAX_CHANGE))
 
 
 def _log_likelihood(counts: Floats, mean: Floats) -> Floats:
-    """Poisson's, of N rays, up to what the means do not change."""
+    """Return the Poisson log-likelihood of N rays, without the terms that do not depend on the means."""
     return np.sum(counts * np.log(mean) - mean, axis=0)
 
 
 def virtual_monoenergetic(values: ArrayLike, materials: Sequence[str], energy: float) -> Floats:
-    """What X rays of one energy, keV, would see: ``sum of mu values``.
+    """Return the attenuation of material paths or volumes at one energy, keV: ``sum of mu values`` over the materials.
 
-    Of paths (materials, ...) these are line integrals without unit, of volumes relative to their materials' densities
-    attenuation coefficients, 1/mm.
+    For paths (materials, ...), mm, the result are line integrals; for volumes relative to their materials' densities it is
+    the attenuation coefficient, 1/mm.
     """
-    given = real_array(values, "values", None)
-    if not given.ndim or len(given) != len(materials):
+    array = real_array(values, "values", None)
+    if not array.ndim or len(array) != len(materials):
         raise InputError(f"values: expected a first axis of {len(materials)}, {', '.join(materials)}")
-    at = real_array([energy], "energy", (1,))
-    return np.tensordot(np.concatenate([attenuations(name, at) for name in materials]), given, axes=1)
+    energies = real_array([energy], "energy", (1,))
+    return np.tensordot(np.concatenate([attenuations(name, energies) for name in materials]), array, axes=1)
 
 
 def decompose_images(images: ArrayLike, materials: Sequence[str], energies: ArrayLike) -> Floats:
-    """Volumes (materials, ...), relative to the materials' densities, from images of mu (images, ...), 1/mm.
+    """Return material volumes (materials, ...), relative to the materials' densities, from images of mu (images, ...), 1/mm.
 
-    They are those of least squares. Each image is taken as one of the energy (images,), keV, that its bin has in effect:
-    beam hardening must have been corrected, which `decompose` does not need. `InputError` where there are fewer images
-    than materials.
+    They are the least-squares solution. Each image is treated as one of a single energy (images,), keV, the effective energy
+    of its bin; so beam hardening must have been corrected, which `decompose` does not require. Raises `InputError` if there
+    are fewer images than materials.
     """
-    at = real_array(energies, "energies", (None,))
-    given = real_array(images, "images", None)
-    if not given.ndim or len(given) != len(at) or len(at) < len(materials):
-        expected = f"one for each of {len(at)} energies, and as many as materials, {len(materials)}"
+    keV = real_array(energies, "energies", (None,))
+    array = real_array(images, "images", None)
+    if not array.ndim or len(array) != len(keV) or len(keV) < len(materials):
+        expected = f"one for each of {len(keV)} energies, and as many as materials, {len(materials)}"
         raise InputError(f"images: expected {expected}")
-    mu = np.stack([attenuations(name, at) for name in materials], axis=1)
-    return np.tensordot(np.linalg.pinv(mu), given, axes=1)
+    mu = np.stack([attenuations(name, keV) for name in materials], axis=1)
+    return np.tensordot(np.linalg.pinv(mu), array, axes=1)
 
 
 def correct_beam_hardening(counts: ArrayLike, m: SpectralTransmission, mAs: ArrayLike) -> Floats:
-    """The path through water, mm, that would leave each ray's counts of all bins together: (...), without the bins' axis.
+    """Return the path through water, mm, with the counts of each ray, all bins together: (...), without the bins' axis.
 
-    Reconstructed, it is the density relative to water's, without the cupping that beam hardening causes in soft tissue.
-    It is found in a table of the logarithm of counts, which falls with the path; at most 2 m.
+    Reconstructed, it is the density relative to water's, without the cupping that beam hardening causes in soft tissue. It
+    is interpolated in a table of the logarithm of counts, which falls with the path; at most 2 m.
     """
     instance(m, SpectralTransmission, "correct_beam_hardening")
     values = _checked_counts(counts, m).sum(axis=0)
     weights = m.weights.sum(axis=0)
-    known = np.sinh(np.linspace(-6.0, np.arcsinh(_DEEPEST), 8192))  # mm: finer where it is thin; below 0 for noise
+    # Finer steps at short paths; paths below 0 are for noisy counts.
+    water_paths = np.sinh(np.linspace(-6.0, np.arcsinh(_MAX_WATER), 8192))
     mu = attenuations("water", m.spectrum.energies)
-    signal = [np.log(np.exp(-mu * path) @ weights) for path in known]
+    log_counts = [np.log(np.exp(-mu * water) @ weights) for water in water_paths]
     with np.errstate(divide="ignore"):
         measured = np.log(values / m.scale(values.shape, mAs))
-    return np.interp(-measured, np.negative(signal), known)
+    return np.interp(-measured, np.negative(log_counts), water_paths)
 
 
 def _checked_counts(counts: ArrayLike, m: SpectralTransmission) -> Floats:
+    """Return counts (bins, ...) as an array; raise `InputError` for negative ones or another number of bins."""
     values = none_below_0(counts, "counts")
     if not values.ndim or len(values) != len(m.weights):
         raise InputError(f"counts: expected a first axis of {len(m.weights)} bins, got shape {values.shape}")

@@ -1,4 +1,4 @@
-"""What detectors make of photons: counts in energy bins, or energy absorbed."""
+"""Response of X-ray detectors to photons: counts in energy bins, or absorbed energy."""
 
 import math
 from collections.abc import Sequence
@@ -19,26 +19,26 @@ _SIGMA = 1 / math.sqrt(8 * math.log(2))
 """Standard deviation of a Gaussian of full width at half maximum 1."""
 
 
-class Detector(Protocol):
-    """What a pixel makes of photons."""
+class PanelDetector(Protocol):
+    """Response of a panel's pixels to photons."""
 
     def response(self, energies: Floats, bins: Bins | None) -> Floats:
-        """What a photon of each energy (n,), keV, that hits the pixel adds to each bin: (bins, n)."""
+        """Return the contribution to each bin of one photon of each energy (n,), keV, that hits the pixel: (bins, n)."""
 
 
 @dataclass(frozen=True, eq=False)
 class PhotonCounter:
-    """A detector that counts photons in energy bins; as it is by default, all of them, in the bins of their energies.
+    """A detector that counts photons in energy bins; by default every photon, in the bin of its energy.
 
-    Photons cross the sensor at a right angle. What it absorbs it counts once, at the photon's energy: fluorescence that
-    escapes and charge that neighbors share are for `sharing` to say.
+    Photons cross the sensor at a right angle. Each absorbed photon is counted once, at its energy; escaping fluorescence and
+    charge shared by neighbouring pixels are described by `sharing`.
 
     Attributes
     ----------
     material : str or None
-        The sensor's, such as "CdTe" or "silicon"; None stops every photon.
+        Material of the sensor, such as "CdTe" or "silicon"; None stops every photon.
     thickness : float
-        The sensor's, mm.
+        Thickness of the sensor, mm.
     energy_fwhm : float
         Full width at half maximum, keV, of the Gaussian that blurs energies; 0 for none.
     sharing : array (bins, bins) or None
@@ -58,19 +58,19 @@ class PhotonCounter:
             object.__setattr__(self, "sharing", freeze(sharing))
 
     def response(self, energies: Floats, bins: Bins | None) -> Floats:
-        """Counts (bins, n) of a photon of each energy (n,), keV."""
+        """Return the expected counts (bins, n) of one photon of each energy (n,), keV."""
         if bins is None:
             raise InputError("bins: a detector that counts photons needs them, such as ((20, 60), (60, 120))")
         edges = checked_bins(bins)
         if self.energy_fwhm:
             deviations = (edges[:, :, None] - energies) / (self.energy_fwhm * _SIGMA * math.sqrt(2))
-            below = np.array([math.erf(x) for x in deviations.flat]).reshape(deviations.shape) / 2
-            counted = below[:, 1] - below[:, 0]
+            fraction_below = np.array([math.erf(x) for x in deviations.flat]).reshape(deviations.shape) / 2
+            counts = fraction_below[:, 1] - fraction_below[:, 0]
         else:
-            counted = ((edges[:, :1] <= energies) & (energies < edges[:, 1:])).astype(float)
+            counts = ((edges[:, :1] <= energies) & (energies < edges[:, 1:])).astype(float)
         if self.sharing is not None:
-            counted = real_array(self.sharing, "detector: sharing", (len(edges), len(edges))) @ counted
-        return counted * absorbed(self.material, self.thickness, energies)
+            counts = real_array(self.sharing, "detector: sharing", (len(edges), len(edges))) @ counts
+        return counts * absorbed_fraction(self.material, self.thickness, energies)
 
 
 @dataclass(frozen=True)
@@ -80,9 +80,9 @@ class EnergyIntegrator:
     Attributes
     ----------
     material : str or None
-        The scintillator's, such as "CsI"; None stops every photon.
+        Material of the scintillator, such as "CsI"; None stops every photon.
     thickness : float
-        The scintillator's, mm.
+        Thickness of the scintillator, mm.
     """
 
     material: str | None = "CsI"
@@ -92,14 +92,14 @@ class EnergyIntegrator:
         object.__setattr__(self, "thickness", positive(self.thickness, "detector: thickness", "mm"))
 
     def response(self, energies: Floats, bins: Bins | None) -> Floats:
-        """Energy absorbed (1, n), keV, of a photon of each energy (n,), keV."""
+        """Return the absorbed energy (1, n), keV, of one photon of each energy (n,), keV."""
         if bins is not None:
             raise InputError("bins: a detector that integrates the energy has none: expected None")
-        return (energies * absorbed(self.material, self.thickness, energies))[None]
+        return (energies * absorbed_fraction(self.material, self.thickness, energies))[None]
 
 
-def absorbed(material: str | None, thickness: float, energies: Floats) -> Floats:
-    """Shares (n,) of the photons that `thickness`, mm, of a material stops; None stops all."""
+def absorbed_fraction(material: str | None, thickness: float, energies: Floats) -> Floats:
+    """Return the fraction (n,) of photons of each energy that `thickness`, mm, of a material stops; 1 for None."""
     if material is None:
         return np.ones(len(energies))
     with naming("detector"):
@@ -107,7 +107,7 @@ def absorbed(material: str | None, thickness: float, energies: Floats) -> Floats
 
 
 def checked_bins(bins: Bins) -> Floats:
-    """Bins as an array (bins, 2); `InputError` where one is empty, out of order, or overlaps the next."""
+    """Return bins as an array (bins, 2); raise `InputError` if one is empty, out of order, or overlaps the next."""
     edges = real_array(bins, "bins", (None, 2))
     if not len(edges):
         raise InputError("bins: expected one or more, got none")
@@ -115,6 +115,6 @@ def checked_bins(bins: Bins) -> Floats:
         if not 0 <= low < high:
             raise InputError(f"bins: bin {i}: expected a lower and a higher energy, keV, got {low:g} and {high:g}")
         if i and low < edges[i - 1, 1]:
-            before = edges[i - 1, 1]
-            raise InputError(f"bins: bins {i - 1} and {i} overlap or are out of order: {low:g} < {before:g} keV")
+            upper = edges[i - 1, 1]
+            raise InputError(f"bins: bins {i - 1} and {i} overlap or are out of order: {low:g} < {upper:g} keV")
     return edges

@@ -1,4 +1,4 @@
-"""Motion and change since a reference volume, from few views: where the body is now, and what in it is not as it was."""
+"""Motion and change since a reference volume, from few views: the body's rigid motion, and the residual change."""
 
 from dataclasses import dataclass, replace
 from typing import Any
@@ -16,21 +16,24 @@ from ..validation import freeze, instance, real_array, whole_number
 from ..volumes.volume import LINE_INTEGRALS, Volume, require_quantity
 
 _LEVELS = ((4, 4), (2, 2), (2, 1))
-"""Pixels are joined to squares of the first number to be compared, of the second to be projected: coarse ones first, to find
-motion that is larger than details. The last take their derivatives from those before, as they are many projections."""
-_FAR = 1.0
-"""Voxels from where derivatives were taken, beyond which they are taken anew."""
+"""Pairs of block sizes, pixels: at which images are compared, and at which they are projected.
+
+Coarse blocks come first, to find motion that is larger than details. The last pair reuses the derivatives of the one
+before, since derivatives take many projections.
+"""
+_MAX_DISTANCE = 1.0
+"""Distance in voxels from the motion at which derivatives were computed, beyond which they are computed anew."""
 _SETTLED, _FINE = 0.1, 0.02
-"""A step is small where it is less than these shares of the standard deviations, or of a voxel."""
-_EXACT = 1e-12
-"""Variance of line integrals, below which they are as exact as they can be computed."""
-_BLIND = 1e12
-"""Condition number of what images say of six numbers, from which on they do not say all."""
+"""Largest final step, as a share of the standard deviations, or of a voxel."""
+_MIN_VARIANCE = 1e-12
+"""Variance of line integrals by rounding, the least that is assumed."""
+_MAX_CONDITION = 1e12
+"""Condition number of the information matrix from which on the images do not determine all six numbers."""
 
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """A rigid motion of a body: turned about `center`, then shifted.
+    """A rigid motion of a body: a rotation about `center`, then a shift.
 
     Attributes
     ----------
@@ -39,12 +42,12 @@ class Motion:
     rotation : array (3,)
         Rotation vector, rad: its direction is the axis, its length the angle.
     center : array (3,)
-        The reference's middle before, world mm.
+        Centre of the reference before the motion, world mm.
     covariance : array (6, 6)
-        Of shift and rotation, mm and rad: that of noise, made larger where what is left over is more than noise. The
-        standard deviations of the rotation are up to a third too small.
+        Covariance of shift and rotation, mm and rad, by noise, enlarged where the residuals exceed noise. The standard
+        deviations of the rotation are up to a third too small.
     settled : bool
-        Whether the last step was small.
+        Whether the last step was small, so that the iterations converged.
     """
 
     shift: Floats
@@ -55,19 +58,19 @@ class Motion:
 
     @property
     def pose(self) -> Floats:
-        """World now from world before, (4, 4)."""
+        """Transform (4, 4) from world points before the motion to world points after it."""
         return _pose(np.concatenate([self.shift, self.rotation]), self.center)
 
     def moved(self, volume: Volume) -> Volume:
-        """A volume of the body before, where it is now: the same voxels on a moved grid."""
-        return Volume(volume.array, _moved(volume.grid, self.pose), volume.quantity, volume.note)
+        """Return a volume of the body after the motion: the same voxels on a moved grid."""
+        return Volume(volume.array, _moved_grid(volume.grid, self.pose), volume.quantity, volume.note)
 
 
 class MotionFinder:
-    """Finds the motions of a body since a reference, one set of images after the other: for motion as it happens.
+    """Finds the motions of a body since a reference from successive sets of images, for motion as it happens.
 
-    Images are nearly linear in a motion of less than a voxel: the derivatives of the one before are kept as long as they are
-    right. Then a motion takes two or three projections, else about ten. Parameters are those of `find_motion`.
+    Images are nearly linear in a motion of less than a voxel, so the derivatives of the set before are kept as long as they
+    are valid. Then a motion takes two or three projections, else about ten. Parameters are those of `find_motion`.
     """
 
     def __init__(
@@ -81,32 +84,32 @@ class MotionFinder:
         self._photons = None if photons is None else real_array(photons, "photons", None)
         step = reference.grid.spacing.min()
         radius = np.linalg.norm(reference.grid.corners()[0] - self._center) / 2
-        self._steps = np.array([step] * 3 + [step / radius] * 3)
-        self._known: dict[int, tuple[Floats, Floats]] = {}  # by level: where derivatives were taken, and they
+        self._steps = np.array([step] * 3 + [step / radius] * 3)  # mm and rad that move the body by about a voxel
+        self._derivatives_at: dict[int, tuple[Floats, Floats]] = {}  # by block size: motion, and derivatives at it
 
     def __call__(self, images: ArrayLike, start: Motion | None = None, iterations: int = 10) -> Motion:
-        """The motion in `images`, see `find_motion`; `start` is a first guess, such as the motion before."""
-        seen = real_array(images, "images", (len(self.views), *self.views.shape))
-        noise = self._noise(seen)
+        """Return the motion in `images`, see `find_motion`; `start` is a first guess, such as the motion before."""
+        measured = real_array(images, "images", (len(self.views), *self.views.shape))
+        noise = self._noise(measured)
         motion = np.zeros(6) if start is None else np.concatenate([start.shift, start.rotation])
         levels = [pair for pair in _LEVELS if all(n % pair[0] == 0 for n in self.views.shape)] or [(1, 1)]
-        for level, width in levels if start is None else levels[-1:]:
-            own, variances = _joined(seen, level), _joined(noise, level).ravel() / level**2
+        for level, fine in levels if start is None else levels[-1:]:
+            blocks, variances = _block_means(measured, level), _block_means(noise, level).ravel() / level**2
             for _ in range(whole_number(iterations, "iterations")):
-                slopes = self._slopes(motion, level)
-                left = (own - _joined(self._project(motion, width), level // width)).ravel()
-                unexplained = max(0.0, float(np.mean(left**2 - variances)))
-                of_each = 1 / np.maximum(variances + unexplained, _EXACT)
-                information = (slopes * of_each) @ slopes.T
-                if not np.linalg.cond(information) < _BLIND:
-                    unseen = "these images do not show all of a motion"
-                    raise InputError(f"find_motion: {unseen}: expected more or other views")
+                derivatives = self._derivatives(motion, level)
+                residual = (blocks - _block_means(self._project(motion, fine), level // fine)).ravel()
+                unexplained = max(0.0, float(np.mean(residual**2 - variances)))
+                weights = 1 / np.maximum(variances + unexplained, _MIN_VARIANCE)
+                information = (derivatives * weights) @ derivatives.T
+                if not np.linalg.cond(information) < _MAX_CONDITION:
+                    reason = "these images do not show all of a motion"
+                    raise InputError(f"find_motion: {reason}: expected more or other views")
                 inverse = np.linalg.inv(information)
-                step = inverse @ (slopes @ (of_each * left))
+                step = inverse @ (derivatives @ (weights * residual))
                 motion = motion + self._steps * step
-                variance = float(of_each @ left**2) / max(1, left.size - 6)
-                enough = np.maximum(_SETTLED * np.sqrt(variance * np.diag(inverse)), _FINE * level)
-                settled = bool(np.all(np.abs(step) <= enough))
+                variance = float(weights @ residual**2) / max(1, residual.size - 6)
+                limits = np.maximum(_SETTLED * np.sqrt(variance * np.diag(inverse)), _FINE * level)
+                settled = bool(np.all(np.abs(step) <= limits))
                 if settled:
                     break
         if not settled:
@@ -114,17 +117,17 @@ class MotionFinder:
         covariance = variance * inverse * np.outer(self._steps, self._steps)
         return Motion(freeze(motion[:3]), freeze(motion[3:]), self._center, freeze(covariance), settled)
 
-    def _slopes(self, motion: Floats, level: int) -> Floats:
-        """Derivatives (6, pixels) of the images by the six numbers in units of their steps, near a motion."""
-        place, slopes = self._known.get(level, (np.full(6, np.inf), np.zeros((6, 0))))
-        if np.abs((motion - place) / self._steps).max() > _FAR:
-            ends = [[self._project(motion + sign * by, level) for sign in (1, -1)] for by in np.diag(self._steps)]
-            slopes = np.stack([(after - before).ravel() / 2 for after, before in ends])
-            self._known[level] = motion, slopes
-        return slopes
+    def _derivatives(self, motion: Floats, level: int) -> Floats:
+        """Return the derivatives (6, pixels) of the images by the six numbers, in units of `_steps`, at or near a motion."""
+        computed_at, derivatives = self._derivatives_at.get(level, (np.full(6, np.inf), np.zeros((6, 0))))
+        if np.abs((motion - computed_at) / self._steps).max() > _MAX_DISTANCE:
+            ends = [[self._project(motion + sign * step, level) for sign in (1, -1)] for step in np.diag(self._steps)]
+            derivatives = np.stack([(upper - lower).ravel() / 2 for upper, lower in ends])
+            self._derivatives_at[level] = motion, derivatives
+        return derivatives
 
     def _noise(self, images: Floats) -> Floats:
-        """Variances of the images by the photons that pass, 0 where their number is not known."""
+        """Return the variances of line integrals by the number of transmitted photons; 0 if it is unknown."""
         if self._photons is None:
             return np.zeros(images.shape)
         if self._photons.shape not in ((), images.shape) or self._photons.min() <= 0:
@@ -132,9 +135,9 @@ class MotionFinder:
         return np.exp(images) / self._photons
 
     def _project(self, motion: Floats, level: int) -> Floats:
-        """Images (M, n_v, n_u) of the moved reference, of pixels `level` times as large."""
-        grid = _moved(self.reference.grid, _pose(motion, self._center))
-        A = Projector(grid, _coarser(self.views, level), backend=self._backend)
+        """Return images (M, n_v, n_u) of the moved reference, with pixels `level` times as large."""
+        grid = _moved_grid(self.reference.grid, _pose(motion, self._center))
+        A = Projector(grid, _coarse_views(self.views, level), backend=self._backend)
         return np.asarray(A(self.reference.array), float)
 
 
@@ -147,26 +150,27 @@ def find_motion(
     iterations: int = 10,
     backend: str = "auto",
 ) -> Motion:
-    """How a body has moved since a reference volume was made of it, from its images now.
+    """Find the rigid motion of a body since a reference volume was made of it, from its present images.
 
-    By Gauss-Newton on the difference of the images and those of the moved reference, from coarse pixels to fine ones, with
-    derivatives that are differences of projections. For many sets of images, such as those of a film, make a `MotionFinder`.
+    The difference between the images and those of the moved reference is minimised by Gauss-Newton steps, from coarse pixels
+    to fine ones, with derivatives that are differences of projections. For many sets of images, such as those of a film,
+    create a `MotionFinder`.
 
     Parameters
     ----------
     reference
-        The body before, such as a reconstruction: of mu, on any grid.
+        The body before the motion, such as a reconstruction: a volume of mu, on any grid.
     images
-        Line integrals now, (M, n_v, n_u).
+        Present line integrals, (M, n_v, n_u).
     views
-        Theirs.
+        Views of the images.
     photons
-        Photons of a pixel where nothing is between, one number or images: pixels then count by the photons that pass.
-        Without it all count alike.
+        Number of photons of a pixel without a body, one number or images: pixels are then weighted by the number of
+        transmitted photons. Without it all have the same weight.
     start
-        A first guess, within a voxel or so; without it the reference is taken to be where it was, within a few.
+        A first guess, within about a voxel; without it, the body must be within a few voxels of the reference.
     iterations
-        At most so many on each of the levels of pixels.
+        Largest number of steps at each pixel size.
 
     Returns
     -------
@@ -175,7 +179,7 @@ def find_motion(
     Raises
     ------
     InputError
-        Images or photons of another shape, a volume of CT numbers, views that do not show all six numbers.
+        Images or photons have another shape, the volume holds CT numbers, or the views do not determine all six numbers.
 
     Warns
     -----
@@ -193,35 +197,38 @@ def find_change(
     iterations: int = 20,
     **options: Any,
 ) -> Volume:
-    """What has changed since a reference, besides its motion: `sirt` of what the moved reference does not explain.
+    """Reconstruct the change of a body since a reference, besides its motion: `sirt` of the residual images.
 
-    The volume is on the moved reference's grid. Few iterations show where and about how much; `options` are those of
-    `sirt`, such as a mask.
+    The volume is on the moved reference's grid. Few iterations show the place and roughly the size of a change; `options`
+    are those of `sirt`, such as a mask.
     """
     instance(reference, Volume, "reference")
-    now = reference if motion is None else motion.moved(reference)
-    A = Projector(now.grid, views)
-    left = real_array(images, "images", A.shape_out) - A(now)
-    found = sirt(A, left, iterations, nonnegative=False, **options)
-    return Volume(found.volume.array, now.grid, now.quantity)
+    present = reference if motion is None else motion.moved(reference)
+    A = Projector(present.grid, views)
+    residual = real_array(images, "images", A.shape_out) - A(present)
+    result = sirt(A, residual, iterations, nonnegative=False, **options)
+    return Volume(result.volume.array, present.grid, present.quantity)
 
 
 def _pose(motion: Floats, center: Floats) -> Floats:
+    """Return the transform (4, 4) of a motion, shift and rotation vector (6,), about a centre."""
     (rotation,) = rotations(motion[None, 3:])
     return affine_matrix(rotation, center + motion[:3] - rotation @ center)
 
 
-def _moved(grid: Grid, pose: Floats) -> Grid:
+def _moved_grid(grid: Grid, pose: Floats) -> Grid:
+    """Return the grid transformed by a pose (4, 4)."""
     return Grid(grid.shape, pose @ grid.affine)
 
 
-def _coarser(views: Views, level: int) -> Views:
+def _coarse_views(views: Views, level: int) -> Views:
+    """Return views of the same size with pixels `level` times as large."""
     n_v, n_u = views.shape
     size = n_v // level, n_u // level
     return replace(views, u_steps=level * views.u_steps, v_steps=level * views.v_steps, shape=size)
 
 
-def _joined(images: Floats, level: int) -> Floats:
-    """Means of squares of pixels of images (..., n_v, n_u)."""
+def _block_means(images: Floats, level: int) -> Floats:
+    """Return the means of images (..., n_v, n_u) over square blocks of `level` pixels."""
     *first, n_v, n_u = images.shape
     return images.reshape(*first, n_v // level, level, n_u // level, level).mean(axis=(-3, -1))

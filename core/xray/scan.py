@@ -1,4 +1,4 @@
-"""The model "spectral" of recipes: what an X-ray system's panels make of its tubes' photons behind a body."""
+"""The model "spectral" of recipes: images of a body by the tubes and panels of an X-ray system."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -17,41 +17,42 @@ from ..projector import Model, Projector, Transmission
 from ..projector.bundles import Beam
 from ..volumes.volume import Volume
 from .decomposition import correct_beam_hardening, virtual_monoenergetic
-from .detectors import Detector, EnergyIntegrator, PhotonCounter
+from .detectors import EnergyIntegrator, PanelDetector, PhotonCounter
 from .spectra import Spectrum, tube_spectrum
 from .spectral import SpectralTransmission, panel_blur, water_and_bone
 from .system import XraySystem, filter_thicknesses
 
-_ALL = ((0.0, 1000.0),)
+_ALL_ENERGIES = ((0.0, 1000.0),)
 WATER_AND_BONE = "water-bone"
 
 
 @dataclass(frozen=True, eq=False)
 class SpectralScan(Model):
-    """What the panels of an X-ray system make of its tubes' photons: kVp, mAs, filters and focal spots are the system's.
+    """Polychromatic image model of an X-ray system: spectra of its tubes, and the response of its panels.
 
-    A `Projector` of it gives line integrals of volumes, from which `counts` makes the images: these are not linear.
+    kVp, mAs, filters and focal spots are those of `system`. A `Projector` with this model computes line integrals of
+    volumes; `counts` computes images from them, which are not linear in the volume.
 
     Attributes
     ----------
     system : XraySystem
         Sources with their panels, one for each view.
     materials : str
-        What volumes consist of: "water-bone", as CT numbers say (`water_and_bone`), or one of `MATERIALS`.
+        Materials of volumes: "water-bone", a mixture given by CT numbers (`water_and_bone`), or one of `MATERIALS`.
     panel : str
-        "counting", which counts photons (`PhotonCounter`), or "energy", whose signal is keV (`EnergyIntegrator`).
+        "counting" for photon counts (`PhotonCounter`), or "energy" for a signal in keV (`EnergyIntegrator`).
     window : (float, float) or None
-        Energies, keV, from and to, that are counted; None for all.
+        Lower and upper energy, keV, of the counted photons; None for all.
     sensor : str or None
-        Material that stops the photons, `sensor_thickness`, mm, of it; None stops all.
+        Material of the sensor, `sensor_thickness` mm thick; None stops all photons.
     sensor_fwhm : float
         Energy resolution of a counting panel, keV.
     intrinsic_fwhm : float
-        The panel's own blur, mm, beside that of the focal spots (`panel_blur`).
+        Blur of the panel, mm, besides that of the focal spots (`panel_blur`).
     background : float
         Counts of each pixel besides those of the spectrum, such as scatter.
     spectrum : Spectrum or None
-        In place of those of the tubes.
+        Spectrum to use instead of those of the tubes.
     """
 
     system: XraySystem
@@ -70,94 +71,105 @@ class SpectralScan(Model):
 
     def __post_init__(self) -> None:
         if not isinstance(self.system, XraySystem):
-            found = getattr(self.system, "kind", type(self.system).__name__)
-            raise InputError(f"spectral: expected a scanner of X-ray tubes and panels, got one of the kind {found}")
-        for _ in self.transmissions(self.system.views((1, 1))):  # spectra outside the table, empty windows
+            kind = getattr(self.system, "kind", type(self.system).__name__)
+            raise InputError(f"spectral: expected a scanner of X-ray tubes and panels, got one of the kind {kind}")
+        for _ in self.transmissions(self.system.views((1, 1))):  # refuses spectra outside the table, empty windows
             pass
 
     def record(self) -> dict[str, Any]:
-        """The settings, for a run's record."""
+        """Return the settings for a run's record."""
         names = ("materials", "panel", "window", "sensor", "sensor_thickness", "sensor_fwhm", "intrinsic_fwhm")
         return {name: getattr(self, name) for name in names}
 
     def unit(self, volume: Volume) -> str:
-        """Unit of the images."""
+        """Return the unit of the images, "counts" or "keV"."""
         return "counts" if self.panel == "counting" else "keV"
 
     def check(self, views: Views) -> None:
-        """Raise `InputError` where there is not one view of each source."""
+        """Raise `InputError` unless there is one view for each source."""
         if len(views) != len(self.system):
             raise InputError(f"spectral: expected {len(self.system)} views, one of each source, got {len(views)}")
 
     def beams(self, views: Views, m: int, grid: Grid) -> Iterator[Beam]:
-        """The rays of the line integrals."""
+        """Return the rays of the line integrals of view m."""
         return Transmission().beams(views, m, grid)
 
     def at_ct_energy(self, volume: Volume, energy: float | None) -> Volume:
-        """A volume of CT numbers, or of mu that holds at an energy, keV, as mu at `CT_ENERGY`, which the model takes."""
+        """Return a volume as mu at `CT_ENERGY`, which the model takes.
+
+        The given volume holds CT numbers, or mu at `energy`, keV. Raises `InputError` for mu without an energy.
+        """
         if volume.quantity == "hu":
             return hu_to_mu(volume, CT_ENERGY)
         self.check_volume(volume)
         if energy is None:
-            needed = "spectra need the energy at which the volume's mu holds"
-            raise InputError(f"volume.energy (--energy): missing; {needed}")
+            reason = "spectra need the energy at which the volume's mu holds"
+            raise InputError(f"volume.energy (--energy): missing; {reason}")
         if energy == CT_ENERGY:
             return volume
         mu = virtual_monoenergetic(self._relative(volume, energy), self._names, CT_ENERGY)
         return Volume(np.asarray(mu, np.float32), volume.grid, "mu", volume.note)
 
     def counts(self, volume: Volume, A: Projector, progress: Progress | None = None) -> Floats32:
-        """Expected images (M, n_v, n_u) of a volume of mu at `CT_ENERGY`, without the background; `A` has this model."""
+        """Return the expected images (M, n_v, n_u) of a volume of mu at `CT_ENERGY`, without background.
+
+        `A` is a `Projector` with this model. The images are in the unit of `unit`.
+        """
         self.check_volume(volume)
-        parts = self._relative(volume, CT_ENERGY)
-        n = len(parts)
-        paths = np.stack([np.asarray(A(part, part_of(progress, i, n))) for i, part in enumerate(parts)])
+        volumes = self._relative(volume, CT_ENERGY)
+        n = len(volumes)
+        paths = np.stack([np.asarray(A(array, part_of(progress, i, n))) for i, array in enumerate(volumes)])
         images = np.empty(A.shape_out, np.float32)
-        for which, m in self.transmissions(A.views):
-            images[which] = m.images(paths[:, which], self.system.mas[which])[0]
+        for views, m in self.transmissions(A.views):
+            images[views] = m.images(paths[:, views], self.system.mas[views])[0]
         return images
 
     def line_integrals(self, images: ArrayLike, views: Views, corrected: bool = True) -> Floats32:
-        """Line integrals (M, n_v, n_u) of what is measured: of mu at `CT_ENERGY` in water that leaves as much.
+        """Return line integrals (M, n_v, n_u) of mu at `CT_ENERGY` along the paths through water that explain images.
 
-        Not `corrected` for beam hardening they are logarithms alone, of mu at no energy. Where nothing has passed, half a
-        count is taken for it.
+        If not `corrected` for beam hardening they are mere logarithms, of mu at no particular energy. Pixels without photons
+        are treated as having half a count.
         """
         measured = np.maximum(np.asarray(images, np.float64) - self.background, 0.5)
-        found = np.empty(measured.shape, np.float32)
-        for which, m in self.transmissions(views, ("water",)):
-            mAs, signal = self.system.mas[which], measured[None, which]
+        result = np.empty(measured.shape, np.float32)
+        for indices, m in self.transmissions(views, ("water",)):
+            mAs, signal = self.system.mas[indices], measured[None, indices]
             if corrected:
-                found[which] = correct_beam_hardening(signal, m, mAs) * attenuation("water", CT_ENERGY)
+                result[indices] = correct_beam_hardening(signal, m, mAs) * attenuation("water", CT_ENERGY)
             else:
-                found[which] = np.log(m.expected(np.zeros(signal.shape), mAs) / signal)[0]
-        return found
+                result[indices] = np.log(m.expected(np.zeros(signal.shape), mAs) / signal)[0]
+        return result
 
     def transmissions(
         self, views: Views, materials: tuple[str, ...] = ()
     ) -> Iterator[tuple[Indexes, SpectralTransmission]]:
-        """Indexes of the views of each spectrum, with its counts behind materials, by default the model's."""
-        system, bins = self.system, _ALL if self.window is None else (self.window,)
+        """Yield, for each spectrum of the tubes, the indices of its views and its transmission model behind materials.
+
+        `materials` are by default those of the scan.
+        """
+        system, bins = self.system, _ALL_ENERGIES if self.window is None else (self.window,)
         tubes = list(zip(system.kvp.tolist(), system.filters.tolist(), strict=True))
         blurs = panel_blur(system, self.intrinsic_fwhm)
         for tube in dict.fromkeys(tubes):
-            which = np.flatnonzero([other == tube for other in tubes])
-            with naming(f"X-ray source {system.numbers[which[0]]}"):
+            indices = np.flatnonzero([view_tube == tube for view_tube in tubes])
+            with naming(f"X-ray source {system.numbers[indices[0]]}"):
                 spectrum = self.spectrum or tube_spectrum(tube[0], filter_thicknesses(tube[1]))
                 arguments = (materials or self._names, bins if self.panel == "counting" else None, self._detector())
-                yield which, SpectralTransmission(views[which], spectrum, *arguments, blurs[which])
+                yield indices, SpectralTransmission(views[indices], spectrum, *arguments, blurs[indices])
 
-    def _detector(self) -> Detector:
+    def _detector(self) -> PanelDetector:
+        """Return the detector of the panels' pixels."""
         if self.panel == "counting":
             return PhotonCounter(self.sensor, self.sensor_thickness, self.sensor_fwhm)
         return EnergyIntegrator(self.sensor, self.sensor_thickness)
 
     @property
     def _names(self) -> tuple[str, ...]:
+        """Names of the scan's materials."""
         return ("water", "bone") if self.materials == WATER_AND_BONE else (self.materials,)
 
     def _relative(self, volume: Volume, energy: float) -> Array | Floats:
-        """Each material (materials, n_x, n_y, n_z), relative to its own density."""
+        """Return volumes of the materials (materials, n_x, n_y, n_z), each relative to its own density."""
         if self.materials == WATER_AND_BONE:
             return water_and_bone(volume, energy)
         return volume.array[None].astype(np.float64) / attenuation(self.materials, energy)

@@ -1,4 +1,4 @@
-"""Spectra of X-ray tubes: tungsten anodes, filters, half-value layers, air kerma."""
+"""Spectra of X-ray tubes with tungsten anodes: filters, half-value layers, air kerma."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from ..errors import InputError, naming, needing
 from ..validation import at_least_0, freeze, positive, real_array
 from .coefficients import attenuations, energy_absorption, table_numbers
 
-_ANGLE, _LOWEST, _STEP = 12.0, 10.0, 0.5  # of the table: degrees, keV
+_ANGLE, _LOWEST, _STEP = 12.0, 10.0, 0.5  # the table's anode angle, degrees; least energy and step, keV
 _FILTERS: Mapping[str, float] = MappingProxyType({"Al": 2.5})
 
 _MICROGRAY = 1.602176634e-5
@@ -21,7 +21,7 @@ _MICROGRAY = 1.602176634e-5
 
 @dataclass(frozen=True, eq=False)
 class Spectrum:
-    """Photons by energy: those of a tube, or any others, as of one energy ``Spectrum([60], [1e5])``.
+    """Number of photons by energy: of a tube, or any other, such as a single energy ``Spectrum([60], [1e5])``.
 
     Attributes
     ----------
@@ -51,11 +51,11 @@ class Spectrum:
 
     @property
     def kerma(self) -> float:
-        """Air kerma at 1 m, µGy per mAs; at other distances it falls with their square."""
+        """Air kerma at 1 m, µGy per mAs; it falls with the square of the distance."""
         return self._kerma(self.photons)
 
     def filtered(self, filters: Mapping[str, float]) -> "Spectrum":
-        """The spectrum behind filters: thicknesses, mm, by element ("Al", "Cu", "W" …) or name of `MATERIALS`."""
+        """Return the spectrum behind filters: thicknesses, mm, by element ("Al", "Cu", "W" …) or name of `MATERIALS`."""
         photons = self.photons
         for material, thickness in filters.items():
             with naming("filters"):
@@ -64,20 +64,20 @@ class Spectrum:
         return Spectrum(self.energies, photons)
 
     def coarser(self, step: float) -> "Spectrum":
-        """The spectrum in steps of `step` keV from 0 on, each at the mean energy of its photons: quicker to compute with."""
-        which = np.floor(self.energies / positive(step, "step", "keV") + 1e-9).astype(int)
-        which -= which[0]
-        photons = np.bincount(which, self.photons).astype(np.float64)
-        energy = np.bincount(which, self.photons * self.energies)
-        there = photons > 0
-        return Spectrum(energy[there] / photons[there], photons[there])
+        """Return the spectrum in steps of `step` keV from 0 on, each at its photons' mean energy, for faster computing."""
+        step_index = np.floor(self.energies / positive(step, "step", "keV") + 1e-9).astype(int)
+        step_index -= step_index[0]
+        photons = np.bincount(step_index, self.photons).astype(np.float64)
+        total_energy = np.bincount(step_index, self.photons * self.energies)
+        is_filled = photons > 0
+        return Spectrum(total_energy[is_filled] / photons[is_filled], photons[is_filled])
 
     def half_value_layer(self, material: str) -> float:
-        """The thickness, mm, of a material as in `filtered` behind which half the air kerma is left."""
+        """Return the thickness, mm, of a material, as in `filtered`, that halves the air kerma."""
         return self.value_layer(material, 0.5)
 
     def value_layer(self, material: str, share: float) -> float:
-        """The thickness, mm, of a material that leaves a `share`, between 0 and 1, of the air kerma.
+        """Return the thickness, mm, of a material that reduces the air kerma to a `share` between 0 and 1.
 
         The second half-value layer is ``value_layer(material, 0.25) - value_layer(material, 0.5)``.
         """
@@ -85,40 +85,40 @@ class Spectrum:
             raise InputError(f"share: expected between 0 and 1, got {share:g}")
         mu = attenuations(material, self.energies)
         low, high = 0.0, -np.log(share) / mu.min()
-        wanted = share * self.kerma
+        target = share * self.kerma
         for _ in range(60):
-            middle = (low + high) / 2
-            low, high = (middle, high) if self._kerma(self.photons * np.exp(-mu * middle)) > wanted else (low, middle)
+            trial = (low + high) / 2
+            low, high = (trial, high) if self._kerma(self.photons * np.exp(-mu * trial)) > target else (low, trial)
         return float(high)
 
     def _kerma(self, photons: Floats) -> float:
+        """Return the air kerma, µGy per mAs, of these numbers of photons at the spectrum's energies."""
         return _MICROGRAY * float(photons @ (self.energies * energy_absorption("air", self.energies)))
 
 
 def tube_spectrum(kvp: float, filters: Mapping[str, float] = _FILTERS, angle: float = _ANGLE) -> Spectrum:
-    """The spectrum of a tungsten tube at 1 m behind its filters, by default 2.5 mm of aluminum.
+    """Return the spectrum of a tungsten tube at 1 m behind its filters, by default 2.5 mm of aluminum.
 
     Parameters
     ----------
     kvp
         Tube voltage, kV, from 40 to 150.
     filters
-        As for `Spectrum.filtered`: all that is between anode and patient, with what the tube's own window and oil are
-        worth. Air absorbs, too: ``{"Al": 2.5, "air": 1000}``. Photons below 10 keV, which tubes do not let out, are left
-        out.
+        As for `Spectrum.filtered`: all materials between anode and patient, including the equivalent of the tube's window
+        and oil. Air absorbs, too: ``{"Al": 2.5, "air": 1000}``. Photons below 10 keV, which do not leave tubes, are omitted.
     angle
-        The anode's, degrees. Other angles than 12 are calculated by SpekPy, if that is installed.
+        Anode angle, degrees. Other angles than 12 are calculated by SpekPy, if it is installed.
 
     Returns
     -------
     Spectrum
-        In steps of 0.5 keV, from a table made with SpekPy 2.5 (G. Poludniowski et al., Medical Physics 48 (2021) 3630).
-        Between the voltages of the table, 2 kV apart, it is linear.
+        In steps of 0.5 keV, from a table made with SpekPy 2.5 (G. Poludniowski et al., Medical Physics 48 (2021) 3630),
+        interpolated linearly between the table's voltages, which are 2 kV apart.
 
     Raises
     ------
     InputError
-        A voltage outside the table, a filter of no known material; another angle without SpekPy.
+        The voltage is outside the table, a filter's material is unknown, or the angle is another one and SpekPy is missing.
     """
     kvp, angle = positive(kvp, "kvp", "kV"), positive(angle, "angle", "degrees")
     voltages, photons = _table()
@@ -129,23 +129,24 @@ def tube_spectrum(kvp: float, filters: Mapping[str, float] = _FILTERS, angle: fl
     if angle == _ANGLE:
         energies = np.asarray(_LOWEST + _STEP * (np.arange(photons.shape[1]) + 0.5), np.float64)
         row = min(int((kvp - voltages[0]) / 2), len(voltages) - 2)
-        share = (kvp - voltages[row]) / 2
-        there = energies < kvp
-        between: Floats = (1 - share) * photons[row] + share * photons[row + 1]
-        bare = Spectrum(energies[there], between[there])
+        fraction = (kvp - voltages[row]) / 2
+        is_present = energies < kvp
+        interpolated: Floats = (1 - fraction) * photons[row] + fraction * photons[row + 1]
+        unfiltered = Spectrum(energies[is_present], interpolated[is_present])
     else:
-        bare = _by_spekpy(kvp, angle)
-    return bare.filtered(filters)
+        unfiltered = _spekpy_spectrum(kvp, angle)
+    return unfiltered.filtered(filters)
 
 
 @cache
 def _table() -> tuple[Floats, Floats]:
-    """Voltages (n,) and photons (n, energies) of tube_spectra.txt."""
+    """Return the voltages (n,), kV, and photons (n, energies) of tube_spectra.txt."""
     table = table_numbers("tube_spectra.txt")
     return table[:, 0], table[:, 1:]
 
 
-def _by_spekpy(kvp: float, angle: float) -> Spectrum:
+def _spekpy_spectrum(kvp: float, angle: float) -> Spectrum:
+    """Return SpekPy's unfiltered spectrum at 1 m; raise `InputError` if SpekPy is not installed or refuses."""
     with needing("mphdrr[spectra]", f"angle: expected {_ANGLE:g} degrees, or SpekPy for {angle:g}"):
         import spekpy
     try:
@@ -153,5 +154,5 @@ def _by_spekpy(kvp: float, angle: float) -> Spectrum:
     except Exception as error:
         raise InputError(f"tube spectrum: SpekPy refuses {kvp:g} kV and {angle:g} degrees ({error})") from error
     energies, photons = tube.get_spectrum()
-    there = energies > _LOWEST
-    return Spectrum(energies[there], photons[there] * _STEP / 100)
+    is_kept = energies > _LOWEST
+    return Spectrum(energies[is_kept], photons[is_kept] * _STEP / 100)

@@ -1,4 +1,4 @@
-"""Counts of a spectrum behind materials, and their derivatives by the materials' paths."""
+"""Polychromatic transmission: expected counts of a spectrum behind materials, and their derivatives by the paths."""
 
 import math
 from collections.abc import Sequence
@@ -16,49 +16,49 @@ from ..projector import Projector
 from ..validation import all_above_0, at_least_0, freeze, instance, none_below_0, real_array
 from ..volumes.volume import Volume, require_quantity
 from .coefficients import attenuations
-from .detectors import Bins, Detector, PhotonCounter
+from .detectors import Bins, PanelDetector, PhotonCounter
 from .spectra import Spectrum
 from .system import XraySystem
 
 _BINS = ((20.0, 60.0), (60.0, 120.0))
-_RAYS = 8192  # computed at once
+_RAYS = 8192  # number of rays computed at once
 _METER = 1000.0  # mm
 
 
 class SpectralTransmission:
-    """Expected counts of X rays of many energies behind materials: ``sum over E of photons response exp(-sum mu path)``.
+    """Expected counts of X rays behind materials: ``sum over E of photons response exp(-sum mu path)``.
 
     Parameters
     ----------
     views
-        `Views`, or a scanner that has them: counts are of their pixels, whose areas and distances they give. None for
+        `Views`, or a scanner that has them: counts are those of their pixels, with the pixels' areas and distances. None for
         single rays: counts are then those of 1 mm^2 at 1 m.
     spectrum
-        The photons, such as a `tube_spectrum`, or its `coarser` form, which is quicker.
+        The photons, such as a `tube_spectrum`, or its `coarser` form, which is faster.
     materials
         Names of `MATERIALS`, or elements such as "Cu".
     bins
-        Lower and upper energies, keV; None for an `EnergyIntegrator`, whose one signal then stands for counts.
+        Lower and upper energies, keV; None for an `EnergyIntegrator`, whose single signal then stands for counts.
     detector
         A `PhotonCounter` or `EnergyIntegrator`. By default every photon is counted in the bin of its energy.
     blur
-        FWHM on the panel, mm, one number or one of each view (M,), of the Gaussian blur of images by panel and focal spot,
-        as `panel_blur` gives it. Counts blurred over an image's edge are lost.
+        FWHM on the panel, mm, one number or one for each view (M,), of the Gaussian blur of images by panel and focal spot,
+        as `panel_blur` returns it. Counts blurred over an image's edge are lost.
     background
-        Counts besides those of the spectrum, such as scatter: one number, or what broadcasts to (bins, M, n_v, n_u). Blur
-        and background are of `project` and its derivative alone: single rays have none.
+        Counts besides those of the spectrum, such as scatter: one number, or an array that broadcasts to (bins, M, n_v,
+        n_u). Both are part of `images` and `project`, and blur of `volume_gradient`; single rays have none.
 
     Attributes
     ----------
     weights : array (bins, n)
-        What the photons of each energy add to each bin where nothing attenuates, of 1 mm^2 at 1 m and 1 mAs.
+        Expected counts in each bin from the photons of each energy, without attenuation, for 1 mm^2 at 1 m and 1 mAs.
     mu : array (materials, n)
         Attenuation coefficients, 1/mm.
 
     Raises
     ------
     InputError
-        No such material, bins that overlap or that no photon reaches, parallel views.
+        There is no such material, bins overlap or get no photons, or views are parallel.
     """
 
     def __init__(
@@ -67,7 +67,7 @@ class SpectralTransmission:
         spectrum: Spectrum,
         materials: Sequence[str] = ("water", "bone"),
         bins: Bins | None = _BINS,
-        detector: Detector | None = None,
+        detector: PanelDetector | None = None,
         blur: ArrayLike = 0.0,
         background: ArrayLike = 0.0,
     ) -> None:
@@ -87,47 +87,48 @@ class SpectralTransmission:
                 raise InputError(f"bins: no photon reaches bin {i}: expected energies of the spectrum")
         self.weights = freeze(weights)
         self.mu = freeze(np.array([attenuations(name, spectrum.energies) for name in self.materials]))
-        self._pixels = None if self.views is None else _pixels(self.views)
-        self._blurs = _blurs(self.views, none_below_0(blur, "blur")) if np.any(blur) else []
+        self._pixels = None if self.views is None else _pixel_factors(self.views)
+        self._blurs = _blur_matrices(self.views, none_below_0(blur, "blur")) if np.any(blur) else []
         self.background = freeze(none_below_0(background, "background"))
 
     def expected(self, paths: ArrayLike, mAs: ArrayLike) -> Floats:
-        """Expected counts (bins, ...) of rays with `paths` (materials, ...), mm of each material at its own density.
+        """Return the expected counts (bins, ...) of rays with `paths` (materials, ...), mm of each material.
 
-        With views the paths are (materials, M, n_v, n_u), and `mAs` is a number or one for each view (M,).
+        Each material has its own density. With views the paths are (materials, M, n_v, n_u), and `mAs` is a number or one
+        for each view (M,).
         """
-        given, scale = self._checked(paths, mAs)
-        return self._sums(given, self.weights) * scale
+        array, scale = self._checked(paths, mAs)
+        return self._sums(array, self.weights) * scale
 
     def jacobian(self, paths: ArrayLike, mAs: ArrayLike) -> Floats:
-        """Derivatives (bins, materials, ...) of the expected counts by the paths, counts per mm."""
-        given, scale = self._checked(paths, mAs)
-        sums = self._sums(given, self._slopes())
-        return sums.reshape(len(self.weights), *given.shape) * scale
+        """Return the derivatives (bins, materials, ...) of the expected counts by the paths, counts per mm."""
+        array, scale = self._checked(paths, mAs)
+        sums = self._sums(array, self._derivative_weights())
+        return sums.reshape(len(self.weights), *array.shape) * scale
 
     def gradient(self, paths: ArrayLike, values: ArrayLike, mAs: ArrayLike) -> Floats:
-        """The adjoint of the `jacobian` of `values` (bins, ...): (materials, ...)."""
+        """Apply the adjoint of the `jacobian` to `values` (bins, ...); return (materials, ...)."""
         jacobian = self.jacobian(paths, mAs)
         values = real_array(values, "values", (len(self.weights), *jacobian.shape[2:]))
         return np.einsum("bm...,b...->m...", jacobian, values)
 
     def fisher(self, paths: ArrayLike, mAs: ArrayLike) -> Floats:
-        """Fisher's information (materials, materials, ...) of Poisson counts on the paths, 1/mm^2.
+        """Return the Fisher information (materials, materials, ...) of Poisson counts about the paths, 1/mm^2.
 
-        Its inverse is the least covariance of unbiased estimates of the paths.
+        Its inverse is the smallest covariance of unbiased estimates of the paths.
         """
         jacobian = self.jacobian(paths, mAs)
         return np.einsum("bi...,bj...->ij...", jacobian, jacobian / self.expected(paths, mAs)[:, None])
 
     def project(self, volumes: Sequence[Volume | Array] | Array, A: Projector, mAs: ArrayLike) -> Floats:
-        """Expected counts (bins, M, n_v, n_u) of material volumes, each relative to its material's own density.
+        """Return the expected counts (bins, M, n_v, n_u) of material volumes, each relative to its material's own density.
 
-        `A` is the `Projector` of the volumes' grid into these views; its line integrals of the volumes are the paths.
+        `A` is the `Projector` from the volumes' grid to these views; its line integrals of the volumes are the paths.
         """
         return self.images(self._paths(volumes, A), mAs)
 
     def images(self, paths: ArrayLike, mAs: ArrayLike) -> Floats:
-        """Expected counts (bins, M, n_v, n_u) of the views' `paths` (materials, M, n_v, n_u), with blur and background."""
+        """Return expected counts (bins, M, n_v, n_u) for paths (materials, M, n_v, n_u), with blur and background."""
         counts = self.expected(paths, mAs)
         for m, (along_v, along_u) in enumerate(self._blurs):
             counts[:, m] = along_v @ counts[:, m] @ along_u.T
@@ -136,7 +137,10 @@ class SpectralTransmission:
     def volume_gradient(
         self, volumes: Sequence[Volume | Array] | Array, values: ArrayLike, A: Projector, mAs: ArrayLike
     ) -> Array:
-        """The adjoint of the derivative of `project` by the volumes, of `values` (bins, M, n_v, n_u): one per material."""
+        """Apply the adjoint of the derivative of `project` by the volumes to `values`; return one volume per material.
+
+        `values` are (bins, M, n_v, n_u).
+        """
         values = np.array(values, np.float64)
         for m, (along_v, along_u) in enumerate(self._blurs):
             values[:, m] = along_v.T @ values[:, m] @ along_u
@@ -144,7 +148,7 @@ class SpectralTransmission:
         return np.stack([A.T(path) for path in paths])
 
     def scale(self, shape: tuple[int, ...], mAs: ArrayLike) -> Floats:
-        """What turns `weights` into the counts of rays of a `shape`: mAs, and pixels' areas and distances."""
+        """Return the factor from `weights` to the counts of rays of a `shape`: mAs times pixel area and distance factor."""
         exposure = all_above_0(mAs, "mAs")
         if self._pixels is None:
             if exposure.ndim:
@@ -157,33 +161,35 @@ class SpectralTransmission:
         return self._pixels * exposure.reshape(-1, 1, 1)
 
     def model(self, paths: Floats, scale: Floats) -> tuple[Floats, Floats]:
-        """Counts (bins, N) and their derivatives (bins, materials, N) of N rays."""
+        """Return the counts (bins, N) of N rays and their derivatives (bins, materials, N) by the paths, counts per mm."""
         n = len(self.weights)
-        sums = self._sums(paths, np.concatenate([self.weights, self._slopes()])) * scale
+        sums = self._sums(paths, np.concatenate([self.weights, self._derivative_weights()])) * scale
         return sums[:n], sums[n:].reshape(n, *paths.shape)
 
-    def _slopes(self) -> Floats:
-        """Weights (bins * materials, n) of the derivatives."""
-        slopes = -self.weights[:, None] * self.mu
-        return slopes.reshape(-1, self.mu.shape[1])
+    def _derivative_weights(self) -> Floats:
+        """Return the weights (bins * materials, n) of the derivatives by the paths: ``-mu weights``."""
+        weights = -self.weights[:, None] * self.mu
+        return weights.reshape(-1, self.mu.shape[1])
 
     def _sums(self, paths: Floats, weights: Floats) -> Floats:
-        """Sums over the energies, of each row of `weights` times what the paths let pass: (rows, ...)."""
+        """Return, for each row of `weights`, the sum over energies of weight times transmittance, (rows, ...)."""
         rays = paths.reshape(len(paths), -1)
         sums = np.empty((len(weights), rays.shape[1]))
         for start in range(0, rays.shape[1], _RAYS):
-            part = slice(start, start + _RAYS)
-            sums[:, part] = weights @ np.exp(-(self.mu.T @ rays[:, part]))
+            batch = slice(start, start + _RAYS)
+            sums[:, batch] = weights @ np.exp(-(self.mu.T @ rays[:, batch]))
         return sums.reshape(len(weights), *paths.shape[1:])
 
     def _checked(self, paths: ArrayLike, mAs: ArrayLike) -> tuple[Floats, Floats]:
-        given = real_array(paths, "paths", None)
-        if not given.ndim or len(given) != len(self.materials):
+        """Return the paths as an array, and the factor from `weights` to the counts of their rays."""
+        array = real_array(paths, "paths", None)
+        if not array.ndim or len(array) != len(self.materials):
             expected = f"first axis of {len(self.materials)}, {', '.join(self.materials)}"
-            raise InputError(f"paths: expected a {expected}; got shape {given.shape}")
-        return given, self.scale(given.shape[1:], mAs)
+            raise InputError(f"paths: expected a {expected}; got shape {array.shape}")
+        return array, self.scale(array.shape[1:], mAs)
 
     def _paths(self, volumes: Sequence[Volume | Array] | Array, A: Projector) -> Floats:
+        """Return the line integrals (materials, M, n_v, n_u) of material volumes, mm."""
         if len(volumes) != len(self.materials):
             expected = f"{len(self.materials)}, {', '.join(self.materials)}"
             raise InputError(f"volumes: expected {expected}; got {len(volumes)}")
@@ -192,56 +198,57 @@ class SpectralTransmission:
 
 
 def panel_blur(system: XraySystem, fwhm: float = 0.0) -> Floats:
-    """The blur of images of what is at the isocentre, FWHM on the panel (N,), mm: of a panel's own FWHM and the focal spots.
+    """Return the blur of images of objects at the isocentre, FWHM on the panel (N,), mm: of panel and focal spots together.
 
-    A focal spot's shadow is its size times the panel's distance behind the isocentre, by that of the source before it; an
-    even one blurs as the Gaussian of the same variance.
+    A focal spot's shadow is its size times the panel's distance behind the isocentre, divided by the source's distance in
+    front of it; a uniform shadow blurs like the Gaussian of the same variance. `fwhm` is the panel's own blur, mm.
     """
     instance(system, XraySystem, "panel_blur")
-    before = np.linalg.norm(system.sources, axis=1)
-    shadow = system.focal_spot * (np.linalg.norm(system.panel_centers - system.sources, axis=1) / before - 1)
+    distances = np.linalg.norm(system.sources, axis=1)
+    shadow = system.focal_spot * (np.linalg.norm(system.panel_centers - system.sources, axis=1) / distances - 1)
     return np.hypot(at_least_0(fwhm, "fwhm"), np.maximum(shadow, 0) * FWHM_PER_SIGMA / math.sqrt(12))
 
 
-def _blurs(views: Views | None, blur: Floats) -> list[tuple[Floats, Floats]]:
-    """Of each view the matrices that blur its images along v and u."""
+def _blur_matrices(views: Views | None, blur: Floats) -> list[tuple[Floats, Floats]]:
+    """Return, for each view, the matrices that blur its images along v and along u."""
     if views is None or blur.shape not in ((), (len(views),)):
         raise InputError("blur: expected one number, or one of each view, and views")
     sigmas = np.broadcast_to(blur / FWHM_PER_SIGMA, len(views))
     steps = np.linalg.norm([views.v_steps, views.u_steps], axis=2)
     along_v, along_u = (
-        [gaussian_blur(n, sigma / step) for sigma, step in zip(sigmas, own, strict=True)]
-        for n, own in zip(views.shape, steps, strict=True)
+        [gaussian_blur(n, sigma / step) for sigma, step in zip(sigmas, view_steps, strict=True)]
+        for n, view_steps in zip(views.shape, steps, strict=True)
     )
     return list(zip(along_v, along_u, strict=True))
 
 
-def _pixels(views: Views) -> Floats:
-    """Photons (M, n_v, n_u) through each pixel for one per mm^2 at 1 m: its solid angle in units of 1 mm^2 at 1 m."""
+def _pixel_factors(views: Views) -> Floats:
+    """Return the solid angle of each pixel (M, n_v, n_u) in units of that of 1 mm^2 at 1 m."""
     views.require_pinholes("spectral transmission")
     areas = np.cross(views.u_steps, views.v_steps)
-    pixels = np.empty((len(views), *views.shape))
+    factors = np.empty((len(views), *views.shape))
     for m, area in enumerate(areas):
         sources, targets = views.rays(m)
         rays = targets - sources
-        pixels[m] = (np.abs(rays @ area) * _METER**2 / np.linalg.norm(rays, axis=1) ** 3).reshape(views.shape)
-    return pixels
+        factors[m] = (np.abs(rays @ area) * _METER**2 / np.linalg.norm(rays, axis=1) ** 3).reshape(views.shape)
+    return factors
 
 
 def water_and_bone(volume: Volume, energy: float = CT_ENERGY) -> Floats:
-    """Water and cortical bone, relative to their own densities, from CT numbers: (2, n_x, n_y, n_z); or from mu, 1/mm.
+    """Return volumes of water and cortical bone (2, n_x, n_y, n_z) from CT numbers, or from mu, 1/mm.
 
-    `energy`, keV, is that at which mu holds, or the CT's. They attenuate as `hu_to_mu` says, at every energy, but for air's
-    own coefficient: below water it thins out, above it is replaced by bone. Denser than bone is bone alone, as dense as the
-    number asks for at that energy.
+    Both are relative to the materials' own densities. `energy`, keV, is that at which mu holds, or the CT's. The mixture
+    attenuates as `hu_to_mu` does at every energy, except for air's own coefficient: below 0 HU water becomes thinner, above
+    it is replaced by bone. Voxels denser than bone are bone alone, with the density that their value requires at this
+    energy.
     """
     instance(volume, Volume, "water_and_bone")
     require_quantity(volume.quantity, ("hu", "mu"), "water_and_bone")
-    water, bone = (float(attenuations(name, np.array([energy]))[0]) for name in ("water", "bone"))
+    water_mu, bone_mu = (float(attenuations(name, np.array([energy]))[0]) for name in ("water", "bone"))
     values = volume.array.astype(np.float64)
-    hu = values / 1000 if volume.quantity == "hu" else values / water - 1
-    share = np.maximum(hu, 0) * water / (bone - water)
-    both = np.stack([1 + np.clip(hu, -1, 0) - share, share])
-    denser = share > 1
-    both[:, denser] = np.stack([0 * hu[denser], (1 + hu[denser]) * water / bone])
-    return both
+    hu = values / 1000 if volume.quantity == "hu" else values / water_mu - 1  # CT numbers by 1000
+    bone_share = np.maximum(hu, 0) * water_mu / (bone_mu - water_mu)
+    result = np.stack([1 + np.clip(hu, -1, 0) - bone_share, bone_share])
+    is_denser = bone_share > 1
+    result[:, is_denser] = np.stack([0 * hu[is_denser], (1 + hu[is_denser]) * water_mu / bone_mu])
+    return result

@@ -89,9 +89,9 @@ def assert_equal(one: PinholeSystem, other: PinholeSystem) -> None:
     for name in PinholeSystem.columns.typed:
         column = PinholeSystem.columns[name]
         if column.is_text:
-            np.testing.assert_array_equal(column.of(one), column.of(other))
+            np.testing.assert_array_equal(column.values(one), column.values(other))
         else:
-            np.testing.assert_allclose(column.of(one), column.of(other), rtol=1e-9, atol=1e-9)
+            np.testing.assert_allclose(column.values(one), column.values(other), rtol=1e-9, atol=1e-9)
 
 
 # The settings

@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 from torch import nn
 
-from mphdrr.core.learning.networks import NETWORKS, Kind
+from mphdrr.core.learning.networks import NETWORKS, NetworkKind
 from mphdrr.core.learning.recipe import TrainingRecipe, read_recipe
 
 from .small_recipes import TRAINING
@@ -38,7 +38,7 @@ class Toy(nn.Module):
         return [found, 0.5 * (found + sample.osem[:, :1])]
 
 
-class ToyKind(Kind):
+class ToyKind(NetworkKind):
     """The row of `NETWORKS`."""
 
     def load(self) -> type:

@@ -133,7 +133,7 @@ def test_gradients_by_every_number_are_the_central_differences(edge, system):
     two = system[2:4]
     points = [[3.0, -8.0, 5.0], [-11.0, 2.0, -9.0]]
     numbers = {"aperture_mu": [3.0, 2.2], "opening_angle": 1.4, "crystal_mu": [0.3, 0.1], "photons_per_decay": 0.9}
-    given = [points, *Modules.of(two), *numbers.values(), 2.0]
+    given = [points, *Modules.from_system(two), *numbers.values(), 2.0]
     given = [torch.tensor(x, dtype=torch.float64, requires_grad=True) for x in given]
 
     def values(points, *rest):

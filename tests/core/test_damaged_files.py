@@ -164,7 +164,7 @@ def test_damage_that_is_found_while_hdf5_reads_is_an_error_and_no_crash(tmp_path
 from mphdrr.core import hdf5, InputError
 try:
     with hdf5.opened({str(tmp_path / "a.h5")!r}) as file:
-        print([hdf5.numbers(file[f"g{{i}}/a"]).sum() for i in (1, 2)])
+        print([hdf5.read_numbers(file[f"g{{i}}/a"]).sum() for i in (1, 2)])
 except InputError as error:
     print(error)
 """

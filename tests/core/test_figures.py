@@ -16,7 +16,7 @@ from mphdrr.addon.cli import main
 from mphdrr.addon.cli.scene import INSTALL_BLENDER
 from mphdrr.core.figures.kinds import KINDS
 from mphdrr.core.figures.page import Page
-from mphdrr.core.figures.subject import Subject
+from mphdrr.core.figures.subject import FigureSubject
 from mphdrr.core.figures.sums import orthogonal_sum
 from mphdrr.core.geometry.presets import c_arm_views
 from mphdrr.core.runs import letters
@@ -30,16 +30,16 @@ DRAWN = [kind for kind in KINDS.values() if kind.draw is not None]
 
 
 @pytest.fixture(scope="module")
-def subject() -> Subject:
+def subject() -> FigureSubject:
     system = mph.read_system(WORKBOOK)[::5]
     pose = mph.euler_pose(np.radians(30), np.radians(55), np.radians(-10), (10.0, 0.0, -5.5))
     volume = mph.DerenzoPhantom(40, (8, 6, 5, 4, 3, 2), 40, 100).voxelize(mph.Grid.centered(40, 2.6), pose)
     views = system.views(shape=(16, 24))
     run = mph.ProjectionRun(mph.Projector(volume.grid, views)(volume), system, views, volume)
-    return Subject(scanner=system, volume=volume, run=run, pose=pose, name="Derenzo <&>")
+    return FigureSubject(scanner=system, volume=volume, run=run, pose=pose, name="Derenzo <&>")
 
 
-def drawn(name: str, subject: Subject, size: tuple[int, int] | None = None) -> Page:
+def drawn(name: str, subject: FigureSubject, size: tuple[int, int] | None = None) -> Page:
     page = Page(*(size or KINDS[name].size))
     KINDS[name].draw(page, subject)
     return page
@@ -86,7 +86,7 @@ def test_sums_print_translation_and_rotation(subject, tmp_path):
 def test_sums_of_ct_numbers_are_refused():
     ct = mph.Volume(np.zeros((4, 4, 4)), mph.Grid.centered(4, 1.0), "hu")
     with pytest.raises(mph.InputError, match="orthogonal sums: expected a volume of activity or mu, got hu"):
-        drawn("sums", Subject(volume=ct))
+        drawn("sums", FigureSubject(volume=ct))
 
 
 def test_mosaics_show_the_images_with_their_numbers(subject, tmp_path):
@@ -98,14 +98,14 @@ def test_mosaics_show_the_images_with_their_numbers(subject, tmp_path):
         assert {str(number) for number in run.system.numbers} <= set(said)
     assert f"{run.projections.max():.4g}" in texts(wide, tmp_path)
     assert f"{run.projections[:, 4:-4, 6:-6].max():.4g}" in texts(fov, tmp_path)
-    only = drawn("mosaic", Subject(run=run, modules="1-6"), (900, 700))
+    only = drawn("mosaic", FigureSubject(run=run, modules="1-6"), (900, 700))
     assert "6" in texts(only, tmp_path) and "11" not in texts(only, tmp_path)
 
 
 @pytest.mark.parametrize("number", [1, 76])
 def test_the_virtual_c_arm_prints_the_modules_distances(subject, tmp_path, number):
     system = subject.scanner[subject.scanner.numbers == number]
-    page = drawn("c-arm", Subject(scanner=subject.scanner, modules=str(number)))
+    page = drawn("c-arm", FigureSubject(scanner=subject.scanner, modules=str(number)))
     b, l = float(system.pinhole_distance[0]), float(system.collimator_length[0])
     arm = c_arm_views(system)
     off = float(np.linalg.norm(arm.sources[0] - system.centers[0]))

@@ -89,7 +89,7 @@ def test_depth_is_the_distance_to_the_minkowski_difference(rng):
     spatial = pytest.importorskip("scipy.spatial")
     system = crowd(rng)
     parts = system.parts()
-    hulls = Hulls.of(parts)
+    hulls = Hulls.from_parts(parts)
     for p, part in enumerate(parts):
         assert spatial.ConvexHull(part.vertices).volume == pytest.approx(spatial.ConvexHull(hulls.vertices[p]).volume)
     i, j = np.triu_indices(len(parts), 1)
@@ -152,7 +152,7 @@ def test_a_sliver_of_a_thousandth_is_found(rng):
         # The cone's half-angle is 30 degrees; at the depth of 60 mm its radius is 34.64 mm.
         offset = (34.64 + beyond) * np.array([np.cos(angle), np.sin(angle)])
         system = system_of([[200.0, 0, 0], [140, *offset]], 0.5, 5.0, [50.0, 2.0], 1.0, 100.0)
-        hulls = Hulls.of(system.parts(Construction(0.5, 1.0)))
+        hulls = Hulls.from_parts(system.parts(Construction(0.5, 1.0)))
         directions = cone_directions(200_000, np.sqrt(0.75)) @ system.frames()[0]
         fine = np.zeros(200_000, dtype=bool)
         for p in (2, 3):
@@ -165,7 +165,7 @@ def test_a_sliver_of_a_thousandth_is_found(rng):
 
 
 def test_rays_meet_hulls_where_points_along_them_are_inside(rng):
-    hulls = Hulls.of(crowd(rng, 4).parts())
+    hulls = Hulls.from_parts(crowd(rng, 4).parts())
     origin = np.array([10.0, -20.0, 5.0])
     directions = cone_directions(1000, -1.0)
     lengths = rng.uniform(100, 250, 1000)

@@ -27,9 +27,9 @@ def job(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """A folder that stands for /sys/fs/cgroup, with /proc/self beside it; `groups` says where a process is."""
     monkeypatch.setattr(memory, "_PROCESS", tmp_path / "proc")
     monkeypatch.setattr(memory, "available", memory.available.__wrapped__)  # type: ignore[attr-defined]
-    memory._groups.cache_clear()
+    memory._control_groups.cache_clear()
     yield tmp_path / "sys"
-    memory._groups.cache_clear()
+    memory._control_groups.cache_clear()
 
 
 def groups(job: Path, cgroup: str, mounts: str) -> None:

@@ -9,7 +9,7 @@ import pytest
 
 import mphdrr.core as mph
 from mphdrr.core.learning.judging.judge import judge
-from mphdrr.core.learning.judging.methods import Family, JudgedMethod, smoothed, tuned
+from mphdrr.core.learning.judging.methods import Family, JudgedMethod, smooth, tune
 from mphdrr.core.learning.judging.recipe import read_judge_recipe
 from mphdrr.core.learning.judging.scoring import Case
 from mphdrr.core.learning.judging.sets import SETS, events_by_recipe, set_fingerprint, set_text
@@ -256,7 +256,7 @@ def test_one_reconstruction_gives_all_stops_and_filters(folder):
     assert family.method((3, 10.0)).fingerprint != family.method((1, 10.0)).fingerprint
     blob = np.zeros((12, 12, 12), np.float32)
     blob[6, 6, 6] = 1
-    wide = smoothed(blob, grid, 20.0)
+    wide = smooth(blob, grid, 20.0)
     assert wide.sum() == pytest.approx(1, abs=0.02) and wide[6, 6, 7] / wide[6, 6, 6] == pytest.approx(0.66, abs=0.05)
 
 
@@ -320,7 +320,7 @@ def test_the_best_choice_is_found_where_few_are_tried_on_all_events(name):
     cases = [Case(None, run, grid, 0, {}) for run in range(25)]
     for case in cases:
         object.__setattr__(case, "truth", truth)
-    found = tuned(Known(name, grid, 1, 1, tuple((float(i),) for i in range(6))), cases)
+    found = tune(Known(name, grid, 1, 1, tuple((float(i),) for i in range(6))), cases)
     means = errors.mean(0)
     assert found["choice"] == [means.argmin()] and found["events"] == 25
     assert found["nrmse"] == pytest.approx(means.min(), rel=1e-5)

@@ -14,7 +14,7 @@ from mphdrr.core.learning.judging import rods
 from mphdrr.core.learning.judging.consistency import expected_deviance, relative_deviance
 from mphdrr.core.learning.judging.rods import rod_contrasts
 from mphdrr.core.learning.judging.scoring import SCORINGS, Case
-from mphdrr.core.learning.judging.summary import compared, means_of, told_of
+from mphdrr.core.learning.judging.summary import compare_scores, mean_scores, row_notes
 from mphdrr.core.phantoms import painting
 
 AS_SHIPPED = True  # voxels of all samples
@@ -105,10 +105,10 @@ def scores_of_pairs(altered, factor):
 def test_false_rods_are_counted_where_a_rod_is_missing():
     rows = [scores_of_pairs(altered, 0.9) for altered in (1, 2, 3, -4)]
     blind = [scores_of_pairs(altered, 0.2) for altered in (1, 2, 3, -4)]
-    found = means_of(rows)
+    found = mean_scores(rows)
     assert found["false_rods"].value == 1 and found["sites"] == 4 and found["sensitivity"].value == 1
-    assert means_of(blind)["false_rods"].value == 0 and means_of(blind)["sensitivity"].value == 0
-    beside = compared(rows, blind, 0)
+    assert mean_scores(blind)["false_rods"].value == 0 and mean_scores(blind)["sensitivity"].value == 0
+    beside = compare_scores(rows, blind, 0)
     assert beside["false_rods_more"] == (1, 1, 1) and beside["ratio"].value == pytest.approx(0.1 / 0.8)
-    assert "4 altered sites, fewer than 200" in told_of(found)
+    assert "4 altered sites, fewer than 200" in row_notes(found)
     assert scores_of_pairs(0, 1.0).keys() == {"nrmse", "megabytes"}

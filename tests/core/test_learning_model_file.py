@@ -28,7 +28,7 @@ from mphdrr.core.cli import main
 from mphdrr.core.events import EventSet
 from mphdrr.core.learning import model_file
 from mphdrr.core.learning.judging.sets import events_by_recipe
-from mphdrr.core.learning.model_file import Contents, read_model, sealed, write_model
+from mphdrr.core.learning.model_file import ModelContents, read_model, seal, write_model
 from mphdrr.core.learning.networks import NETWORKS
 from mphdrr.core.reconstruction.methods import method_of
 from mphdrr.core.reconstruction.snapshots import Snapshots
@@ -107,7 +107,7 @@ def test_a_pickled_object_is_refused_and_not_run(folder, model, tmp_path):
         path.write_bytes(memory.getvalue())
         with pytest.raises(mph.InputError, match="its seal is missing"):
             read_model(path)
-        path.write_bytes(sealed(memory.getvalue()))  # by one who knows how
+        path.write_bytes(seal(memory.getvalue()))  # by one who knows how
         with pytest.raises(mph.InputError) as refusal:
             read_model(path)
         assert "it holds more than numbers and texts, nothing of which was run" in str(refusal.value)
@@ -130,7 +130,7 @@ def test_a_pickled_object_is_refused_and_not_run(folder, model, tmp_path):
 def test_other_formats_are_refused_in_a_line(folder, model, tmp_path, changes, words):
     memory = io.BytesIO()
     torch.save({**torch.load(folder / "model.pt", weights_only=True), **changes}, memory)
-    (tmp_path / "m.pt").write_bytes(sealed(memory.getvalue()))
+    (tmp_path / "m.pt").write_bytes(seal(memory.getvalue()))
     with pytest.raises(mph.InputError, match=words):
         read_model(tmp_path / "m.pt")
 
@@ -317,7 +317,7 @@ print(main(["learn", "train", "r.toml", "-o", "out/m.pt"]), file=sys.stderr)
 
 
 def test_contents_are_all_there_is(model):
-    assert {*Contents.__annotations__} == {
+    assert {*ModelContents.__annotations__} == {
         "weights", "recipe", "scanner", "shape", "affine", "physics", "fixed", "counts", "trained_on", "curve", "judgement",
         "versions",
     }  # fmt: skip

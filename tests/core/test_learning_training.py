@@ -25,10 +25,10 @@ import mphdrr
 import mphdrr.core as mph
 from mphdrr.core.cli import main
 from mphdrr.core.learning import data
-from mphdrr.core.learning.data import Source, prepared
+from mphdrr.core.learning.data import Source, prepare_samples
 from mphdrr.core.learning.networks import NETWORKS
-from mphdrr.core.learning.recipe import parsed, template_text
-from mphdrr.core.learning.training import loss_of, nrmse
+from mphdrr.core.learning.recipe import parse_recipe, template_text
+from mphdrr.core.learning.training import nrmse, training_loss
 
 from .small_learning import TOY, small_training
 from .small_recipes import TRAINING
@@ -42,7 +42,7 @@ def recipe(monkeypatch, tmp_path, small_set):
 
 def changed(recipe, before: str, after: str):
     assert before in recipe.text
-    return parsed(recipe.text.replace(before, after), "training.toml", recipe.folder)
+    return parse_recipe(recipe.text.replace(before, after), "training.toml", recipe.folder)
 
 
 def refused(capsys, *arguments: object) -> str:
@@ -131,7 +131,7 @@ def test_a_network_takes_the_settings_that_its_class_has(recipe):
 
 def test_the_recipe_to_begin_with_is_one_for_each_network(tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(NETWORKS, "toy", TOY)
-    assert parsed(template_text("toy"))["network.kind"] == "toy"
+    assert parse_recipe(template_text("toy"))["network.kind"] == "toy"
     assert main(["learn", "new", "--like", "unrolled", "-o", str(tmp_path / "new.toml")]) == 0
     assert 'kind = "unrolled"' in (tmp_path / "new.toml").read_text(encoding="utf-8")
     capsys.readouterr()
@@ -142,7 +142,7 @@ def test_the_recipe_to_begin_with_is_one_for_each_network(tmp_path, monkeypatch,
 
 def test_samples_are_counts_osem_and_the_truth_at_their_level(recipe, tmp_path):
     source = Source(recipe)
-    (samples,) = prepared(source, tmp_path, ["train"])
+    (samples,) = prepare_samples(source, tmp_path, ["train"])
     numbers = source.events.split("train").numbers
     assert samples.draws == [(number, draw) for number in numbers for draw in (0, 1)]
     levels = []
@@ -178,12 +178,12 @@ def test_samples_are_made_once_and_go_on_where_they_were_stopped(recipe, tmp_pat
             raise mph.Cancelled
 
     with pytest.raises(mph.Cancelled):
-        prepared(Source(recipe), tmp_path, ["train"], progress=stop)
+        prepare_samples(Source(recipe), tmp_path, ["train"], progress=stop)
     first = len(made)
-    (samples,) = prepared(Source(recipe), tmp_path, ["train"])
+    (samples,) = prepare_samples(Source(recipe), tmp_path, ["train"])
     assert first < len(samples) and sorted(made) == samples.draws
-    (again,) = prepared(Source(recipe), tmp_path, ["train"])
-    (other,) = prepared(Source(changed(recipe, "after = [1, 2]", "after = [1, 3]")), tmp_path, ["train"])
+    (again,) = prepare_samples(Source(recipe), tmp_path, ["train"])
+    (other,) = prepare_samples(Source(changed(recipe, "after = [1, 2]", "after = [1, 3]")), tmp_path, ["train"])
     assert again.folder == samples.folder != other.folder
     assert len(made) == 2 * len(samples)
     assert not list(samples.folder.glob(".*"))
@@ -193,7 +193,7 @@ def test_samples_that_do_not_fit_onto_the_disk_are_refused_before_any_is_made(re
     usage = data.shutil.disk_usage(tmp_path)
     monkeypatch.setattr(data.shutil, "disk_usage", lambda _: usage._replace(free=10_000))
     with pytest.raises(mph.InputError, match=r"the samples take .* KiB, 10 KiB are free"):
-        prepared(Source(recipe), tmp_path, ["train"])
+        prepare_samples(Source(recipe), tmp_path, ["train"])
 
 
 @pytest.mark.parametrize(
@@ -212,7 +212,7 @@ def test_events_that_cannot_be_learned_from_are_refused(recipe, tmp_path, before
 def test_truth_from_coarse_voxels_is_doubted(recipe, tmp_path):
     recipe = changed(recipe, "spacing = 12.0", "spacing = 8.0")
     with pytest.warns(mph.InputWarning, match="flatter"):
-        prepared(Source(recipe), tmp_path, ["test"])
+        prepare_samples(Source(recipe), tmp_path, ["test"])
 
 
 def test_the_loss_is_the_nrmse_and_a_share_of_those_on_the_way():
@@ -220,9 +220,9 @@ def test_the_loss_is_the_nrmse_and_a_share_of_those_on_the_way():
     assert float(nrmse(truth, truth)) < 1e-5
     assert float(nrmse(torch.zeros_like(truth), truth)) == pytest.approx(1)
     zero, double = torch.zeros(2, 1, 1, 1, 2), 2 * truth[:, None]
-    assert float(loss_of([zero, double, truth[:, None]], truth)) == pytest.approx(0.6, abs=1e-5)
+    assert float(training_loss([zero, double, truth[:, None]], truth)) == pytest.approx(0.6, abs=1e-5)
     estimate = truth[:, None].clone().requires_grad_()
-    loss_of([estimate], truth).backward()
+    training_loss([estimate], truth).backward()
     assert torch.isfinite(estimate.grad).all()
 
 

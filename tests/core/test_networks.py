@@ -13,9 +13,9 @@ pytest.importorskip("monai", reason="MONAI is not installed")
 
 import mphdrr.core as mph  # noqa: E402
 from mphdrr.core.learning.networks import NETWORKS  # noqa: E402
-from mphdrr.core.learning.networks.network import UNet, spread, surplus  # noqa: E402
+from mphdrr.core.learning.networks.network import UNet, normalized_backprojection, relative_residual  # noqa: E402
 from mphdrr.core.learning.networks.parallel import parallel_beam  # noqa: E402
-from mphdrr.core.learning.setup import Sample, Setup  # noqa: E402
+from mphdrr.core.learning.setup import Sample, ScannerSetup  # noqa: E402
 
 from .conftest import WORKBOOK  # noqa: E402
 
@@ -40,16 +40,16 @@ def one_thread():
 
 
 @cache
-def setup_of(every: int = 16, permuted: int | None = None, backend: str = "auto", **model: Any) -> Setup:
+def setup_of(every: int = 16, permuted: int | None = None, backend: str = "auto", **model: Any) -> ScannerSetup:
     """Of every n-th module; `model` are settings of its `Emission`."""
     system = mph.read_system(WORKBOOK)[::every]
     views = system.views(shape=(8, 8), detector="real")
-    return Setup(
+    return ScannerSetup(
         mph.Projector(GRID, views, mph.Emission(system, time=60.0, **model), backend, threads=1), 2, (1, 2, 3), permuted
     )
 
 
-def scan(setup: Setup, seed: int = 1, level: float = 1.0, background: float = 1.0) -> Sample:
+def scan(setup: ScannerSetup, seed: int = 1, level: float = 1.0, background: float = 1.0) -> Sample:
     """Of a few hot voxels."""
     rng = np.random.default_rng(seed)
     truth = np.zeros(GRID.shape, np.float32)
@@ -72,7 +72,7 @@ def network(kind: str, random: bool = True, **options: Any) -> torch.nn.Module:
     return model
 
 
-def result(model: torch.nn.Module, setup: Setup, sample: Sample) -> torch.Tensor:
+def result(model: torch.nn.Module, setup: ScannerSetup, sample: Sample) -> torch.Tensor:
     model.eval()
     with torch.no_grad():
         return model(setup, sample)[-1]
@@ -150,7 +150,7 @@ def test_the_order_of_the_cameras_does_not_matter(kind):
     setup, model = setup_of(), network(kind)
     sample, order = scan(setup), np.array([3, 0, 4, 1, 2])
     A = setup.A
-    other = Setup(mph.Projector(A.grid, A.views[order], A.model.of_views(order), threads=1), 2, (1, 2, 3))
+    other = ScannerSetup(mph.Projector(A.grid, A.views[order], A.model.of_views(order), threads=1), 2, (1, 2, 3))
     turned = sample._replace(counts=sample.counts[:, order], background=sample.background[:, order])
     torch.testing.assert_close(result(model, other, turned), result(model, setup, sample), rtol=1e-3, atol=1e-4)
 
@@ -176,16 +176,17 @@ def test_permuted_poses_explain_images_by_other_modules():
     sample = scan(true)
     x = sample.osem[:, 1:2]
     exact = sample._replace(counts=true.A(x[:, 0] * sample.scale) + sample.background)
-    assert surplus(true, exact, x).abs().max() < 1e-3
-    assert surplus(permuted, exact, x).square().mean() > 0.01
+    assert relative_residual(true, exact, x).abs().max() < 1e-3
+    assert relative_residual(permuted, exact, x).square().mean() > 0.01
 
 
-def test_spread_surplus_is_the_em_update():
+def test_the_backprojected_residual_is_the_em_update():
     setup = setup_of()
     sample = scan(setup, level=1e6)
     x = np.asarray(sample.osem[0, 1] * sample.scale)
     updated = mph.mlem(setup.A, sample.counts[0].numpy(), 1, sample.background[0].numpy(), start=x).volume.array
-    ours = sample.osem[:, 1:2] * (1 + spread(setup, surplus(setup, sample, sample.osem[:, 1:2])))
+    residual = relative_residual(setup, sample, sample.osem[:, 1:2])
+    ours = sample.osem[:, 1:2] * (1 + normalized_backprojection(setup, residual))
     seen = np.asarray(setup.sensitivity) > 0.01 * float(setup.sensitivity.max())
     np.testing.assert_allclose((ours[0, 0] * sample.scale).numpy()[seen], updated[seen], rtol=1e-3, atol=1e-3 * x.max())
 
@@ -194,13 +195,13 @@ def test_cameras_in_training_are_a_random_few_and_in_use_all():
     setup = setup_of()
     sample, model = scan(setup), network("cameras", rounds=1)
     asked: list[int] = []
-    whole = model._opinions
+    whole = model._outputs
 
-    def counted(setup: Setup, images: Any, volumes: Any, some: torch.Tensor) -> Any:
+    def counted(setup: ScannerSetup, images: Any, volumes: Any, some: torch.Tensor) -> Any:
         asked.append(len(some))
         return whole(setup, images, volumes, some)
 
-    model._opinions = counted
+    model._outputs = counted
     model.train()(setup, sample)
     assert asked == [3]
     asked.clear()

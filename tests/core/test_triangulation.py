@@ -156,8 +156,14 @@ def pair(apart, parallel=False):
 
 
 def test_rays_that_leave_the_depth_unknown_are_refused():
-    refused(lambda: mph.triangulate(pair(40), [0, 1], [[30, 40], [30, 40]]), "parallel", "how deep")
-    refused(lambda: mph.triangulate(pair(40, True), [0, 1], [[30, 40], [20, 40]]), "parallel", "how deep")
+    refused(
+        lambda: mph.triangulate(pair(40), [0, 1], [[30, 40], [30, 40]]), "parallel", "depth of the point is unknown"
+    )
+    refused(
+        lambda: mph.triangulate(pair(40, True), [0, 1], [[30, 40], [20, 40]]),
+        "parallel",
+        "depth of the point is unknown",
+    )
     # These meet behind the sources, as if swapped.
     refused(lambda: mph.triangulate(pair(40), [0, 1], [[30, 40], [80, 40]]), "behind the source of image")
     pixels = mph.project_points(pair(0.5), [[3, 4, 0]])[:, 0]

@@ -48,7 +48,7 @@ def test_a_column_added_at_run_time_is_in_workbooks_maps_and_commands(kind, work
     mph.write_system(plainly, tmp_path / "without.xlsx")
     written = mph.write_system(system, tmp_path / "new.xlsx")
     back = mph.read_system(written.path)
-    np.testing.assert_array_equal(column.of(back), values)
+    np.testing.assert_array_equal(column.values(back), values)
     (cells,) = [cells for cells in back.source.cells if cells.quantity == column.name]
     sheets = [openpyxl.load_workbook(tmp_path / f"{name}.xlsx")[SHEETS[kind]] for name in ("new", "without")]
     assert [sheets[0][f"{cells.column}{row}"].value for row in (1, 2)] == list(column.headings)
@@ -58,18 +58,18 @@ def test_a_column_added_at_run_time_is_in_workbooks_maps_and_commands(kind, work
     other = system.replace(**{column.field: values[[1, 1, 2]]})
     copied = mph.write_system(other, tmp_path / "copy.xlsx", template=written.path)
     assert copied.changed == (f"{SHEETS[kind]}!{cells.column}3",)
-    np.testing.assert_array_equal(column.of(mph.read_system(copied.path)), values[[1, 1, 2]])
+    np.testing.assert_array_equal(column.values(mph.read_system(copied.path)), values[[1, 1, 2]])
     grown = mph.write_system(system, tmp_path / "grown.xlsx", template=tmp_path / "without.xlsx")
-    np.testing.assert_array_equal(column.of(mph.read_system(grown.path)), values)
+    np.testing.assert_array_equal(column.values(mph.read_system(grown.path)), values)
 
     # Column maps.
     draft = mph.draft_column_map(written.path)
     assert not draft.questions
     columns = mph.ColumnMap.from_toml(draft.columns.to_toml())
-    np.testing.assert_array_equal(column.of(mph.read_system(written.path, columns)), values)
+    np.testing.assert_array_equal(column.values(mph.read_system(written.path, columns)), values)
     short = mph.draft_column_map(tmp_path / "without.xlsx").columns
     mapped = mph.write_system(system, tmp_path / "mapped.xlsx", tmp_path / "without.xlsx", short)
-    np.testing.assert_array_equal(column.of(mph.read_system(mapped.path, mapped.columns)), values)
+    np.testing.assert_array_equal(column.values(mph.read_system(mapped.path, mapped.columns)), values)
 
     # Commands.
     option = f"--{column.field.replace('_', '-')}"
@@ -124,7 +124,7 @@ def test_a_cell_that_holds_nothing_for_its_column_is_refused(kind, workbook, tmp
     with edited(tmp_path / "new.xlsx") as book:
         book[cells.sheet][f"{cells.column}4"] = {"text": 12, "length": None, "choice": "gOLD"}[kind]
     back = mph.read_system(tmp_path / "new.xlsx")
-    assert column.of(back)[1] == {"text": "12", "length": 0.5, "choice": "Gold"}[kind]
+    assert column.values(back)[1] == {"text": "12", "length": 0.5, "choice": "Gold"}[kind]
     same = mph.write_system(back, tmp_path / "same.xlsx", tmp_path / "new.xlsx")
     assert same.changed == ()
 

@@ -7,7 +7,7 @@ import pytest
 
 import mphdrr.core as mph
 from mphdrr.core.xray.coefficients import energy_absorption
-from mphdrr.core.xray.dose import build_up_factor, convolved, decays, sum_of_lines, voxel_kernel
+from mphdrr.core.xray.dose import build_up_factor, convolve, decays, line_kernel, voxel_kernel
 
 
 def uniform(kbq=1000.0, shape=6, spacing=4.0):
@@ -39,7 +39,7 @@ def test_decays_set_the_energies_of_icrp_107_free(isotope, electrons, photons):
 def test_a_large_medium_absorbs_the_whole_energy(energy):
     r = np.concatenate([[0], np.geomspace(1e-3, 5000, 20000)])
     for build_up, tolerance in ((False, 1e-3), (True, 0.05)):  # exposure's build-up is not quite that of absorption
-        along = sum_of_lines(((energy, 1.0),), 1.0, r, build_up)
+        along = line_kernel(((energy, 1.0),), 1.0, r, build_up)
         assert np.sum((along[1:] + along[:-1]) / 2 * np.diff(r)) == pytest.approx(energy, rel=tolerance)
 
 
@@ -56,8 +56,8 @@ def test_a_sphere_absorbs_the_share_of_the_closed_form(energy, radius):
     x = ((np.arange(n * parts) + 0.5) / parts - n / 2) * radius / 11
     inside = x[:, None, None] ** 2 + x[None, :, None] ** 2 + x**2 <= radius**2
     share = inside.reshape(n, parts, n, parts, n, parts).mean(axis=(1, 3, 5))
-    kernel = voxel_kernel(grid, lambda r: sum_of_lines(((energy, 1.0),), 1.0, r, False))
-    absorbed = (convolved(share, kernel) * share).sum() * grid.voxel_volume / energy / share.sum()
+    kernel = voxel_kernel(grid, lambda r: line_kernel(((energy, 1.0),), 1.0, r, False))
+    absorbed = (convolve(share, kernel) * share).sum() * grid.voxel_volume / energy / share.sum()
     x = radius * float(energy_absorption("water", np.array([energy]))[0]) / 10
     expected = 1 - 3 / (8 * x**3) * (2 * x**2 - 1 + (1 + 2 * x) * math.exp(-2 * x))
     assert absorbed == pytest.approx(expected, rel=0.02)

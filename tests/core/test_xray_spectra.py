@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import mphdrr.core as mph
-from mphdrr.core.xray.coefficients import between, energy_absorption
+from mphdrr.core.xray.coefficients import energy_absorption, interpolate_log
 
 
 @pytest.mark.parametrize(
@@ -59,9 +59,9 @@ def test_between_the_energies_of_a_table_coefficients_follow_power_laws():
     assert energy_absorption("air", np.array([80.0, 1000.0])) == pytest.approx([0.02407, 0.02789])
     known = np.array([10.0, 15, 20, 30, 40, 60, 100])
     energies = np.array([10.0, 12, 17, 25, 59, 61, 99])
-    np.testing.assert_allclose(between(energies, known, 7 * known**-3.0), 7 * energies**-3.0, rtol=1e-12)
+    np.testing.assert_allclose(interpolate_log(energies, known, 7 * known**-3.0), 7 * energies**-3.0, rtol=1e-12)
     with pytest.raises(mph.InputError, match="energies 9 to 20 keV: expected 10 to 100 keV"):
-        between(np.array([9.0, 20.0]), known, known)
+        interpolate_log(np.array([9.0, 20.0]), known, known)
 
 
 def test_what_is_no_spectrum_is_refused_in_one_line():

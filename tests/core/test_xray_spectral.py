@@ -150,7 +150,7 @@ def test_more_materials_than_bins_and_bins_that_overlap_are_refused():
 def test_rays_without_counts_are_told():
     m = mph.SpectralTransmission(None, TUBE)
     counts = np.stack([m.expected([100.0, 10.0], 1.0), [0.0, 0.0]], axis=1)
-    with pytest.warns(mph.InputWarning, match="1 of 2 rays did not settle"):
+    with pytest.warns(mph.InputWarning, match="1 of 2 rays did not converge"):
         found = mph.decompose(counts, m, 1.0)
     assert found[:, 0] == pytest.approx([100.0, 10.0]) and np.isfinite(found).all()
 

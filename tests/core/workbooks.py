@@ -106,7 +106,7 @@ def laid_out(layout: Layout) -> Workbook:
     for name, at in dim.items():
         main[f"{at}{top + 2}"] = name
     b_formula = f"SQRT(SUMSQ({x}#,{y}#,{z}#))"
-    expected = {name: PinholeSystem.columns[name].of(system) for name in PinholeSystem.columns.derived}
+    expected = {name: PinholeSystem.columns[name].values(system) for name in PinholeSystem.columns.derived}
     for i in range(n):
         row = first + i
         if layout.numbered:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from mphdrr.core.perspective.places import LEAST, PRODUCT, SUM, _gather_in_numpy, _places, _scatter_in_numpy
+from mphdrr.core.perspective.places import LEAST, PRODUCT, SUM, _gather_in_numpy, _scatter_in_numpy, _stencils
 from mphdrr.core.projector.backends.cpu import _PlacesJob
 
 from .jobs import BAD, Array, Made, Read, close, packed
@@ -138,7 +138,7 @@ def _job(rng: np.random.Generator, number: int) -> Made:
         matrix = matrices[0].copy()
         if flat:
             matrix[2], matrix[4] = 0, [0, 0, 0, 1]
-        inside, _, _, depth = _places((n[0], n[1]), planes, matrix, tuple(m), flat, nearest)
+        inside, _, _, depth = _stencils((n[0], n[1]), planes, matrix, tuple(m), flat, nearest)
         given = np.where(inside, right_points / (depth**2 if by_depth else 1), 0)
         _scatter_in_numpy(given, planes, right_values[0], matrix, part)
         sums = np.abs(given).sum() + np.nanmax(np.abs(right_values))

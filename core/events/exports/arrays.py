@@ -19,7 +19,7 @@ def npy_bytes(array: Array) -> bytes:
 
 def pt_bytes(array: Array) -> bytes:
     """Return the bytes of a .pt file of an array: one tensor, which ``torch.load(path, weights_only=True)`` reads."""
-    with needing(of="files of tensors (.pt)"):
+    with needing(feature="files of tensors (.pt)"):
         import torch
     buffer = io.BytesIO()  # torch writes a file's own name into it, and that of a temporary one is random
     torch.save(torch.from_numpy(np.array(array, order="C")), buffer)

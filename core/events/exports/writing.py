@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from ...errors import InputError
-from ...files import ensure_folder, is_leftover, write_bytes, written_name
+from ...files import ensure_folder, final_name, is_leftover, write_bytes
 from ...memory import readable_size
 from ...progress import Progress, tell
 from ..cells import csv_line, csv_lines, escaped, unescaped
@@ -85,7 +85,7 @@ class ExportPlan:
         """Remove incomplete files of a killed export, which programs that read whole folders would find."""
         export_files = {self.folder / file for part in self.parts for file in part.files}
         for path in (*self.folder.glob(".*"), *self.folder.glob("*/.*")):
-            name = written_name(path.name)
+            name = final_name(path.name)
             if name and is_leftover(path) and (path.with_name(name) in export_files or path.parent == self.folder):
                 path.unlink(missing_ok=True)
 
@@ -131,7 +131,7 @@ def make_plan(layout: ExportLayout, folder: Path, program: str, options: dict[st
 
 def _count_earlier_events(folder: Path, request: dict[str, Any], rows: list[Row]) -> int:
     """Return the number of events of the same export that the folder holds; `InputError` where it holds anything else."""
-    if all(written_name(path.name) for path in folder.iterdir()):
+    if all(final_name(path.name) for path in folder.iterdir()):
         return 0
     try:
         earlier_request = json.loads((folder / REQUEST).read_text(encoding="utf-8"))

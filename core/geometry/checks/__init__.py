@@ -1,4 +1,9 @@
-"""Checks of a scanner: can it be built, and does every module see its ROI?
+"""Checks of a system of pinhole modules: whether it can be built, and whether every module sees its ROI.
+
+`check_geometry` runs all checks and returns a `GeometryReport`, whose `messages` are one line for each finding.
+
+To add a check, write a `Finding` with its message in report.py, a function ``find_...`` that returns a tuple of them, in one
+of the files below, and a field of `GeometryReport` that `check_geometry` fills. The command line and the window follow.
 
 hulls.py          convex hulls of the modules' parts
 overlaps.py       parts that overlap, pinholes in other modules, collimators in the ROI
@@ -31,9 +36,9 @@ def check_geometry(
 ) -> GeometryReport:
     """Find parts that overlap, ROIs that are not seen whole, blocked holes, unsuitable plates and open surfaces.
 
-    Collimators are built as in `core.geometry.collimator.Construction`: thicknesses in mm, the angle in rad, and the place
-    of the knife edge in the plate. With `aperture_mu`, the plates' attenuation coefficient, 1/mm (see `attenuation`),
-    plates that are too thin are found, too.
+    The first four settings are those of `core.geometry.collimator.Construction`: thicknesses in mm, the angle in rad, and
+    the place of the knife edge in the plate. With `aperture_mu`, the plates' attenuation coefficient, 1/mm (see
+    `attenuation`), plates that are too thin are found, too.
 
     >>> check_geometry(system).ok
     True
@@ -42,7 +47,7 @@ def check_geometry(
     construction = Construction(plate_thickness, wall_thickness, opening_angle, edge_at)
     collimators = system.collimators(construction)
     parts = system.parts(construction)
-    hulls = Hulls.of(parts)
+    hulls = Hulls.from_parts(parts)
     faults = [(part, surface_fault(part.solid)) for part in parts]
     return GeometryReport(
         n_modules=len(system),

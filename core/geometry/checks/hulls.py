@@ -1,4 +1,4 @@
-"""Convex hulls of the modules' parts. Each is a frustum with square ends: the filled collimator, or the crystal's box."""
+"""Convex hulls of the modules' parts, frustums with square ends: a filled collimator, or the box of a crystal."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ..module_parts import BOX_FACES, ModulePart
 from ..part_colors import PartKind
 
 TOUCH = 1e-6
-"""Bodies that penetrate each other by less than this, mm, only touch."""
+"""Depth, mm, up to which two bodies that penetrate each other are taken to touch only."""
 
 _SQUARE = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
 _EDGES = np.array([[0, 1], [0, 3], [0, 4], [1, 5], [2, 6], [3, 7]])  # one for each direction
@@ -21,20 +21,20 @@ _EDGES = np.array([[0, 1], [0, 3], [0, 4], [1, 5], [2, 6], [3, 7]])  # one for e
 
 @dataclass(frozen=True, eq=False)
 class Hulls:
-    """Convex hulls of P parts, world mm. A point x is inside where ``normals @ x <= offsets`` for all faces."""
+    """Convex hulls of P parts, world mm. A point x is inside a hull if ``normals @ x <= offsets`` for all its faces."""
 
-    numbers: Integers  # (P,), the modules'
-    kinds: tuple[PartKind, ...]
-    vertices: Floats  # (P, 8, 3)
-    normals: Floats  # (P, 6, 3)
-    offsets: Floats  # (P, 6)
-    edges: Floats  # (P, 6, 3), unit vectors
-    centers: Floats  # (P, 3), of the bounding spheres
-    radii: Floats  # (P,)
+    numbers: Integers  # (P,), numbers of the parts' modules
+    kinds: tuple[PartKind, ...]  # kind of each part
+    vertices: Floats  # (P, 8, 3), corners, mm
+    normals: Floats  # (P, 6, 3), outward unit normals of the faces
+    offsets: Floats  # (P, 6), of the faces along their normals, mm
+    edges: Floats  # (P, 6, 3), unit vectors along the edges, one for each direction
+    centers: Floats  # (P, 3), centres of the bounding spheres, mm
+    radii: Floats  # (P,), radii of the bounding spheres, mm
 
     @classmethod
-    def of(cls, parts: Sequence[ModulePart]) -> Hulls:
-        """The hulls of `parts`."""
+    def from_parts(cls, parts: Sequence[ModulePart]) -> Hulls:
+        """Return the convex hulls of `parts`."""
         vertices = np.stack([moved(part.pose, _corners(part.solid[0])) for part in parts])
         a, b, _, d = (vertices[:, BOX_FACES[:, i]] for i in range(4))
         normals = _unit(np.cross(b - a, d - a))
@@ -50,15 +50,16 @@ class Hulls:
 
 
 def _corners(vertices: Floats) -> Floats:
-    """Corners (8, 3) of the hull: both ends of a solid but a box are squares around Z, of which the outermost count."""
+    """Return the corners (8, 3) of a solid's hull: a box's own, else those of the largest squares at both ends of Z."""
     if len(vertices) == 8:  # a box
         return vertices
     corners = []
     for z in (vertices[:, 2].min(), vertices[:, 2].max()):
-        half = np.abs(vertices[vertices[:, 2] == z, :2]).max()
-        corners.append(np.column_stack([half * _SQUARE, np.full(4, z)]))
+        half_width = np.abs(vertices[vertices[:, 2] == z, :2]).max()
+        corners.append(np.column_stack([half_width * _SQUARE, np.full(4, z)]))
     return np.concatenate(corners)
 
 
 def _unit(vectors: Floats) -> Floats:
+    """Return vectors (..., 3) scaled to length 1."""
     return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)

@@ -1,7 +1,7 @@
-"""Aperture plates that are too thick for the opening angle of their hole, or too thin to stop the photons.
+"""Checks of aperture plates: too thick for the opening angle of their hole, or too thin to stop the photons.
 
-`Emission` treats the plate as infinitely thick, which is right for plates that neither shade their hole from the ROI nor let
-photons through beside it. All others are found here.
+`Emission` treats a plate as infinitely thick. That is right for plates that neither shade their hole from the ROI nor let
+photons through beside it; all others are found here.
 """
 
 import math
@@ -13,34 +13,34 @@ from ..collimator import Collimator
 from ..system import PinholeSystem
 from .report import ThinPlate, Vignetted
 
-FEWEST_OPEN = 0.99
-"""Fraction of a hole that must be open to every ray from its ROI."""
-MOST_THROUGH = 0.01
+MIN_OPEN_SHARE = 0.99
+"""Fraction of a hole's area that must be open to every ray from its ROI."""
+MAX_TRANSMITTED = 0.01
 """Photons that may pass a plate beside its hole, relative to those that pass the hole."""
 
 
 def find_vignetted(system: PinholeSystem, collimators: Sequence[Collimator]) -> tuple[Vignetted, ...]:
-    """Modules whose plate leaves less than `FEWEST_OPEN` of the hole open to the steepest rays from their ROI."""
-    found = []
+    """Find the modules whose plate leaves less than `MIN_OPEN_SHARE` of the hole open to the steepest rays from the ROI."""
+    findings = []
     b, radius, isocentres = system.pinhole_distance.tolist(), system.roi_radius.tolist(), system.isocentres()
-    for m, body in enumerate(collimators):
-        if radius[m] >= b[m]:  # the pinhole is inside the ROI, which is found as an intrusion
+    for m, collimator in enumerate(collimators):
+        if radius[m] >= b[m]:  # the pinhole is inside the ROI, which is reported as an intrusion
             continue
-        needed = needed_angle(isocentres[m, 2], body.diameter, radius[m], math.hypot(*isocentres[m, :2]))
-        if needed >= math.pi:  # tilted so far that its ROI reaches behind the plate
+        needed = needed_angle(isocentres[m, 2], collimator.diameter, radius[m], math.hypot(*isocentres[m, :2]))
+        if needed >= math.pi:  # tilted so far that the ROI reaches behind the plate
             continue
-        share, built = body.open_share(math.tan(needed / 2)), body.construction
-        if share < FEWEST_OPEN:
+        share, plate = collimator.open_share(math.tan(needed / 2)), collimator.construction
+        if share < MIN_OPEN_SHARE:
             number = int(system.numbers[m])
-            found.append(Vignetted(number, share, built.plate_thickness, built.opening_angle, needed))
-    return tuple(found)
+            findings.append(Vignetted(number, share, plate.plate_thickness, plate.opening_angle, needed))
+    return tuple(findings)
 
 
 def needed_angle(b: float, d: float, radius: float, aside: float = 0.0) -> float:
-    """The smallest opening angle, rad, at which a plate of any thickness leaves the whole hole open to the whole ROI.
+    """Return the smallest opening angle, rad, with which a plate of any thickness leaves the hole open to the whole ROI.
 
     It is twice the steepest ray's angle to the axis; that ray is tangent to the ROI and passes the hole's far rim.
-    `b`, `d` and `radius` (below b) are in mm; of a tilted module, b is the isocentre's height above the pinhole plane and
+    `b`, `d` and `radius` (below b) are in mm; for a tilted module, b is the isocentre's height above the pinhole plane and
     `aside` its distance from the axis.
     """
     across = aside + d / 2
@@ -50,20 +50,20 @@ def needed_angle(b: float, d: float, radius: float, aside: float = 0.0) -> float
 def find_thin_plates(
     system: PinholeSystem, collimators: Sequence[Collimator], aperture_mu: float
 ) -> tuple[ThinPlate, ...]:
-    """Modules where more than `MOST_THROUGH` of the photons along the axis pass the plate beside the hole.
+    """Find the modules at which more than `MAX_TRANSMITTED` of the photons along the axis pass the plate beside the hole.
 
-    Beside the hole is where the plate has its full thickness, out to the rim of its front.
+    The area beside the hole is the one with the plate's full thickness, out to the rim of its front.
     """
     mu = positive(aperture_mu, "aperture_mu", "1/mm")
-    found = []
-    for number, body in zip(system.numbers.tolist(), collimators, strict=True):
-        built = body.construction
-        transmission = math.exp(-mu * built.plate_thickness)
-        widest = max(body.hole_radius(built.front), body.hole_radius(built.back))
-        beside = (2 * body.front_half_width) ** 2 - math.pi * widest**2
-        optics = Optics(aperture_mu=mu, opening_angle=built.opening_angle)
-        hole = math.pi / 4 * optics.effective_diameter(body.diameter) ** 2
-        share = transmission * beside / hole
-        if share > MOST_THROUGH:
-            found.append(ThinPlate(number, built.plate_thickness, transmission, share))
-    return tuple(found)
+    findings = []
+    for number, collimator in zip(system.numbers.tolist(), collimators, strict=True):
+        plate = collimator.construction
+        transmission = math.exp(-mu * plate.plate_thickness)
+        widest = max(collimator.hole_radius(plate.front), collimator.hole_radius(plate.back))
+        plate_area = (2 * collimator.front_half_width) ** 2 - math.pi * widest**2
+        optics = Optics(aperture_mu=mu, opening_angle=plate.opening_angle)
+        hole_area = math.pi / 4 * optics.effective_diameter(collimator.diameter) ** 2
+        share = transmission * plate_area / hole_area
+        if share > MAX_TRANSMITTED:
+            findings.append(ThinPlate(number, plate.plate_thickness, transmission, share))
+    return tuple(findings)

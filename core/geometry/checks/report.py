@@ -1,4 +1,4 @@
-"""The findings of the checks, as numbers and as one line each. Modules are named by their users' numbers."""
+"""Findings of the checks, as numbers and as one line each. Modules are named by their numbers in the workbook."""
 
 import math
 from dataclasses import asdict, dataclass
@@ -10,15 +10,15 @@ from ..part_colors import PartKind
 
 
 @dataclass(frozen=True)
-class Overlap(Finding):
-    """Parts of two modules, taken as convex bodies, penetrate each other."""
+class PartOverlap(Finding):
+    """Overlap of parts of two modules, taken as convex bodies."""
 
-    first: int
+    first: int  # number of one module
     first_part: PartKind
-    second: int
+    second: int  # number of the other module
     second_part: PartKind
-    depth: float  # mm, of the shortest translation that separates them
-    point: tuple[float, float, float]  # inside both, world mm
+    depth: float  # length of the shortest translation that separates the parts, mm
+    point: tuple[float, float, float]  # a point inside both parts, world mm
     message = (
         "modules {0.first} and {0.second}: {0.first_part} and {0.second_part} overlap, {0.depth:.4g} mm deep at "
         "({0.point[0]:.1f}, {0.point[1]:.1f}, {0.point[2]:.1f}) mm"
@@ -27,42 +27,42 @@ class Overlap(Finding):
 
 @dataclass(frozen=True)
 class NearPair(Finding):
-    """Two pinholes are `distance` mm apart, which is too close for their fronts to stand side by side."""
+    """Pair of pinholes that are too close for the fronts of their collimators to stand side by side."""
 
-    first: int
-    second: int
-    distance: float
+    first: int  # number of one module
+    second: int  # number of the other module
+    distance: float  # distance from pinhole to pinhole, mm
     message = "modules {0.first} and {0.second}: nearly at one place, pinholes {0.distance:.4g} mm apart"
 
 
 @dataclass(frozen=True)
 class SwallowedPinhole(Finding):
-    """A pinhole's centre lies `depth` mm below the surface of another module's part, taken as a convex body."""
+    """Pinhole whose centre lies inside another module's part, taken as a convex body."""
 
-    module: int
-    by: int
-    part: PartKind
-    depth: float
+    module: int  # number of the pinhole's module
+    by: int  # number of the other module
+    part: PartKind  # the other module's part
+    depth: float  # depth of the pinhole's centre below the part's surface, mm
     message = "module {0.module}: its pinhole lies {0.depth:.4g} mm inside module {0.by}'s {0.part}"
 
 
 @dataclass(frozen=True)
 class Intrusion(Finding):
-    """A module's collimator reaches `depth` mm into the largest ROI, whose radius is `roi_radius` mm."""
+    """Collimator that reaches into the largest ROI."""
 
-    module: int
-    roi_radius: float
-    depth: float
+    module: int  # number of the module
+    roi_radius: float  # radius of the largest ROI, mm
+    depth: float  # depth of the collimator's nearest point below the surface of the ROI, mm
     message = "module {0.module}: its collimator reaches {0.depth:.4g} mm into the ROI of {0.roi_radius:.4g} mm"
 
 
 @dataclass(frozen=True)
 class Uncovered(Finding):
-    """A module's field of view does not hold its ROI."""
+    """ROI that is partly outside its module's field of view."""
 
-    module: int
+    module: int  # number of the module
     roi_radius: float  # mm
-    seen_radius: float  # mm, of the largest sphere at the isocentre in the field of view
+    seen_radius: float  # radius of the largest sphere at the isocentre in the field of view, mm
     unseen_share: float  # fraction of the ROI's volume outside the field of view
     message = (
         "module {0.module}: sees {0.seen_radius:.4g} mm around the isocentre, {0.shortage:.4g} mm less than its ROI radius; "
@@ -71,47 +71,47 @@ class Uncovered(Finding):
 
     @property
     def shortage(self) -> float:
-        """Missing radius, mm."""
+        """Difference between the radius of the ROI and that of the seen sphere, mm."""
         return self.roi_radius - self.seen_radius
 
 
 @dataclass(frozen=True)
 class Blocked(Finding):
-    """Another module stands in the way of a fraction `share` of the rays (of the solid angle) from ROI to pinhole."""
+    """View that another module blocks partly."""
 
-    module: int
-    by: int
-    share: float
+    module: int  # number of the module whose view is blocked
+    by: int  # number of the module that stands in the way
+    share: float  # blocked fraction of the solid angle of the rays from the ROI to the pinhole
     message = "module {0.module}: module {0.by} blocks {0.share:.2%} of the rays from its ROI"
 
 
 @dataclass(frozen=True)
 class Vignetted(Finding):
-    """The plate is too thick for the hole's opening angle and shades the hole from part of the ROI."""
+    """Hole that its plate, too thick for the opening angle, shades from part of the ROI."""
 
-    module: int
+    module: int  # number of the module
     open_share: float  # fraction of the hole's area that is open to the steepest rays from the ROI
     plate_thickness: float  # mm
     opening_angle: float  # rad
-    needed_angle: float  # rad; with it, a plate of any thickness would leave the hole open
+    needed_angle: float  # opening angle with which a plate of any thickness would leave the hole open, rad
     message = (
         "module {0.module}: only {0.open_share:.1%} of its hole is open to the rim of its ROI: a plate of "
         "{0.plate_thickness:.4g} mm is too thick for an opening angle of {1:.4g} degrees, {2:.1f} are needed"
     )
 
     def __str__(self) -> str:
-        # Rounded up, so that a plate of that angle passes.
+        # The angle is rounded up, so that a plate with the angle of the message passes the check.
         needed = math.ceil(math.degrees(self.needed_angle) * 10) / 10
         return self.message.format(self, math.degrees(self.opening_angle), needed)
 
 
 @dataclass(frozen=True)
 class ThinPlate(Finding):
-    """The plate lets through a fraction `transmission` of the photons along the axis."""
+    """Plate that is too thin to stop the photons beside the hole."""
 
-    module: int
+    module: int  # number of the module
     plate_thickness: float  # mm
-    transmission: float
+    transmission: float  # fraction of the photons along the axis that pass the plate
     share: float  # photons that pass the plate beside the hole, relative to those that pass the hole and its edge
     message = (
         "module {0.module}: its plate of {0.plate_thickness:.4g} mm lets {0.transmission:.2%} of the photons through: "
@@ -121,27 +121,24 @@ class ThinPlate(Finding):
 
 @dataclass(frozen=True)
 class OpenMesh(Finding):
-    """The surface of a part is not closed, not consistently wound, or inside out."""
+    """Surface of a part that is not closed, not consistently oriented, or inside out."""
 
-    module: int
+    module: int  # number of the module
     part: PartKind
-    fault: str
+    fault: str  # the fault as a phrase that follows "mesh" in the message
     message = "module {0.module}: its {0.part}'s mesh {0.fault}"
 
 
 @dataclass(frozen=True)
 class GeometryReport:
-    """What `check_geometry` found in so many modules of that construction (mm, mm, rad).
-
-    The findings of each kind are in the order of the modules.
-    """
+    """Report of `check_geometry`: the findings of each kind, in the order of the modules, and the construction."""
 
     n_modules: int
-    plate_thickness: float
-    wall_thickness: float
-    opening_angle: float
+    plate_thickness: float  # mm
+    wall_thickness: float  # mm
+    opening_angle: float  # rad
     edge_at: EdgePlace
-    overlaps: tuple[Overlap, ...] = ()
+    overlaps: tuple[PartOverlap, ...] = ()
     near_pairs: tuple[NearPair, ...] = ()
     swallowed_pinholes: tuple[SwallowedPinhole, ...] = ()
     intrusions: tuple[Intrusion, ...] = ()
@@ -153,18 +150,18 @@ class GeometryReport:
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """All findings."""
+        """All findings, kind by kind."""
         return tuple(finding for kind in vars(self).values() if isinstance(kind, tuple) for finding in kind)
 
     @property
     def ok(self) -> bool:
-        """Whether nothing was found."""
+        """Whether there are no findings."""
         return not self.findings
 
     def messages(self, module: int | None = None) -> list[str]:
-        """One line for each finding, or only for those that concern the module of the given number."""
+        """Return one line for each finding, or only for those that concern the module with the number `module`."""
         return [str(finding) for finding in self.findings if module is None or module in finding.modules]
 
     def as_dict(self) -> dict[str, Any]:
-        """The report as numbers, strings and lists, for JSON."""
+        """Return the report as numbers, strings and lists, for JSON."""
         return {**asdict(self), "ok": self.ok}

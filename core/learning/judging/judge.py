@@ -1,4 +1,4 @@
-"""The judge: all methods on all tests and levels, every event's scores kept, one table and one picture."""
+"""The judge: all methods on all tests and levels, with the scores of every event, a table and a picture."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ from ...reconstruction.scores.images import bias_and_deviation, nrmse
 from ...validation import one_of
 from ...volumes.volume import Volume
 from ...workbook import read_scanner
-from .methods import Family, JudgedMethod, tuned
+from .methods import Family, JudgedMethod, tune
 from .recipe import JudgeRecipe, Test
 from .records import Records, read_json, write_json
 from .report import BASELINE, METHOD, ORACLE, Judgement, write_report
-from .scoring import Case, Scores, defect_of, measured, told
+from .scoring import Case, Scores, as_believed, common_defect, measure_cost
 from .sets import events_by_recipe, refuse_trained_on, set_fingerprint, short_hash
-from .summary import compared, means_of, told_of
+from .summary import compare_scores, mean_scores, row_notes
 
 Row = dict[str, Any]
 
 _SEVERAL = -1
-"""The draw of scores that are of several draws."""
-_PICTURES = 3
+"""Draw number of scores over several draws of noise."""
+_PICTURES = 3  # number of tests with a picture
 
 
 def judge(
@@ -37,25 +37,25 @@ def judge(
 ) -> Judgement:
     """Judge methods beside baselines, and write ``judgement.md``, ``.json`` and ``.png`` into a folder.
 
-    Work that was interrupted goes on where it stopped: each event's scores are kept in the folder's ``scores``, by method,
-    set, event, level and draw, and what baselines were tuned to in ``tuning.json``.
+    Interrupted work is resumed by the next call: each event's scores are kept in the folder's ``scores``, by method, set,
+    event, level and draw, and the baselines' tuning in ``tuning.json``.
 
     Parameters
     ----------
     recipe
-        Tests, validation data and baselines. Its models are to be read by the caller, into `methods`.
+        Tests, validation data and baselines. The caller reads its models and gives them as `methods`.
     folder
-        Made where it is not there.
+        Folder of the results, created if necessary.
     methods
-        Networks or any others.
+        Networks or any other methods.
     progress
         Called as ``progress(done, total)`` after each volume; may raise `Cancelled`.
 
     Raises
     ------
     InputError
-        A set cannot be read; a method was trained, or baselines would be tuned, on events of a test; a method gives
-        another grid than the recipe's; two methods have one name; or another process judges in this folder.
+        A set cannot be read; a method was trained, or baselines would be tuned, on events of a test; a method returns
+        another grid than the recipe's; two methods have the same name; or another process judges in this folder.
     """
     folder = ensure_folder(folder)
     names = [method.name for method in methods]
@@ -63,178 +63,179 @@ def judge(
         raise InputError(f"judge: expected methods of different names, got {', '.join(names)}")
     with locked(folder / ".lock", f"{folder}: another process judges in this folder; wait for its end"):
         remove_leftovers(ensure_folder(folder / "scores"))
-        found = _Judging(recipe, folder, methods, progress).judgement()
-        write_report(found, folder)
-    return found
+        judgement = _JudgeRun(recipe, folder, methods, progress).judgement()
+        write_report(judgement, folder)
+    return judgement
 
 
-class _Judging:
-    """One work of the judge."""
+class _JudgeRun:
+    """A run of the judge: its tests, methods and progress."""
 
     def __init__(
         self, recipe: JudgeRecipe, folder: Path, methods: Sequence[JudgedMethod], progress: Progress | None
     ) -> None:
         self.recipe, self.folder, self.progress = recipe, folder, progress
-        self.validation, *self.tests = (_Tested(recipe, test) for test in (recipe.validation, *recipe.tests))
+        self.validation, *self.tests = (_TestEvents(recipe, test) for test in (recipe.validation, *recipe.tests))
         tuned_on = events_by_recipe(self.validation.events)
-        for tested in self.tests:
-            refuse_trained_on("baselines", tuned_on, tested.events, tested.name)
-        self.chosen = {tested.name: _chosen(tested, methods) for tested in self.tests}
-        for tested in self.tests:
-            for method in self.chosen[tested.name]:
-                refuse_trained_on(method.name, method.trained_on, tested.events, tested.name)
-        self.done, self.total = 0, sum(map(self._volumes, self.tests))
+        for test in self.tests:
+            refuse_trained_on("baselines", tuned_on, test.events, test.name)
+        self.methods_by_test = {test.name: _named_methods(test, methods) for test in self.tests}
+        for test in self.tests:
+            for method in self.methods_by_test[test.name]:
+                refuse_trained_on(method.name, method.trained_on, test.events, test.name)
+        self.n_done, self.n_total = 0, sum(map(self._n_volumes, self.tests))
         self.tuning = read_json(folder / "tuning.json")
 
     def judgement(self) -> Judgement:
-        """Do all that is not done yet."""
+        """Compute everything that is not done yet, and return the judgement."""
         rows: list[Row] = []
         pictures: list[tuple[str, list[tuple[str, Volume]]]] = []
-        for tested in self.tests:
-            for level in tested.test["levels"]:
-                rows += self._rows(tested, level)
+        for test in self.tests:
+            for level in test.settings["levels"]:
+                rows += self._rows(test, level)
             if len(pictures) < _PICTURES:
-                pictures.append((tested.name, self._picture(tested)))
-        return Judgement(rows, {tested.name: tested.record for tested in self.tests}, self.tuning, pictures)
+                pictures.append((test.name, self._picture(test)))
+        return Judgement(rows, {test.name: test.record for test in self.tests}, self.tuning, pictures)
 
-    def _volumes(self, tested: _Tested) -> int:
-        """How many volumes a test asks for."""
-        methods = len(self.recipe.families) * (1 + tested.test["tuned_on_itself"])
-        methods += len(self.chosen[tested.name])
-        return methods * len(tested.events) * len(tested.test["levels"])
+    def _n_volumes(self, test: _TestEvents) -> int:
+        """Return the number of volumes that a test needs."""
+        n_baselines = len(self.recipe.families) * (1 + test.settings["tuned_on_itself"])
+        return (n_baselines + len(self.methods_by_test[test.name])) * len(test.events) * len(test.settings["levels"])
 
-    def _tell(self, more: int) -> None:
-        self.done += more
-        tell(self.progress, self.done, self.total)
+    def _report(self, n_more: int) -> None:
+        """Report that more volumes are done."""
+        self.n_done += n_more
+        tell(self.progress, self.n_done, self.n_total)
 
-    def _tuned(self, family: Family, on: _Tested, level: float) -> JudgedMethod:
-        """The baseline of a family that does best on events at a level."""
-        what = {"family": family.record, "set": set_fingerprint(on.events), "test": on.fingerprint, "level": level}
-        name = short_hash(what)
+    def _tuned(self, family: Family, test: _TestEvents, level: float) -> JudgedMethod:
+        """Return the best baseline of a family on the events of a test at a level."""
+        key = {"family": family.record, "set": set_fingerprint(test.events), "test": test.fingerprint, "level": level}
+        name = short_hash(key)
         if name not in self.tuning:
-            cases = (on.case(event, level) for event in on.events)
-            self.tuning[name] = {**what, **tuned(family, cases, lambda *_: self._tell(0))}
+            cases = (test.case(event, level) for event in test.events)
+            self.tuning[name] = {**key, **tune(family, cases, lambda *_: self._report(0))}
             write_json(self.folder / "tuning.json", self.tuning)
         return family.method(self.tuning[name]["choice"])
 
-    def _methods(self, tested: _Tested, level: float) -> list[tuple[str, JudgedMethod]]:
-        """All methods of a test at a level, each with its kind."""
-        found = [(BASELINE, self._tuned(family, self.validation, level)) for family in self.recipe.families]
-        if tested.test["tuned_on_itself"]:
-            found += [(ORACLE, self._tuned(family, tested, level)) for family in self.recipe.families]
-        return found + [(METHOD, method) for method in self.chosen[tested.name]]
+    def _methods(self, test: _TestEvents, level: float) -> list[tuple[str, JudgedMethod]]:
+        """Return all methods of a test at a level, each with its kind of row."""
+        methods = [(BASELINE, self._tuned(family, self.validation, level)) for family in self.recipe.families]
+        if test.settings["tuned_on_itself"]:
+            methods += [(ORACLE, self._tuned(family, test, level)) for family in self.recipe.families]
+        return methods + [(METHOD, method) for method in self.methods_by_test[test.name]]
 
-    def _rows(self, tested: _Tested, level: float) -> list[Row]:
-        """A row for each method, beside the best baseline and the best of those tuned on the set itself."""
-        methods = self._methods(tested, level)
-        scores = self._scores(tested, level, [method for _, method in methods])
-        found: list[Row] = [
-            {"test": tested.name, "level": level, "method": method.name, "kind": kind, "fingerprint": method.fingerprint,
-             **means_of(*own)}
-            for (kind, method), own in zip(methods, scores, strict=True)
+    def _rows(self, test: _TestEvents, level: float) -> list[Row]:
+        """Return a row for each method, compared with the best baseline and with the best one tuned on the test itself."""
+        methods = self._methods(test, level)
+        scores = self._scores(test, level, [method for _, method in methods])
+        rows: list[Row] = [
+            {"test": test.name, "level": level, "method": method.name, "kind": kind, "fingerprint": method.fingerprint,
+             **mean_scores(*method_scores)}
+            for (kind, method), method_scores in zip(methods, scores, strict=True)
         ]  # fmt: skip
         for kind, name in ((BASELINE, "best_baseline"), (ORACLE, "best_on_itself")):
-            known = [i for i, row in enumerate(found) if row["kind"] == kind]
-            if known:
-                best = min(known, key=lambda i: float(found[i]["nrmse"]))
-                for row, (own, _) in zip(found, scores, strict=True):
-                    beside = compared(own, scores[best][0], self.recipe["judge.seed"])
-                    row[name] = {"method": found[best]["method"], **beside}
-        return [{**row, "notes": told_of(row)} for row in found]
+            candidates = [i for i, row in enumerate(rows) if row["kind"] == kind]
+            if candidates:
+                best = min(candidates, key=lambda i: float(rows[i]["nrmse"]))
+                for row, (method_scores, _) in zip(rows, scores, strict=True):
+                    comparison = compare_scores(method_scores, scores[best][0], self.recipe["judge.seed"])
+                    row[name] = {"method": rows[best]["method"], **comparison}
+        return [{**row, "notes": row_notes(row)} for row in rows]
 
     def _scores(
-        self, tested: _Tested, level: float, methods: Sequence[JudgedMethod]
+        self, test: _TestEvents, level: float, methods: Sequence[JudgedMethod]
     ) -> list[tuple[list[Row], list[Row]]]:
-        """Each method's scores of all events, and those over draws of noise of some.
+        """Return each method's scores of all events, and those over draws of noise of some.
 
-        All methods are asked for an event before the next, so that they share what it is read and made for.
+        All methods get an event before the next one is read, so that they share what is prepared for it.
         """
-        names = (f"{tested.fingerprint}-{method.fingerprint[:16]}.jsonl" for method in methods)
+        names = (f"{test.fingerprint}-{method.fingerprint[:16]}.jsonl" for method in methods)
         records = [Records(self.folder / "scores" / name) for name in names]
-        found: list[tuple[list[Row], list[Row]]] = [([], []) for _ in methods]
-        for part, (events, draw, score) in enumerate(
-            ((tested.events, 0, tested.scores), (tested.drawn, _SEVERAL, tested.draws))
+        rows_by_method: list[tuple[list[Row], list[Row]]] = [([], []) for _ in methods]
+        for kind, (events, draw, score) in enumerate(
+            ((test.events, 0, test.scores), (test.drawn, _SEVERAL, test.draws))
         ):
             for event in events:
-                cases = cache(partial(tested.case, event, level))  # by the draw of noise, made once for all methods
+                cases = cache(partial(test.case, event, level))  # by the draw of noise, made once for all methods
                 key = event.recipe.fingerprint, event.number, level, draw
-                for method, kept, rows in zip(methods, records, found, strict=True):
-                    if key not in kept:
-                        with naming(f"{tested.name}: event {event.number}: {method.name}"):
-                            kept.add(key, score(cases, method))
-                    rows[part].append(kept[key])
-                    self._tell(draw != _SEVERAL)
-        return found
+                for method, record, rows in zip(methods, records, rows_by_method, strict=True):
+                    if key not in record:
+                        with naming(f"{test.name}: event {event.number}: {method.name}"):
+                            record.add(key, score(cases, method))
+                    rows[kind].append(record[key])
+                    self._report(draw != _SEVERAL)
+        return rows_by_method
 
-    def _picture(self, tested: _Tested) -> list[tuple[str, Volume]]:
-        """The first event of a test: the truth, the first baseline's volume and those of all methods."""
-        level = tested.test["levels"][0]
-        case = tested.case(tested.events[0], level)
-        first = [method for _, method in self._methods(tested, level)][:1]
-        shown = {method.name: method for method in (*first, *self.chosen[tested.name])}
-        return [("truth", case.truth), *((name, method.function(case.run)) for name, method in shown.items())]
+    def _picture(self, test: _TestEvents) -> list[tuple[str, Volume]]:
+        """Return volumes of a test's first event by name: the truth, those of the first baseline and of all methods."""
+        level = test.settings["levels"][0]
+        case = test.case(test.events[0], level)
+        baseline = [method for _, method in self._methods(test, level)][:1]
+        methods = {method.name: method for method in (*baseline, *self.methods_by_test[test.name])}
+        return [("truth", case.truth), *((name, method.function(case.run)) for name, method in methods.items())]
 
 
-def _chosen(tested: _Tested, methods: Sequence[JudgedMethod]) -> list[JudgedMethod]:
-    """The methods that a test names, of those that there are; without names all."""
-    known = {method.name: method for method in methods}
-    names = tested.test["models"] or tuple(known)
+def _named_methods(test: _TestEvents, methods: Sequence[JudgedMethod]) -> list[JudgedMethod]:
+    """Return the methods that a test names, or all methods if it names none."""
+    methods_by_name = {method.name: method for method in methods}
+    names = test.settings["models"] or tuple(methods_by_name)
     for name in names:
-        one_of(name, known, f"{tested.name}: models")
-    return [known[name] for name in names]
+        one_of(name, methods_by_name, f"{test.name}: models")
+    return [methods_by_name[name] for name in names]
 
 
-class _Tested:
-    """A test with its events."""
+class _TestEvents:
+    """A test of the recipe with its events, and the geometry and physics that methods are told."""
 
     def __init__(self, recipe: JudgeRecipe, test: Test) -> None:
-        self.grid, self.test, self.name = recipe.grid, test, str(test["name"])
+        self.grid, self.settings, self.name = recipe.grid, test, str(test["name"])
         self.system, self.file = None, ""
         with naming(self.name):
             self.events = recipe.events(test)
             if test["believed"] is not None:
-                own, self.file = self.events.recipe.system, str(recipe.folder / test["believed"])
-                scanner = read_scanner(self.file, own["system.kind"])
-                self.system = chosen_modules(scanner, own["system.modules"], self.file)
-            self.defect = defect_of(self.events) if test["scoring"] == "defect" else {}
+                system, self.file = self.events.recipe.system, str(recipe.folder / test["believed"])
+                scanner = read_scanner(self.file, system["system.kind"])
+                self.system = chosen_modules(scanner, system["system.modules"], self.file)
+            self.defect = common_defect(self.events) if test["scoring"] == "defect" else {}
 
     @cached_property
     def fingerprint(self) -> str:
-        """What scores depend on besides event, level, draw and method."""
+        """Hash of everything that scores depend on besides event, level, draw and method."""
         source = None if self.system is None or self.system.source is None else self.system.source.sha256
-        own = [self.test[name] for name in ("scoring", "model", "believed_model", "draws", "channel_width")]
-        return short_hash([*own, self.grid.shape, self.grid.affine.tolist(), source, self.defect])
+        settings = [self.settings[name] for name in ("scoring", "model", "believed_model", "draws", "channel_width")]
+        return short_hash([*settings, self.grid.shape, self.grid.affine.tolist(), source, self.defect])
 
     @property
     def record(self) -> dict[str, Any]:
-        """What the judgement says of the test."""
-        own = {name: self.test[name] for name in ("scoring", "levels", "believed", "believed_model")}
-        return {"set": set_fingerprint(self.events), "events": len(self.events), "fingerprint": self.fingerprint, **own}
+        """Entry of the test in the judgement."""
+        record = {"set": set_fingerprint(self.events), "events": len(self.events), "fingerprint": self.fingerprint}
+        return record | {name: self.settings[name] for name in ("scoring", "levels", "believed", "believed_model")}
 
     @property
     def drawn(self) -> EventSet:
-        """The events of which bias and deviation over draws of noise are taken."""
-        return self.events[: self.test["drawn_events"] if self.test["draws"] > 1 else 0]
+        """Events for bias and deviation over draws of noise."""
+        return self.events[: self.settings["drawn_events"] if self.settings["draws"] > 1 else 0]
 
     def case(self, event: Event, level: float, draw: int = 0) -> Case:
-        """An event as methods are asked for it."""
+        """Return an event at one level and noise draw as methods get it."""
         seed = (event.noise_seed + draw) % 2**64
-        run = event.run(self.test["model"], seed, level)
-        if self.test["believed_model"] is not None:
-            run = replace(event.run(self.test["believed_model"], seed, level), projections=run.projections)
-        return Case(event, told(run, self.system, self.file), self.grid, self.test["channel_width"], self.defect)
+        run = event.run(self.settings["model"], seed, level)
+        if self.settings["believed_model"] is not None:
+            run = replace(event.run(self.settings["believed_model"], seed, level), projections=run.projections)
+        run = as_believed(run, self.system, self.file)
+        return Case(event, run, self.grid, self.settings["channel_width"], self.defect)
 
     def scores(self, cases: Callable[[int], Case], method: JudgedMethod) -> Scores:
-        """The scores of a method's volume."""
+        """Return the scores and the cost of a method's volume of an event; `cases` returns the event by noise draw."""
         case = cases(0)
-        with measured() as found:
+        with measure_cost() as cost:
             volume = method.function(case.run)
-        found["seconds"] += method.saved()
-        return {**case.score(volume, self.test["scoring"]), **found}
+        cost["seconds"] += method.saved()
+        return {**case.score(volume, self.settings["scoring"]), **cost}
 
-    def draws(self, of_draw: Callable[[int], Case], method: JudgedMethod) -> Scores:
-        """Bias and standard deviation over draws of noise: their root mean squares by that of the truth."""
-        cases = [of_draw(draw) for draw in range(self.test["draws"])]
-        found = bias_and_deviation((method.function(case.run) for case in cases), cases[0].truth)
-        truth = cases[0].truth.array
-        return {name: nrmse(volume.array + truth, truth) for name, volume in found._asdict().items()}
+    def draws(self, cases: Callable[[int], Case], method: JudgedMethod) -> Scores:
+        """Return bias and standard deviation over draws of noise: their root mean squares by that of the truth."""
+        all_cases = [cases(draw) for draw in range(self.settings["draws"])]
+        volumes = bias_and_deviation((method.function(case.run) for case in all_cases), all_cases[0].truth)
+        truth = all_cases[0].truth.array
+        return {name: nrmse(volume.array + truth, truth) for name, volume in volumes._asdict().items()}

@@ -1,4 +1,4 @@
-"""The channelised Hotelling observer: how well the best linear observer of a few channels sees a signal."""
+"""Channelised Hotelling observer: detection of a signal by the best linear observer of a few channels."""
 
 import math
 from typing import NamedTuple
@@ -15,19 +15,19 @@ from .statistics import Estimate, area_under_curve
 CHANNELS = 5
 _FOLDS = 10
 _REACH = 1.5
-"""Channels are cut at this many widths, where the first has fallen to 0.001 of its middle."""
+"""Radius of the channels in widths, where the first one has fallen to 0.001 of its central value."""
 
 
-class Observed(NamedTuple):
-    """How well the observer tells images with a signal from those without."""
+class ObserverScore(NamedTuple):
+    """Performance of the observer in telling images with a signal from those without."""
 
     auc: Estimate
     snr: float
-    """Difference of the ratings' means by their standard deviation, the root mean square of both kinds'."""
+    """Difference of the mean ratings by their standard deviation, the root mean square of both kinds'."""
 
 
 def laguerre_gauss(distances: ArrayLike, width: float, channels: int = CHANNELS, dimensions: int = 3) -> Floats:
-    """Laguerre-Gauss channels at distances from the signal's middle, orthogonal in so many dimensions.
+    """Return Laguerre-Gauss channels at distances from the signal's centre, orthogonal in this number of dimensions.
 
     They are ``L_p(2 pi r^2 / a^2) exp(-pi r^2 / a^2)`` with the width a and Laguerre's polynomials of order
     ``dimensions / 2 - 1``, a basis of all functions that are the same in all directions.
@@ -37,14 +37,14 @@ def laguerre_gauss(distances: ArrayLike, width: float, channels: int = CHANNELS,
     distances
         (n,), mm.
     width
-        a, mm: the first channel's integral along a line through its middle, by its value there.
+        a, mm: the first channel's integral along a line through its centre, divided by its value there.
     channels
-        How many, p = 0, 1, ...
+        Number of channels, p = 0, 1, ...
 
     Returns
     -------
     array (n, channels)
-        Each with a Euclidean norm of 1.
+        Each channel has a Euclidean norm of 1.
 
     References
     ----------
@@ -56,12 +56,12 @@ def laguerre_gauss(distances: ArrayLike, width: float, channels: int = CHANNELS,
     rows = [np.ones_like(x), 1 + order - x]
     for p in range(1, whole_number(channels, "channels")):
         rows.append(((2 * p + 1 + order - x) * rows[p] - (p + order) * rows[p - 1]) / (p + 1))
-    found = np.exp(-x / 2)[:, None] * np.stack(rows[:channels], axis=1)
-    return found / np.linalg.norm(found, axis=0)
+    profiles = np.exp(-x / 2)[:, None] * np.stack(rows[:channels], axis=1)
+    return profiles / np.linalg.norm(profiles, axis=0)
 
 
 def channel_outputs(volume: Volume, place: ArrayLike, width: float, channels: int = CHANNELS) -> Floats:
-    """What the channels (`laguerre_gauss`) around a place, (3,) mm, see of a volume: (channels,)."""
+    """Return the outputs (channels,) of the channels of `laguerre_gauss` around a place, (3,) mm, of a volume."""
     step = float(volume.grid.spacing.min())
     n = math.ceil(_REACH * width / step)
     axis = step * np.arange(-n, n + 1)
@@ -70,19 +70,19 @@ def channel_outputs(volume: Volume, place: ArrayLike, width: float, channels: in
     return values @ laguerre_gauss(np.linalg.norm(offsets, axis=1), width, channels)
 
 
-def observe(absent: ArrayLike, present: ArrayLike, folds: int = _FOLDS) -> Observed:
-    """How well Hotelling's observer tells the channels' outputs of images with the signal from those without.
+def observe(absent: ArrayLike, present: ArrayLike, folds: int = _FOLDS) -> ObserverScore:
+    """Measure how well Hotelling's observer tells the channel outputs of images with the signal from those without.
 
-    Its template is the inverse of both kinds' mean covariance times the difference of their means. Each image is rated by
-    a template that the others have trained: all but one of `folds` parts. An observer that rates what it was trained on
-    flatters.
+    Its template is the inverse of both kinds' mean covariance times the difference of their means. Each image is rated by a
+    template trained on the others: on all but one of `folds` parts, since an observer that rates its training data is too
+    optimistic.
 
     Parameters
     ----------
     absent, present
-        Outputs (n, channels), in an order that is random.
+        Outputs (n, channels), in random order.
     folds
-        2 trains on one half and tests on the other, in turn; as many as images leaves one out.
+        2 trains on one half and tests on the other, in turn; the number of images leaves one out.
 
     Raises
     ------
@@ -91,22 +91,22 @@ def observe(absent: ArrayLike, present: ArrayLike, folds: int = _FOLDS) -> Obser
 
     References
     ----------
-    See `laguerre_gauss`; Barrett and Myers, section 13.2.12.
+    H. H. Barrett, K. J. Myers 2004, Foundations of Image Science, section 13.2.12, and those of `laguerre_gauss`.
     """
     kinds = [real_array(outputs, "outputs", (None, None)) for outputs in (absent, present)]
-    channels, fewest = kinds[0].shape[1], min(map(len, kinds))
-    folds = min(whole_number(folds, "folds"), fewest)
+    channels, n_min = kinds[0].shape[1], min(map(len, kinds))
+    folds = min(whole_number(folds, "folds"), n_min)
     if folds < 2 or sum(map(len, kinds)) * (1 - 1 / folds) < channels + 3:
         counts = " and ".join(str(len(outputs)) for outputs in kinds)
         raise InputError(f"observer: expected more images of each kind for {channels} channels, got {counts}")
     ratings = [np.empty(len(outputs)) for outputs in kinds]
     for fold in range(folds):
         tested = [np.arange(len(outputs)) % folds == fold for outputs in kinds]
-        trained = [outputs[~own] for outputs, own in zip(kinds, tested, strict=True)]
+        trained = [outputs[~in_fold] for outputs, in_fold in zip(kinds, tested, strict=True)]
         low, high = (outputs.mean(axis=0) for outputs in trained)
         template = np.linalg.lstsq(sum(np.cov(outputs.T) for outputs in trained) / 2, high - low, rcond=None)[0]
-        for outputs, own, rated in zip(kinds, tested, ratings, strict=True):
-            rated[own] = (outputs[own] - (low + high) / 2) @ template
-    below, above = ratings
+        for outputs, in_fold, kind_ratings in zip(kinds, tested, ratings, strict=True):
+            kind_ratings[in_fold] = (outputs[in_fold] - (low + high) / 2) @ template
+    below, above = ratings  # without and with the signal
     noise = math.sqrt((below.var(ddof=1) + above.var(ddof=1)) / 2)
-    return Observed(area_under_curve(below, above), float(above.mean() - below.mean()) / noise)
+    return ObserverScore(area_under_curve(below, above), float(above.mean() - below.mean()) / noise)

@@ -22,58 +22,58 @@ VERSION = 1
 
 _TEST = by_key((
     Setting("events", str, None, "Folder of the set", is_path=True),
-    Setting("split", str, None, "Its split that counts", "all events"),
-    Setting("model", str, "emission", "Which of its images"),
-    Setting("count", int, None, "How many events, the first ones", "all", least=1),
-    Setting("name", str, None, "What the table calls it"),
-    Setting("models", str, None, "Names of the models that are judged on it", "all", sizes=()),
-    Setting("scoring", str, "volumes", "What is scored besides the voxels",
+    Setting("split", str, None, "Split of the set that is used", "all events"),
+    Setting("model", str, "emission", "Model of the set whose images are used"),
+    Setting("count", int, None, "Number of events, the first ones of the set", "all", least=1),
+    Setting("name", str, None, "Name in the table"),
+    Setting("models", str, None, "Names of the models that are judged on this test", "all", sizes=()),
+    Setting("scoring", str, "volumes", "Scores besides those of the voxels",
             words=named(SCORINGS)),
     Setting("levels", float, (1.0,), "Shares of the acquisition time", above=0, sizes=()),
-    Setting("believed", str, None, "Workbook of the geometry that methods are told", "that which made the images",
+    Setting("believed", str, None, "Workbook of the geometry that methods are told", "that of the images",
             is_path=True),
     Setting("believed_model", str, None, "Model of the set whose physics methods are told", "that of the images"),
     Setting("tuned_on_itself", bool, False, "Also judge baselines that are tuned on the test's own events"),
-    Setting("draws", int, 0, "Draws of noise of which bias and standard deviation are taken; 0: neither", least=0),
-    Setting("drawn_events", int, 3, "Events, the first ones, that bias and deviation are of", least=1),
-    Setting("channel_width", float, 30.0, "Of the observer's channels", unit="mm", above=0),
+    Setting("draws", int, 0, "Draws of noise for bias and standard deviation; 0: neither", least=0),
+    Setting("drawn_events", int, 3, "Number of events, the first ones, for bias and deviation", least=1),
+    Setting("channel_width", float, 30.0, "Width of the observer's channels", unit="mm", above=0),
 ))  # fmt: skip
 _ROWS = by_key((
     like("grid.voxels", "phantom.voxels"),
     like("grid.spacing", "phantom.spacing"),
-    like("grid.center", "phantom.position", text="Middle of the volumes, x y z"),
-    Setting("baselines.subsets", int, 10, "Of OSEM and BSREM", least=1),
+    like("grid.center", "phantom.position", text="Centre of the volumes, x y z"),
+    Setting("baselines.subsets", int, 10, "Number of subsets of OSEM and BSREM", least=1),
     Setting("baselines.stops", int, (2, 4, 8, 12, 16, 24), "Iterations of OSEM to choose from", least=1, sizes=()),
-    Setting("baselines.fwhm", float, (0.0, 2.4, 3.6, 4.8, 6.5, 8.0, 10.0), "Widths of the filter after it to choose from",
+    Setting("baselines.fwhm", float, (0.0, 2.4, 3.6, 4.8, 6.5, 8.0, 10.0), "Widths of the filter after OSEM to choose from",
             unit="mm", least=0, sizes=()),
-    Setting("baselines.iterations", int, 15, "Of BSREM", least=1),
-    Setting("baselines.weights", float, (0.0003, 0.001, 0.003, 0.01, 0.03, 0.1), "Of BSREM's prior to choose from; it has "
-            "relative differences", above=0, sizes=()),
-    Setting("baselines.families", str, ("osem", "bsrem"), "Which there are", words=named(("osem", "bsrem")), sizes=()),
-    Setting("judge.seed", int, 0, "Of the bootstrap", least=0),
+    Setting("baselines.iterations", int, 15, "Iterations of BSREM", least=1),
+    Setting("baselines.weights", float, (0.0003, 0.001, 0.003, 0.01, 0.03, 0.1), "Weights of BSREM's prior, of relative "
+            "differences, to choose from", above=0, sizes=()),
+    Setting("baselines.families", str, ("osem", "bsrem"), "Families of baselines", words=named(("osem", "bsrem")), sizes=()),
+    Setting("judge.seed", int, 0, "Seed of the bootstrap", least=0),
 ))  # fmt: skip
 _TABLES = ("grid", "baselines", "judge")
 
 
 class Test(Values):
-    """A test: events, and what is scored of them."""
+    """A test: its events, and what is scored of the volumes."""
 
     rows = _TEST  # type: ignore[assignment]
-    __test__ = False  # for pytest
+    __test__ = False  # no test class for pytest
 
 
 @dataclass(frozen=True)
 class JudgeRecipe(Values):
-    """What the judge does: values of settings by their keys, and tables; `InputError` names what cannot be understood.
+    """Recipe of the judge: values of settings by their keys, and tables; `InputError` names what cannot be understood.
 
     Parameters
     ----------
     given
-        The values of settings, such as that of "baselines.subsets".
+        Values of settings, such as that of "baselines.subsets".
     values
-        The recipe's tables, of which those of tests, validation and models are read here.
+        Tables of the recipe, of which those of tests, validation and models are read here.
     folder
-        The paths in the recipe are relative to it.
+        Folder to which the paths in the recipe are relative.
     """
 
     rows = _ROWS  # type: ignore[assignment]
@@ -86,29 +86,29 @@ class JudgeRecipe(Values):
 
     @cached_property
     def grid(self) -> Grid:
-        """The voxels that all methods give."""
+        """Voxels that all methods return."""
         return grid_of(self, "grid")
 
     @cached_property
     def tests(self) -> list[Test]:
-        """The tests."""
+        """Tests of the recipe."""
         entries = self.values.get("tests")
         if not isinstance(entries, list) or not entries or not all(isinstance(entry, dict) for entry in entries):
             raise InputError("tests: expected one [[tests]] or more")
-        found = [self._test(entry, f"tests: {entry.get('name', number)}") for number, entry in enumerate(entries, 1)]
-        names = [plain_name(test["name"], "tests: name") for test in found]
+        tests = [self._test(entry, f"tests: {entry.get('name', number)}") for number, entry in enumerate(entries, 1)]
+        names = [plain_name(test["name"], "tests: name") for test in tests]
         if len(set(names)) < len(names):
             raise InputError(f"tests: expected different names, got {', '.join(names)}")
-        return found
+        return tests
 
     @cached_property
     def validation(self) -> Test:
-        """The events that baselines are tuned on."""
+        """Events on which baselines are tuned."""
         return self._test({"name": "validation", **table(self.values, "validation")}, "validation")
 
     @cached_property
     def models(self) -> dict[str, Path]:
-        """The models' files by the names that the table gives them."""
+        """Paths of the models' files by their names in the table."""
         models = table(self.values, "models")
         for name, file in models.items():
             if not isinstance(file, str) or not file:
@@ -117,15 +117,15 @@ class JudgeRecipe(Values):
 
     @cached_property
     def families(self) -> list[Family]:
-        """The baselines of which one each is chosen on the validation data."""
+        """Families of baselines, one of each is chosen on the validation data."""
         stops, widths, weights = (self[f"baselines.{name}"] for name in ("stops", "fwhm", "weights"))
-        known = {"osem": (max(stops), tuple(product(stops, widths))),
+        parameters = {"osem": (max(stops), tuple(product(stops, widths))),
                  "bsrem": (self["baselines.iterations"], tuple((weight,) for weight in weights))}  # fmt: skip
         names, subsets = self["baselines.families"], self["baselines.subsets"]
-        return [Family(name, self.grid, known[name][0], subsets, known[name][1]) for name in names]
+        return [Family(name, self.grid, parameters[name][0], subsets, parameters[name][1]) for name in names]
 
     def events(self, test: Test) -> EventSet:
-        """The events of a test, or of the validation data."""
+        """Return the events of a test, or of the validation data; raise `InputError` if there are none."""
         events, split = EventSet(self.folder / test["events"]), test["split"]
         events = events if split is None else events.split(split)
         if not len(events):
@@ -133,16 +133,20 @@ class JudgeRecipe(Values):
         return events[: test["count"]]
 
     def _test(self, entry: dict[str, Any], name: str) -> Test:
+        """Return a test from its table; errors are headed by `name`."""
         with naming(name):
-            found = Test(flat(entry, _TEST))
-            required(found["events"], "events", "name the folder of the set")
-            return found
+            test = Test(flat(entry, _TEST))
+            required(test["events"], "events", "name the folder of the set")
+            return test
 
 
 def read_judge_recipe(path: AnyPath) -> JudgeRecipe:
-    """The judge's recipe in a TOML file; paths in it are relative to its folder. `InputError` names the entry."""
+    """Read the judge's recipe from a TOML file; its paths are relative to the file's folder.
+
+    Raises `InputError`, which names the entry that cannot be understood.
+    """
     with naming(path):
         values = read_toml(path)
         check_entries(values, VERSION, ("version", "tests", "models", "validation", *_TABLES))
-        given = flat({name: table(values, name) for name in _TABLES}, _ROWS, *_TABLES)
-        return JudgeRecipe(given, values, Path(path).absolute().parent)
+        settings = flat({name: table(values, name) for name in _TABLES}, _ROWS, *_TABLES)
+        return JudgeRecipe(settings, values, Path(path).absolute().parent)

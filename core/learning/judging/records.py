@@ -1,4 +1,4 @@
-"""What the judge has done so far: every single event's scores, in files that are whole at any time."""
+"""Records of the judge's work: every event's scores, in files that are complete at any time."""
 
 import json
 from pathlib import Path
@@ -8,12 +8,12 @@ from ...errors import reading
 from ...files import read_text, write_bytes
 
 Key = tuple[str, int, float, int]
-"""A recipe's fingerprint and the event's number in it, the level, and the draw of noise; -1 for several draws."""
+"""Fingerprint of the event's recipe, number of the event, level, and noise draw; -1 for several draws."""
 _KEY = ("recipe", "event", "level", "draw")
 
 
 class Records:
-    """The scores of one method in one test: a line of JSON for each event, level and draw."""
+    """Scores of one method in one test: a line of JSON for each event, level and draw."""
 
     def __init__(self, path: Path) -> None:
         self.path, self._rows = path, dict[Key, dict[str, Any]]()
@@ -30,13 +30,13 @@ class Records:
         return self._rows[key]
 
     def add(self, key: Key, scores: dict[str, Any]) -> None:
-        """Keep scores: on return they are on the disk."""
+        """Add scores; on return they are on the disk."""
         self._rows[key] = {**dict(zip(_KEY, key, strict=True)), **scores}
         write_bytes(self.path, "".join(f"{json.dumps(row)}\n" for row in self._rows.values()).encode())
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """What a file holds, nothing where there is none."""
+    """Return the content of a JSON file, or an empty dictionary if there is no file."""
     if not path.exists():
         return {}
     with reading(path, "JSON"):
@@ -44,5 +44,5 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def write_json(path: Path, values: Any) -> None:
-    """Write what JSON can hold."""
+    """Write JSON values to a file."""
     write_bytes(path, (json.dumps(values, indent=1) + "\n").encode())

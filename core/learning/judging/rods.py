@@ -1,4 +1,4 @@
-"""Single rods: how much of its contrast a volume shows at a place where a rod is, or where one could be."""
+"""Contrast of single rods in a volume, at places where a rod is or could be."""
 
 import numpy as np
 
@@ -9,18 +9,18 @@ from ...volumes.resampling import values_at
 from ...volumes.volume import Volume
 
 PRESENT = 0.5
-"""A rod is seen where more than this share of its contrast is."""
-_LENGTH = 0.5  # of the rods' length, around its middle, that means are over
-_INNER = 0.25  # diameters from its axis: the circle that, with the axis, stands for the rod
-_OUTER = 1.0  # diameters from its axis: halfway to its neighbours
-_ANGLES, _DEPTHS = 24, 9
+"""Share of its contrast above which a rod is seen."""
+_LENGTH = 0.5  # central share of the rods' length over which means are taken
+_INNER = 0.25  # radius, in diameters, of the circle that, with the axis, samples the rod
+_OUTER = 1.0  # radius, in diameters, of the circle halfway to the neighbours
+_ANGLES, _DEPTHS = 24, 9  # number of samples around a circle and along the rod
 
 
 def rod_contrasts(volume: Volume, phantom: DerenzoPhantom, pose: ArrayLike, rods: ArrayLike) -> Floats:
-    """The contrast that a volume shows of each rod, by that between the phantom's rods and what is around them.
+    """Return the contrast recovery of each rod in a volume: its contrast divided by that of the phantom.
 
-    It is the mean in the rod's middle minus that on the circle halfway to its neighbours, over the middle half of its
-    length, by the phantom's difference: 1 for the truth, 0 where no rod can be seen, NaN without any difference. Places on
+    The contrast is the mean in the rod minus that on the circle halfway to its neighbours, over the central half of its
+    length. Recovery is 1 for the truth, 0 where no rod can be seen, NaN if nothing around the rod is background. Points on
     the circle that lie in a rod of another sector are left out.
 
     Parameters
@@ -28,27 +28,27 @@ def rod_contrasts(volume: Volume, phantom: DerenzoPhantom, pose: ArrayLike, rods
     volume
         On any grid.
     phantom
-        Its activities, height and rods around count; the rods in question need not be among its own.
+        Its activities, height and surrounding rods are used; the rods in question need not be among its own.
     pose
         World-from-phantom (4, 4), mm.
     rods
-        (n, 4), as `DerenzoPhantom.rods` gives them: sector, x, y, diameter, mm.
+        (n, 4), as `DerenzoPhantom.rods` returns them: sector, x, y, diameter, mm.
     """
-    world, found = np.asarray(pose, float), []
+    world, contrasts = np.asarray(pose, float), []
     for _, x, y, diameter in np.asarray(rods, float):
-        inside, around = (_points((x, y), diameter * np.array(r), phantom.height) for r in ((0.0, _INNER), (_OUTER,)))
-        free = np.isclose(phantom.values(around), phantom.background)
+        rod, circle = (_points((x, y), diameter * np.array(r), phantom.height) for r in ((0.0, _INNER), (_OUTER,)))
+        free = np.isclose(phantom.values(circle), phantom.background)
         if not free.any():
-            found.append(np.nan)
+            contrasts.append(np.nan)
             continue
-        peak, valley = (values_at(volume, moved(world, points)).mean() for points in (inside, around[free]))
-        found.append(float(peak - valley) / (phantom.activity - phantom.background))
-    return np.array(found, np.float64)
+        peak, valley = (values_at(volume, moved(world, points)).mean() for points in (rod, circle[free]))
+        contrasts.append(float(peak - valley) / (phantom.activity - phantom.background))
+    return np.array(contrasts, np.float64)
 
 
-def _points(middle: tuple[float, float], radii: Floats, height: float) -> Floats:
-    """Points (n, 3) on circles around a rod's axis, over the part of its length that counts."""
+def _points(center: tuple[float, float], radii: Floats, height: float) -> Floats:
+    """Return points (n, 3) on circles around a rod's axis, over the central part of its length."""
     angles = 2 * np.pi * (np.arange(_ANGLES) + 0.5) / _ANGLES
     depths = ((np.arange(_DEPTHS) + 0.5) / _DEPTHS - 0.5) * _LENGTH * height
     radius, angle, z = np.meshgrid(radii, angles, depths, indexing="ij")
-    return np.stack([middle[0] + radius * np.cos(angle), middle[1] + radius * np.sin(angle), z], -1).reshape(-1, 3)
+    return np.stack([center[0] + radius * np.cos(angle), center[1] + radius * np.sin(angle), z], -1).reshape(-1, 3)

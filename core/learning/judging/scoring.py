@@ -1,4 +1,4 @@
-"""What one volume of one event is worth: scores by kind of test."""
+"""Scores of one volume of one event, by kind of test."""
 
 import dataclasses
 import threading
@@ -31,71 +31,74 @@ from .observer import channel_outputs
 from .rods import PRESENT, rod_contrasts
 
 Scores = dict[str, Any]
-_EVERY = 0.005  # s, between looks at the memory
+_INTERVAL = 0.005  # s between readings of the memory in use
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Case:
-    """One event at one level and draw of noise, as methods are asked for it."""
+    """Event at one level and noise draw, as methods get it."""
 
     event: Event
     run: ProjectionRun
-    """With the geometry that methods are told."""
+    """Run with the geometry that methods are told."""
     grid: Grid
     width: float = 30.0
-    """Of the observer's channels, mm."""
+    """Width of the observer's channels, mm."""
     defect: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     """Settings of the defect that some events of the test have."""
 
     @cached_property
     def planned(self) -> PlannedEvent:
-        """What the event was made of."""
+        """Plan from which the event was made."""
         return self.event.planned
 
     @cached_property
     def truth(self) -> Volume:
-        """The event's truth on the judge's grid, as means over its voxels."""
+        """Truth of the event on the judge's grid, as means over its voxels."""
         return resample(self.event.truth, self.grid, "mean")
 
     @cached_property
     def points(self) -> Floats:
-        """The middles of the judge's voxels, (n, 3) mm."""
+        """Centres (n, 3), mm, of the judge's voxels."""
         index = np.indices(self.grid.shape).reshape(3, -1).T
         return moved(self.grid.affine, index)
 
     @cached_property
     def missing(self) -> list[Floats]:
-        """The activity (n,) in `points` that the test's defect takes from the event's heart, and on its other side."""
-        whole = dataclasses.replace(_phantom(self, CardiacTorso), defect_severity=0.0)
-        angle, values = self.defect["defect_angle_degrees"], whole.values(self.points, self.event.placement)
-        turned = ({**self.defect, "defect_angle_degrees": each} for each in (angle, angle % 360 - 180))
-        lacking = (dataclasses.replace(whole, **settings) for settings in turned)
-        return [(values - each.values(self.points, self.event.placement)).clip(0) for each in lacking]
+        """Activity (n,) in `points` that the defect takes from the heart, and that a defect opposite would take."""
+        healthy = dataclasses.replace(_phantom(self, CardiacTorso), defect_severity=0.0)
+        angle, values = self.defect["defect_angle_degrees"], healthy.values(self.points, self.event.placement)
+        settings_by_side = ({**self.defect, "defect_angle_degrees": side} for side in (angle, angle % 360 - 180))
+        torsos = (dataclasses.replace(healthy, **settings) for settings in settings_by_side)
+        return [(values - torso.values(self.points, self.event.placement)).clip(0) for torso in torsos]
 
     @cached_property
     def projector(self) -> Projector:
-        """From the judge's grid to the run's images, with the model that made them."""
+        """Projector from the judge's grid to the run's images, with the model that made them."""
         return projector_of_run(self.run, self.grid, recipe=model_of(self.run, self.run.recipe))
 
     def score(self, volume: Volume, scoring: str) -> Scores:
-        """The scores of a volume in a test of a kind (`SCORINGS`)."""
+        """Return the scores of a volume in a test of this kind (`SCORINGS`)."""
         if not same_grid(volume.grid, self.grid):
             raise InputError(f"a method gave {volume.grid.shape} voxels on another grid than the judge's: {self.grid}")
         A = self.projector
         deviance = relative_deviance(self.run.projections, A(volume.array) + A.background)
-        found: Scores = {"nrmse": nrmse(volume, self.truth), "deviance": deviance}
+        scores: Scores = {"nrmse": nrmse(volume, self.truth), "deviance": deviance}
         if min(self.grid.shape) >= 11:  # the window's side
-            found["ssim"] = ssim(volume, self.truth)
-        return found | SCORINGS[scoring](volume, self)
+            scores["ssim"] = ssim(volume, self.truth)
+        return scores | SCORINGS[scoring](volume, self)
 
     def contrasts(self, volume: Volume, phantom: DerenzoPhantom, rods: Any) -> Any:
-        """`rod_contrasts` of the event's phantom, which it may have mirrored, enlarged and made hotter."""
-        found = rod_contrasts(volume, phantom, self.event.placement, rods)
-        return found / self.planned.activity_factor
+        """Return `rod_contrasts` for the event's phantom, which may be mirrored, enlarged and hotter than `phantom`."""
+        contrasts = rod_contrasts(volume, phantom, self.event.placement, rods)
+        return contrasts / self.planned.activity_factor
 
 
-def told(run: ProjectionRun, system: Scanner | None, file: str) -> ProjectionRun:
-    """A run whose images are said to be another scanner's, whose workbook is `file`; as it is for None."""
+def as_believed(run: ProjectionRun, system: Scanner | None, file: str) -> ProjectionRun:
+    """Return a run whose images are attributed to another scanner, that of the workbook `file`.
+
+    The run is unchanged if `system` is None. Raises `InputError` for another number of modules.
+    """
     if system is None:
         return run
     if len(system) != len(run.system):
@@ -107,40 +110,41 @@ def told(run: ProjectionRun, system: Scanner | None, file: str) -> ProjectionRun
 
 
 @contextmanager
-def measured() -> Iterator[Scores]:
-    """Put into what it gives how long a work took, "seconds", and by how much memory grew for it at most, "megabytes"."""
+def measure_cost() -> Iterator[Scores]:
+    """Yield a dictionary, which gets the duration of the context, "seconds", and its growth of memory, "megabytes"."""
     import psutil
 
-    found, process, ended = Scores(), psutil.Process(), threading.Event()
-    first = most = process.memory_info().rss
+    cost, process, stop = Scores(), psutil.Process(), threading.Event()
+    initial = peak = process.memory_info().rss
 
     def watch() -> None:
-        nonlocal most
-        while not ended.wait(_EVERY):
-            most = max(most, process.memory_info().rss)
+        """Keep the largest memory in use until the end."""
+        nonlocal peak
+        while not stop.wait(_INTERVAL):
+            peak = max(peak, process.memory_info().rss)
 
     watcher = threading.Thread(target=watch, daemon=True)
     watcher.start()
-    begun = time.perf_counter()
+    start = time.perf_counter()
     try:
-        yield found
+        yield cost
     finally:
-        found["seconds"] = time.perf_counter() - begun
-        ended.set()
+        cost["seconds"] = time.perf_counter() - start
+        stop.set()
         watcher.join()
-        found["megabytes"] = (max(most, process.memory_info().rss) - first) / 2**20
+        cost["megabytes"] = (max(peak, process.memory_info().rss) - initial) / 2**20
 
 
-def _rods(volume: Volume, case: Case) -> Scores:
-    """Contrast recovery of all rods, and how many of them are seen."""
+def _score_rods(volume: Volume, case: Case) -> Scores:
+    """Return the mean contrast recovery of all rods, their number, and the number of rods that are seen."""
     phantom = _phantom(case, DerenzoPhantom)
     contrasts = case.contrasts(volume, phantom, phantom.rods())
-    known = contrasts[~np.isnan(contrasts)]
-    return {"contrast": float(known.mean()), "rods": len(known), "rods_seen": int((known > PRESENT).sum())}
+    valid = contrasts[~np.isnan(contrasts)]
+    return {"contrast": float(valid.mean()), "rods": len(valid), "rods_seen": int((valid > PRESENT).sum())}
 
 
-def _pair(volume: Volume, case: Case) -> Scores:
-    """The contrast at the place that was altered, and whether a rod is there."""
+def _score_pair(volume: Volume, case: Case) -> Scores:
+    """Return the contrast at the altered place, and whether there is a rod."""
     phantom = _phantom(case, DerenzoPhantom)
     site = phantom.altered_site()
     if site is None:
@@ -149,30 +153,37 @@ def _pair(volume: Volume, case: Case) -> Scores:
     return {"site": float(contrast), "site_has_rod": phantom.altered < 0}
 
 
-def _defect(volume: Volume, case: Case) -> Scores:
-    """What the observer's channels see at the defect's place, and its contrast: 1 - its mean by that of the other side."""
-    own, other = case.missing
-    place = own @ case.points / own.sum()
-    shown, true = (
-        1 - np.mean(v.array.ravel()[own > own.max() / 2]) / np.mean(v.array.ravel()[other > other.max() / 2])
+def _score_defect(volume: Volume, case: Case) -> Scores:
+    """Return the outputs of the observer's channels at the defect's place, and the recovery of its contrast.
+
+    The contrast is 1 minus the mean in the defect divided by that on the opposite side.
+    """
+    lost, opposite = case.missing
+    center = lost @ case.points / lost.sum()
+    contrast, truth = (
+        1 - np.mean(v.array.ravel()[lost > lost.max() / 2]) / np.mean(v.array.ravel()[opposite > opposite.max() / 2])
         for v in (volume, case.truth)
     )
-    outputs = channel_outputs(volume, place, case.width).tolist()
+    outputs = channel_outputs(volume, center, case.width).tolist()
     has_defect = _phantom(case, CardiacTorso).defect_severity > 0
-    return {"channels": outputs, "defect": has_defect} | ({"contrast": float(shown / true)} if has_defect else {})
+    return {"channels": outputs, "defect": has_defect} | ({"contrast": float(contrast / truth)} if has_defect else {})
 
 
-def defect_of(events: Any) -> dict[str, Any]:
-    """The settings of the one defect that some events of a test have; `InputError` where there is none, or are several."""
+def common_defect(events: Any) -> dict[str, Any]:
+    """Return the settings of the single defect that some events of a test have.
+
+    Raises `InputError` if there is no event with a defect, or if there are several defects.
+    """
     phantoms = [event.planned.phantom for event in events]
     names = [field.name for field in dataclasses.fields(CardiacTorso) if field.name.startswith("defect_")]
-    found = [{name: getattr(p, name) for name in names} for p in phantoms if getattr(p, "defect_severity", 0)]
-    if not found or any(each != found[0] for each in found):
+    defects = [{name: getattr(p, name) for name in names} for p in phantoms if getattr(p, "defect_severity", 0)]
+    if not defects or any(defect != defects[0] for defect in defects):
         raise InputError("scoring defect: expected cardiac torsos, some with one and the same defect")
-    return found[0]
+    return defects[0]
 
 
 def _phantom(case: Case, kind: type[Any]) -> Any:
+    """Return the event's phantom; raise `InputError` if it is not of this class."""
     phantom = case.planned.phantom
     if not isinstance(phantom, kind):
         raise InputError(f"event {case.event.number}: this scoring is of a {kind.title}, not of {case.event.name}")
@@ -181,8 +192,8 @@ def _phantom(case: Case, kind: type[Any]) -> Any:
 
 SCORINGS: dict[str, Callable[[Volume, Case], Scores]] = {
     "volumes": lambda volume, case: {},
-    "rods": _rods,
-    "pairs": _pair,
-    "defect": _defect,
+    "rods": _score_rods,
+    "pairs": _score_pair,
+    "defect": _score_defect,
 }
-"""What is scored besides the voxels, by kind of test."""
+"""Functions that score volumes besides the voxels, by kind of test."""

@@ -1,4 +1,4 @@
-"""The judge's sets of events: recipes to begin with, and what names a set."""
+"""Event sets of the judge: recipes for them, and names that identify sets."""
 
 import hashlib
 import json
@@ -23,39 +23,39 @@ SETS: Mapping[str, str] = MappingProxyType({
     "pairs": "a test: Derenzo rods, one left out or added",
     "cardiac": "a test: a torso with and without a perfusion defect; 64³ voxels, all modules",
 })  # fmt: skip
-"""What each recipe is for, by name."""
+"""Purpose of each recipe, by name."""
 
 
 def set_text(name: str, workbook: AnyPath = EXAMPLE) -> str:
-    """The text of a recipe (TOML) of events, with a workbook's path as the recipe's folder sees it."""
+    """Return the text of an event recipe (TOML) with the path of a workbook, relative to the recipe's folder."""
     one_of(name, SETS, "set of events")
     return with_workbook((_FOLDER / f"{name}.toml").read_text(encoding="utf-8"), workbook)
 
 
 def events_by_recipe(events: EventSet) -> dict[str, list[int]]:
-    """The numbers of the events by their recipes' fingerprints: which events these are, wherever their files lie.
+    """Return the numbers of the events by their recipes' fingerprints, which identifies them wherever their files are.
 
-    An event follows from its recipe, with the contents of all files that this names, and its number.
+    An event follows from its recipe, including the contents of all files that it names, and its number.
     """
-    found: dict[str, list[int]] = {}
+    numbers_by_recipe: dict[str, list[int]] = {}
     for event in events:
-        found.setdefault(event.recipe.fingerprint, []).append(event.number)
-    return {recipe: sorted(numbers) for recipe, numbers in sorted(found.items())}
+        numbers_by_recipe.setdefault(event.recipe.fingerprint, []).append(event.number)
+    return {recipe: sorted(numbers) for recipe, numbers in sorted(numbers_by_recipe.items())}
 
 
 def set_fingerprint(events: EventSet) -> str:
-    """The name of a set of events: the first 16 digits of a SHA-256 of what `events_by_recipe` gives."""
+    """Return the name of a set of events: 16 digits of a SHA-256 of `events_by_recipe`."""
     return short_hash(events_by_recipe(events))
 
 
 def short_hash(record: Any) -> str:
-    """16 digits of the SHA-256 of what JSON can hold."""
+    """Return 16 digits of the SHA-256 of JSON values."""
     return hashlib.sha256(json.dumps(record, sort_keys=True).encode()).hexdigest()[:16]
 
 
 def refuse_trained_on(method: str, trained_on: Mapping[str, list[int]], events: EventSet, name: str) -> None:
-    """Raise `InputError` where a method was trained on events of a test; `trained_on` as of `events_by_recipe`."""
+    """Raise `InputError` if a method was trained on events of a test; `trained_on` is in the form of `events_by_recipe`."""
     tests = events_by_recipe(events)
-    seen = [n for recipe, numbers in tests.items() for n in sorted({*numbers} & {*trained_on.get(recipe, ())})]
-    if seen:
-        raise InputError(f"{method}: it was trained on events of the test {name}: {several(seen)}; judge it on others")
+    hits = [n for recipe, numbers in tests.items() for n in sorted({*numbers} & {*trained_on.get(recipe, ())})]
+    if hits:
+        raise InputError(f"{method}: it was trained on events of the test {name}: {several(hits)}; judge it on others")

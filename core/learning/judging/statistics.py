@@ -1,4 +1,4 @@
-"""Intervals of what a few events or sites say: ratios, differences, shares and areas under curves."""
+"""Confidence intervals for a few events or sites: ratios, differences, proportions, areas under curves."""
 
 import math
 from collections.abc import Callable
@@ -11,9 +11,9 @@ from ...errors import InputError
 from ...validation import real_array
 
 Z95 = 1.959963984540054
-"""How many standard deviations of a normal distribution hold 95 % of it."""
+"""Half-width in standard deviations of the central 95 % of a normal distribution."""
 _RESAMPLES = 4000
-_STEPS = 60  # of bisection: down to the last digit of a number from 0 to 1
+_STEPS = 60  # steps of bisection, down to the last digit of a number from 0 to 1
 
 
 class Estimate(NamedTuple):
@@ -28,30 +28,32 @@ class Estimate(NamedTuple):
 
 
 def ratio_of_means(values: ArrayLike, others: ArrayLike, seed: int = 0) -> Estimate:
-    """The mean of `values` by that of `others`, both (n,) of the same events: paired bootstrap, percentiles.
+    """Return the mean of `values` divided by that of `others`, both (n,) of the same events, with its interval.
 
-    Efron, Tibshirani 1993, An Introduction to the Bootstrap, chapter 13. The same seed gives the same interval.
+    The interval is that of a paired bootstrap by percentiles (Efron, Tibshirani 1993, An Introduction to the Bootstrap,
+    chapter 13). The same seed gives the same interval.
     """
     return _bootstrap(values, others, np.divide, seed)
 
 
 def difference_of_means(values: ArrayLike, others: ArrayLike, seed: int = 0) -> Estimate:
-    """The mean of `values` minus that of `others`, as in `ratio_of_means`."""
+    """Return the mean of `values` minus that of `others`, both (n,) of the same events, with a paired bootstrap interval."""
     return _bootstrap(values, others, np.subtract, seed)
 
 
 def _bootstrap(values: ArrayLike, others: ArrayLike, compare: Callable[..., Floats], seed: int) -> Estimate:
-    both = np.stack([real_array(values, "values", (None,)), real_array(others, "other values", (np.size(values),))])
-    if not both.size:
+    """Return a comparison of two means with its paired bootstrap interval."""
+    pairs = np.stack([real_array(values, "values", (None,)), real_array(others, "other values", (np.size(values),))])
+    if not pairs.size:
         raise InputError("bootstrap: expected values of one event or more, got none")
-    n = both.shape[1]
-    shares = np.random.default_rng(seed).multinomial(n, np.full(n, 1 / n), _RESAMPLES) / n
-    low, high = np.percentile(compare(*(both @ shares.T)), [2.5, 97.5])
-    return Estimate(float(compare(*both.mean(axis=1))), float(low), float(high))
+    n = pairs.shape[1]
+    weights = np.random.default_rng(seed).multinomial(n, np.full(n, 1 / n), _RESAMPLES) / n
+    low, high = np.percentile(compare(*(pairs @ weights.T)), [2.5, 97.5])
+    return Estimate(float(compare(*pairs.mean(axis=1))), float(low), float(high))
 
 
 def wilson(successes: int, trials: int) -> Estimate:
-    """The share of trials that succeed, with Wilson's interval; of no trials NaN, from 0 to 1.
+    """Return the proportion of successes with Wilson's interval; NaN with the interval 0 to 1 without trials.
 
     E. B. Wilson 1927, "Probable inference, the law of succession, and statistical inference", J. Am. Stat. Assoc. 22.
     """
@@ -64,31 +66,33 @@ def wilson(successes: int, trials: int) -> Estimate:
 
 
 def area_under_curve(absent: ArrayLike, present: ArrayLike) -> Estimate:
-    """The chance that a rating of a signal that is present exceeds one where it is absent; ties count half.
+    """Return the probability that a rating with the signal exceeds one without it, ties by half, with its interval.
 
     The interval is that of Newcombe 2006, "Confidence intervals for an effect size measure based on the Mann-Whitney
     statistic. Part 2", Stat. Med. 25, method 5, whose variance is Hanley and McNeil's (1982) for exponential ratings: it
     stays within 0 and 1 and has a width even where all ratings are in order.
     """
-    without, having = np.sort(real_array(absent, "ratings", (None,))), real_array(present, "ratings", (None,))
-    m, n = len(without), len(having)
+    negatives, positives = np.sort(real_array(absent, "ratings", (None,))), real_array(present, "ratings", (None,))
+    m, n = len(negatives), len(positives)
     if not m or not n:
         raise InputError(f"AUC: expected ratings with and without the signal, got {n} and {m}")
-    below = (np.searchsorted(without, having, "left") + np.searchsorted(without, having, "right")) / 2
+    below = (np.searchsorted(negatives, positives, "left") + np.searchsorted(negatives, positives, "right")) / 2
     area = float(below.mean()) / m
 
     def deviation(theta: float) -> float:
-        spread = ((m + n) / 2 - 1) * ((1 - theta) / (2 - theta) + theta / (1 + theta))
-        return math.sqrt(theta * (1 - theta) * (1 + spread) / (m * n))
+        """Return the standard deviation of the area if its true value is theta."""
+        correlation = ((m + n) / 2 - 1) * ((1 - theta) / (2 - theta) + theta / (1 + theta))
+        return math.sqrt(theta * (1 - theta) * (1 + correlation) / (m * n))
 
-    def end(outside: float) -> float:
+    def interval_end(outside: float) -> float:
+        """Return the value towards `outside`, 0 or 1, from which the area is 1.96 standard deviations away."""
         inside = area
-        for _ in range(_STEPS):  # the farthest value from which the area is no more than 1.96 deviations away
-            middle = (inside + outside) / 2
-            if abs(middle - area) <= Z95 * deviation(middle):
-                inside = middle
+        for _ in range(_STEPS):
+            theta = (inside + outside) / 2
+            if abs(theta - area) <= Z95 * deviation(theta):
+                inside = theta
             else:
-                outside = middle
+                outside = theta
         return inside
 
-    return Estimate(area, end(0.0), end(1.0))
+    return Estimate(area, interval_end(0.0), interval_end(1.0))

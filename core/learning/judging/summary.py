@@ -1,4 +1,4 @@
-"""From single events' scores to the rows of the judge's table."""
+"""Summary of single events' scores in the rows of the judge's table."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -13,55 +13,58 @@ from .statistics import difference_of_means, ratio_of_means, wilson
 Rows = Sequence[Mapping[str, Any]]
 
 ENOUGH_EVENTS, ENOUGH_SITES = 50, 200
-"""Of which intervals mean what they say; of fewer the table tells."""
+"""Numbers of events and of sites from which on intervals are reliable; rows with fewer get a note."""
 _MEANS = ("nrmse", "ssim", "contrast", "deviance", "seconds")
 _DRAWN = ("bias", "deviation")
 
 
-def means_of(rows: Rows, drawn: Rows = ()) -> dict[str, Any]:
-    """What one method's scores say by themselves: means, shares with Wilson's intervals, the observer's AUC."""
-    found: dict[str, Any] = {"events": len(rows)}
+def mean_scores(rows: Rows, drawn: Rows = ()) -> dict[str, Any]:
+    """Return the summary of one method's scores: means, proportions with Wilson's intervals, the observer's AUC.
+
+    `drawn` are scores over draws of noise.
+    """
+    summary: dict[str, Any] = {"events": len(rows)}
     for names, source in ((_MEANS, rows), (_DRAWN, drawn)):
         for name in names:
             values = [row[name] for row in source if name in row]
             if values:
-                found[name] = float(np.mean(values))
-    found["megabytes"] = max(row["megabytes"] for row in rows)
+                summary[name] = float(np.mean(values))
+    summary["megabytes"] = max(row["megabytes"] for row in rows)
     if any("rods" in row for row in rows):
-        found["sensitivity"] = wilson(sum(row["rods_seen"] for row in rows), sum(row["rods"] for row in rows))
-    with_rod, without = ([row for row in rows if row.get("site_has_rod") is has] for has in (True, False))
+        summary["sensitivity"] = wilson(sum(row["rods_seen"] for row in rows), sum(row["rods"] for row in rows))
+    with_rod, without_rod = ([row for row in rows if row.get("site_has_rod") is has] for has in (True, False))
     if with_rod:
-        found["sensitivity"] = wilson(sum(row["site"] > PRESENT for row in with_rod), len(with_rod))
-    if without:
-        found["false_rods"] = wilson(sum(row["site"] > PRESENT for row in without), len(without))
-    if with_rod or without:
-        found["sites"] = len(with_rod) + len(without)
+        summary["sensitivity"] = wilson(sum(row["site"] > PRESENT for row in with_rod), len(with_rod))
+    if without_rod:
+        summary["false_rods"] = wilson(sum(row["site"] > PRESENT for row in without_rod), len(without_rod))
+    if with_rod or without_rod:
+        summary["sites"] = len(with_rod) + len(without_rod)
     absent, present = ([row["channels"] for row in rows if row.get("defect") is has] for has in (False, True))
     if absent and present:
         try:
-            observed = observe(absent, present)
+            observer = observe(absent, present)
         except InputError as error:
-            found["note"] = str(error)
+            summary["note"] = str(error)
         else:
-            found |= {"auc": observed.auc, "snr": observed.snr}
-    return found
+            summary |= {"auc": observer.auc, "snr": observer.snr}
+    return summary
 
 
-def compared(rows: Rows, others: Rows, seed: int) -> dict[str, Any]:
-    """How a method does beside another on the same events, in the same order: paired bootstrap intervals."""
-    own, other = (np.array([row["nrmse"] for row in each]) for each in (rows, others))
-    found: dict[str, Any] = {"ratio": ratio_of_means(own, other, seed)}
-    own, other = (
-        np.array([float(row["site"] > PRESENT) for row in each if row.get("site_has_rod") is False])
-        for each in (rows, others)
+def compare_scores(rows: Rows, others: Rows, seed: int) -> dict[str, Any]:
+    """Return paired bootstrap intervals of a method beside another, `others`, on the same events in the same order."""
+    values, other_values = (np.array([row["nrmse"] for row in method_rows]) for method_rows in (rows, others))
+    comparison: dict[str, Any] = {"ratio": ratio_of_means(values, other_values, seed)}
+    values, other_values = (
+        np.array([float(row["site"] > PRESENT) for row in method_rows if row.get("site_has_rod") is False])
+        for method_rows in (rows, others)
     )
-    if len(own):
-        found["false_rods_more"] = difference_of_means(own, other, seed)
-    return found
+    if len(values):
+        comparison["false_rods_more"] = difference_of_means(values, other_values, seed)
+    return comparison
 
 
-def told_of(row: Mapping[str, Any]) -> list[str]:
-    """What weakens a row of the table."""
+def row_notes(row: Mapping[str, Any]) -> list[str]:
+    """Return notes on the weaknesses of a row of the table."""
     notes = [row["note"]] if "note" in row else []
     if row["events"] < ENOUGH_EVENTS:
         notes.append(f"{row['events']} events, fewer than {ENOUGH_EVENTS}")

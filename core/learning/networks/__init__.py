@@ -1,4 +1,13 @@
-"""The networks that reconstruct, one file each, by their names in recipes."""
+"""Networks that reconstruct, one file each, and the table of their names in recipes.
+
+Entry points: `NETWORKS` (the table), `network.Network` (the interface: a network is called with a `ScannerSetup` and a
+`Sample` and returns volumes), `network.UNet`.
+
+To add a network, write a file with a class derived from `Network` and add a row to `NETWORKS` that names both. The
+arguments of the class, with their defaults, are its settings in recipes; `network.relative_residual` and
+`network.normalized_backprojection` tell a network what the counts say about a volume. Names of submodules are names of
+weights in model files: they stay.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -9,24 +18,25 @@ from ...errors import needing
 
 
 @dataclass(frozen=True)
-class Kind:
-    """A network: its class is ``file.Model``, whose arguments are the settings ``network.<name>``."""
+class NetworkKind:
+    """A kind of network: its texts and its class, whose arguments are the settings ``network.<name>``."""
 
-    label: str
+    label: str  # name in messages and figures
     text: str  # one line of help
-    file: str  # beside this one
+    path: str  # file in this folder and class, "after_osem.AfterOsem"
 
     def load(self) -> Any:
-        """Its class; `InputError` where torch or MONAI is missing."""
+        """Import and return the class; raise `InputError` if torch or MONAI is missing."""
+        file, name = self.path.split(".")
         with needing("mphdrr[learning]"):
-            return import_module(f".{self.file}", __name__).Model
+            return getattr(import_module(f".{file}", __name__), name)
 
 
-NETWORKS: Mapping[str, Kind] = {
-    "after-osem": Kind("U-Net after OSEM", "Corrects volumes by OSEM", "after_osem"),
-    "cameras": Kind("Camera nets", "Each camera's own estimate in (u, v, k), weighed by content", "cameras"),
-    "parallel": Kind("Parallel projections", "Infers parallel projections, then FBP", "parallel"),
-    "unrolled": Kind("Unrolled", "Steps through the exact operators", "unrolled"),
-    "channels": Kind("Views as channels", "Is told no geometry: for comparison", "channels"),
+NETWORKS: Mapping[str, NetworkKind] = {
+    "after-osem": NetworkKind("U-Net after OSEM", "Corrects volumes by OSEM", "after_osem.AfterOsem"),
+    "cameras": NetworkKind("Camera nets", "One estimate per camera in (u, v, k), weighed by content", "cameras.CameraNets"),
+    "parallel": NetworkKind("Parallel projections", "Infers parallel projections, then FBP", "parallel.ParallelProjections"),
+    "unrolled": NetworkKind("Unrolled", "Steps through the exact operators", "unrolled.UnrolledEm"),
+    "channels": NetworkKind("Views as channels", "Without geometry, for comparison", "channels.ViewsAsChannels"),
 }  # fmt: skip
-"""The networks by their names in recipes. A new one is a file here and a row."""
+"""Kinds of networks by their names in recipes."""

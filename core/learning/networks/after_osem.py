@@ -4,25 +4,25 @@ from collections.abc import Sequence
 
 from torch import Tensor
 
-from ..setup import Sample, Setup
-from .network import Network, UNet, middle, positive
+from ..setup import Sample, ScannerSetup
+from .network import Network, UNet, middle_osem, nonnegative
 
 
-class Model(Network):
-    """Adds to the middle one of the volumes by OSEM what a U-Net makes of all of them.
+class AfterOsem(Network):
+    """Adds to the middle OSEM volume the output of a U-Net that gets all OSEM volumes.
 
     Parameters
     ----------
     channels : sequence of int
-        Of each level of the U-Net.
+        Number of channels of each level of the U-Net.
     volumes : int
-        By OSEM.
+        Number of OSEM volumes.
     """
 
     def __init__(self, channels: Sequence[int] = (16, 32, 48), *, volumes: int = 3):
         super().__init__()
         self.net = UNet(volumes, 1, channels)
 
-    def forward(self, setup: Setup, sample: Sample) -> list[Tensor]:
-        """See `Network`."""
-        return [positive(middle(sample) + self.net(sample.osem))]
+    def forward(self, setup: ScannerSetup, sample: Sample) -> list[Tensor]:
+        """Return the estimates of the volumes, the result last; see `Network`."""
+        return [nonnegative(middle_osem(sample) + self.net(sample.osem))]

@@ -1,4 +1,4 @@
-"""Views as channels into a decoder of volumes, which is told no geometry: what the others are compared with."""
+"""Views as channels into a decoder of volumes: a network without geometry, for comparison."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -7,21 +7,21 @@ from monai.networks.nets import Generator, Regressor
 from torch import Tensor
 
 from ...errors import InputError
-from ..setup import Sample, Setup
-from .network import LEAKY, Network, positive
+from ..setup import Sample, ScannerSetup
+from .network import LEAKY, Network, nonnegative
 
 
-class Model(Network):
-    """All images as channels of one, made ever smaller; then a volume made ever larger. For one number of views and voxels.
+class ViewsAsChannels(Network):
+    """An encoder of all images as channels of one image, and a decoder to a volume, for fixed numbers of views and voxels.
 
     Parameters
     ----------
     channels : sequence of int
-        Of the images as they get smaller by 2; those of the volume are the same backwards.
+        Number of channels of the levels at which images are halved; the volume has the same in reverse order.
     latent : int
-        Numbers between images and volume.
+        Size of the latent vector between images and volume.
     views, pixels, voxels
-        M, (n_v, n_u) and (n_x, n_y, n_z) that it is for.
+        Fixed sizes M, (n_v, n_u) and (n_x, n_y, n_z).
     """
 
     def __init__(
@@ -38,25 +38,25 @@ class Model(Network):
             raise InputError(f"network.channels: expected one level or more, each of 1 or more, got {list(channels)}")
         self.sizes = views, tuple(pixels), tuple(voxels)
         strides = [2] * len(channels)
-        start = [-(-n // 2 ** len(channels)) for n in voxels]  # rounded up: what is too much is cut off
-        like = {"num_res_units": 1, "act": LEAKY, "norm": None}
-        self.encoder = Regressor((views, *pixels), (latent,), channels, strides, **like)
-        self.decoder = Generator((latent,), (channels[-1], *start), (*channels[-2::-1], 1), strides, **like)
+        start = [-(-n // 2 ** len(channels)) for n in voxels]  # rounded up; the excess is cut off
+        options = {"num_res_units": 1, "act": LEAKY, "norm": None}
+        self.encoder = Regressor((views, *pixels), (latent,), channels, strides, **options)
+        self.decoder = Generator((latent,), (channels[-1], *start), (*channels[-2::-1], 1), strides, **options)
 
     @classmethod
-    def fixed(cls, setup: Setup) -> dict[str, Any]:
-        """See `Network`."""
+    def fixed(cls, setup: ScannerSetup) -> dict[str, Any]:
+        """Return the arguments that follow from the setup: numbers of views, pixels and voxels."""
         M, *pixels = setup.A.shape_out
         return {"views": M, "pixels": pixels, "voxels": setup.A.shape_in}
 
-    def forward(self, setup: Setup, sample: Sample) -> list[Tensor]:
-        """See `Network`; raises `InputError` for another number of views, pixels or voxels."""
+    def forward(self, setup: ScannerSetup, sample: Sample) -> list[Tensor]:
+        """Return one estimate; raise `InputError` for another number of views, pixels or voxels. See `Network`."""
         M, *pixels = setup.A.shape_out
         sizes = M, tuple(pixels), setup.A.shape_in
         if sizes != self.sizes:
-            own, given = ("{} views of {} pixels and {} voxels".format(*each) for each in (self.sizes, sizes))
-            raise InputError(f"channels: the network is for {own}, not for {given}")
+            expected, actual = ("{} views of {} pixels and {} voxels".format(*s) for s in (self.sizes, sizes))
+            raise InputError(f"channels: the network is for {expected}, not for {actual}")
         images = sample.counts - sample.background
         x = self.decoder(self.encoder(images / images.mean((1, 2, 3), keepdim=True).clamp(min=1e-9)))
         n_x, n_y, n_z = setup.A.shape_in
-        return [positive(x[..., :n_x, :n_y, :n_z].to(images.dtype))]
+        return [nonnegative(x[..., :n_x, :n_y, :n_z].to(images.dtype))]

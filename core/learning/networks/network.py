@@ -1,4 +1,4 @@
-"""What all networks share: the interface, the U-Net, what counts say of a volume, and how values stay at least 0."""
+"""Parts that all networks share: the interface, the U-Net, data-consistency terms, non-negativity."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Sequence
@@ -10,39 +10,40 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from ...errors import InputError
-from ..setup import Sample, Setup
+from ..setup import Sample, ScannerSetup
 
 LEAKY = ("leakyrelu", {"negative_slope": 0.1, "inplace": True})
-"""The rectifier of all networks, as MONAI names it."""
-_LEVELS = 3  # fewer are no U-Net for MONAI
+"""Activation function of all networks, in MONAI's notation."""
+_LEVELS = 3  # least number of levels of MONAI's U-Net
 
 
 class Network(nn.Module, ABC):
-    """A way from counts to a volume. Its arguments have plain values and defaults, which recipes set.
+    """Interface of networks that compute volumes from counts.
 
-    Arguments that only have names (after ``*``) are no settings: `fixed` has their values for a setup. It keeps nothing
-    else of a scanner: `setup` is given with each call, so that a network that is told the geometry works with any. What
-    needs a fixed number of views or voxels (`channels`) says so with `InputError`.
+    The constructor's arguments have plain values and defaults; recipes set them. Keyword-only arguments (after ``*``) are no
+    settings: `fixed` derives them from a setup. A network stores nothing else about a scanner: it gets the `setup` with each
+    call, so that a network that uses the geometry works with any scanner. One that needs a fixed number of views or voxels
+    (`channels`) refuses others with `InputError`.
     """
 
     may_be_0: Collection[str] = ()
-    """Arguments that may be 0; other whole numbers are 1 or more."""
+    """Names of arguments that may be 0; other integers are 1 or more."""
 
     @classmethod
-    def fixed(cls, setup: Setup) -> dict[str, Any]:
-        """Arguments that follow from the setup: ``Model(**settings, **Model.fixed(setup))``."""
+    def fixed(cls, setup: ScannerSetup) -> dict[str, Any]:
+        """Return the keyword-only arguments that follow from a setup, for ``cls(**settings, **cls.fixed(setup))``."""
         return {"volumes": len(setup.after)}
 
     @abstractmethod
-    def forward(self, setup: Setup, sample: Sample) -> list[Tensor]:
-        """Volumes (B, 1, n_x, n_y, n_z) in units of the samples' scale: estimates on the way, and last the result."""
+    def forward(self, setup: ScannerSetup, sample: Sample) -> list[Tensor]:
+        """Return volumes (B, 1, n_x, n_y, n_z) in units of the samples' scale: intermediate estimates, the result last."""
 
 
 class UNet(nn.Module):
     """MONAI's U-Net in 3-D or 2-D, for any size, without normalisation, which would lose the activity.
 
-    Its last layer begins with 0: a network that corrects a volume begins with that volume. `InputError` for fewer than
-    three levels of `channels`, which it calls `name`, or a level without a channel.
+    The weights of its last layer are 0 at first, so that a network that corrects a volume starts with that volume. Raises
+    `InputError` for fewer than three levels of `channels`, which messages call `name`, or a level without channels.
     """
 
     def __init__(self, inputs: int, outputs: int, channels: Sequence[int], dimensions: int = 3, name: str = "channels"):
@@ -51,44 +52,45 @@ class UNet(nn.Module):
             raise InputError(f"network.{name}: expected three levels or more, each of 1 or more, got {list(channels)}")
         strides = (1, *[2] * (len(channels) - 1))
         self.divisor = 2 ** (len(channels) - 1)
-        kernels, like = [3] * len(channels), {"norm_name": "", "act_name": LEAKY}
-        self.net = DynUNet(dimensions, inputs, outputs, kernels, strides, strides[1:], filters=list(channels), **like)
+        kernels, layers = [3] * len(channels), {"norm_name": "", "act_name": LEAKY}
+        self.net = DynUNet(dimensions, inputs, outputs, kernels, strides, strides[1:], filters=list(channels), **layers)
         last = self.net.output_block.conv.conv
         nn.init.zeros_(last.weight)
         nn.init.zeros_(last.bias)
 
     def forward(self, x: Tensor) -> Tensor:
-        """(B, inputs, …) to (B, outputs, …), of the same type also where it computes with another."""
+        """Return outputs (B, outputs, …) for inputs (B, inputs, …), in the inputs' type even with mixed precision."""
         sides = x.shape[2:]
-        missing = [-n % self.divisor for n in sides]
-        padded = functional.pad(x, [each for n in reversed(missing) for each in (0, n)])
+        padding = [-n % self.divisor for n in sides]
+        padded = functional.pad(x, [width for n in reversed(padding) for width in (0, n)])
         layout = torch.channels_last_3d if len(sides) == 3 else torch.channels_last
         y: Tensor = self.net(padded.contiguous(memory_format=layout)).to(x.dtype)
         return y[(..., *(slice(n) for n in sides))]
 
 
-def middle(sample: Sample) -> Tensor:
-    """The volume by OSEM (B, 1, n_x, n_y, n_z) that networks begin with, of which `Sample.scale` is told."""
+def middle_osem(sample: Sample) -> Tensor:
+    """Return the OSEM volume of the middle iteration, (B, 1, n_x, n_y, n_z), whose root mean square is `Sample.scale`."""
     m = sample.osem.shape[1] // 2
     return sample.osem[:, m : m + 1]
 
 
-def surplus(setup: Setup, sample: Sample, x: Tensor) -> Tensor:
-    """By how much the counts exceed those that volumes x (B, 1, …) let expect, as a share: (B, M, n_v, n_u)."""
-    activity = functional.relu(x[:, 0]) * sample.scale.view(-1, 1, 1, 1)  # leaky in training: counts cannot be negative
+def relative_residual(setup: ScannerSetup, sample: Sample, x: Tensor) -> Tensor:
+    """Return ``(counts + 0.5) / (A x + background + 0.5) - 1``, (B, M, n_v, n_u), for volumes x (B, 1, n_x, n_y, n_z)."""
+    # In training x may be below 0, but expected counts may not.
+    activity = functional.relu(x[:, 0]) * sample.scale.view(-1, 1, 1, 1)
     expected = setup.A(activity) + sample.background
     return (sample.counts + 0.5) / (expected + 0.5) - 1
 
 
-def spread(setup: Setup, shares: Tensor) -> Tensor:
-    """The mean (B, 1, n_x, n_y, n_z) of the shares (B, M, n_v, n_u) of the pixels that see a voxel, as they see it.
+def normalized_backprojection(setup: ScannerSetup, images: Tensor) -> Tensor:
+    """Return the backprojection ``A^T r / A^T 1`` of images r (B, M, n_v, n_u): (B, 1, n_x, n_y, n_z).
 
-    Of `surplus` it is the EM algorithm's relative change of the volume.
+    For r of `relative_residual` it is the relative change of the volume by the EM algorithm.
     """
-    sensitivity = setup.sensitivity.to(shares)
-    return (setup.A.T(shares) / sensitivity.clamp(min=1e-3 * float(sensitivity.max())))[:, None]
+    sensitivity = setup.sensitivity.to(images)
+    return (setup.A.T(images) / sensitivity.clamp(min=1e-3 * float(sensitivity.max())))[:, None]
 
 
-def positive(x: Tensor) -> Tensor:
-    """At least 0 when it is used; leaky in training, where a ReLU at the end can die for good."""
+def nonnegative(x: Tensor) -> Tensor:
+    """Return x limited to values >= 0; in training with a slope of 0.1 below 0, since a ReLU can get stuck at 0."""
     return functional.leaky_relu(x, 0.1) if torch.is_grad_enabled() else functional.relu(x)

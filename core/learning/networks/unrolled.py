@@ -1,4 +1,4 @@
-"""Steps of the EM algorithm through the exact operators, each with a small U-Net."""
+"""Unrolled EM: steps with the exact operators, each with a small U-Net."""
 
 from collections.abc import Sequence
 
@@ -6,32 +6,33 @@ import torch
 from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
-from ..setup import Sample, Setup
-from .network import Network, UNet, middle, positive, spread, surplus
+from ..setup import Sample, ScannerSetup
+from .network import Network, UNet, middle_osem, nonnegative, normalized_backprojection, relative_residual
 
 
-class Model(Network):
-    """Begins as `after_osem`, whose weights it can take; each step adds a part of an EM update and its own U-Net's change.
+class UnrolledEm(Network):
+    """EM steps with U-Nets: each step adds a multiple of the EM update and the output of the step's own U-Net.
 
-    The update is the gradient of the log-likelihood by the exact operators, divided by the sensitivity. A U-Net gets it,
-    the volume, and those by OSEM.
+    It starts as `after_osem`, whose weights it can load. The EM update is the gradient of the log-likelihood by the exact
+    operators, divided by the sensitivity and times the volume. A U-Net gets it, the volume and the OSEM volumes.
 
     Parameters
     ----------
     steps : int
+        Number of steps.
     channels : sequence of int
-        Of each level of the U-Nets.
+        Number of channels of each level of the U-Nets.
     learn_step : bool
-        Each step also adds a learned multiple of the EM update, at first 0.
+        Whether the multiple of the EM update, at first 0, is learned.
     through : bool
-        Gradients in training flow through the operators; if not, each step takes its expected counts as given.
+        Whether training gradients flow through the operators; if not, each step's expected counts are constants.
     dual : bool
-        Before they are spread over the volume, the counts' surpluses are corrected by a small network on the images, which
-        gets those of the step before, too, as in learned primal-dual reconstruction.
+        Whether relative residuals are corrected by a small network on the images before their backprojection, as in learned
+        primal-dual reconstruction; it also gets those of the step before.
     save_memory : bool
-        U-Nets are computed twice in training and keep nothing meanwhile.
+        Whether U-Nets are computed twice in training instead of keeping intermediate results.
     volumes : int
-        By OSEM.
+        Number of OSEM volumes.
 
     References
     ----------
@@ -56,23 +57,27 @@ class Model(Network):
         self.step = nn.Parameter(torch.zeros(steps), requires_grad=learn_step)
         self.duals = nn.ModuleList(UNet(2, 1, (8, 16, 16), dimensions=2) for _ in range(steps if dual else 0))
 
-    def forward(self, setup: Setup, sample: Sample) -> list[Tensor]:
-        """See `Network`."""
-        x, shares = positive(middle(sample) + self._of(self.net, sample.osem)), torch.zeros_like(sample.counts)
-        estimates = [x]
+    def forward(self, setup: ScannerSetup, sample: Sample) -> list[Tensor]:
+        """Return the estimates of the volumes, the result last; see `Network`."""
+        x = nonnegative(middle_osem(sample) + self._run(self.net, sample.osem))
+        corrected, estimates = torch.zeros_like(sample.counts), [x]
         for k, net in enumerate(self.nets):
-            found = surplus(setup, sample, x if self.through else x.detach())
-            shares = found + self._correction(k, found, shares) if self.duals else found
-            change = spread(setup, shares)
-            features = torch.cat([x, 5 * change, 5 * change * x, sample.osem], 1)  # changes are some 20 % of the volume
-            x = positive(x + self.step[k] * change * x + self._of(net, features))
+            residual = relative_residual(setup, sample, x if self.through else x.detach())
+            corrected = residual + self._correction(k, residual, corrected) if self.duals else residual
+            change = normalized_backprojection(setup, corrected)
+            features = torch.cat([x, 5 * change, 5 * change * x, sample.osem], 1)  # 5, as changes are about 20 %
+            x = nonnegative(x + self.step[k] * change * x + self._run(net, features))
             estimates.append(x)
         return estimates
 
-    def _of(self, net: nn.Module, features: Tensor) -> Tensor:
+    def _run(self, net: nn.Module, features: Tensor) -> Tensor:
+        """Return the network's output, recomputed in the backward pass if memory is to be saved."""
         return checkpoint(net, features, use_reentrant=False) if self.save_memory else net(features)
 
-    def _correction(self, k: int, found: Tensor, before: Tensor) -> Tensor:
-        """What step k adds to the surpluses (B, M, n_v, n_u), view by view."""
-        images = torch.stack([found, before], 2).flatten(0, 1)
-        return self.duals[k](images).view(found.shape)  # type: ignore[no-any-return]
+    def _correction(self, k: int, residual: Tensor, previous: Tensor) -> Tensor:
+        """Return step k's correction (B, M, n_v, n_u) of the relative residual, view by view.
+
+        `previous` is the corrected residual of the step before.
+        """
+        images = torch.stack([residual, previous], 2).flatten(0, 1)
+        return self.duals[k](images).view(residual.shape)  # type: ignore[no-any-return]

@@ -29,7 +29,7 @@ from typing import Any
 import numpy as np
 
 from ...arrays import ArrayOrTensor, to_numpy, to_tensor
-from ...errors import InputError, installing, warn
+from ...errors import InputError, install_advice, warn
 
 
 @dataclass(frozen=True)
@@ -117,7 +117,7 @@ def choose(name: str) -> Backend:
     try:
         _require(backend)
     except _CANNOT_LOAD as error:
-        remedy = f": {installing(_PACKAGES[name])}" if name in _PACKAGES else ""
+        remedy = f": {install_advice(_PACKAGES[name])}" if name in _PACKAGES else ""
         raise InputError(f"backend {name!r} cannot be used ({_reason(error)}){remedy}") from None
     return backend
 

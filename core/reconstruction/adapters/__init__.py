@@ -141,5 +141,5 @@ def parallelproj_operator(A: LinearOperator) -> ParallelprojOperator:
 
 def _module(name: str, package: str) -> Any:
     """A module of this folder, which imports the package; `InputError` where that, or something it needs, is missing."""
-    with needing(of=package):
+    with needing(feature=package):
         return importlib.import_module(f".{name}", __package__)

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from ...errors import InputError
-from ...hdf5 import numbers, opened, pack
+from ...hdf5 import opened, pack, read_numbers
 from ..volume import Volume
 from .contents import Contents, require_voxels
 
@@ -26,7 +26,7 @@ def read(path: Path) -> Contents:
         length, unit = (_text(dataset.attrs.get("unit")) for dataset in (affine, array))
         if length not in (None, "mm"):
             raise InputError(f"its affine is in {length}: expected mm")
-        return Contents(numbers(array), numbers(affine), quantity, unit)
+        return Contents(read_numbers(array), read_numbers(affine), quantity, unit)
 
 
 def _text(attribute: Any) -> str | None:

@@ -10,7 +10,7 @@ _FORMULA = re.compile(r"'*[=+\-@\t\r]")
 
 
 def escaped(value: Any) -> Any:
-    """Return a cell's content for `value`: a text that a spreadsheet would run as a formula with a leading apostrophe."""
+    """Return `value` for a cell: with a leading apostrophe if it is a text that a spreadsheet would run as a formula."""
     return f"'{value}" if isinstance(value, str) and _FORMULA.match(value) else value
 
 

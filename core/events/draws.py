@@ -53,7 +53,7 @@ class Dice:
         return max(i for i, weight in enumerate(odds) if weight > 0)
 
     def draw(self, value: Any, name: str, is_integer: bool = False) -> Any:
-        """Draw the value of a setting of a name; `value` is as `DrawnSetting.checked` returns it."""
+        """Return `value`, checked by `DrawnSetting`, with its draws replaced by random values that belong to a name."""
         if isinstance(value, Mapping):
             if "one_of" in value:
                 options = value["one_of"]

@@ -135,7 +135,7 @@ class PhantomEntry(DrawnValues):
     @property
     def is_volume(self) -> bool:
         """Whether the phantom comes from files of volumes, not of shapes (.toml)."""
-        return self["file"] is not None and not is_text(self["file"])
+        return self["file"] is not None and not is_shape_file(self["file"])
 
 
 def phantom_entry(values: dict[str, Any], number: int, quantity: str) -> PhantomEntry:
@@ -165,7 +165,7 @@ def phantom_entry(values: dict[str, Any], number: int, quantity: str) -> Phantom
 
 @functools.cache
 def _phantom_rows(kind: str) -> Mapping[str, Setting]:
-    """Return the settings of a kind of phantom, by key; those of a phantom from a file where `kind` is no kind's name."""
+    """Return the settings that a phantom may have, by key: one of a kind, or one from a file where no kind has the name."""
     return by_key([*(row for k in KINDS if k.name == kind for row in own_settings(k, DrawnSetting)), *_ROWS])
 
 
@@ -174,7 +174,7 @@ def _check_files(entry: PhantomEntry, quantity: str) -> None:
     files, mu_files = possible_values(entry["file"]), possible_values(entry["mu_file"])
     if "" in (*files, *mu_files):
         raise InputError("file: expected a file's name, got ''")
-    if any(len(set(map(is_text, names))) > 1 for names in (files, mu_files)):
+    if any(len(set(map(is_shape_file, names))) > 1 for names in (files, mu_files)):
         raise InputError("file: expected either volumes or phantoms (.toml), got both: make two [[phantoms]] of them")
     for key in ("mu_file", "center", "energy"):
         if key in entry.given and not entry.is_volume:
@@ -186,12 +186,12 @@ def _check_files(entry: PhantomEntry, quantity: str) -> None:
         raise InputError("energy: converts CT numbers to mu, but the truth is activity and there is no mu_file")
 
 
-def is_text(file: Any) -> bool:
+def is_shape_file(file: Any) -> bool:
     """Return whether a file name, or the first of a draw, is that of a phantom's shapes (.toml)."""
     return str(possible_values(file)[0]).lower().endswith(".toml")
 
 
-def as_settings(phantom: Any, kind: Kind) -> dict[str, Any]:
+def recorded_settings(phantom: Any, kind: Kind) -> dict[str, Any]:
     """Return all settings of a phantom by their names in recipes, with lists instead of tuples, as JSON has them."""
     settings = {key: getattr(phantom, name) for key, name in setting_names(kind.phantom).items()}
     return {key: np.asarray(value).tolist() if isinstance(value, tuple) else value for key, value in settings.items()}

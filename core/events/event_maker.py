@@ -41,7 +41,7 @@ class EventArrays:
     planned: PlannedEvent
     """Drawn parameters of the event."""
     truth: Volume
-    """Volume of which all images are."""
+    """True volume, from which all images are simulated."""
     images: dict[str, Floats32]
     """Images (M, n_v, n_u) by model: expected means, background included."""
     units: dict[str, str]

@@ -70,7 +70,7 @@ class Event:
 
     @contextmanager
     def held(self) -> Iterator[Event]:
-        """Give the event with its file held open, for several readings in one thread."""
+        """Open the event's file and yield an event that reads from it, for several readings in one thread."""
         event = Event(self._folder, self.number)
         with self.opened() as event._file:
             yield event
@@ -134,7 +134,7 @@ class Event:
 
     @property
     def truth(self) -> Volume:
-        """The true volume, of which all images are."""
+        """The true volume, from which all images were simulated."""
         return Volume(freeze(self.truth_part()), self.recipe.grid, self.recipe.quantity)
 
     def truth_part(self, part: tuple[slice, ...] = (), out: Floats32 | None = None) -> Floats32:

@@ -119,7 +119,7 @@ def _split_cells(line: str) -> list[str]:
 
 
 def _parse_cell(name: str, text: str) -> Any:
-    """Return the value of a cell in the column `name`: None, a text, or what its JSON says."""
+    """Return the value of a cell in the column `name`: None, a text, or the value of its JSON."""
     if not text:
         return None
     if name in _TEXTS:

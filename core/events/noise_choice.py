@@ -11,7 +11,7 @@ from ..validation import seed_number
 from .event_set import COUNTED, Event, EventSet
 
 NoiseChoice = int | Literal["own"] | None
-"""Noise of the images: None for expected means, "own" for the seed stored in each event, or a number to draw anew."""
+"""Noise of the images: None for expected means, "own" for the seed stored in each event, or another seed."""
 
 
 def checked_noise(noise: object) -> NoiseChoice:

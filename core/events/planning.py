@@ -16,7 +16,7 @@ from ..phantoms.torso import CardiacTorso
 from ..recording import Remembered, remembered
 from ..validation import seed_number
 from .draws import Dice, possible_values
-from .entries import as_settings
+from .entries import recorded_settings
 from .recipe import EventRecipe
 
 FIXED_COLUMNS = (
@@ -123,7 +123,7 @@ class PlannedEvent:
     def all_settings(self) -> dict[str, Any]:
         """All settings of the phantom, drawn or not, by their names in recipes; the file names of a phantom from files."""
         if self.entry.kind is not None:
-            return {"kind": self.entry.kind.name, **as_settings(self.phantom, self.entry.kind)}
+            return {"kind": self.entry.kind.name, **recorded_settings(self.phantom, self.entry.kind)}
         return {"file": self.file} | ({} if self.mu_file is None else {"mu_file": self.mu_file})
 
     def gains(self, count: int) -> Floats:

@@ -78,7 +78,7 @@ def make_in_processes(target: SetFolder, numbers: Sequence[int], workers: int) -
 
 
 def threads_per_worker(workers: int) -> int:
-    """Return the number of threads for each worker, with which all workers together use the cores of the job."""
+    """Return the number of threads for each of `workers` processes that together use all cores of the job."""
     return max(1, cores() // workers)
 
 

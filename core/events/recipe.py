@@ -25,7 +25,7 @@ from .entries import (
     check_entries,
     flat,
     grid_of,
-    is_text,
+    is_shape_file,
     like,
     phantom_entry,
     plain_name,
@@ -287,7 +287,7 @@ class EventRecipe:
             for key in ("file", "mu_file"):
                 if key in entry:
                     quantity = "mu" if key == "mu_file" else self.quantity
-                    content = "copy" if is_text(entry[key]) else _volume_content(quantity, phantom["energy"])
+                    content = "copy" if is_shape_file(entry[key]) else _volume_content(quantity, phantom["energy"])
                     entry[key] = replaced(entry[key], content)
         for name, model in self.models.items():
             if (files := model["attenuation.file"]) is not None:

@@ -164,7 +164,7 @@ def making(
 
 
 def _shard_numbers(requested: Sequence[range], i: int, n: int) -> list[int]:
-    """Return the event numbers of part i of n: those of the requested ones that are i - 1 modulo n."""
+    """Return the numbers of part i of n, from 1, of the requested events: every number that is i - 1 modulo n."""
     if not (isinstance(i, int) and isinstance(n, int) and 1 <= i <= n):
         raise InputError(f"shard: expected i/n with i from 1 to n, got {i}/{n}")
     return [number for span in requested for number in range(span.start + (i - 1 - span.start) % n, span.stop, n)]

@@ -1,4 +1,4 @@
-"""Work of a worker process: make an event of a set and write its file."""
+"""Task of a worker process: to make an event of a set and write its file."""
 
 import os
 import time

@@ -47,7 +47,10 @@ def _write(system: Scanner, views: Views, temporary: Path) -> None:
 
 
 def read_geometry(path: AnyPath) -> tuple[Scanner, Views]:
-    """Read what `write_geometry` wrote in the format ``"mphdrr"``, bit for bit; `InputError` for any other file."""
+    """Read scanner and views, bit for bit, from a file that `write_geometry` wrote in the format ``"mphdrr"``.
+
+    `InputError` for any other file.
+    """
     content = read_bytes(path)
     try:
         document = json.loads(content)

@@ -62,7 +62,7 @@ class Detector:
         return torch.stack([self.width / 2 + (-column if self.reverse_x_axis else column), self.height / 2 - row], -1)
 
     def unproject(self, pixels: Tensor) -> Tensor:
-        """Return the points (..., 3), mm, of `pixels` (..., 2) on the detector, in the camera's frame."""
+        """Return the points (..., 3), mm, of `pixels` (..., 2) in the camera's frame: the inverse of `project`."""
         column, row = pixels[..., 0] - self.width / 2, self.height / 2 - pixels[..., 1]
         if self.old:
             y, z = self.y0 - row * self.dely, -(column * self.delx + self.x0)

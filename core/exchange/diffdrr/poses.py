@@ -27,7 +27,7 @@ class RigidTransform:
         return len(self.matrix)
 
     def __getitem__(self, index: Any) -> Tensor:
-        """Return the matrices of some poses."""
+        """Return the matrices of the poses at an index or a slice."""
         return self.matrix[index]
 
     def __call__(self, points: Tensor) -> Tensor:

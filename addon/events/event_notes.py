@@ -14,7 +14,7 @@ import numpy as np
 
 from ...core import InputError, events, recording
 from ...core.events.folders import INDEX, RECIPE, SetFolder
-from ...core.events.store import EVENTS, SHARDS, size_of
+from ...core.events.store import EVENTS, SHARDS, file_size
 from ...core.memory import readable_size
 from ..blender import reports, storage, timers, windows
 
@@ -78,9 +78,9 @@ def _read_recipe(path: Path) -> Note:
 def _read_set(path: Path) -> Note:
     """Return a note on the number and the size of a set's events."""
     folder = SetFolder(path)
-    places, models = folder.store.places(), tuple(folder.recipe.models)
-    size = sum(map(size_of, places.values()))
-    return Note(f"{len(places)} of {sum(map(len, folder.asked))} events, {readable_size(size)}", models=models)
+    locations, models = folder.store.locations(), tuple(folder.recipe.models)
+    size = sum(map(file_size, locations.values()))
+    return Note(f"{len(locations)} of {sum(map(len, folder.requested))} events, {readable_size(size)}", models=models)
 
 
 def _note(path: Path, read: Callable[[Path], Note]) -> Note:

@@ -112,7 +112,7 @@ def make_set_job(filepath: str, folder: str, count: int) -> jobs.Job:
         return time.perf_counter() - start
 
     def finish(seconds: float) -> str:
-        n_events = len(SetFolder(path).store.places())
+        n_events = len(SetFolder(path).store.locations())
         if not new_events:
             return f"All events asked for are there already: {n_events} in {path}"
         size = memory.readable_size(sum(event.size for event in new_events))

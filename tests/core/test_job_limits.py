@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from mphdrr.core import memory
-from mphdrr.core.events.pool import threads_each
+from mphdrr.core.events.pool import threads_per_worker
 from mphdrr.core.rays.parallel import thread_count
 
 from .conftest import WORKBOOK, refused, run_python
@@ -95,7 +95,7 @@ def test_a_share_of_the_processors_time_is_rounded_up_to_cores(job, monkeypatch,
     groups(job, "0::/a/b\n", VERSION_2)
     files(job / "a", cpu__max=quota)
     assert memory.cores() == thread_count(None) == (cores or 64)
-    assert [threads_each(n) for n in (1, 2, 100)] == [cores or 64, max(1, (cores or 64) // 2), 1]
+    assert [threads_per_worker(n) for n in (1, 2, 100)] == [cores or 64, max(1, (cores or 64) // 2), 1]
 
 
 @pytest.mark.parametrize("quota, cores", [("-1", 6), ("250000", 3), ("900000", 6)])

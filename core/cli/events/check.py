@@ -38,7 +38,7 @@ def _run(arguments: argparse.Namespace) -> None:
     record = [{**asdict(fault), "path": str(fault.path)} for fault in faults]
     if not arguments.repair or not faults:
         if not faults:
-            lines = [f"{folder}: {sum(map(len, SetFolder(folder).asked))} events, every byte as it was written"]
+            lines = [f"{folder}: {sum(map(len, SetFolder(folder).requested))} events, every byte as it was written"]
         print_answer(arguments, record, lines)
         if faults:
             raise InputError(f"{folder}: {count_text(len(faults), 'fault')}; --repair mends what can be mended")

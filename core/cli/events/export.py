@@ -34,15 +34,15 @@ def _run(arguments: argparse.Namespace) -> None:
     mphdrr events export set --to 3dunet --model counts --noise own -o unet
     mphdrr events export set --to webdataset --split train -o shards
     """
-    from ...events.exports import planned_export
+    from ...events.exports import plan_export
 
     chosen = events.EventSet(arguments.folder)
     if arguments.split is not None:
         chosen = chosen.split(arguments.split)
     names = ("noise", "level", "slots", "raw", "events_per_shard", "uncompressed")
     options = {name: getattr(arguments, name) for name in names}
-    plan = planned_export(chosen, arguments.output, arguments.to, models=arguments.model, **options)
-    say(plan.says())
+    plan = plan_export(chosen, arguments.output, arguments.to, models=arguments.model, **options)
+    say(plan.summary())
     plan.write(progress_bar("exporting"))
     record = {"folder": arguments.output, "program": arguments.to, "events": len(plan.rows)}
     print_answer(arguments, record, [f"{arguments.output}: {len(plan.rows)} events, {PROGRAMS[arguments.to].title}"])

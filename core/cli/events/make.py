@@ -60,7 +60,7 @@ def _run(arguments: argparse.Namespace) -> None:
     options = {name: getattr(arguments, name) for name in ("count", "first", "workers", "shard", "dask", "pack")}
     work = events.making(recipe, arguments.folder, **options)
     n_made, folder = run_with_reports(work, arguments.quiet), work.folder
-    n_events, n_total = len(folder.store.places()), sum(map(len, folder.asked))
+    n_events, n_total = len(folder.store.locations()), sum(map(len, folder.requested))
     record = {"folder": arguments.folder, "asked": n_total, "events": n_events, "made": n_made}
     print_answer(arguments, record, [f"{arguments.folder}: {n_events} of {n_total} events, {n_made} made now"])
 
@@ -87,10 +87,10 @@ def run_with_reports(work: Making, quiet: bool) -> int:
 
 def _expected_size(work: Making) -> str:
     """Return the expected size of the missing events as text, from the first events of the set if there are any."""
-    from ...events.store import size_of
+    from ...events.store import file_size
 
     missing = len(work.missing)
-    sizes = [size_of(place) for place in islice(work.folder.store.places().values(), 100)]
+    sizes = [file_size(location) for location in islice(work.folder.store.locations().values(), 100)]
     if sizes:
         mean_size = sum(sizes) / len(sizes)
         return f"about {readable_size(mean_size)} each, {readable_size(mean_size * missing)} in all"

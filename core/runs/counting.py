@@ -11,8 +11,8 @@ from ..arrays import Array, Floats
 from ..errors import InputError, reading
 from ..files import AnyPath, require_file
 from ..hdf5 import datasets, opened, read_numbers
+from ..models.model import with_image_axes
 from ..physics.dead_time import live_shares
-from ..projector.models import each_pixel
 from ..volumes.formats import numpy_files
 from .recipe import Recipe
 
@@ -60,5 +60,5 @@ def scale_by_module(values: float | Floats, shares: Array) -> float | Floats:
     """Return efficiencies or a background, (), (M,) or (M, n_v, n_u), multiplied by the modules' `shares` (M, 1, 1)."""
     if np.all(shares == 1):
         return values
-    scaled = each_pixel(values) * shares
+    scaled = with_image_axes(values) * shares
     return scaled if np.ndim(values) == 3 else scaled[:, 0, 0]

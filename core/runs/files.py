@@ -211,7 +211,7 @@ def _pack_npz(described: _Arrays, attributes: dict[str, Any]) -> memoryview:
     """Return a NumPy archive: arrays by name, and the attributes as JSON text."""
     arrays = {name: array for name, (_, array) in described.items()}
     text = json.dumps({**attributes, _SHA256: _content_hash(arrays, attributes)})
-    return numpy_files.packed({**arrays, _ATTRIBUTES: np.array(text)})
+    return numpy_files.pack_npz({**arrays, _ATTRIBUTES: np.array(text)})
 
 
 def _read_npz(path: Path) -> _Contents:

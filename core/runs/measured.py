@@ -17,8 +17,8 @@ from ..errors import InputError, expecting, naming, number_ranges, warn
 from ..files import read_text
 from ..geometry.scanner import Detector, Scanner
 from ..memory import require
+from ..models.model import checked_background, checked_times, with_image_axes
 from ..progress import Stages
-from ..projector.models import checked_background, checked_times, each_pixel
 from ..validation import instance, one_of, real_numbers, require_finite, shape_text
 from .counting import recipe_efficiency, recorded_shares, scale_by_module
 from .frame_checks import warn_of_frames
@@ -143,7 +143,7 @@ def counts_run(
     if scatter is not None:
         estimate, record["scatter"] = scatter.estimate(window_images, indices, frames_read, efficiency)
     background = scale_by_module(model_recipe["model.background"], recorded_shares(model_recipe, images, record))
-    background = background if estimate is None else each_pixel(background) + estimate
+    background = background if estimate is None else with_image_axes(background) + estimate
     more: Any = {"settings": record, "background": background, "efficiency": efficiency}
     run = ProjectionRun(images, system, views, unit="counts", **more)
     _warn_of_contradictions(frames_read, used, words, run)
@@ -292,7 +292,7 @@ def _declared_dead(run: ProjectionRun, words: list[str], used: list[int], shape:
     mask = np.zeros(shape, bool)
     if np.all(run.efficiency):
         return mask
-    is_alive = np.broadcast_to(each_pixel(run.efficiency) > 0, run.projections.shape)
+    is_alive = np.broadcast_to(with_image_axes(run.efficiency) > 0, run.projections.shape)
     if run.settings["detector"] == "virtual":
         is_alive = is_alive[:, ::-1, ::-1]
     for k, alive in zip(used, is_alive, strict=True):

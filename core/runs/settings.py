@@ -16,7 +16,7 @@ from ..phantoms.settings import setting_names
 from ..physics.isotopes import ISOTOPES
 from ..physics.materials import APERTURES, CRYSTALS
 from ..physics.noise import NOISE_MODELS
-from ..projector.backends import BACKENDS, OLD_NAMES
+from ..rays.backends import BACKENDS, OLD_NAMES
 from ..recipes.settings import (
     Setting,
     UncheckedSetting,

@@ -5,8 +5,8 @@ import pytest
 
 import mphdrr.core as mph
 from mphdrr.core.exchange import FORMATS
-from mphdrr.core.projector import backends
-from mphdrr.core.projector.rays import window
+from mphdrr.core.rays import backends
+from mphdrr.core.rays.ray_geometry import window
 
 ANGLES = np.array([0.0, 0.3, np.pi / 2, 1.9, np.pi, 4.4])
 TURN = mph.euler_pose(0.3, 0.5, 0.2)
@@ -114,7 +114,7 @@ def test_rays_are_whole_lines_wherever_sources_and_detectors_are_put():
 def test_only_rows_and_columns_that_meet_the_grid_are_traced():
     grid = mph.Grid.centered((4, 4, 4), 1.0)
     views = mph.parallel_views([0.4], (400, 300), 0.1)
-    from mphdrr.core.projector.rays import view_rays
+    from mphdrr.core.rays.ray_geometry import view_rays
 
     rows, columns = window([view_rays(views, 0, grid)], grid.corners())
     assert rows.stop - rows.start == 40

@@ -1,7 +1,7 @@
 """The projector as the operators of other packages, so that their algorithms run on this scanner.
 
-The packages are imported when they are asked for. Their operators compute with `Projector` alone: the same numbers, kernels
-and exact adjoint.
+The packages are imported when they are asked for. Their operators compute with `Projector` alone: the same numbers,
+kernels and exact adjoint.
 
 To add a package, write a module here that imports it, and a function below that imports the module when it is called.
 """

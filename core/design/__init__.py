@@ -1,8 +1,9 @@
 """Geometries that are calibrated by measurements, and improved by gradients.
 
-- `optimize` searches for the best scanner of a recipe (`read_design_recipe`), `pareto` for a front of several. -
-`evaluate` compares two scanners by reconstructions of noisy counts. - `calibration.calibrate` fits modules to images of
-point sources; `calibration_recipe.run_calibration` does it by a recipe.
+- `optimize` searches for the best scanner of a recipe (`read_design_recipe`), `pareto` for a front of several.
+- `evaluate` compares two scanners by reconstructions of noisy counts.
+- `calibration.calibrate` fits modules to images of point sources; `calibration_recipe.run_calibration` does it by a
+  recipe.
 
 To add an objective, write a class in objectives.py that is called with a system and returns its value and the gradient by
 the modules' rows (numbers.py), and name its kind and settings in `_OBJECTIVES` and `_make_objective` of recipe.py. To add

@@ -5,8 +5,8 @@
 >>> events[0].truth, events[0].images("emission", noise_seed=1), events[0].radon(96)
 
 - Making: planning.py (parameters of event i), event_maker.py (its arrays), event_files.py (its file), writing.py (an
-event), pool.py (several processes), work.py (the missing events), store.py, folders.py and index.py (the set's folder). -
-Reading: event_set.py, checking.py, contact_sheet.py, training.py and torch_events.py (torch's `Dataset`), `exports`.
+  event), pool.py (several processes), work.py (the missing events), store.py, folders.py and index.py (the set's folder).
+- Reading: event_set.py, checking.py, contact_sheet.py, training.py and torch_events.py (torch's `Dataset`), `exports`.
 
 To add a setting, add a row to `_ROWS` in recipe.py (of phantoms in entries.py), a `DrawnSetting` (draws.py) where it may
 be a range or a choice, and use it in planning.py (with a column of the index in `FIXED_COLUMNS`, of texts in `_TEXTS` of

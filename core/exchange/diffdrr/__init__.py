@@ -5,9 +5,9 @@ prepares a CT as a `Subject`, a `DRR` makes radiographs of it from poses, and `d
 scanner to DiffDRR. Both generations of DiffDRR's documented interface work:
 
 - since 0.4: ``DRR(subject, sdd, height, delx, ...)``: the source is at the camera's origin, the detector at +z. The whole
-line through source and pixel is integrated, also behind the source and beyond the detector. - before 0.4: ``DRR(volume,
-spacing, sdr, height, delx, ...)``: the source is at +x, the detector at -x, each `sdr` from the camera's origin; the
-volume's corner is at the world's origin. Rays end at the detector.
+  line through source and pixel is integrated, also behind the source and beyond the detector.
+- before 0.4: ``DRR(volume, spacing, sdr, height, delx, ...)``: the source is at +x, the detector at -x, each `sdr` from
+  the camera's origin; the volume's corner is at the world's origin. Rays end at the detector.
 
 Needs torch and RoMa. V. Gopalakrishnan, P. Golland, "Fast Auto-Differentiable Digitally Reconstructed Radiographs for
 Solving Inverse Problems in Intraoperative Imaging", CLIP 2022.

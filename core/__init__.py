@@ -11,7 +11,8 @@ Everything imported here is the public interface. Arguments that cannot be used 
 Each folder is a room, whose docstring says what it is for and how to add to it; docs/structure.md says which rooms it may
 import. A public name is a line below. Files of this folder that all rooms use:
 
-- errors.py: `InputError`, `InputWarning`, and `needing` around the import of a package that may be missing.
+- errors.py: `InputError`, `InputWarning`, and `needing` around the import of a package that may be
+  missing; in Blender it refers to docs/first-steps.md, which says how packages get there.
 - files.py: the only file that writes files, by `replacing`, `new_folder` or `write_bytes`; hdf5.py: sealed HDF5 files.
 - validation.py, arrays.py (types of arrays), memory.py, progress.py, recording.py, cache.py.
 - scanner_kinds.py and method_files.py join rooms: the kinds of scanners, and of files that are methods.

@@ -4,8 +4,9 @@
 Handlers in `live_scanner.py` call `following.refresh`, which makes modules follow their values; `module_edits.py` adds,
 removes and renumbers modules; `maps.map_job` and `optimising.optimize_job` are jobs.
 
-A new kind of scanner is a class in `core/geometry` and a line of `core/scanner_kinds.py`: nothing changes here. A typed
-column of a kind becomes a Blender property in `columns.py`; whatever only pinholes have is in `pinholes.py`.
+A new kind of scanner is a class derived from `Scanner` in a room of core and a line of `core/scanner_kinds.py`: nothing
+changes here. A typed column of a kind becomes a Blender property in `columns.py`; whatever only pinholes have is in
+`pinholes.py`.
 
 What follows a move stands at the head of live_scanner.py (handlers), following.py (values and shapes) and grabbing.py
 (parts that take their module along). `module_values.read_modules` reads any kind of scanner; `cameras.py` sets what a

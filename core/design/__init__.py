@@ -10,9 +10,11 @@ the modules' rows (numbers.py), and name its kind and settings in `_OBJECTIVES` 
 a constraint, write a `Constraint` in penalties.py (its violation, mm, and its `words` if `check_geometry` does not report
 it), its setting, and its line in `constraints` of recipe.py. To let a design change other numbers, add a function that
 makes a system to `GENERATORS` in parameters.py. To add a solver, add a row to `SOLVERS` in solvers.py: with a second row
-the choice is the setting ``search.solver``. To fit another number of a module, give it a place in `geometry` and
-`jacobian` of bundle.py, its name in `FITTED` and its standard deviation in `calibrate` (calibration.py), and a row in
-calibration_recipe.py. Spots are found in spots.py, and images of points computed in point_images.py.
+the choice is the setting ``search.solver``. It is a method of `scipy.optimize.minimize` that takes gradients, bounds and
+``maxiter``, and calls back with an ``intermediate_result``: SLSQP or trust-constr, but not TNC. To fit another number of
+a module, give it a place in `geometry` and `jacobian` of bundle.py, its name in `FITTED` and its standard deviation in
+`calibrate` (calibration.py), and a row in calibration_recipe.py. Spots are found in spots.py, and images of points
+computed in point_images.py.
 
 SciPy is imported when it is asked for. The window's texts are `Design.summary` and `Calibration.summary`.
 """

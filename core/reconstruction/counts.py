@@ -9,10 +9,9 @@ from ..arrays import Array, ArrayLike, Integers
 from ..errors import InputError, warn
 from ..geometry.frames import affine_matrix
 from ..geometry.grid import Grid
-from ..geometry.system import PinholeSystem
 from ..memory import require
 from ..progress import Progress
-from ..projector import Emission, Projector
+from ..projector import Projector
 from ..validation import instance, real_array, shape_text
 from .loop import Loop, plain
 from .priors import Prior, penalty_of
@@ -55,8 +54,8 @@ class CountData:
             both = f"{extra.mean():.3g} counts a pixel, besides the {known.mean():.3g} of the projector's model"
             warn(f"background: {both}: both are expected; leave one out if they are the same", 4)
         data = cls(measured, extra + known).living(A)
-        if isinstance(A.model, Emission) and len(A.views) > 3:  # two or three say too little
-            _warn_if_reversed(A, A.model.system, data)
+        if A.model.has_times and len(A.views) > 3:  # two or three say too little
+            _warn_if_reversed(A, data)
         return data
 
     def living(self, A: Projector) -> "CountData":
@@ -155,19 +154,13 @@ class CountLoop(Loop):
         return {"subsets": len(self.parts), **known} | ({"prior": None} if self.prior is None else self.prior.record())
 
 
-def _coarse(model: Any) -> Emission:
-    """An ideal pinhole of few rays, with the model's times and efficiencies."""
-    own = {"time": model.effective_time, "efficiency": model.efficiency}
-    return Emission(model.system, pixel_points=1, tolerance=1e9, **own)
-
-
-def _warn_if_reversed(A: Projector, system: PinholeSystem, data: CountData) -> None:
+def _warn_if_reversed(A: Projector, data: CountData) -> None:
     """Warn where the counts are far likelier of the modules in reversed order: by a step of MLEM on few, large voxels."""
-    chosen = np.unique(np.rint(np.linspace(0, len(system) - 1, min(len(system), 16))).astype(int))  # symmetric
+    chosen = np.unique(np.rint(np.linspace(0, len(A.views) - 1, min(len(A.views), 16))).astype(int))  # symmetric
     shape = np.minimum(A.grid.shape, 20)
     step = A.grid.shape / shape
     grid = Grid(tuple(shape), A.grid.affine @ affine_matrix(np.diag(step), (step - 1) / 2))
-    B = Projector(grid, A.views[chosen], _coarse(A.model.of_views(chosen)), A.backend, A.threads)
+    B = Projector(grid, A.views[chosen], A.model.of_views(chosen).coarse(), A.backend, A.threads)
     part, seen = data[chosen], np.maximum(B.T(np.ones(B.shape_out, np.float32)), LEAST)
     total, likelihoods = float(part.counts.sum(dtype=float)), []
     even = np.full(shape, total / seen.sum(dtype=float), np.float32)

@@ -183,14 +183,15 @@ LEANING = re.compile(r"(What|Where|How|Which|Whose|Of|By|With|In|As|Those|Its|Th
 VERB = re.compile(
     r"""(?x)(Act|Add|Allocate|Append|Apply|Arrange|Ask|Back-project|Begin|Blend|Bring|Build|Calibrate|Call|
     Cancel|Change|Check|Choose|Clip|Collate|Combine|Compare|Complete|Compute|Consume|Convert|Convolve|
-    Copy|Count|Create|Crop|Cross|Cut|Delay|Delete|Determine|Do|Draw|Empty|End|Enter|Estimate|Exit|
-    Extend|Fill|Filter|Find|Finish|Fit|Flush|Force|Forget|Gather|Give|Group|Have|Hide|Hold|Import|
-    Integrate|Interpolate|Issue|Judge|Keep|Launch|Lay|Link|List|Load|Log|Look|Make|Mark|Measure|
-    Move|Multiply|Narrow|Note|Open|Pack|Paint|Parse|Pick|Place|Predict|Prepare|Press|Print|Project|
-    Propose|Put|Queue|Raise|Read|Rebuild|Recolour|Reconstruct|Record|Refuse|Register|Relink|Remove|
-    Render|Renumber|Repair|Replace|Report|Require|Resample|Reset|Reshape|Restore|Return|Round|Run|
-    Save|Scale|Schedule|Score|Select|Set|Share|Show|Silence|Solve|Sort|Split|Start|Stop|Store|
-    Switch|Take|Train|Transform|Tune|Turn|Type|Undo|Update|Voxelize|Wait|Warn|Write|Yield)\b"""
+    Copy|Count|Create|Crop|Cross|Cut|Declare|Delay|Delete|Determine|Divide|Do|Draw|Empty|End|Enter|
+    Estimate|Exit|Extend|Fill|Filter|Find|Finish|Fit|Flush|Force|Forget|Gather|Give|Group|Have|
+    Hide|Hold|Import|Integrate|Interpolate|Issue|Judge|Keep|Launch|Lay|Link|List|Load|Log|Look|
+    Make|Mark|Measure|Move|Multiply|Narrow|Note|Open|Pack|Paint|Parse|Pick|Place|Predict|Prepare|
+    Press|Print|Project|Propose|Put|Queue|Raise|Read|Rebuild|Recolour|Reconstruct|Record|Refuse|
+    Register|Relink|Remove|Render|Renumber|Repair|Replace|Report|Require|Resample|Reset|Reshape|
+    Restore|Return|Round|Run|Save|Scale|Schedule|Score|Select|Set|Share|Show|Silence|Solve|Sort|
+    Split|Start|Stop|Store|Switch|Take|Train|Transform|Tune|Turn|Type|Undo|Update|Voxelize|Wait|
+    Warn|Write|Yield)\b"""
 )
 
 

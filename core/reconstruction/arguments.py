@@ -26,7 +26,7 @@ def argument(name: str, kind: type, text: str, absent: str = "", **limits: Any) 
 
 @dataclass(frozen=True)
 class Choice:
-    """One of several functions or classes that a setting chooses among, and whose arguments are settings, too."""
+    """Function or class that a setting can choose, and whose arguments are settings, too."""
 
     label: str
     """Name in menus."""

@@ -32,7 +32,7 @@ class CountData:
 
     @classmethod
     def of(cls, method: str, A: Projector, counts: ArrayLike, background: ArrayLike = 0.0) -> "CountData":
-        """Checked: `A` is of emission; counts and background are at least 0, of the projector's shape.
+        """Check `A`, counts and background, and return them as data: counts and background >= 0, of the shape of the images.
 
         The background is one number, one for each module (M,), or images; that of the projector's model is added to it.
         Raises InputError. Pixels that are dead in the model are left out.
@@ -59,14 +59,14 @@ class CountData:
         return data
 
     def living(self, A: Projector) -> "CountData":
-        """The same data, with nothing in pixels that are dead in a projector's model: they then say nothing."""
+        """Return the data with nothing in the pixels that are dead in a projector's model, which then say nothing."""
         return CountData(*(np.where(A.living, data, np.float32(0)) for data in (self.counts, self.background)))
 
     def __getitem__(self, which: Integers) -> "CountData":
         return CountData(self.counts[which], self.background[which])
 
     def ratio(self, images: Array) -> Array:
-        """Measured by expected counts, where a volume's are `images`; 0 where neither is above 0.
+        """Return ``counts / (images + background)`` (M, n_v, n_u) for a volume with the expected counts `images`.
 
         A pixel that counted something which nothing can have caused is left out: it says nothing about the volume.
         """
@@ -74,7 +74,7 @@ class CountData:
         return np.divide(self.counts, expected, out=np.zeros_like(expected), where=expected > LEAST)
 
     def log_likelihood(self, images: Array) -> float:
-        """The log-likelihood (Poisson) of a volume with the images `images`, without the terms that no volume changes.
+        """Return ``sum(counts log(e) - e)``, e = images + background: the Poisson log-likelihood but for a constant.
 
         Pixels with counts that nothing can have caused are left out, as in `ratio`.
         """
@@ -133,14 +133,14 @@ class CountLoop(Loop):
         self.last = -np.inf  # its objective
 
     def images(self, s: int, values: Array, progress: Progress | None) -> Array:
-        """The images of a volume in subset `s`: known where it is what the last step gave."""
+        """Return the images of a volume in subset `s`; those of the last iteration's volume are not computed again."""
         part, _ = self.parts[s]
         if values is self.values and self._images is not None:
             return self._images[part.which]
         return np.asarray(part(values, progress))
 
     def objective(self, values: Array, progress: Progress | None) -> float:
-        """The log-likelihood of a volume, less the prior's penalty."""
+        """Return the log-likelihood of a volume minus the prior's penalty."""
         images: Array = self._A(values, progress)
         likelihood = self.data.log_likelihood(images)
         self._images = images
@@ -148,7 +148,7 @@ class CountLoop(Loop):
         return self.last
 
     def record(self) -> dict[str, Any]:
-        """The number of subsets, totals, counts that one unit of activity in all voxels gives, and the prior."""
+        """Return the number of subsets, the sums of counts, background and sensitivity, and the prior's settings."""
         sums = {"counts": self.data.counts, "background": self.data.background, "sensitivity": self.total}
         known = {name: float(numbers.sum(dtype=float)) for name, numbers in sums.items()}
         return {"subsets": len(self.parts), **known} | ({"prior": None} if self.prior is None else self.prior.record())

@@ -29,7 +29,7 @@ def ostr(
     *options: Any,
     **named: Unpack[IterativeOptions],
 ) -> Reconstruction:
-    """The attenuation for which the photons that pass are most likely, less the penalty of a prior (OSTR).
+    """Reconstruct the attenuation that maximises ``log-likelihood - prior`` of the transmitted photons (OSTR).
 
     Counts are Poisson-distributed, so a ray counts as much as photons pass on it, which `sirt` and `tv` do not know. Each
     update is a step for a subset of the views, ``x <- x + (A.T(passed - counts) - p' / n) / (A.T(A(1) c) + 2 p'' / n)``,

@@ -297,11 +297,11 @@ _DECLARED = (
 )  # fmt: skip
 
 _NEEDED = {"phantom": _PHANTOM, "counts": ("counts.files",)}
-"""What all settings of a table need, but for that which is needed itself."""
+"""Settings that all other settings of a table need, by the table's name."""
 
 
 def _with_needs(row: Setting) -> Setting:
-    """A setting that also needs what all of its table need."""
+    """Return the setting with the settings that its whole table needs, unless it is one of these itself."""
     needed = _NEEDED.get(row.key.partition(".")[0], ())
     return row if row.key in needed else dataclasses.replace(row, needs=(*needed, *row.needs))
 

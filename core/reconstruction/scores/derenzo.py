@@ -1,4 +1,4 @@
-"""What a reconstruction resolves of a Derenzo phantom's rods, sector by sector."""
+"""Scores of the rods of a reconstructed Derenzo phantom: which are resolved, sector by sector."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -24,7 +24,7 @@ NOISE_BELOW, SEEN_BELOW = 0.001, 0.02
 """Chance that noise makes a sector's contrast: of one that is resolved, and of one that is seen, it is less."""
 
 LIGHTS = {"green": "resolved", "amber": "seen, not resolved", "red": "not resolved"}
-"""What a sector is, by the colour of its dot. Amber: its rods stand out of the noise, but not enough."""
+"""Meaning of the colours of a sector's dot. Amber: its rods stand out of the noise, but not enough."""
 
 _LENGTH = 0.5  # of the rods, around their middle, that profiles are means over: ends blur into what is beside them
 _WIDTH = 0.5  # of a rod's diameter, that profiles are means over
@@ -71,11 +71,11 @@ class DerenzoSector:
     contrast_recovery: float
     """Difference of mean peak and mean valley, by that of the phantom."""
     profiles: tuple[RodProfile, ...] = ()
-    """One for each pair of neighbours."""
+    """Profiles, one for each pair of neighbours."""
     note: str = ""
     """Why something is NaN."""
     chance: float = np.nan
-    """That noise alone makes as large a difference of mean peak and mean valley, as rods and valleys scatter."""
+    """p-value of a difference of mean peak and mean valley as large as this by noise alone, as rods and valleys scatter."""
 
     @property
     def resolved(self) -> float:
@@ -202,7 +202,7 @@ def derenzo_score(
 
 @dataclass(frozen=True, eq=False)
 class _Sector:
-    """One sector of a phantom's rods, in a volume. Places (…, 3) are in the rods' own frame, mm."""
+    """Sector of a phantom's rods in a volume. Positions (…, 3) are in the rods' own frame, mm."""
 
     volume: Volume
     phantom: Phantom
@@ -226,7 +226,7 @@ class _Sector:
         return DerenzoSector(diameter, ratio, contrast, tuple(profiles), note, self._chance(profiles))
 
     def _chance(self, profiles: list[RodProfile]) -> float:
-        """That noise makes as large a difference of rods and valleys: of Student's t."""
+        """Return the one-sided p-value of the difference of rods and valleys, by Student's t."""
         values = np.array([profile.values for profile in profiles]) * (1 if profiles[0].is_hot else -1)
         which = np.unique(self._pairs, return_inverse=True)[1].ravel()
         rods = np.bincount(which, values[:, [0, -1]].ravel()) / np.bincount(which)
@@ -239,7 +239,7 @@ class _Sector:
         return float(beyond / (2 * half))
 
     def _missing(self, diameter: float) -> str:
-        """Why the sector has no score, if that is so."""
+        """Return the reason why the sector has no score, if it has none."""
         if not len(self._centers):
             return "no rods"
         if not len(self._pairs):
@@ -290,7 +290,7 @@ class _Sector:
         return self.volume.grid.index_from_world @ self._world_from_rods
 
     def _true_values(self) -> tuple[float, float]:
-        """The phantom's values in the rods and halfway between them, means over the part of the length that counts."""
+        """Return the phantom's mean values in the rods and halfway between them, over the scored part of the length."""
         starts, ends = self._centers[self._pairs].transpose(1, 0, 2)
         low, high, _ = self._span
         along = (_middles(9) * (high - low) + (low + high) / 2)[:, None, None] * [0, 0, 1]
@@ -322,5 +322,5 @@ class _Sector:
 
 
 def _middles(count: int) -> Floats:
-    """The middles of so many equal parts of the length from -1/2 to 1/2."""
+    """Return the middles of so many equal parts of the length from -1/2 to 1/2."""
     return (np.arange(count) + 0.5) / count - 0.5

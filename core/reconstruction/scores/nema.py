@@ -77,7 +77,7 @@ class NemaScore(Rows[NemaSphere]):
 
 
 def nema_score(volume: Volume, phantom: NemaBody, pose: ArrayLike | None = None) -> NemaScore:
-    """Percent contrast and background variability of a reconstructed NEMA body phantom, by NEMA NU 2-2018, section 7.
+    """Score a reconstructed NEMA body phantom: contrast and background variability by NEMA NU 2-2018, section 7.
 
     Regions are circles in the phantom's transverse planes; parts of voxels count as such. That of a sphere lies in the plane
     of the spheres' centres and has its inner diameter. Of each diameter there are 12 background regions in each of 5 planes,
@@ -150,7 +150,7 @@ def _level(background: Floats) -> float:
 
 
 def _means(volume: Volume, world: Floats, centers: Floats, diameter: float, name: str) -> Floats:
-    """Means (n,) over circles in the phantom's planes, around `centers` (n, 3) in its frame."""
+    """Return the means (n,) over circles in the phantom's planes, around `centers` (n, 3) in its frame."""
     grid = volume.grid
     # Points that stand for equal areas of a circle, along a spiral with turns of the golden angle (Vogel 1979).
     count = math.ceil(_POINTS * math.pi / 4 * max(5.0, diameter / grid.spacing.min()) ** 2)
@@ -166,7 +166,7 @@ def _means(volume: Volume, world: Floats, centers: Floats, diameter: float, name
 
 
 def _background_places(phantom: NemaBody) -> Floats:
-    """x and y (12, 2), mm, of background regions in the phantom's frame."""
+    """Return x and y (12, 2), mm, of background regions in the phantom's frame."""
     body = next(shape for shape in phantom.shapes if shape.name == "front")
     low = body.position[2] - phantom.length / 2
     if low > min(_SLICES):

@@ -31,16 +31,20 @@ def ellipse_area(length, slope):
     return np.pi * k * np.sqrt(k**2 - (a * slope) ** 2) / (t * np.sqrt(squared))
 
 
-def test_path_through_the_edge_equals_a_fine_walk_along_the_line(rng):
+@pytest.mark.parametrize(
+    ("plate", "nearest", "tangent"), [(None, 1.1, 0.8), (0.6, 0.0, 0.3), (2.0, 0.0, 0.8), (4.0, 0.0, 1.4)]
+)
+def test_path_through_the_edge_and_its_plate_equals_a_fine_walk_along_the_line(plate, nearest, tangent, rng):
+    edge = KnifeEdge(1.1, 0.3, tangent, plate)
+    z = np.linspace(-60, 60, 1_200_001)
     for _ in range(12):
-        radius, angle, slope_u, slope_v = rng.uniform((1.1, 0, -0.5, -0.5), (2.5, 7, 0.5, 0.5))
+        radius, angle, slope_u, slope_v = rng.uniform((nearest, 0, -0.5, -0.5), (2.5, 7, 0.5, 0.5))
         x, y = radius * np.cos(angle), radius * np.sin(angle)
-        z = np.linspace(-60, 60, 1_200_001)
-        inside = np.hypot(x + z * slope_u, y + z * slope_v) > KNIFE.radius + np.abs(z) * KNIFE.tangent
+        inside = np.hypot(x + z * slope_u, y + z * slope_v) > edge.radius + np.abs(z) * tangent
+        inside &= np.abs(z) < (plate or np.inf) / 2
         length = inside.sum() * (z[1] - z[0]) * np.sqrt(1 + slope_u**2 + slope_v**2)
-        slopes = np.array([slope_u]), np.array([slope_v])
-        passed = dataclasses.replace(KNIFE, mu=0.01).transmission(x, y, *slopes)[0]
-        assert -np.log(passed) / 0.01 == pytest.approx(length, abs=1e-3)
+        passed = edge.transmission(x, y, np.array([slope_u]), np.array([slope_v]))[0]
+        assert passed == pytest.approx(np.exp(-edge.mu * length), abs=3e-4)
 
 
 def test_nothing_passes_steeper_than_the_cone():

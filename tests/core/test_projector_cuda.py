@@ -40,6 +40,15 @@ def small_pieces(monkeypatch):
     monkeypatch.setattr(cuda, "_RAYS_AT_ONCE", 17)
 
 
+@pytest.fixture
+def fans(rng):
+    """A volume, and the fans of four views."""
+    views = some_views(rng, (7, 30), n=4)
+    vectors = np.concatenate([view_rays(views, m).vectors() for m in range(4)])
+    fans = index_fans(Grid(SHAPE, affine(LINEAR["sheared"], SHAPE)), vectors, views.shape)
+    return rng.random(SHAPE, dtype=np.float32), fans
+
+
 @pytest.mark.parametrize("shape", SHAPES)
 @pytest.mark.parametrize("kind", LINEAR)
 def test_nasty_rays(shape, kind, rng):
@@ -224,11 +233,8 @@ def test_projector_agrees_with_the_reference(attenuation, system, rng, monkeypat
         assert abs(np.vdot(Ax, y) - np.vdot(x, ATy)) < 1e-5 * np.linalg.norm(Ax) * np.linalg.norm(y)
 
 
-def test_rays_of_fans_are_the_listed_rays(rng, small_pieces):
-    grid = Grid(SHAPE, affine(LINEAR["sheared"], SHAPE))
-    views = some_views(rng, (7, 30), n=4)
-    fans = index_fans(grid, np.concatenate([view_rays(views, m).vectors() for m in range(4)]), views.shape)
-    volume = rng.random(SHAPE, dtype=np.float32)
+def test_rays_of_fans_are_the_listed_rays(fans, small_pieces):
+    volume, fans = fans
     for function in (cuda.forward, cuda.derivatives):
         together = function(volume, fans)
         assert together.any()
@@ -296,19 +302,16 @@ def test_what_is_missing_is_said_in_one_line(monkeypatch):
     refused(made, "pip install warp-lang")
 
 
-def test_short_memory_means_more_launches(monkeypatch, rng):
-    grid = Grid(SHAPE, affine(LINEAR["sheared"], SHAPE))
-    views = some_views(rng, (7, 30), n=4)
-    fans = index_fans(grid, np.concatenate([view_rays(views, m).vectors() for m in range(4)]), views.shape)
-    volume = rng.random(SHAPE, dtype=np.float32)
-    launches = []
-    launch = warp.launch
+def test_short_memory_means_more_launches(monkeypatch, fans):
+    launches, launch = [], warp.launch
     monkeypatch.setattr(warp, "launch", lambda *a, **k: launches.append(a[1]) or launch(*a, **k))
-    expected = cuda.forward(volume, fans)
+    expected = cuda.forward(*fans)
     monkeypatch.setattr(cuda, "_FEWEST_RAYS", 1)
     monkeypatch.setattr(type(cuda.device()), "free_memory", 1000)  # 500 for the rays: 2 or 3 rows of a view
-    np.testing.assert_array_equal(cuda.forward(volume, fans), expected)
+    np.testing.assert_array_equal(cuda.forward(*fans), expected)
     assert launches[0] == (4, 7, 30) and len(launches) > 8 and {dim[0] for dim in launches[1:]} == {1}
+    A = Projector(Grid.centered((40, 40, 40), 1.0), some_views(np.random.default_rng(0)), backend="cuda")
+    refused(lambda: A(np.ones(A.shape_in)), "are free on")  # not even the volume fits
 
 
 @pytest.mark.long
@@ -319,13 +322,6 @@ def test_kernels_compile_for_gpus_without_one(tmp_path):
     cuda.device()
     (compiled,) = warp.compile_aot_module(warp_kernels, arch=75, module_dir=tmp_path, use_ptx=True)
     assert compiled.read_text().count(".entry") == 2
-
-
-def test_volume_too_large_for_the_device_is_refused(monkeypatch, rng):
-    grid = Grid.centered((40, 40, 40), 1.0)
-    A = Projector(grid, some_views(rng), backend="cuda")
-    monkeypatch.setattr(type(cuda.device()), "free_memory", 1000)
-    refused(lambda: A(np.ones(grid.shape)), "are free on")
 
 
 @pytest.mark.parametrize("same", [True, False])

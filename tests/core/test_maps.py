@@ -9,7 +9,7 @@ import pytest
 
 import mphdrr.core as mph
 
-from .conftest import general_grid
+from .conftest import general_grid, voxel_centers
 from .test_performance import EDGE, law_of_the_point_source
 
 DEGREE = math.radians(1)
@@ -20,11 +20,6 @@ def pinholes(directions, radius=250.0):
     directions = np.asarray(directions, float)
     directions = directions / np.linalg.norm(directions, axis=1)[:, None]
     return mph.PinholeSystem(radius * directions, 2.0, 50.0, 100.0, 10.0, 75.0)
-
-
-def voxel_centers(grid):
-    index = np.stack(np.meshgrid(*map(np.arange, grid.shape), indexing="ij"), axis=-1).reshape(-1, 3)
-    return index @ grid.affine[:3, :3].T + grid.affine[:3, 3]
 
 
 def test_sensitivity_map_sums_the_law_of_the_point_source(workbook, rng):
@@ -55,7 +50,7 @@ def test_sensitivity_map_is_what_the_adjoint_gives(workbook):
 def test_maps_are_the_values_at_the_voxels_centres(system, rng):
     grid = general_grid(rng, (21, 19, 23))
     grid = mph.Grid(grid.shape, grid.affine * np.array([[12.0], [12.0], [12.0], [1.0]]))
-    points = voxel_centers(grid)
+    points = voxel_centers(grid).reshape(-1, 3)
     counts = mph.sensitivity(system, points, **EDGE)
     fwhm = np.nan_to_num(mph.resolution(system, points, intrinsic_fwhm=3.0, **EDGE))
     total = counts.sum(axis=1)
@@ -139,7 +134,7 @@ def test_gap_is_the_largest_of_all_planes(system, rng):
 def test_completeness_is_one_less_the_share_of_the_gap(system, rng):
     grid = mph.Grid.centered((5, 6, 4), 60.0)
     volume = mph.completeness_map(system, grid)
-    gaps = mph.sampling_gaps(system, voxel_centers(grid))
+    gaps = mph.sampling_gaps(system, voxel_centers(grid).reshape(-1, 3))
     assert np.allclose(volume.array.ravel(), 1 - gaps / (math.pi / 2), atol=0.1 / 90 + 1e-6)
     seen_by = mph.modules_map(system, grid).array
     assert np.all(volume.array[seen_by == 0] == 0)

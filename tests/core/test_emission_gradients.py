@@ -86,18 +86,6 @@ def test_backends_agree_on_gradients_by_mu(backend, which, system, rng):
         torch.testing.assert_close(gradient, reference, rtol=2e-5, atol=2e-5 * float(reference.abs().max()))
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_gradient_by_mu_in_closed_form(backend):
-    """Activity f in one voxel, matter in the voxels before it: f (1 - exp(-m s)) / m exp(-sum of mu s), s = 2 mm."""
-    grid = mph.Grid.centered((1, 1, 5), 2.0)
-    f, mu = torch.tensor([0, 0, 0, 3.0, 0]), torch.tensor([0.1, 0.0, 0.3, 0.2, 0.4], requires_grad=True)
-    line = mph.trace_rays(f.reshape(1, 1, 5), [0.1, 0.2, -50.0], [0.1, 0.2, 60.0], backend, grid, mu.reshape(1, 1, 5))
-    expected = 3 * (1 - torch.exp(-2 * mu[3])) / mu[3] * torch.exp(-2 * mu[:3].sum())
-    torch.testing.assert_close(line[0], expected, rtol=1e-5, atol=0, check_dtype=False)
-    (got,), (wanted,) = torch.autograd.grad(line.sum(), mu, retain_graph=True), torch.autograd.grad(expected, mu)
-    torch.testing.assert_close(got, wanted, rtol=1e-5, atol=1e-6)
-
-
 def test_what_is_no_mu_is_refused(system, rng):
     grid = general_grid(rng, (4, 3, 2))
     views, mu = system[:1].views((2, 2)), some_mu(rng, grid)

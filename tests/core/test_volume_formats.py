@@ -206,7 +206,7 @@ def test_a_series_in_any_order_is_the_volume_it_was_written_from(tmp_path, ct, r
         mph.read_volume(tmp_path / "series", progress=stop)
 
 
-def test_the_chest_is_the_same_from_nifti_and_from_dicom(tmp_path, scanner):
+def test_the_chest_is_the_same_from_nifti_and_from_dicom(tmp_path):
     if not CHEST.is_file():
         pytest.skip(f"no {CHEST.name} beside the checkout")
     nifti = mph.read_volume(CHEST)
@@ -214,12 +214,6 @@ def test_the_chest_is_the_same_from_nifti_and_from_dicom(tmp_path, scanner):
     series = mph.read_volume(tmp_path / "series")
     assert np.array_equal(series.array, nifti.array)
     assert np.allclose(series.grid.affine, nifti.grid.affine, rtol=0, atol=1e-9)
-    views = scanner[::20].views(shape=(16, 16))
-    images = [
-        mph.Projector(volume.grid, views)(volume) for volume in (mph.hu_to_mu(mph.centered(x)) for x in (nifti, series))
-    ]
-    assert images[0].max() > 1
-    assert np.allclose(images[0], images[1], rtol=1e-6, atol=1e-6)
 
 
 def test_every_other_slice_missing_is_warned_of(tmp_path, ct):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import itertools
 
@@ -13,7 +12,7 @@ import mphdrr.core as mph
 from mphdrr.core.physics.aperture import KnifeEdge, openings
 
 from .conftest import emission, refused
-from .test_emission import one_module, spot_image, turned_grid
+from .test_emission import one_module, turned_grid
 from .traced_photons import image_of_voxel, misplaced, traced_image
 
 KNIFE = KnifeEdge(radius=1.1, mu=3.0, tangent=0.8)
@@ -67,29 +66,6 @@ def test_open_area_equals_the_integral_over_paths(n):
             assert abs(area - expected) < tolerance * np.pi / 4 * d**2
             if slope == 0:
                 assert area * 4 / np.pi == pytest.approx(d**2 + 2 * d * t / mu + 2 * t**2 / mu**2, rel=1e-12)
-
-
-@pytest.mark.parametrize("n", [1, 5])
-def test_an_opaque_edge_leaves_the_hole(n):
-    """At every angle within the cone: the hole's obliquity is in cos^4(psi)."""
-    for slope in (0.0, 0.3, 0.79):
-        slopes = np.array([slope]), np.array([0.0])
-        area = sum(opening.area(*slopes)[0] for opening in openings(n, 2.2, dataclasses.replace(KNIFE, mu=1e7)))
-        assert area == pytest.approx(np.pi / 4 * 2.2**2, rel=1e-6)
-
-
-@pytest.mark.parametrize("n", [1, 7])
-def test_point_source_on_the_axis_counts_what_the_edge_lets_pass(n):
-    """Against the solid angle of the hole and the edge, integrated over the plane with each point's own direction."""
-    system, mu = one_module(), 3.6
-    model = emission(system, aperture_points=n, aperture_mu=mu, edge="path")
-    image, _ = spot_image(model, (0, 0, 0))
-    h = 200.0
-    r = (np.arange(400_000) + 0.5) * 1e-5  # to 4 mm
-    passed = np.where(r < 1, 1.0, KnifeEdge(1.0, mu, 1.0).transmission(r, 0.0, r / h, 0 * r))
-    solid = np.sum(passed * h / (h**2 + r**2) ** 1.5 * r) * 1e-5 / 2
-    assert image.sum() == pytest.approx(solid * 1.2**3, rel=5e-3)
-    assert model.effective_diameter[0] ** 2 == pytest.approx(4 + 4 / mu + 2 / mu**2)
 
 
 FINE, SIDE = 0.1, 8.0

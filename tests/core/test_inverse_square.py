@@ -8,7 +8,7 @@ import pytest
 import mphdrr.core as mph
 from mphdrr.core.errors import InputError
 
-from .conftest import BACKENDS, emission
+from .conftest import BACKENDS
 from .test_emission import one_module, turned_grid
 
 
@@ -35,19 +35,6 @@ def test_one_voxel_is_its_chord_times_the_sensitivity_at_its_middle(backend):
     np.testing.assert_allclose(images.reshape(-1), expected, rtol=2e-5, atol=2e-5 * expected.max())
     behind = mph.Grid.centered((2, 2, 2), 10.0, (250, 0, 0))
     assert not mph.Projector(behind, views, mph.InverseSquareSum(system), backend)(np.ones((2, 2, 2))).any()
-
-
-def test_it_is_not_the_law_of_a_point_source(rng):
-    """Total counts of a spot fall with the fourth power of its height: `Emission`'s with the second."""
-    system = one_module()
-
-    def total(model, x):
-        grid = turned_grid((3, 3, 3), 0.8, (x, 0, 0))
-        views = system.views((150, 150), "real", pitch=0.02)
-        return mph.Projector(grid, views, model)(np.ones((3, 3, 3))).sum(dtype=float)
-
-    for model, power in ((emission(system), 2), (mph.InverseSquareSum(system), 4)):
-        assert total(model, 60.0) / total(model, -60.0) == pytest.approx((260 / 140) ** power, rel=0.02)
 
 
 @pytest.mark.parametrize("photons", [1.0, 1e5])

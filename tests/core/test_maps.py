@@ -22,20 +22,6 @@ def pinholes(directions, radius=250.0):
     return mph.PinholeSystem(radius * directions, 2.0, 50.0, 100.0, 10.0, 75.0)
 
 
-def test_sensitivity_map_is_what_the_adjoint_gives(workbook):
-    """Counts of a unit of activity in each voxel, summed over pixels that cover the crystals."""
-    system = mph.read_system(workbook)
-    grid = mph.Grid.centered((6, 7, 5), 12.0, (4.0, -6.0, 3.0))
-    views = system.views(shape=(128, 128), detector="real")
-    settings = {"crystal_mu": 0.25, "photons_per_decay": 0.89, **EDGE}
-    projector = mph.Projector(grid, views, mph.Emission(system, **settings))
-    backprojected = projector.T(np.ones((len(system), 128, 128), np.float32)) / grid.voxel_volume
-    found = mph.sensitivity_map(system, grid, **settings).array
-    whole = mph.modules_map(system, grid).array == len(system)
-    assert whole.mean() > 0.9
-    assert np.allclose(backprojected[whole], found[whole], rtol=0.01)
-
-
 def test_maps_are_the_values_at_the_voxels_centres(system, rng):
     grid = general_grid(rng, (21, 19, 23))
     grid = mph.Grid(grid.shape, grid.affine * np.array([[12.0], [12.0], [12.0], [1.0]]))

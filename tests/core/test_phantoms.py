@@ -135,7 +135,7 @@ def test_line_integrals_are_those_of_the_values(phantom, quantity, rng):
     [mph.Ellipsoid(radii=(30, 20, 25), activity=3), mph.Cylinder(radius=24, height=40, activity=3)],
     ids=lambda shape: shape.KIND,
 )
-def test_projections_of_voxels_converge_to_the_closed_form(shape, rng, capsys):
+def test_projections_of_voxels_converge_to_the_closed_form(shape, rng):
     """A voxel's mean does not depend on where in it the ray runs: h for single rays, h^2 for the mean over many rays."""
     phantom, pose = mph.ShapePhantom([shape]), mph.euler_pose(0.4, 0.7, -1.1, (1, 2, -3))
     starts = rng.normal(size=(20_000, 3))
@@ -150,8 +150,6 @@ def test_projections_of_voxels_converge_to_the_closed_form(shape, rng, capsys):
         single.append(np.sqrt(np.mean(error**2)))
         mean.append(abs(error[through].mean()))
     orders = [np.log2(np.array(errors[:-1]) / errors[1:]) for errors in (single, mean)]
-    with capsys.disabled():
-        print(f"\n{shape.KIND}: orders of single rays {np.round(orders[0], 2)}, of their mean {np.round(orders[1], 2)}")
     assert single[-1] < 0.01 and np.all((orders[0] > 0.8) & (orders[0] < 1.3))
     assert mean[-1] < 1e-3 and np.all((orders[1] > 1.5) & (orders[1] < 2.7))
 

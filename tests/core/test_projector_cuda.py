@@ -164,6 +164,18 @@ def test_rays_of_fans_are_the_listed_rays(fans, small_pieces):
         np.testing.assert_array_equal(together, np.concatenate(single))
 
 
+def test_arrays_are_added_to_in_place(fans, rng):
+    volume, fans = fans
+    values, mu = rng.random(len(fans), dtype=np.float32), 0.1 * rng.random(SHAPE, dtype=np.float32)
+    for part, *before in (("backproject",), ("mu_gradient", volume)):
+        sums, expected = np.ones(SHAPE, np.float32), np.ones(SHAPE)
+        getattr(cuda, part)(sums, *before, values, fans, Attenuation(mu))
+        getattr(reference, part)(
+            expected, *(a.astype(float) for a in (*before, values)), fans, Attenuation(mu.astype(float))
+        )
+        np.testing.assert_allclose(sums, expected, rtol=2e-5, atol=2e-5 * np.abs(expected).max())
+
+
 @pytest.mark.parametrize("rays_at_once", [2**24, 17])
 def test_tensors_on_the_device_are_not_copied(rays_at_once, rng, monkeypatch):
     monkeypatch.setattr(cuda, "_RAYS_AT_ONCE", rays_at_once)

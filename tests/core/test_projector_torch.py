@@ -20,21 +20,6 @@ VIEWS = Views(
 )
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_gradient_is_the_adjoint(backend):
-    A = Projector(GRID, VIEWS, backend=backend)
-    x = torch.rand(GRID.shape, requires_grad=True)
-    weights = torch.rand(A.shape_out)
-    (A(x) * weights).sum().backward()
-    assert x.grad.dtype == torch.float32
-    np.testing.assert_allclose(x.grad.numpy(), A.T(weights.numpy()), rtol=1e-5, atol=1e-6)
-
-    y = torch.rand(A.shape_out, requires_grad=True)
-    weights = torch.rand(GRID.shape)
-    (A.T(y) * weights).sum().backward()
-    np.testing.assert_allclose(y.grad.numpy(), A(weights.numpy()), rtol=1e-5, atol=1e-6)
-
-
 @pytest.mark.parametrize("backend", ["numpy", "torch"])
 def test_gradcheck_in_float64(backend):
     grid = Grid.centered((3, 2, 2), 2.0)
@@ -70,7 +55,7 @@ def test_gradient_through_a_bad_loss_is_not_refused():
     A = Projector(GRID, VIEWS)
     x = torch.zeros(GRID.shape, requires_grad=True)
     (A(x) * float("nan")).sum().backward()
-    assert torch.isnan(x.grad).any()
+    assert torch.isnan(x.grad).any() and x.grad.dtype == torch.float32
 
 
 def test_bad_tensors_are_one_clear_line():
@@ -85,7 +70,4 @@ def test_bad_tensors_are_one_clear_line():
         (torch.ones(GRID.shape, device="meta"), "meta"),
     ):
         refused(lambda bad=bad: A(bad), word)
-
-
-def test_volumes_of_tensors_in_a_graph_say_what_to_do():
     refused(lambda: Volume(torch.ones(GRID.shape, requires_grad=True), GRID), "volume: ", "detach")

@@ -165,10 +165,10 @@ def test_project_takes_one_series_of_a_dicom_folder(tmp_path, ct, workbook, scan
     assert "only folders of DICOM files hold several series" in capsys.readouterr().err
 
     # A reconstructed tomogram of one file beside them, as activity.
-    write_tomogram(mph.Volume(2 * activity.array + 1, activity.grid), tmp_path / "recon.dcm")
+    tomogram = mph.Volume(2 * activity.array + 1, activity.grid)
+    write_tomogram(tomogram, tmp_path / "recon.dcm")
     assert run(*common, "--volume", tmp_path / "recon.dcm", "--emission", "-o", out) == 0
-    counts = mph.project_run(
-        system, mph.centered(mph.Volume(2 * activity.array + 1, activity.grid)), shape=(9, 9), backend="numpy",
-        model=mph.Emission(system),
-    ).projections  # fmt: skip
-    np.testing.assert_allclose(mph.read_run(out).projections, counts, rtol=1e-6)
+    expected = mph.project_run(
+        system, mph.centered(tomogram), shape=(9, 9), backend="numpy", model=mph.Emission(system)
+    )
+    np.testing.assert_allclose(mph.read_run(out).projections, expected.projections, rtol=1e-6)

@@ -149,14 +149,8 @@ def test_phantom_outside_the_grid_leaves_it_empty():
         ({"altered": 1000}, "Derenzo altered: there is no rod 1000 to leave out of 73"),
         ({"altered": 1, "rod_diameters": (13, 0, 0, 0, 0, 0)}, "there is no rod 1 to leave out of 1"),
         ({"altered": -7}, "Derenzo altered: expected a sector with rods to add one to, got sector 7 of 6"),
-        (
-            {"altered": -6, "rod_diameters": (8, 6, 5, 4, 3, 0)},
-            "expected a sector with rods to add one to, got sector 6",
-        ),
-        (
-            {"altered": -1, "rod_diameters": (12, 1, 1, 1, 1, 1)},
-            "there is no room for one more rod of 12 mm in sector 1",
-        ),
+        ({"altered": -6, "rod_diameters": (8, 6, 5, 4, 3, 0)}, "a sector with rods to add one to, got sector 6"),
+        ({"altered": -1, "rod_diameters": (12, 1, 1, 1, 1, 1)}, "no room for one more rod of 12 mm in sector 1"),
         ({"altered": 1.5}, "Derenzo altered: expected a whole number, got 1.5"),
         ({"rod_diameters": (8, 6, 5, 4, 3, 1e-9)}, "more than 100000 rods"),
         ({"height": -1}, "Derenzo height"),

@@ -96,7 +96,7 @@ def test_the_mean_shift_is_that_of_exponential_absorption(mu):
 
 @pytest.mark.parametrize("within", ["within_crystal", "within_walls"])
 def test_beyond_the_crystals_side_nothing_is_recorded(within):
-    system = module(side=40.0)
+    system = module(detector_side=40.0)
     views = system.views((60, 60), "real", pitch=1.0)
     grid = mph.Grid.centered((9, 9, 9), 12.0)
     model = mph.Emission(system, crystal_mu=IODIDE, depth_layers=8, **{within: True})

@@ -93,11 +93,6 @@ def test_volume_of_the_same_grid_read_from_a_file_is_accepted():
     Projector(GRID, VIEWS)(Volume(ONES, Grid(GRID.shape, affine)))
 
 
-def test_unknown_backend_lists_the_choices():
-    refused(lambda: Projector(GRID, VIEWS, backend="gpu"), "'gpu'", "auto, cpu, torch, numpy, cuda")
-    refused(lambda: trace_rays(Volume(ONES, GRID), [0, 0, 0], [1, 1, 1], "gpu"), "'gpu'", "cpu")
-
-
 def without(monkeypatch, *missing):
     require = backends._require
 
@@ -110,7 +105,9 @@ def without(monkeypatch, *missing):
     backends._warn_slower.cache_clear()
 
 
-def test_missing_library_is_named(monkeypatch):
+def test_unknown_backends_and_missing_libraries_are_named(monkeypatch):
+    refused(lambda: Projector(GRID, VIEWS, backend="gpu"), "'gpu'", "auto, cpu, torch, numpy, cuda")
+    refused(lambda: trace_rays(Volume(ONES, GRID), [0, 0, 0], [1, 1, 1], "gpu"), "'gpu'", "cpu")
     without(monkeypatch, "cpu", "torch")
     refused(lambda: Projector(GRID, VIEWS, backend="cpu"), "backend 'cpu'", "no kernels")
     refused(lambda: Projector(GRID, VIEWS, backend="torch"), "pip install torch")

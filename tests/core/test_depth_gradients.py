@@ -26,13 +26,9 @@ def numbers(rng, modules=3):
     return rng.random(GRID.shape), rng.random((modules, *SHAPE))
 
 
-def by_direction(settings):
-    return "edge" in settings or "depth_layers" in settings
-
-
 def system_for(settings):
-    """One module where kernels depend on the direction, which takes long."""
-    return SYSTEM[:1] if by_direction(settings) else SYSTEM
+    """Return one module where kernels depend on the direction, which takes long."""
+    return SYSTEM[:1] if {"edge", "depth_layers"} & settings.keys() else SYSTEM
 
 
 MU = mph.Volume(np.random.default_rng(2).uniform(0, 0.02, (5, 6, 5)), mph.Grid.centered((5, 6, 5), 11.0), "mu")

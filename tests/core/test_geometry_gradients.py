@@ -17,6 +17,10 @@ from mphdrr.core.volumes.volume import Volume  # noqa: E402
 
 from .conftest import BACKENDS, general_grid, refused, same_matter  # noqa: E402
 
+GRID = Grid.centered((5, 4, 3), 1.0)
+VIEWS = Views(
+    [[0.1, 0.3, -20], [2, -20, 1]], [[0, 0, 20], [0, 20, 0]], [[1, 0, 0], [1, 0, 0]], [[0, 1, 0], [0, 0, 1]], (4, 5)
+)
 MU = [None, "shared", "own"]
 SHAPES = [(12, 9, 10), (7, 5, 6), (1, 6, 4), (5, 1, 3), (4, 5, 1), (1, 1, 1)]
 
@@ -199,14 +203,12 @@ def test_fans_are_their_rays(backend, which, rng, monkeypatch):
 
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_gradient_by_volume_is_the_adjoint(backend, rng):
-    views = Views([[0.1, 0.3, -20]], [[0, 0, 20]], [[1, 0, 0]], [[0, 1, 0]], (4, 5))
-    grid = Grid.centered((5, 4, 3), 1.0)
     values = torch.tensor(rng.random(20), dtype=torch.float32)
-    volume = torch.rand(grid.shape, requires_grad=True)
-    y = trace_rays(volume, *views.rays(0), backend, grid)
+    volume = torch.rand(GRID.shape, requires_grad=True)
+    y = trace_rays(volume, *VIEWS.rays(0), backend, GRID)
     assert y.dtype == (torch.float64 if backend == "numpy" else torch.float32)
     (y * values).sum().backward()
-    expected = Projector(grid, views, backend=backend).T(values.numpy().reshape(1, 4, 5))
+    expected = Projector(GRID, VIEWS[:1], backend=backend).T(values.numpy().reshape(1, 4, 5))
     np.testing.assert_allclose(volume.grad.numpy(), expected, rtol=1e-5, atol=1e-6)
 
 
@@ -235,7 +237,7 @@ def test_kinds_of_arguments(rng):
 
 
 def test_bad_input_is_one_clear_line():
-    grid = Grid.centered((5, 4, 3), 1.0)
+    grid = GRID
     ones, point = torch.ones(grid.shape), torch.zeros(3)
     for call, word in (
         (lambda: trace_rays(ones, point, point), "grid"),
@@ -256,18 +258,11 @@ def test_bad_input_is_one_clear_line():
 
 
 def test_gradients_of_gradients_are_refused(rng):
-    grid = Grid.centered((5, 4, 3), 1.0)
     source = torch.tensor([0.1, 0.2, -9.0], requires_grad=True)
-    y = trace_rays(torch.rand(grid.shape), source, [0.0, 0.3, 9.0], grid=grid).sum()
+    y = trace_rays(torch.rand(GRID.shape), source, [0.0, 0.3, 9.0], grid=GRID).sum()
     (gradient,) = torch.autograd.grad(y, source, create_graph=True)
     with pytest.raises(InputError, match="create_graph"):
         torch.autograd.grad(gradient.sum(), source)
-
-
-GRID = Grid.centered((5, 4, 3), 1.0)
-VIEWS = Views(
-    [[0.1, 0.3, -20], [2, -20, 1]], [[0, 0, 20], [0, 20, 0]], [[1, 0, 0], [1, 0, 0]], [[0, 1, 0], [0, 0, 1]], (4, 5)
-)
 
 
 @pytest.mark.parametrize("backend", ["numpy", "torch"])

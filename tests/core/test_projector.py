@@ -30,19 +30,15 @@ def affine(linear, shape, center=(3.0, -5.0, 2.0)):
     return a
 
 
-def linear_parts(seed=0):
-    rng = np.random.default_rng(seed)
-    return {
-        "plain": np.eye(3) * 2.0,
-        "anisotropic": np.diag([0.7, 2.0, 3.5]),
-        "mirrored": np.diag([-1.0, 1.5, 1.0]),
-        "permuted": np.eye(3)[[2, 0, 1]] * 1.5,
-        "rotated": rotation(rng) * 1.3,
-        "sheared": rotation(rng) @ (np.diag([1.0, 1.4, 0.8]) + np.triu(rng.uniform(-0.5, 0.5, (3, 3)), 1)),
-    }
-
-
-LINEAR = linear_parts()
+_rng = np.random.default_rng(0)
+LINEAR = {
+    "plain": np.eye(3) * 2.0,
+    "anisotropic": np.diag([0.7, 2.0, 3.5]),
+    "mirrored": np.diag([-1.0, 1.5, 1.0]),
+    "permuted": np.eye(3)[[2, 0, 1]] * 1.5,
+    "rotated": rotation(_rng) * 1.3,
+    "sheared": rotation(_rng) @ (np.diag([1.0, 1.4, 0.8]) + np.triu(_rng.uniform(-0.5, 0.5, (3, 3)), 1)),
+}
 SHAPES = [(5, 7, 6), (1, 1, 1), (1, 9, 4), (6, 5, 1)]
 
 

@@ -37,13 +37,6 @@ def beside_and_through(system, **more):
     return [next(part for part in parts if part.holes[0] == hole) for hole in (0, 1)]
 
 
-def seen_through_neighbour(system):
-    """A place that the first crystal sees through the second module's hole."""
-    (u, _, k), q = system.frames()[0], system.centers[1]
-    pixel = system.centers[0] - LENGTH * k + 0.3 * SIDE * u * np.sign((q - system.centers[0]) @ u)
-    return q + 1.5 * (q - pixel)
-
-
 def counted(system, model, place, size, pixels=32, n=1):
     """Of one decay a second in a cube the first module's counts."""
     grid = mph.Grid.centered((n, n, n), size / n, place)
@@ -103,7 +96,10 @@ def traced(system, place, size, points, areas, of_hole, rng):
 
 def test_photons_one_by_one_through_a_neighbours_hole(rng):
     system, size, n = two_modules(), 6.0, 2**20
-    place, (_, through) = seen_through_neighbour(system), beside_and_through(system)
+    _, through = beside_and_through(system)
+    (u, _, k), q = system.frames()[0], system.centers[1]
+    pixel = system.centers[0] - LENGTH * k + 0.3 * SIDE * u * np.sign((q - system.centers[0]) @ u)
+    place = q + 1.5 * (q - pixel)  # the first crystal sees it through the second module's hole
     radius, (u, v, _) = through.scanner.effective_diameter[1] / 2, system.frames()[1]
     angle, r = 2 * math.pi * rng.random(n), radius * np.sqrt(rng.random(n))
     points = system.centers[1] + (r * np.cos(angle))[:, None] * u + (r * np.sin(angle))[:, None] * v

@@ -46,21 +46,21 @@ DIRECTED = {"edge": "path", "depth_layers": 2}
         ({**DIRECTED, "mu": MU}, 1e-3))),
 ])  # fmt: skip
 def test_derivatives_are_central_differences(settings, small, rng):
-    """By places, tilts, collimators, holes, pixels and the image's middle, each within 1e-6 of the largest of its kind.
+    """Places, tilts, collimators, holes, pixels and the image's middle: each within 1e-6 of the largest of its kind.
 
-    Where a faint tap of a kernel is left out or not, or rays pass from voxel to voxel, steps are small, by all at once.
+    Where a faint tap of a kernel is left out or not, or rays pass from voxel to voxel, steps are small, of all numbers together.
     """
     system = SYSTEM if small < 0.1 and "mu" not in settings else system_for(settings)
     x, weights = numbers(rng, len(system))
     gradient = mph.geometry_gradient(projector(system, **settings), x, weights)
     centers, tilt = gradient.by_columns(system)
     gradient = {**gradient._asdict(), "centers": centers, "tilt": tilt}
-    at = {"pitch": PITCH, "offset": OFFSET}
-    at |= {name: getattr(system, name) for name in STEPS if name not in at}
-    along = {name: small * step * rng.normal(size=np.shape(at[name])) for name, step in STEPS.items()}
+    values = {"pitch": PITCH, "offset": OFFSET}
+    values |= {name: getattr(system, name) for name in STEPS if name not in values}
+    along = {name: small * step * rng.normal(size=np.shape(values[name])) for name, step in STEPS.items()}
 
     def sums(names, sign):
-        changes = {name: at[name] + sign * along[name] for name in names}
+        changes = {name: values[name] + sign * along[name] for name in names}
         optics = {name: changes.pop(name) for name in ("pitch", "offset") if name in changes}
         return (projector(system.replace(**changes), **optics, **settings)(x) * weights).sum(axis=(1, 2))
 

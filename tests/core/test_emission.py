@@ -54,7 +54,7 @@ def assert_real_is_virtual(model, rng, pitch=4.0, magnification=3.0, offset=(0.0
         model.system.views((9, 10), "real", pitch=pitch, offset=offset),
         model.system.views((9, 10), "virtual", magnification, magnification * pitch, -magnification * offset),
     )
-    real, virtual = (mph.Projector(grid, each, model)(x) for each in views)
+    real, virtual = (mph.Projector(grid, detector, model)(x) for detector in views)
     assert real.any()
     np.testing.assert_allclose(virtual[:, ::-1, ::-1], real, rtol=1e-5, atol=1e-5 * real.max())
 
@@ -119,7 +119,7 @@ def test_views_of_another_system_and_what_is_no_mu_are_refused(system):
     grid = mph.Grid.centered((4, 4, 4), 1.0)
     views, ones = system.views((4, 4)), np.ones(grid.shape)
     sources, centers, u, v = views.sources, views.detector_centers, views.u_steps, views.v_steps
-    for words, given in (
+    for words, changes in (
         (("12 modules", "4 views"), {"views": system[:4].views((4, 4))}),
         (("view 0", "pinhole"), {"views": system[np.arange(12)[::-1]].views((4, 4))}),
         (("view 0", "along"), {"views": mph.Views(sources, centers, u + np.array([0, 0, 1]), v, (4, 4))}),
@@ -131,7 +131,7 @@ def test_views_of_another_system_and_what_is_no_mu_are_refused(system):
         (("negative",), {"mu": mph.Volume(-ones, grid, "mu")}),
         (("A(x, mu=...)",), {"mu": torch.ones(grid.shape, requires_grad=True)}),
     ):
-        options = {"system": system, "views": views, **given}
+        options = {"system": system, "views": views, **changes}
         refused(lambda options=options: mph.Projector(grid, options.pop("views"), emission(**options)), *words)
     refused(lambda: mph.Projector(grid, views, emission(system))(mph.Volume(ones, grid, "hu")), "activity")
 
@@ -177,14 +177,16 @@ def model_of(name, system, grid, rng):
 @pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("name", MODELS)
 def test_every_models_adjoint_is_exact_and_backends_agree(backend, name, system, rng):
-    """Of tilted modules and of straight ones, whose rays run along voxels' faces: an odd number of pixels, even voxels."""
+    """The straight modules' rays run along voxels' faces: an odd number of pixels, even voxels."""
     straight = mph.PinholeSystem([[150, 0, 0], [0, -140, 0], [0, 30, 130]], 2.0, 60.0, 50.0, 10.0, 60.0)
     for scanner, grid, offset in (
         (system[3:6], general_grid(rng, (9, 8, 7)), (20.0, 0.0)),
         (straight, mph.Grid.centered((9, 8, 7), 6.0), (0.0, 0.0)),
     ):
         views, model = scanner.views((9, 11), offset=offset), model_of(name, scanner, grid, rng)
-        A, reference = (mph.Projector(grid, views, model, which, threads=2) for which in (backend, "numpy"))
+        A, reference = (
+            mph.Projector(grid, views, model, backend_name, threads=2) for backend_name in (backend, "numpy")
+        )
         assert_adjoint(A, rng)
         x = rng.random(grid.shape)
         x[:, :, 0] = x[0] = 0

@@ -85,13 +85,11 @@ def test_chord_of_a_slab(backend):
     From outside and from inside; also with mu in front, on its own planes.
     """
     grid = Grid.centered((8, 40, 40), 2.0)
-    before = Volume(
-        np.full((2, 10, 10), 0.1), Grid.centered((2, 10, 10), 8.0, (-28.0, 0, 0)), "mu"
-    )  # x from -36 to -20
+    front = Volume(np.full((2, 10, 10), 0.1), Grid.centered((2, 10, 10), 8.0, (-28.0, 0, 0)), "mu")  # x from -36 to -20
     activity, mu = Volume(np.ones(grid.shape), grid), Volume(np.full(grid.shape, 0.07), grid, "mu")
     m = float(mu.array[0, 0, 0])
     target = torch.tensor([60.0, 7.1, -3.9], dtype=torch.float64, requires_grad=True)
-    for start, matter in ((-50.0, None), (-50.0, mu), (-3.0, mu), (-50.0, before), (-25.0, before)):
+    for start, matter in ((-50.0, None), (-50.0, mu), (-3.0, mu), (-50.0, front), (-25.0, front)):
         source = torch.tensor([start, 1.3, 0.7], dtype=torch.float64, requires_grad=True)
         y = trace_rays(activity, source, target, backend, mu=matter)
         secant = (target - source).norm() / (target - source)[0]
@@ -99,7 +97,7 @@ def test_chord_of_a_slab(backend):
             expected = (1 - torch.exp(-m * (8 - source[0].clamp(min=-8)) * secant)) / m
         else:
             thickness = (
-                (-20 - source[0].clamp(min=-36)) * secant * (0.0 if matter is None else float(before.array[0, 0, 0]))
+                (-20 - source[0].clamp(min=-36)) * secant * (0.0 if matter is None else float(front.array[0, 0, 0]))
             )
             expected = 16 * secant * torch.exp(-thickness)
         torch.testing.assert_close(y[0], expected)
@@ -115,12 +113,12 @@ def test_integrals_and_gradients_depend_on_matter_and_not_on_its_grid(backend, r
     grid = general_grid(rng, (6, 5, 4))
     volume, values = Volume(rng.random(grid.shape), grid), rng.uniform(0, 0.2, grid.shape)
     ends = oblique_rays(rng, grid)
-    reference, *others = (
+    reference, *results = (
         (trace_rays(volume, *ends, backend, mu=mu), *gradients(volume, *ends, backend, np.ones(len(ends[0])), mu))
         for mu in same_matter(grid, values)
     )
-    for other in others:
-        for k, (numbers, expected) in enumerate(zip(other, reference, strict=True)):
+    for result in results:
+        for k, (numbers, expected) in enumerate(zip(result, reference, strict=True)):
             share = 1e-8 if k or backend == "numpy" else 1e-6
             np.testing.assert_allclose(numbers, expected, rtol=0, atol=share * np.abs(expected).max())
 

@@ -163,12 +163,12 @@ def test_adjoint_is_exact_and_backends_agree(settings, backend, rng):
             np.testing.assert_allclose(numbers, expected, rtol=0, atol=(1e-12 if double else 1e-5) * expected.max())
 
 
-@pytest.mark.parametrize(("settings", "points", "most"), [
+@pytest.mark.parametrize(("settings", "points", "bound"), [
     ({"intrinsic_fwhm": 1.0, "crystal_mu": "NaI", "isotope": "Tc-99m", "aperture_mu": "tungsten"}, (61, 13), 0.01),
     ({"edge": "path", "aperture_mu": 3.6, "plate_thickness": 3.0}, (61, 13), 0.01),
     ({"edge": "path", "aperture_mu": 3.6, "within_crystal": True, **DEEP}, (37, 8), 0.012),
 ])  # fmt: skip
-def test_images_are_those_of_many_rays(settings, points, most, rng):
+def test_images_are_those_of_many_rays(settings, points, bound, rng):
     grid, system = mph.Grid.centered((12, 12, 12), 6.0), SYSTEM[1:]
     x = rng.random(grid.shape) ** 8
     A = depth_projector(grid, 24, system=system, **settings)
@@ -176,7 +176,7 @@ def test_images_are_those_of_many_rays(settings, points, most, rng):
     rays = mph.Emission(
         system, hole="rays", aperture_points=hole_points, pixel_points=pixel_points, tolerance=1e9, **settings
     )
-    assert misplaced(A(x), mph.Projector(grid, A.views, rays)(x)) < most
+    assert misplaced(A(x), mph.Projector(grid, A.views, rays)(x)) < bound
 
 
 def test_threads_change_nothing(rng):
@@ -267,13 +267,13 @@ def test_gradients_by_attenuation_and_activity_are_central_differences(size, set
     views, mu = SYSTEM.views((6, 6)), mph.Volume(np.zeros(grid.shape), grid, "mu")
     A = mph.Projector(grid, views, mph.Emission(SYSTEM, mu, **settings), double=True)
     assert bool(A._close_parts) == (size == 130.0)
-    x, values = (torch.tensor(rng.uniform(0, most, grid.shape), requires_grad=True) for most in (1, 0.1 / size))
+    x, values = (torch.tensor(rng.uniform(0, largest, grid.shape), requires_grad=True) for largest in (1, 0.1 / size))
     weights, along, step = torch.tensor(rng.random(A.shape_out)), torch.tensor(rng.random(grid.shape)), 1e-6
     (A(x, mu=values) * weights).sum().backward()
-    activity, at = x.detach(), values.detach()
-    more, less = ((A(activity, mu=at + sign * step * along) * weights).sum() for sign in (1, -1))
-    np.testing.assert_allclose((values.grad * along).sum(), (more - less) / (2 * step), rtol=1e-6)
-    np.testing.assert_allclose((x.grad * along).sum(), (A(along, mu=at) * weights).sum(), rtol=1e-9)
+    activity, mu_values = x.detach(), values.detach()
+    ahead, behind = ((A(activity, mu=mu_values + sign * step * along) * weights).sum() for sign in (1, -1))
+    np.testing.assert_allclose((values.grad * along).sum(), (ahead - behind) / (2 * step), rtol=1e-6)
+    np.testing.assert_allclose((x.grad * along).sum(), (A(along, mu=mu_values) * weights).sum(), rtol=1e-9)
 
 
 def test_a_batch_is_each_alone(rng):

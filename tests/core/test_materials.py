@@ -150,10 +150,7 @@ def test_several_lines_count_as_they_do_together(system):
         ({"aperture_mu": "tungsten"}, "aperture_mu 'tungsten': at which energy"),
         ({"aperture_mu": "tungsen"}, "aperture_mu: material 'tungsen': expected one of"),
         ({"crystal_mu": "NaI", "photons_per_decay": 0.9}, "crystal_mu 'NaI': at which energy"),
-        (
-            {"crystal_mu": "NaI", "isotope": "Tc-99m", "window": (1, 2), "photons_per_decay": 0.9},
-            "photons in its window",
-        ),
+        ({"crystal_mu": "NaI", "isotope": "Tc-99m", "window": (1, 2), "photons_per_decay": 0.9}, "in its window"),
         ({"aperture_mu": "wolfram", "isotope": "Tc-99m"}, "aperture_mu: material 'wolfram': expected one of tungsten"),
         ({"crystal_mu": "NaI", "isotope": mph.Isotope("Co-60", 1.7e8, ((1173.2, 1.0),))}, "crystal_mu: energy 1173.2"),
     ],

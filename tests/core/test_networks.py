@@ -228,11 +228,8 @@ def test_the_u_net_takes_any_size(shape):
     assert UNet(2, 3, (4, 4, 4))(torch.ones(1, 2, *shape)).shape == (1, 3, *shape)
 
 
-U_NET = "three levels or more"
-
-
 @pytest.mark.parametrize(("kind", "name", "channels", "expected"), [
-    *(("cameras", name, channels, U_NET) for name in ("channels", "camera_channels")
+    *(("cameras", name, channels, "three levels or more") for name in ("channels", "camera_channels")
       for channels in ((), (4,), (4, 4), (4, 0, 4), (4, 4, -4))),
     *(("channels", "channels", channels, "one level or more") for channels in ((), (4, 0))),
 ])  # fmt: skip

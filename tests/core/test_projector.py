@@ -12,7 +12,6 @@ from mphdrr.core.volumes.volume import Volume
 
 from .conftest import BACKENDS
 
-FAST_BACKENDS = BACKENDS[1:]
 TOLERANCE = {"numpy": 1e-9, "torch": 1e-5, "cpu": 1e-5}
 
 
@@ -140,7 +139,7 @@ def test_integrals_are_the_sums_of_the_voxels_clipped_lengths(backend, shape, ki
     np.testing.assert_allclose(integrals, expected, rtol=TOLERANCE[backend], atol=TOLERANCE[backend])
 
 
-@pytest.mark.parametrize("backend", FAST_BACKENDS)
+@pytest.mark.parametrize("backend", BACKENDS[1:])
 @pytest.mark.parametrize("shape", SHAPES)
 @pytest.mark.parametrize("kind", LINEAR)
 def test_backends_agree_on_nasty_rays(backend, shape, kind):

@@ -167,11 +167,11 @@ def test_rays_of_fans_are_the_listed_rays(fans, small_pieces):
 def test_arrays_are_added_to_in_place(fans, rng):
     volume, fans = fans
     values, mu = rng.random(len(fans), dtype=np.float32), 0.1 * rng.random(SHAPE, dtype=np.float32)
-    for part, *before in (("backproject",), ("mu_gradient", volume)):
+    for part, *volumes in (("backproject",), ("mu_gradient", volume)):
         sums, expected = np.ones(SHAPE, np.float32), np.ones(SHAPE)
-        getattr(cuda, part)(sums, *before, values, fans, Attenuation(mu))
+        getattr(cuda, part)(sums, *volumes, values, fans, Attenuation(mu))
         getattr(reference, part)(
-            expected, *(a.astype(float) for a in (*before, values)), fans, Attenuation(mu.astype(float))
+            expected, *(a.astype(float) for a in (*volumes, values)), fans, Attenuation(mu.astype(float))
         )
         np.testing.assert_allclose(sums, expected, rtol=2e-5, atol=2e-5 * np.abs(expected).max())
 
@@ -274,22 +274,22 @@ def test_gradients_are_those_of_the_reference(attenuation, system, rng, small_pi
     poses = torch.tensor(system.poses())
 
     def gradients(backend):
-        x, m, sources, targets, places, lengths = given = [
+        x, m, sources, targets, places, lengths = inputs = [
             torch.as_tensor(a).clone().requires_grad_()
             for a in (volume, mu * 0.02, *ends, poses[:, :3, 3], system.collimator_length)
         ]
         numbers = np.random.default_rng(0)
         matter = {"mu": m} if attenuation else {}
         on = {"grid": grid, "backend": backend, **matter, **({"mu_grid": mu_grid} if attenuation else {})}
-        found = []
+        gradients_by_input = []
         for y in (
             trace(x, sources, targets, **on),
             Projector(grid, views, model, backend=backend)(x, **matter),
             emission_images(x, places, poses[:, :3, :3], lengths, 2.0, (9, 8), diameter=2.0, pixel_points=2, **on),
         ):
             loss = (y * torch.tensor(numbers.normal(size=y.shape))).sum()
-            found += [g for g in torch.autograd.grad(loss, given, allow_unused=True) if g is not None]
-        return found
+            gradients_by_input += [g for g in torch.autograd.grad(loss, inputs, allow_unused=True) if g is not None]
+        return gradients_by_input
 
     pairs = list(zip(gradients("cuda"), gradients("numpy"), strict=True))
     assert len(pairs) == (4 + 2 + 4 if attenuation else 3 + 1 + 3)

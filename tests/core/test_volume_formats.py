@@ -255,25 +255,25 @@ def test_enhanced_and_run_length_coded_images(tmp_path, ct):
     def sequence_of(**tags):
         return [set_tags(Dataset(), **tags)]
 
-    one = write_series(ct, tmp_path / "e")[0]
+    image = write_series(ct, tmp_path / "e")[0]
     order = [3, 0, 6, 1, 5, 2, 4]
     positions = (LPS @ ct.grid.affine @ [[0] * 7, [0] * 7, order, [1] * 7])[:3].T
     positions = [sequence_of(ImagePositionPatient=numbers(position)) for position in positions]
     shared = sequence_of(
-        PixelMeasuresSequence=sequence_of(PixelSpacing=one.PixelSpacing, SliceThickness="2.5"),
-        PlaneOrientationSequence=sequence_of(ImageOrientationPatient=one.ImageOrientationPatient),
+        PixelMeasuresSequence=sequence_of(PixelSpacing=image.PixelSpacing, SliceThickness="2.5"),
+        PlaneOrientationSequence=sequence_of(ImageOrientationPatient=image.ImageOrientationPatient),
         PixelValueTransformationSequence=sequence_of(RescaleSlope="1", RescaleIntercept="-1000", RescaleType="HU"),
     )
     moved = ("PixelSpacing", "ImageOrientationPatient", "ImagePositionPatient", "RescaleSlope", "RescaleIntercept")
-    one.SOPClassUID = one.file_meta.MediaStorageSOPClassUID = EnhancedCTImageStorage
+    image.SOPClassUID = image.file_meta.MediaStorageSOPClassUID = EnhancedCTImageStorage
     set_tags(
-        one, **dict.fromkeys(moved), NumberOfFrames=7, SharedFunctionalGroupsSequence=shared,
-        PerFrameFunctionalGroupsSequence=[sequence_of(PlanePositionSequence=each)[0] for each in positions],
+        image, **dict.fromkeys(moved), NumberOfFrames=7, SharedFunctionalGroupsSequence=shared,
+        PerFrameFunctionalGroupsSequence=[sequence_of(PlanePositionSequence=position)[0] for position in positions],
         PixelData=(ct.array[:, :, order].transpose(2, 1, 0) + 1000).astype("<u2").tobytes(),
     )  # fmt: skip
     shutil.rmtree(tmp_path / "e")
     (tmp_path / "e").mkdir()
-    save(one)
+    save(image)
     volume = mph.read_volume(tmp_path / "e")
     assert np.array_equal(volume.array, ct.array)
     assert np.allclose(volume.grid.affine, ct.grid.affine, rtol=0, atol=1e-9)
@@ -369,8 +369,8 @@ def _tilt(written, folder):
 
 def _text_for_a_number(written, folder):
     path = Path(written[4].filename)
-    before, tag, after = path.read_bytes().partition(b"(\x00R\x10DS")  # RescaleIntercept
-    path.write_bytes(before + tag + after[:2] + b"nothing!"[: after[0]] + after[2 + after[0] :])
+    head, tag, rest = path.read_bytes().partition(b"(\x00R\x10DS")  # RescaleIntercept
+    path.write_bytes(head + tag + rest[:2] + b"nothing!"[: rest[0]] + rest[2 + rest[0] :])
 
 
 def _compressed(written, folder):

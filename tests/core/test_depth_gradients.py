@@ -48,7 +48,7 @@ DIRECTED = {"edge": "path", "depth_layers": 2}
 def test_derivatives_are_central_differences(settings, small, rng):
     """Places, tilts, collimators, holes, pixels and the image's middle: each within 1e-6 of the largest of its kind.
 
-    Where a faint tap of a kernel is left out or not, or rays pass from voxel to voxel, steps are small, of all numbers together.
+    Where a faint tap of a kernel is left out or not, or rays pass from voxel to voxel, a small step is taken by all at once.
     """
     system = SYSTEM if small < 0.1 and "mu" not in settings else system_for(settings)
     x, weights = numbers(rng, len(system))

@@ -199,21 +199,6 @@ def test_cameras_of_tensors_count_as_the_model_with_the_same_optics(system):
         assert float(tried[i].grad[0]) == pytest.approx(float(difference), rel=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("settings", "why"),
-    [
-        ({"aperture_mu": [1.0, 2.0]}, "^aperture_mu: expected one number, or one for each of 12 modules, got 2"),
-        ({"crystal_mu": 12 * [0.0]}, "^crystal_mu: expected more than 0"),
-        ({"edge": "path"}, "needs aperture_mu"),
-        ({"depth_layers": 2}, "needs crystal_mu"),
-        ({"opening_angle": 3.2}, "^opening_angle: expected less than pi"),
-    ],
-)
-def test_optics_that_cannot_be_are_refused(settings, why, system):
-    with pytest.raises(mph.InputError, match=why):
-        mph.sensitivity(system, [[0, 0, 0]], **settings)
-
-
 def test_optics_and_models_are_copied_and_pickled(system):
     """As for other processes, and by packages that copy their physics."""
     model = mph.Emission(system, isotope="Tc-99m", aperture_mu="tungsten", crystal_mu="NaI")

@@ -27,8 +27,8 @@ from .small_events import small_recipe
 
 WORKBOOK = Path(__file__).parents[2] / "examples" / "dc-spect-80.xlsx"
 
-_needs_torch = pytest.mark.skipif(importlib.util.find_spec("torch") is None, reason="torch is not installed")
-BACKENDS = ["numpy", pytest.param("torch", marks=_needs_torch), "cpu"]
+needs_torch = pytest.mark.skipif(importlib.util.find_spec("torch") is None, reason="torch is not installed")
+BACKENDS = ["numpy", pytest.param("torch", marks=needs_torch), "cpu"]
 """Parameters of what holds of every backend on the processor."""
 
 

@@ -12,6 +12,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import pytest
 
@@ -174,7 +175,6 @@ def test_the_checksum_of_a_packed_metaimage_is_read(tmp_path, rng):
 
 def test_files_of_earlier_versions_are_read(tmp_path, run, volume):
     """Which have no seal and no checksum."""
-    import h5py
 
     mph.write_run(run, tmp_path / "run.h5")
     with hdf5.opened(tmp_path / "run.h5") as new, h5py.File(tmp_path / "old.h5", "w") as old:
@@ -203,7 +203,6 @@ def test_an_edited_array_is_noticed(tmp_path, run):
 
 def test_every_reader_of_hdf5_opens_a_sealed_file(tmp_path, run):
     """Other programs do, too: the seal lies in the block that HDF5 leaves to users."""
-    import h5py
 
     mph.write_run(run, tmp_path / "run.h5")
     with h5py.File(tmp_path / "run.h5", "r") as file:

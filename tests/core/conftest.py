@@ -113,7 +113,7 @@ def stop(*_: object) -> None:
     raise Cancelled
 
 
-def assert_progress(call: Callable[[Callable[..., None]], object], steps: int = 3) -> None:
+def assert_progress(call: Callable[[Callable[..., None]], object], steps: int = 2) -> None:
     """Check that `call(progress)` goes on to its end in `steps` or more, and ends where its progress is cancelled."""
     shares: list[float] = []
     call(lambda done, total: shares.append(done / total))

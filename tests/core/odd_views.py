@@ -37,6 +37,8 @@ def odd_views(parallel: bool = False) -> Views:
     return Views(centers, middles, u_steps, v_steps, (90, 100), parallel)
 
 
-def points_seen(views: Views, rng: np.random.Generator, n: int) -> np.ndarray:
-    """World points (n, 3), mm, around the isocentre."""
-    return rng.uniform(-40, 40, (n, 3))
+def moved_views(views: Views, pose: np.ndarray) -> Views:
+    """Return views that a pose (4, 4) has moved in space."""
+    points = (x @ pose[:3, :3].T + pose[:3, 3] for x in (views.sources, views.detector_centers))
+    steps = (x @ pose[:3, :3].T for x in (views.u_steps, views.v_steps))
+    return Views(*points, *steps, views.shape, views.parallel)

@@ -9,6 +9,7 @@ from mphdrr.core.projector import backends
 from mphdrr.core.projector.rays import view_rays, window
 
 from .conftest import refused
+from .odd_views import moved_views
 
 ANGLES = np.array([0.0, 0.3, np.pi / 2, 1.9, np.pi, 4.4])
 TURN = mph.euler_pose(0.3, 0.5, 0.2)
@@ -63,12 +64,7 @@ def test_line_integrals_of_a_box_are_its_chords(backend, monkeypatch):
         pytest.skip(f"no backend {backend} here")
     grid = mph.Grid((8, 6, 10), TURN @ mph.Grid.centered((8, 6, 10), (2.0, 3.0, 1.5)).affine)
     views = mph.parallel_views(ANGLES, (9, 12), 2.3, elevation=0.1, center=(0.4, 0, 0.3))
-    turned = mph.Views(
-        *(x @ TURN[:3, :3] for x in (views.sources, views.detector_centers, views.u_steps, views.v_steps)),
-        views.shape,
-        parallel=True,
-    )
-    chords = box_chords(turned, np.array([8.0, 9.0, 7.5]))
+    chords = box_chords(moved_views(views, np.linalg.inv(TURN)), np.array([8.0, 9.0, 7.5]))
     images = mph.Projector(grid, views, backend=backend)(np.ones(grid.shape))
     tolerance = 1e-9 if backend == "numpy" else 2e-5
     np.testing.assert_allclose(images, chords, atol=tolerance)

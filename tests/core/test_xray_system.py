@@ -91,10 +91,10 @@ REFUSALS = [
     (lambda: one(filters="2.5 mm"), "filters '2.5 mm': expected materials with their mm, such as Al 2.5"),
     (lambda: one(filters={"Al": -1}), "filter Al: expected"),
     (lambda: one(filters=3), "filters: expected material and mm"),
-    (lambda: mph.xray_arc(z=400), "z"),
-    (lambda: mph.xray_arc(n=0), "n"),
-    (lambda: mph.xray_arc(panel_size=-1), "panel"),
-    (lambda: mph.xray_arc(start=0.0, end=7.0), "end"),
+    (lambda: mph.xray_arc(z=400), "z: expected less than"),
+    (lambda: mph.xray_arc(n=0), "number of sources: expected"),
+    (lambda: mph.xray_arc(panel_size=-1), "panel_size: expected more"),
+    (lambda: mph.xray_arc(start=0.0, end=7.0), "at most a full turn apart"),
 ]
 
 
